@@ -1,0 +1,33 @@
+"""Errors that are meant for the person at the keyboard.
+
+Every one says what is wrong, where (file, key, item), and what to do. The command line
+prints their message without a traceback; anything else is a defect of ours and keeps it.
+"""
+
+
+class Qs3Error(Exception):
+    """Base of all errors caused by input, settings or surroundings."""
+
+
+class ConfigError(Qs3Error):
+    """A setting is out of range or contradicts another one."""
+
+
+class MissingDataError(Qs3Error):
+    """A dataset, folder or file that was asked for is not there."""
+
+
+class DataError(Qs3Error):
+    """A file is there but damaged, or does not hold what its format promises."""
+
+
+class MeshError(DataError):
+    """A mesh is empty, not finite, truncated or unreadable."""
+
+
+class RenderError(Qs3Error):
+    """A renderer cannot be used here, or failed."""
+
+
+class SelectionError(Qs3Error):
+    """A round of self-training selected too little to train on."""

@@ -1,0 +1,72 @@
+"""A triangle mesh: the one form in which shapes travel through qs3."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from qs3.errors import MeshError
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles in metres (or in the file's unit, before normalisation), z up.
+
+    Attributes:
+        vertices: [V, 3] float64.
+        faces: [F, 3] int32, indices into `vertices`; orientation is not relied upon.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int32)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise MeshError(f"vertices have shape {vertices.shape}, expected [V, 3]")
+        if faces.ndim != 2 or faces.shape[1] != 3:
+            raise MeshError(f"faces have shape {faces.shape}, expected [F, 3] triangles")
+        if len(faces) == 0:
+            raise MeshError("the mesh has no faces")
+        if not np.isfinite(vertices).all():
+            bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+            raise MeshError(f"vertex {bad} is not finite")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise MeshError(
+                f"a face refers to vertex {int(faces.max())}, but there are {len(vertices)}"
+            )
+        vertices.flags.writeable = False
+        faces.flags.writeable = False
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """[2, 3] lowest and highest corner over the vertices that faces use."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    @property
+    def sha256(self) -> str:
+        """Hash of vertices and faces; equal meshes have equal hashes on every machine."""
+        digest = hashlib.sha256()
+        digest.update(self.vertices.astype("<f8").tobytes())
+        digest.update(self.faces.astype("<i4").tobytes())
+        return digest.hexdigest()
+
+    def transformed(self, matrix: np.ndarray) -> Mesh:
+        """Apply a 4x4 homogeneous matrix to the vertices."""
+        return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
+
+
+def merge(meshes: list[Mesh]) -> Mesh:
+    """One mesh from several, parts kept apart (no vertex is shared between them)."""
+    if not meshes:
+        raise MeshError("nothing to merge: the list of meshes is empty")
+    offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
+    vertices = np.concatenate([m.vertices for m in meshes])
+    faces = np.concatenate([m.faces + o for m, o in zip(meshes, offsets, strict=True)])
+    return Mesh(vertices, faces)

@@ -1,0 +1,141 @@
+"""What a renderer is asked for and what it gives back: one protocol for Blender and Mitsuba."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import Camera
+from qs3.meshes.mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A mesh in the world with a diffuse surface.
+
+    Attributes:
+        mesh: world coordinates, metres.
+        albedo: diffuse reflectance in the near infrared, 0..1.
+        label: 0 is background (floor, walls, clutter), 1 the object that is scanned.
+    """
+
+    mesh: Mesh
+    albedo: float = 0.8
+    label: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 < self.albedo <= 1:
+            raise ConfigError(f"albedo must be in (0, 1], got {self.albedo}")
+
+
+@dataclass(frozen=True, eq=False)
+class Projector:
+    """A pinhole projector that throws a slide.
+
+    It looks along its +z with x right and y down, like a camera (qs3.geometry.cameras).
+
+    Attributes:
+        world_from_projector: [4, 4].
+        slide: [H, W] float32 in 0..1, row 0 at the top (towards -y), column 0 at -x.
+        tan_half_width: half the width of the slide on the plane at distance 1; the height
+            follows from the slide's aspect (square slide pixels). Black outside.
+        strength: radiance of a white Lambertian plane that faces the projector at 1 m under
+            a white slide pixel. It falls with the square of the distance along the axis
+            and with the cosine of incidence, without vignetting across the slide.
+    """
+
+    world_from_projector: np.ndarray
+    slide: np.ndarray
+    tan_half_width: float
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.slide.ndim != 2 or self.slide.dtype != np.float32:
+            raise ConfigError(
+                f"a slide is a float32 image [H, W], got {self.slide.dtype} {self.slide.shape}"
+            )
+        if not self.tan_half_width > 0:
+            raise ConfigError(f"tan_half_width must be positive, got {self.tan_half_width}")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Bodies, one projector, and uniform light from all sides.
+
+    Attributes:
+        bodies: at least one.
+        projector: None for a camera that needs no pattern.
+        ambient: radiance of the surroundings as seen by the surfaces. A white Lambertian
+            surface in the open then has this radiance. The background of an image, where
+            no body is, is 0 or the ambient radiance, as the renderer finds easier: no
+            sensor uses it.
+    """
+
+    bodies: tuple[Body, ...]
+    projector: Projector | None = None
+    ambient: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """What one camera sees, over `camera.rendered`.
+
+    Attributes:
+        radiance: [h, w] float32, linear; a white Lambertian surface under irradiance E has
+            radiance E / pi.
+        depth_m: [h, w] float32, along the optical axis at the pixel's centre, inf where
+            nothing is hit.
+        label: [h, w] uint8, `Body.label` of what the pixel's centre sees, 0 where nothing is.
+    """
+
+    radiance: np.ndarray
+    depth_m: np.ndarray
+    label: np.ndarray
+
+
+class Renderer(Protocol):
+    """Turns a scene into images. Not thread safe; one instance a process."""
+
+    def render(
+        self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
+    ) -> list[Image]:
+        """Render every camera.
+
+        Args:
+            scene: what is there.
+            cameras: where it is seen from.
+            seed: of the sampling pattern; the same call gives the same bytes.
+            geometry: for each camera, whether depth_m and label are wanted; where not,
+                they are filled with inf and 0.
+
+        Returns:
+            One image a camera.
+
+        Raises:
+            RenderError: the renderer failed; the message holds its own.
+        """
+        ...
+
+    def provenance(self) -> dict[str, str]:
+        """Renderer, variant and library versions: what decides the bytes it makes."""
+        ...
+
+
+@dataclass(frozen=True)
+class RendererSettings:
+    """Settings both renderers share.
+
+    Attributes:
+        samples: samples a pixel (anti-aliasing of the dots; the light is direct only).
+        threads: 0 is all cores. Output must not depend on it.
+    """
+
+    samples: int = 16
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise ConfigError(f"renderer.samples must be at least 1, got {self.samples}")
