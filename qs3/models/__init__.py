@@ -1,0 +1,1 @@
+"""Backbones: clouds to features. One paper, one file."""

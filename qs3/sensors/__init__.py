@@ -1,0 +1,1 @@
+"""Depth sensors: patterns, cameras, matching, and the renderers behind them."""

@@ -1,0 +1,1 @@
+"""Mesh2Point: place, view, scan, fuse, sample; workers and resume."""

@@ -29,6 +29,8 @@ class Body:
     def __post_init__(self) -> None:
         if not 0 < self.albedo <= 1:
             raise ConfigError(f"albedo must be in (0, 1], got {self.albedo}")
+        if not 0 <= self.label <= 255:
+            raise ConfigError(f"label must be in 0..255, got {self.label}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +70,21 @@ class Scene:
     Attributes:
         bodies: at least one.
         projector: None for a camera that needs no pattern.
-        ambient: radiance of the surroundings as seen by the surfaces. A white Lambertian
-            surface in the open then has this radiance. The background of an image, where
-            no body is, is 0 or the ambient radiance, as the renderer finds easier: no
-            sensor uses it.
+        ambient: radiance of the surroundings, which reaches every surface from all sides,
+            never occluded: a surface gains albedo x ambient. So it carries no sampling
+            noise and is the same in every renderer. Surfaces do not light each other
+            (direct light only), and the background of an image, where no body is, is 0.
     """
 
     bodies: tuple[Body, ...]
     projector: Projector | None = None
     ambient: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.bodies:
+            raise ConfigError("a scene needs at least one body")
+        if not self.ambient >= 0:
+            raise ConfigError(f"ambient must not be negative, got {self.ambient}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,49 @@
+# qs3: make quickstart, make test. `make help` lists the rest.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV   ?= .venv
+RUN    := $(VENV)/bin/python
+OUT    ?= out/quickstart
+# Extra arguments for pip, e.g. an index that has CPU builds of torch.
+PIP_ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help install doctor quickstart test test-all bench lint format clean
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
+
+install: $(VENV)/installed ## the environment in .venv, pinned
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' \
+	  || { echo "qs3 needs Python 3.11 (bpy has wheels for no other). Call: make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) \
+	  || { echo "The venv module is missing. On Debian and Ubuntu: apt-get install python3.11-venv"; exit 1; }
+	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c constraints.txt -e '.[dev]'
+	@touch $@
+	@$(RUN) -m qs3.doctor --install
+
+doctor: install ## what works here, and which system package would help
+	@$(RUN) -m qs3.doctor
+
+quickstart: install ## the main job on embedded data, about a quarter of an hour on 2 cores
+	@$(RUN) -m qs3.quickstart out=$(OUT)
+
+test: install ## lint, types and all tests that are not slow
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+	$(RUN) -m pytest
+
+test-all: install ## the slow tests too
+	$(RUN) -m pytest -m ''
+
+bench: install ## speed, as ratios against named baselines
+	$(RUN) -m pytest tests/benchmarks --benchmark-enable -s
+
+lint format: install
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+clean: ## remove what `make quickstart` made
+	rm -rf out

@@ -1,0 +1,106 @@
+"""The LightningModule: a backbone, the method's loss in the warm-up, the student's in the rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+
+from qs3.data.batches import generator_of
+from qs3.methods.base import Method
+from qs3.methods.student import Student
+from qs3.randomness import derive
+from qs3.selftraining.scheme import Phases
+
+
+# `qs3.loggers.EpochRows` hands the figures on, before the checkpoint is written.
+_PER_EPOCH: dict[str, Any] = {
+    "on_step": False,
+    "on_epoch": True,
+    "logger": False,
+    "sync_dist": True,
+}
+
+
+class Classifier(LightningModule):
+    """Trains a net over all phases of a run.
+
+    Args:
+        build_net: makes a net, [B, N, 3] to logits [B, C], drawing its weights from torch's
+            global generator.
+        build_optimizer: makes the optimiser of given parameters.
+        method: loss of the warm-up.
+        student: loss of the rounds.
+        phases: which epoch belongs to which phase; each phase has its own cosine schedule.
+        seed: of the run.
+    """
+
+    def __init__(
+        self,
+        build_net: Callable[[], nn.Module],
+        build_optimizer: Callable[..., torch.optim.Optimizer],
+        method: Method,
+        student: Student,
+        phases: Phases,
+        seed: int,
+    ) -> None:
+        super().__init__()
+        self.build_net, self.build_optimizer = build_net, build_optimizer
+        self.phases, self.seed = phases, seed
+        self.net = self.fresh_net(phase=0)
+        self.method, self.student = method, student
+        self._hits: list[Tensor] = []
+
+    def fresh_net(self, phase: int) -> nn.Module:
+        """A net with new weights: a function of (seed, phase), whatever was drawn before."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive(self.seed, "init", phase))
+            return self.build_net()
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
+        """Logits."""
+        return self.net(points)
+
+    def configure_optimizers(self) -> Any:
+        """One optimiser, one schedule: a cosine in each phase."""
+        optimizer = self.build_optimizer(self.parameters())
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.phases.cosine)
+        return {"optimizer": optimizer, "lr_scheduler": schedule}
+
+    def start_phase(self, phase: int, fresh: bool) -> None:
+        """Forget the optimiser's moments and, if `fresh`, the weights (start of a round)."""
+        if fresh:
+            self.net.load_state_dict(self.fresh_net(phase).state_dict())
+        optimizer = self.optimizers()
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        optimizer.state.clear()
+
+    def on_train_epoch_start(self) -> None:
+        """Reseed torch (dropout draws from it): an epoch is a function of (seed, epoch)."""
+        torch.manual_seed(derive(self.seed, "dropout", self.current_epoch, self.global_rank))
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
+        """The loss of the current phase."""
+        method = self.method if self.phases.phase(self.current_epoch) == 0 else self.student
+        generator = generator_of(batch, "method", self.seed, self.global_rank, self.device)
+        terms = method.loss(self.net, batch, generator)
+        total = torch.stack(list(terms.values())).sum()
+        size = max(len(part["points"]) for part in batch.values() if isinstance(part, dict))
+        self.log("train/loss", total, batch_size=size, **_PER_EPOCH)
+        return total
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        """Count the hits on held-out labelled clouds (source's, or target_train's if supervised)."""
+        labels = batch["source"][f"y_{self.method.labels}"]
+        self._hits.append(self(batch["source"]["points"]).argmax(dim=1) == labels)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the accuracy as `<owner>_val/acc`; one process decides for all."""
+        accuracy = float(torch.cat(self._hits).double().mean())
+        self._hits.clear()
+        accuracy = float(self.trainer.strategy.broadcast(accuracy))
+        self.log(f"{self.method.labels}_val/acc", accuracy, **_PER_EPOCH)

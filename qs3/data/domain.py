@@ -1,0 +1,167 @@
+"""A domain: one dataset as an experiment sees it, whether generated here or published by others.
+
+Light on purpose: `train.py` asks `Domain.check` before it imports anything heavy.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from qs3.classes import CLASSES
+from qs3.data.importers import Importer, import_into
+from qs3.data.store import PointSet, is_begun, is_finished, open_pointset, read_meta
+from qs3.errors import ConfigError, DataError, MissingDataError
+
+log = logging.getLogger(__name__)
+
+VARIANTS = ("points", "points_clean")
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Where a dataset is, what it is called, and what to do if it is not there.
+
+    Attributes:
+        name: as on the command line, e.g. "specklenet10".
+        symbol: of the paper's tables, e.g. "S".
+        title: as in a sentence, e.g. "SpeckleNet10".
+        path: folder of the store.
+        variant: which array of the store: "points", or "points_clean" for the clean twin.
+        published: how to read the published files, if there are any: an `Importer`, or its
+            config (instantiated when it is needed).
+        simulated: the target's reality is simulated; every output about it says so.
+        gravity: the axis that points up in the store; "z" for all datasets.
+        how_to_get: where the published files come from.
+        make: the command that makes the dataset; None if only published files can give it.
+        stand_in: a command that makes something to try instead.
+        synthesis: settings of `generate.py`; not used here, and never instantiated by us.
+    """
+
+    name: str
+    symbol: str
+    title: str
+    path: str | Path
+    variant: str = "points"
+    published: Importer | Mapping[str, Any] | None = None
+    simulated: bool = False
+    gravity: str = "z"
+    how_to_get: str = ""
+    make: str | None = None
+    stand_in: str | None = None
+    synthesis: Any = None
+
+    def __post_init__(self) -> None:
+        if self.variant not in VARIANTS:
+            raise ConfigError(
+                f"domain {self.name}: variant is {self.variant!r}, expected one of {VARIANTS}"
+            )
+        if self.gravity != "z":
+            raise ConfigError(
+                f"domain {self.name}: gravity is {self.gravity!r}, but the clouds of a store stand "
+                "on z; let the importer turn them (its key `up`)"
+            )
+        object.__setattr__(self, "path", Path(self.path))
+
+    @property
+    def folder(self) -> Path:
+        """The store's folder as an absolute path."""
+        return Path(self.path).absolute()
+
+    @property
+    def label(self) -> str:
+        """How tables and logs call it: title and symbol, and "simulated" where that is so."""
+        return f"{self.title} ({self.symbol}{', simulated' if self.simulated else ''})"
+
+    def importer(self) -> Importer | None:
+        """The reader of the published files, instantiated from its config if need be."""
+        if self.published is None or isinstance(self.published, Importer):
+            return self.published
+        from hydra.errors import InstantiationException
+        from hydra.utils import instantiate
+
+        try:
+            return instantiate(self.published)
+        except InstantiationException as error:
+            raise ConfigError(
+                f"domain {self.name}: `published` is wrong: {error.__cause__ or error}"
+            ) from error
+
+    def check(self) -> None:
+        """Find out, in milliseconds, whether `open` has something to open.
+
+        Raises:
+            MissingDataError: lists the files looked for, where to get them, and the commands.
+        """
+        if is_finished(self.folder):
+            return
+        importer = self.importer()
+        if importer is not None and importer.is_there():
+            return
+        lines = [f"domain {self.name}: {self.label} is not there. Looked for:"]
+        unfinished = is_begun(self.folder)
+        state = "   (begun but not finished)" if unfinished else ""
+        lines.append(f"  {self.folder / 'meta.yaml'}{state}")
+        if importer is not None:
+            lines += [f"  {pattern}" for pattern in importer.looks_for()]
+        if self.how_to_get:
+            lines.append(f"Where to get it: {self.how_to_get.strip()}")
+        if self.make:
+            verb = "Continue making it" if unfinished else "Make it"
+            lines.append(f"{verb}:\n  {self.make}")
+        if self.stand_in:
+            lines.append(f"Or make a stand-in and use that one:\n  {self.stand_in}")
+        raise MissingDataError("\n".join(lines))
+
+    def open(self, verify: bool = True) -> PointSet:
+        """Open the dataset; the first time, bring the published files into the store.
+
+        Raises:
+            MissingDataError: as `check`.
+            DataError: damaged files, or a store imported under other settings.
+        """
+        self.check()
+        importer = self.importer()
+        if not is_finished(self.folder):
+            assert importer is not None  # `check` passed
+            log.info("importing %s from %s", self.label, importer.looks_for()[0])
+            import_into(self.folder, importer, name=self.folder.name, classes=CLASSES)
+        elif importer is not None:
+            self._refuse_stale(importer)
+        return open_pointset(self.folder, self.variant, verify=verify)
+
+    def _refuse_stale(self, importer: Importer) -> None:
+        """Raise DataError if the store was imported with other settings than today's."""
+        imported = read_meta(self.folder).get("imported")
+        if imported is None:  # generated here
+            return
+        now = importer.settings()
+        if not importer.is_there():  # the published files were put away after the import
+            now["folder"] = imported.get("folder")
+        if now != imported:
+            changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
+            was = {key: imported.get(key) for key in changed}
+            wanted = {key: now.get(key) for key in changed}
+            raise DataError(
+                f"{self.folder} was imported with {was}, the config says {wanted}; delete the "
+                "folder to import it again, or give another `path`"
+            )
+
+
+def check_all(*domains: Domain) -> None:
+    """Check several domains and tell of all that are missing at once.
+
+    Raises:
+        MissingDataError: as `Domain.check`, for each one that is not there.
+    """
+    problems = []
+    for domain in {domain.name: domain for domain in domains}.values():
+        try:
+            domain.check()
+        except MissingDataError as error:
+            problems.append(str(error))
+    if problems:
+        raise MissingDataError("\n\n".join(problems))

@@ -1,0 +1,13 @@
+"""Published formats, read once into the store. One format, one file; none needs more than numpy.
+
+An importer is a frozen dataclass (named by `_target_` in conf/domain) that knows where its files
+are and reads them to clouds and manifest rows. Clouds keep their published scale and order;
+only the axes are turned so that z is up.
+"""
+
+from qs3.data.importers.arrays import NamedArrays
+from qs3.data.importers.base import Importer, import_into
+from qs3.data.importers.pointda_h5 import PointDAH5
+from qs3.data.importers.trees import NpyTree, XyzTree
+
+__all__ = ["Importer", "NamedArrays", "NpyTree", "PointDAH5", "XyzTree", "import_into"]

@@ -1,0 +1,89 @@
+"""One .npz with arrays `points` [N, P, 3], `cls` [N], `split` [N] and `name` [N]."""
+
+from __future__ import annotations
+
+import functools
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.data.importers.base import Importer, Item, class_of, split_of
+from qs3.data.manifest import SPLITS, ManifestRow
+from qs3.errors import DataError
+
+_KEYS = ("points", "cls", "split", "name")
+_MAX_BYTES = 8 << 30
+
+
+@dataclass(frozen=True)
+class NamedArrays(Importer):
+    """See the module.
+
+    Attributes:
+        file: name of the .npz in the folder.
+    """
+
+    file: str = "points.npz"
+
+    @property
+    def path(self) -> Path:
+        """Of the .npz."""
+        return self.root / self.file
+
+    def looks_for(self) -> list[str]:
+        """See `Importer`."""
+        return [f"{self.path}   (arrays {', '.join(_KEYS)})"]
+
+    def is_there(self) -> bool:
+        """See `Importer`."""
+        return self.path.is_file()
+
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """See `Importer`; reads the file. Sorted by split, class and name."""
+        arrays = read_npz(self.path)
+        found = []
+        for i, name in enumerate(arrays["name"].tolist()):
+            where = f"{self.path}, cloud {i} ({name})"
+            cls = class_of(str(arrays["cls"][i]), classes, where)
+            split = split_of(str(arrays["split"][i]), where)
+            row = ManifestRow(f"{cls}/{split}/{name}", cls, split, origin=f"{self.file}[{i}]")
+            found.append(Item(row, where, functools.partial(arrays["points"].__getitem__, i)))
+        return sorted(
+            found, key=lambda f: (SPLITS.index(f.row.split), classes.index(f.row.cls), f.row.id)
+        )
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The four arrays, with shapes and kinds checked.
+
+    Raises:
+        DataError: damaged, pickled, an array missing, too large, or of another shape.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+        if size > _MAX_BYTES:
+            raise DataError(f"{path} unpacks to {size} bytes, more than {_MAX_BYTES}")
+        with np.load(path, allow_pickle=False) as file:
+            if missing := [key for key in _KEYS if key not in file.files]:
+                raise DataError(f"{path} has no arrays {missing}; it has {file.files}")
+            arrays = {key: file[key] for key in _KEYS}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
+        raise DataError(f"{path}: not a readable .npz of plain arrays ({error})") from error
+    except Exception as error:  # zlib.error, NotImplementedError (unknown compression), ...
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{path}: damaged ({error})") from error
+    points = arrays["points"]
+    if points.ndim != 3 or points.shape[2] != 3 or points.dtype.kind != "f":
+        raise DataError(f"{path}: points is {points.dtype} {points.shape}, not floats [N, P, 3]")
+    for key in _KEYS[1:]:
+        if arrays[key].shape != points.shape[:1] or arrays[key].dtype.kind != "U":
+            raise DataError(
+                f"{path}: {key} is {arrays[key].dtype} {arrays[key].shape}, expected "
+                f"{len(points)} strings"
+            )
+    return arrays

@@ -1,0 +1,247 @@
+"""What all importers share: their interface, the rules for one cloud, the way into the store."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from qs3.classes import ALIASES
+from qs3.data.manifest import ManifestRow
+from qs3.data.store import is_begun, is_finished, write_pointset
+from qs3.errors import ConfigError, DataError
+from qs3.files import locked
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+
+class Item(NamedTuple):
+    """One published cloud before it is read.
+
+    Attributes:
+        row: its manifest row, as far as it is known.
+        where: how a message names it: the file, or file and number.
+        load: gives the raw [n, 3] array; raises DataError if it is damaged.
+    """
+
+    row: ManifestRow
+    where: str
+    load: Callable[[], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Importer(abc.ABC):
+    """A published dataset on disk.
+
+    Attributes:
+        folder: where its files are.
+        points: P, the points a cloud has as published. A cloud with fewer is filled up by
+            repeating its points from the first on; the manifest's `valid_points` says how many
+            there were. One with more is an error: it is not the dataset that was meant.
+        on_error: "stop" at a damaged cloud, or "skip" it and say so in the manifest.
+    """
+
+    folder: str | Path
+    points: int = 2048
+    on_error: str = "stop"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(self.folder))
+        if self.points < 1:
+            raise ConfigError(f"points of {type(self).__name__} is {self.points}, must be >= 1")
+        if self.on_error not in ("stop", "skip"):
+            raise ConfigError(f"on_error is {self.on_error!r}, expected 'stop' or 'skip'")
+
+    @property
+    def root(self) -> Path:
+        """The folder as an absolute path."""
+        return Path(self.folder).absolute()
+
+    @abc.abstractmethod
+    def looks_for(self) -> list[str]:
+        """The files it reads, as patterns with the whole path, for a message."""
+
+    @abc.abstractmethod
+    def is_there(self) -> bool:
+        """Whether there is anything to read; must be fast."""
+
+    @abc.abstractmethod
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """Everything there is, in the dataset's order.
+
+        Raises:
+            DataError: names the file or folder that does not fit the format.
+        """
+
+    def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
+        """[P, 3] as published to [P, 3] with z up."""
+        return cloud
+
+    def read(self, classes: Sequence[str]) -> tuple[list[np.ndarray], list[ManifestRow]]:
+        """Read everything.
+
+        Args:
+            classes: the names in label order; each must occur in each split that there is.
+
+        Returns:
+            [P, 3] float32 clouds with z up, and their rows (plus rows of what was skipped).
+
+        Raises:
+            DataError: names the file, the line or item, and what is wrong.
+        """
+        clouds, rows = [], []
+        for row, where, load in _progress(self.items(classes), f"importing {self.root.name}"):
+            try:
+                raw = load()
+                cloud = check_cloud(raw, self.points, where)
+            except DataError as error:
+                if self.on_error == "stop":
+                    raise
+                rows.append(dataclasses.replace(row, status="skipped", reason=str(error)))
+                continue
+            clouds.append(self.turn(cloud, row.cls))
+            rows.append(dataclasses.replace(row, valid_points=len(raw)))
+        _check_complete(rows, classes, self.root)
+        _report(rows, self.points, self.root)
+        return clouds, rows
+
+    def settings(self) -> dict[str, Any]:
+        """Plain values that decide what `read` gives; kept in the store's meta.yaml."""
+        values = dataclasses.asdict(self)
+        values["folder"] = str(self.root)
+        return {"format": type(self).__name__, **values}
+
+
+def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequence[str]) -> None:
+    """Read the published files and put the finished store at `folder`, all or nothing.
+
+    Several processes may ask at once (a sweep): one imports, the others wait and find it done.
+    The store is built beside `folder` and renamed, so a kill leaves nothing at `folder`.
+
+    Raises:
+        DataError: damaged files, or `folder` holds something else.
+    """
+    folder = folder.absolute()
+    building = folder.with_name(f".{folder.name}.importing")
+    with locked(folder.with_name(f".{folder.name}.lock")):
+        if is_finished(folder):
+            return
+        if is_begun(folder):
+            raise DataError(
+                f"{folder} holds a generation that was not finished, and {importer.root} holds "
+                "published files: continue the generation with its command, or delete the folder "
+                "to import the published files"
+            )
+        shutil.rmtree(building, ignore_errors=True)
+        clouds, rows = importer.read(classes)
+        write_pointset(
+            building,
+            name=name,
+            classes=classes,
+            arrays={"points": clouds},
+            rows=rows,
+            meta={"imported": importer.settings()},
+        )
+        if folder.is_dir():  # holds a lock at most
+            shutil.rmtree(folder)
+        os.rename(building, folder)
+
+
+def class_of(name: str, classes: Sequence[str], where: str) -> str:
+    """The class that a published name means, whatever its case; see `qs3.classes.ALIASES`.
+
+    Raises:
+        DataError: none of the classes.
+    """
+    lower = name.casefold()
+    found = ALIASES.get(lower, lower)
+    if found not in classes:
+        raise DataError(
+            f"{where}: unknown class {name!r}; known are {', '.join(classes)} "
+            f"and the other names {', '.join(sorted(ALIASES))}"
+        )
+    return found
+
+
+def split_of(name: str, where: str) -> str:
+    """The split that a published name means."""
+    splits = {"train": "train", "test": "test", "validation": "validation", "val": "validation"}
+    if name.casefold() not in splits:
+        raise DataError(f"{where}: unknown split {name!r}; known are {', '.join(splits)}")
+    return splits[name.casefold()]
+
+
+def inside(path: Path, root: Path) -> Path:
+    """The path itself, unless it is a link that leads out of `root` (an unpacked archive's trick).
+
+    Raises:
+        DataError: it is.
+    """
+    if path.is_symlink() and not path.resolve().is_relative_to(root.resolve()):
+        raise DataError(f"{path} is a link that leads out of {root}; copy the files instead")
+    return path
+
+
+def check_cloud(cloud: np.ndarray, points: int, where: str) -> np.ndarray:
+    """[P, 3] float32 from [n, 3] with 1 <= n <= P, filled up by repeating from the first point.
+
+    Raises:
+        DataError: wrong shape, no points, more than P, or a value that is not finite.
+    """
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise DataError(f"{where}: the array has shape {cloud.shape}, expected [{points}, 3]")
+    if not 1 <= len(cloud) <= points:
+        raise DataError(
+            f"{where}: the cloud has {len(cloud)} points, expected 1 to {points}; if the dataset "
+            "was published with another number, set `points` of the importer to it"
+        )
+    with np.errstate(over="ignore"):  # becomes infinite, and is reported as such
+        cloud = np.asarray(cloud, dtype=np.float32)
+    if not (finite := np.isfinite(cloud).all(axis=1)).all():
+        row = int(np.flatnonzero(~finite)[0])
+        raise DataError(f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite")
+    return cloud if len(cloud) == points else cloud[np.arange(points) % len(cloud)]
+
+
+def y_up_to_z_up(cloud: np.ndarray) -> np.ndarray:
+    """(x, y, z) -> (x, -z, y): a rotation by 90 degrees about x. [..., 3] to [..., 3]."""
+    return np.stack([cloud[..., 0], -cloud[..., 2], cloud[..., 1]], axis=-1)
+
+
+def _check_complete(rows: Iterable[ManifestRow], classes: Sequence[str], where: Path) -> None:
+    """Raise DataError if a class has no cloud in a split that other classes have."""
+    have = {(row.split, row.cls) for row in rows if row.status == "ok"}
+    if not have:
+        raise DataError(f"{where} holds no clouds")
+    for split in sorted({split for split, _ in have}):
+        if empty := [name for name in classes if (split, name) not in have]:
+            raise DataError(f"{where}: split {split!r} has no clouds of {', '.join(empty)}")
+
+
+def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
+    """Log how many clouds were filled up and how many left out: never silently."""
+    short = sum(row.valid_points is not None and row.valid_points < points for row in rows)
+    skipped = sum(row.status != "ok" for row in rows)
+    if short:
+        log.warning("%s: %d clouds have under %d points and repeat some", where, short, points)
+    if skipped:
+        log.warning("%s: %d clouds left out; manifest.csv says why", where, skipped)
+
+
+def _progress(items: Sequence[T], what: str) -> Iterator[T]:
+    """Iterate with a progress bar on the terminal; silent where stderr is none."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    yield from track(items, description=what, console=console, disable=not console.is_terminal)

@@ -1,0 +1,356 @@
+r"""Point clouds on disk: one folder a dataset, written atomically, checked whenever it is opened.
+
+    points.npy         float32 [N, P, 3], C order, metres or the published unit; read as a memmap
+    points_clean.npy   optional further arrays of the same shape (here the clean twin)
+    manifest.csv       one row an object; those with status "ok" are the N clouds, in order
+    meta.yaml          name, classes, hashes, and how it was made; written last
+
+`meta.yaml` is the marker of a finished dataset: a folder without it is refused. Its last line
+is a checksum of the lines above, and it holds the SHA-256 of every other file. No file holds a
+date, so the same clouds give the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml  # type: ignore[import-untyped,unused-ignore]
+
+import qs3
+from qs3.data.manifest import (
+    AGAIN,
+    MANIFEST,
+    OK,
+    SPLITS,
+    ManifestRow,
+    check_rows,
+    number,
+    read_manifest,
+    to_csv,
+)
+from qs3.errors import DataError, MissingDataError
+from qs3.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
+
+__all__ = [
+    "SPLITS",
+    "ManifestRow",
+    "PointSet",
+    "is_begun",
+    "is_finished",
+    "open_pointset",
+    "read_manifest",
+    "read_meta",
+    "write_pointset",
+]
+
+FORMAT_VERSION = 1
+_META = "meta.yaml"
+_CHECKSUM = "# sha256 of the lines above: "
+_CHUNK_CLOUDS = 512
+
+
+@dataclass(frozen=True, eq=False)
+class PointSet:
+    """A dataset in memory's terms; the clouds themselves stay on disk until they are indexed.
+
+    Attributes:
+        name: of the dataset.
+        classes: names; a label is a position in this tuple.
+        points: [N, P, 3] float32, read only (a memmap, or a copy after `split`).
+        labels: [N] int64.
+        splits: [N] str.
+        ids: N unique strings.
+        sha256: hash of these clouds with their ids, labels and splits (of the whole dataset,
+            also after `split`); goes into every result.
+        meta: what meta.yaml holds.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    points: np.ndarray
+    labels: np.ndarray
+    splits: np.ndarray
+    ids: tuple[str, ...]
+    sha256: str
+    meta: Mapping[str, Any]
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.labels)
+
+    def indices(self, split: str) -> np.ndarray:
+        """[n] int64 positions of a split's clouds, in the dataset's order."""
+        return np.flatnonzero(self.splits == split)
+
+    def split(self, split: str) -> PointSet:
+        """The clouds of one split, in order; a view of the memmap if they are adjacent.
+
+        Raises:
+            DataError: there are none.
+        """
+        chosen = self.indices(split)
+        if len(chosen) == 0:
+            raise DataError(
+                f"dataset {self.name!r} has no split {split!r}; it has {sorted(self.counts())}"
+            )
+        adjacent = chosen[-1] - chosen[0] + 1 == len(chosen)
+        rows: Any = slice(int(chosen[0]), int(chosen[-1]) + 1) if adjacent else chosen
+        return dataclasses.replace(
+            self,
+            points=self.points[rows],
+            labels=self.labels[rows],
+            splits=self.splits[rows],
+            ids=tuple(self.ids[i] for i in chosen),
+        )
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Clouds by split and class, zeros included; only splits that occur."""
+        return {
+            split: {
+                name: int(np.sum((self.splits == split) & (self.labels == label)))
+                for label, name in enumerate(self.classes)
+            }
+            for split in SPLITS
+            if np.any(self.splits == split)
+        }
+
+
+def is_finished(folder: str | Path) -> bool:
+    """Whether `folder` holds a dataset whose writing came to its end."""
+    return (Path(folder) / _META).is_file()
+
+
+def is_begun(folder: str | Path) -> bool:
+    """Whether something was begun in `folder` and not finished (an empty lock is nothing)."""
+    folder = Path(folder)
+    return (
+        folder.is_dir()
+        and not is_finished(folder)
+        and any(path.name != ".lock" for path in folder.iterdir())
+    )
+
+
+def write_pointset(
+    folder: str | Path,
+    *,
+    name: str,
+    classes: Sequence[str],
+    arrays: Mapping[str, np.ndarray | Sequence[np.ndarray]],
+    rows: Sequence[ManifestRow],
+    meta: Mapping[str, Any],
+) -> PointSet:
+    """Write a dataset and open it again, checked.
+
+    An older dataset in the same folder stops being finished first, so an interruption never
+    leaves the new clouds under the old description. Nobody else may be writing there.
+
+    Args:
+        folder: created if need be; other files in it are left alone.
+        name: of the dataset.
+        classes: names in label order.
+        arrays: by file stem; "points" is required. Each is [N, P, 3] or N arrays of [P, 3];
+            stored as float32.
+        rows: one an object; the k-th one with status "ok" describes cloud k.
+        meta: plain values (numbers, strings, lists, dicts): sensor, renderer, versions, config.
+
+    Returns:
+        The dataset, variant "points".
+
+    Raises:
+        DataError: arrays and rows do not fit together, or a value is not finite.
+        Qs3Error: the folder cannot be written.
+    """
+    folder = Path(folder)
+    rows, classes = number(rows), tuple(classes)
+    check_rows(rows, classes, where=f"rows of dataset {name!r}")
+    stacked = {key: _stack(name, key, value) for key, value in arrays.items()}
+    clouds = sum(row.status == OK for row in rows)
+    shape = _check_arrays(name, stacked, clouds)
+
+    make_folder(folder)
+    (folder / _META).unlink(missing_ok=True)
+    remove_leftovers(folder)
+    hashes = {}
+    for key, array in stacked.items():
+        with atomic_path(folder / f"{key}.npy") as temporary, open(temporary, "wb") as file:
+            file.write(_header(shape))
+            file.write(array.data.cast("B"))
+        hashes[key] = sha256_file(folder / f"{key}.npy")
+    write_text(folder / MANIFEST, to_csv(rows))
+    document = {
+        "format": "qs3 point clouds",
+        "format_version": FORMAT_VERSION,
+        "created_by": f"qs3 {qs3.__version__}",
+        "name": name,
+        "classes": list(classes),
+        "clouds": shape[0],
+        "points": shape[1],
+        "failed": len(rows) - clouds,
+        "sha256": {**hashes, "manifest": sha256_file(folder / MANIFEST)},
+    }
+    if clash := sorted(set(document) & set(meta)):
+        raise DataError(f"meta of dataset {name!r} may not use the keys {clash}")
+    text = yaml.safe_dump({**document, **meta}, sort_keys=False, allow_unicode=True, width=100)
+    write_text(folder / _META, text + _CHECKSUM + _sha256(text) + "\n")
+    return open_pointset(folder, verify=False)
+
+
+def open_pointset(folder: str | Path, variant: str = "points", verify: bool = True) -> PointSet:
+    """Open a dataset, checking all that can be checked in about a second.
+
+    Args:
+        folder: of the dataset.
+        variant: which array, by file stem.
+        verify: also compare the files' SHA-256 with meta.yaml (about 1 s for 500 MB); without it
+            the manifest's is still compared.
+
+    Raises:
+        MissingDataError: there is no such folder, or it was not finished.
+        DataError: a file is damaged or does not fit the others; names file and row.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise MissingDataError(f"there is no dataset folder {folder}")
+    if not is_finished(folder):
+        raise MissingDataError(
+            f"{folder} has no {_META}: the generation or import was not finished; "
+            "run the same command again and it continues"
+        )
+    meta = read_meta(folder)
+    classes, hashes = tuple(meta["classes"]), meta["sha256"]
+    if variant not in hashes or variant == "manifest":
+        have = sorted(set(hashes) - {"manifest"})
+        raise DataError(
+            f"{folder} holds the arrays {have}, not {variant!r}; generate the dataset again with "
+            "it, or choose another variant"
+        )
+    rows = read_manifest(folder, classes, hashes["manifest"])
+    kept = [row for row in rows if row.status == OK]
+    if len(kept) != meta["clouds"]:
+        raise DataError(
+            f"{folder / MANIFEST} has {len(kept)} rows with status ok, but {_META} promises "
+            f"{meta['clouds']} clouds; generate or import the dataset again"
+        )
+    path = folder / f"{variant}.npy"
+    points = _map(path, (meta["clouds"], meta["points"], 3))
+    if verify and sha256_file(path) != hashes[variant]:
+        raise DataError(f"{path} is damaged (its SHA-256 is not the one in {_META}); {AGAIN}")
+    _check_finite(path, points, [row.id for row in kept])
+    position = {name: label for label, name in enumerate(classes)}
+    return PointSet(
+        name=meta["name"],
+        classes=classes,
+        points=points,
+        labels=np.array([position[row.cls] for row in kept], dtype=np.int64),
+        splits=np.array([row.split for row in kept], dtype=np.str_),
+        ids=tuple(row.id for row in kept),
+        sha256=_content_hash(hashes[variant], classes, kept),
+        meta=meta,
+    )
+
+
+def read_meta(folder: str | Path) -> dict[str, Any]:
+    """The contents of a finished dataset's meta.yaml, checked against its last line.
+
+    Raises:
+        DataError: damaged, edited, or of another version of the format.
+    """
+    path = Path(folder) / _META
+    try:
+        text = path.read_bytes().decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
+    body, mark, checksum = text.rpartition(_CHECKSUM)
+    if not mark or checksum != _sha256(body) + "\n":
+        raise DataError(f"{path} is damaged or was edited (its checksum is wrong); {AGAIN}")
+    meta = yaml.safe_load(body)
+    if meta.get("format_version") != FORMAT_VERSION:
+        raise DataError(
+            f"{path} has format version {meta.get('format_version')}, this qs3 reads "
+            f"{FORMAT_VERSION}; use the qs3 that wrote it ({meta.get('created_by')}) or {AGAIN}"
+        )
+    return meta
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _content_hash(array: str, classes: Sequence[str], rows: Sequence[ManifestRow]) -> str:
+    """Hash of what training sees: the array's bytes, and ids, classes and splits in order."""
+    seen = [array, list(classes), [[row.id, row.cls, row.split] for row in rows]]
+    return _sha256(json.dumps(seen, ensure_ascii=True))
+
+
+def _stack(name: str, key: str, value: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
+    """[N, P, 3] little-endian float32 in C order."""
+    if not isinstance(value, np.ndarray) and len({np.shape(cloud) for cloud in value}) > 1:
+        shapes = sorted({np.shape(cloud) for cloud in value})
+        raise DataError(f"array {key!r} of dataset {name!r} has clouds of several shapes {shapes}")
+    return np.ascontiguousarray(value, dtype="<f4")
+
+
+def _check_arrays(name: str, arrays: Mapping[str, np.ndarray], clouds: int) -> tuple[int, int, int]:
+    """The common shape of all arrays, after checking that they fit the manifest."""
+    if "points" not in arrays:
+        raise DataError(f"dataset {name!r} needs an array 'points', got {sorted(arrays)}")
+    for key, array in arrays.items():
+        if not key.isidentifier() or key in ("manifest", "meta"):
+            raise DataError(f"an array of dataset {name!r} cannot be called {key!r}")
+        if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
+            raise DataError(
+                f"array {key!r} of dataset {name!r} has shape {array.shape}, expected [N, P, 3] "
+                "with at least one cloud of one point"
+            )
+        if array.shape != arrays["points"].shape or len(array) != clouds:
+            raise DataError(
+                f"array {key!r} of dataset {name!r} has shape {array.shape}, 'points' has "
+                f"{arrays['points'].shape}, and {clouds} rows have status ok"
+            )
+        if not np.isfinite(array).all():
+            bad = int(np.flatnonzero(~np.isfinite(array).all(axis=(1, 2)))[0])
+            raise DataError(f"array {key!r} of dataset {name!r}: cloud {bad} is not finite")
+    n, p, _ = arrays["points"].shape
+    return n, p, 3
+
+
+def _header(shape: tuple[int, int, int]) -> bytes:
+    """The .npy header of a float32 C-order array: the only one this format has."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
+    return file.getvalue()
+
+
+def _map(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
+    """[N, P, 3] float32 memmap, after comparing header and size with what they must be."""
+    header = _header(shape)
+    expected = len(header) + 4 * int(np.prod(shape))
+    try:
+        with open(path, "rb") as file:
+            found = file.read(len(header))
+        size = path.stat().st_size
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
+    if size != expected:
+        raise DataError(f"{path} has {size} bytes, expected {expected} for {shape}; {AGAIN}")
+    if found != header:
+        raise DataError(f"{path} has not the header of a float32 array {shape}; {AGAIN}")
+    return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)
+
+
+def _check_finite(path: Path, points: np.ndarray, ids: Sequence[str]) -> None:
+    for start in range(0, len(points), _CHUNK_CLOUDS):
+        finite = np.isfinite(points[start : start + _CHUNK_CLOUDS]).all(axis=(1, 2))
+        if not finite.all():
+            bad = start + int(np.flatnonzero(~finite)[0])
+            raise DataError(f"{path}, cloud {bad} (id {ids[bad]!r}) is not finite; {AGAIN}")

@@ -1,0 +1,157 @@
+"""Writing files so that a crash never leaves half of one: used by everything that saves.
+
+The one idea: write a temporary file in the same folder, flush it to the disk, then rename it over
+the final name. A reader sees the old file or the new one, never a mixture. A kill leaves at most
+a temporary file, which `remove_leftovers` clears.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.errors import Qs3Error
+
+_CHUNK = 1 << 20
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path in the folder of `path`; rename it to `path` if the block succeeds.
+
+    The temporary name keeps the extension (some writers choose the format by it). If the block
+    raises, the temporary file is removed and `path` stays as it was.
+
+    Raises:
+        Qs3Error: the folder or file cannot be written (permission, full disk, a file in the way).
+    """
+    path = Path(path)
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{path.name}.", suffix=f".tmp{path.suffix}", dir=path.parent
+        )
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        _flush(temporary)
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+        temporary = None
+        _flush(path.parent)
+    except OSError as error:
+        raise Qs3Error(
+            f"cannot write {path}: {error}; free some space, check the "
+            "permissions, or choose another folder"
+        ) from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def make_folder(path: str | os.PathLike[str]) -> Path:
+    """Make a folder and its parents unless they are there.
+
+    Raises:
+        Qs3Error: it cannot be made or written to.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Qs3Error(f"cannot make the folder {path}: {error}; choose another one") from error
+    if not os.access(path, os.W_OK):
+        raise Qs3Error(f"cannot write in {path}; check the permissions or choose another folder")
+    return Path(path)
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Replace the file `path` by `data`, atomically."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    r"""Replace the file `path` by `text` (UTF-8, `\n` kept as it is), atomically."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Replace `path` by `value` as indented JSON; NaN and infinity are refused (ValueError)."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_npy(path: str | os.PathLike[str], array: np.ndarray) -> None:
+    """Replace `path` by `array` as .npy (never a pickle), atomically."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, array, allow_pickle=False)
+
+
+def sha256_file(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file's bytes as 64 hex digits, read in pieces of 1 MiB."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while chunk := file.read(_CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def remove_leftovers(folder: str | os.PathLike[str], *, of: str | None = None) -> list[Path]:
+    """Delete temporary files that a killed process left directly in `folder`.
+
+    Call it only where nobody else is writing (under `locked`, or on one's own run folder).
+
+    Args:
+        folder: where to look; nothing happens if it does not exist.
+        of: only leftovers of the file with this name.
+
+    Returns:
+        What was deleted.
+    """
+    pattern = f".{of or '*'}.*.tmp*"
+    leftovers = sorted(p for p in Path(folder).glob(pattern) if p.is_file())
+    for path in leftovers:
+        path.unlink(missing_ok=True)
+    return leftovers
+
+
+@contextlib.contextmanager
+def locked(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold an exclusive lock on the file `path` (created, never deleted); wait for others.
+
+    The lock belongs to the process: it is gone when the process ends, however it ends.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(path, "ab")  # noqa: SIM115 (closed below)
+    except OSError as error:
+        raise Qs3Error(f"cannot write the lock {path}: {error.strerror or error}") from error
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _flush(path: Path) -> None:
+    """Force a file's bytes, or a folder's list of names, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _umask() -> int:
+    """The permissions that this process withholds from new files (mkstemp withholds more)."""
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask

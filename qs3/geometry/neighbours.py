@@ -1,0 +1,163 @@
+"""Neighbours of points: kNN, ball query, farthest points, gathering. Batched plain torch.
+
+Written here because torch-cluster is deprecated and pyg-lib is not on PyPI.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from qs3.geometry.sampling import farthest_point_sampling_np
+
+_BLOCK = 1 << 26  # distances held at once: 256 MB in float32
+_CPU_BLOCK = 1 << 20  # 4 MB, to stay near the caches
+_TREE_FROM = 1536  # points in 3D, from which a KD-tree is faster than all distances
+
+
+def knn(x: Float[Tensor, "b n c"], k: int) -> Int[Tensor, "b n k"]:
+    """Indices of the k nearest points of the same cloud, nearest first, itself included.
+
+    Squared Euclidean distances in the dtype of `x` (float32 at least, also under autocast,
+    because in half precision they lose neighbours), about each cloud's mean, so that a cloud
+    far from the origin loses nothing. Points at equal distance come in any order. With k > n
+    the list of n neighbours starts over from the nearest one.
+    """
+    n = x.shape[1]
+    if k > n:
+        return knn(x, n)[:, :, torch.arange(k, device=x.device) % n]
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        if x.dtype in (torch.float16, torch.bfloat16):
+            x = x.float()
+        if x.device.type == "cpu" and x.shape[2] == 3 and n >= _TREE_FROM:
+            return _knn_tree(x, k)
+        return _knn_dense(x - x.mean(dim=1, keepdim=True), k)
+
+
+def _knn_tree(x: Tensor, k: int) -> Tensor:
+    ranks, workers = list(range(1, k + 1)), torch.get_num_threads()
+    found = [cKDTree(cloud).query(cloud, ranks, workers=workers)[1] for cloud in x.numpy()]
+    return torch.from_numpy(np.stack(found).astype(np.int64))
+
+
+def _knn_dense(x: Tensor, k: int) -> Tensor:
+    """Distances by |x_j|^2 - 2 x_i x_j (|x_i|^2 does not change the order within a row)."""
+    b, n, _ = x.shape
+    squares = x.square().sum(2)[:, None]  # [b, 1, n]
+    right = (-2 * x).transpose(1, 2)
+    on_cpu = x.device.type == "cpu"
+    block = _CPU_BLOCK if on_cpu else _BLOCK
+    smallest = _smallest_on_cpu if on_cpu else _smallest
+    rows = max(1, min(n, block // n))
+    clouds = max(1, block // (n * rows))
+    out = torch.empty(b, n, k, dtype=torch.int64, device=x.device)
+    for i in range(0, b, clouds):
+        c = slice(i, i + clouds)
+        for j in range(0, n, rows):
+            part = out[c, j : j + rows]
+            distance = (x[c, j : j + rows] @ right[c]).add_(squares[c])  # [clouds, rows, n]
+            part.copy_(smallest(distance.view(-1, n), k).view(part.shape))
+    return out
+
+
+def _smallest(values: Tensor, k: int) -> Tensor:
+    """Columns of the k smallest values of each row, smallest first: [r, n] -> [r, k]."""
+    return values.topk(k, largest=False)[1]
+
+
+def _smallest_on_cpu(values: Tensor, k: int) -> Tensor:
+    """As `_smallest`, several times faster: only the few values that can be in are sorted.
+
+    Columns are dealt to groups; the k-th smallest of the groups' minima is no less than the
+    k-th smallest of the row, so everything above it is out. That leaves hardly more than k.
+    numpy's sort and argsort are vectorised (AVX-512), its partition and torch's topk are not.
+    """
+    r, n = values.shape
+    groups = 64 * -(-k // 32)
+    if n < 3 * groups:
+        return _smallest(values, k)
+    array = values.numpy()
+    dealt = values[:, : n // groups * groups].reshape(r, -1, groups)
+    bound = np.sort(dealt.amin(1).numpy(), axis=1)[:, k - 1 : k]
+    flat = np.flatnonzero(array <= bound)
+    row = flat // n
+    count = np.bincount(row, minlength=r)
+    width = max(int(count.max()), k)
+    first = np.arange(r) * width - (np.cumsum(count) - count)
+    slot = np.arange(len(flat)) + first[row]  # in [r, width], each row filled from the left
+    few = np.full(r * width, np.inf, dtype=array.dtype)
+    column = np.zeros(r * width, dtype=np.int64)
+    few[slot] = array.ravel()[flat]
+    column[slot] = flat - row * n
+    order = np.argsort(few.reshape(r, width), axis=1)[:, :k]
+    return torch.from_numpy(np.take_along_axis(column.reshape(r, width), order, axis=1))
+
+
+def gather(x: Tensor, index: Int[Tensor, "b ..."]) -> Tensor:
+    """Rows of each cloud: x [b, n, c], index [b, *rest] -> [b, *rest, c]."""
+    flat = index.flatten(1)  # [b, r]
+    rows = torch.gather(x, 1, flat[:, :, None].expand(-1, -1, x.shape[2]))
+    return rows.view(*index.shape, x.shape[2])
+
+
+def farthest_point_sampling(
+    x: Float[Tensor, "b n 3"], n: int, start: Int[Tensor, " b"] | int = 0
+) -> Int[Tensor, "b m"]:
+    """Order in which farthest point sampling takes the first `n` points, from `start`.
+
+    Exact; which of several equally far points comes first is unspecified (on the CPU fpsample
+    decides, elsewhere the lowest index). Indices are distinct, copies of taken points come last.
+    With n > N the order of all N points starts over.
+    """
+    if x.device.type != "cpu":
+        return _farthest_points(x, n, start)
+    starts = torch.as_tensor(start).expand(len(x)).tolist()
+    clouds = zip(x.detach().float().numpy(), starts, strict=True)
+    orders = [farthest_point_sampling_np(cloud, n, first) for cloud, first in clouds]
+    return torch.from_numpy(np.stack(orders))
+
+
+def _farthest_points(x: Tensor, n: int, start: Int[Tensor, " b"] | int = 0) -> Tensor:
+    """All clouds at once, one step a point."""
+    b, total, _ = x.shape
+    if n > total:
+        index = torch.arange(n, device=x.device) % total
+        return _farthest_points(x, total, start)[:, index]
+    x = x.detach().float()
+    x = x - x.mean(dim=1, keepdim=True)
+    out = torch.empty(b, n, dtype=torch.int64, device=x.device)
+    last = torch.as_tensor(start, device=x.device, dtype=torch.int64).expand(b)[:, None]  # [b, 1]
+    nearest = x.new_full((b, total), torch.inf)
+    for i in range(n):
+        out[:, i] = last[:, 0]
+        distance = (x - gather(x, last)).square().sum(-1)  # [b, total]
+        nearest = torch.minimum(nearest, distance).scatter_(1, last, -1.0)  # never again
+        last = nearest.argmax(1, keepdim=True)
+    return out
+
+
+def ball_query(
+    x: Float[Tensor, "b n 3"], centres: Float[Tensor, "b m 3"], radius: float, k: int
+) -> Int[Tensor, "b m k"]:
+    """The first k points, in index order, nearer than `radius` (strictly) to each centre.
+
+    Missing ones repeat the first hit, as in PointNet++; a centre without any hit gets its
+    nearest point.
+    """
+    b, n, _ = x.shape
+    m = centres.shape[1]
+    order = torch.arange(n, device=x.device)
+    rows = max(1, (_CPU_BLOCK if x.device.type == "cpu" else _BLOCK) // (b * n))
+    out = torch.empty(b, m, k, dtype=torch.int64, device=x.device)
+    for j in range(0, m, rows):
+        part = centres[:, j : j + rows]
+        distance = (part[:, :, None] - x[:, None]).square().sum(-1)  # [b, rows, n]
+        hits = torch.where(distance < radius**2, order, n)
+        found = hits.topk(min(k, n), dim=2, largest=False)[0].sort(dim=2)[0]
+        first = torch.where(found[:, :, :1] < n, found[:, :, :1], distance.argmin(2, keepdim=True))
+        out[:, j : j + rows] = first
+        out[:, j : j + rows, : found.shape[2]] = torch.where(found < n, found, first)
+    return out

@@ -1,0 +1,128 @@
+"""Points of clouds and surfaces: farthest point sampling, area sampling, the unit ball. Numpy."""
+
+from __future__ import annotations
+
+import fpsample
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.errors import DataError, MeshError
+
+_BUCKETS_FROM = 96  # points; below, fpsample's plain loop is faster
+
+
+def farthest_point_sampling_np(
+    points: Float[np.ndarray, "points 3"], n: int, start: int = 0
+) -> Int[np.ndarray, " n"]:
+    """Indices in the order of farthest point sampling (Eldar et al. 1997), the first is `start`.
+
+    Exact in float32 about the centroid; which of several equally far points is taken first is
+    unspecified but always the same. Indices are distinct, copies of taken points come last. With
+    n > N the order of all N points starts over.
+    """
+    points = np.asarray(points)
+    total = len(points)
+    if total == 0 or not 0 <= start < total or n < 0:
+        raise DataError(f"cannot take {n} of {total} points from point {start}")
+    if n > total:
+        return np.resize(farthest_point_sampling_np(points, total, start), n)
+    if n == 0:
+        return np.empty(0, dtype=np.int64)
+    if not np.isfinite(points).all():
+        raise DataError("cannot sample points that are NaN or infinite")
+    cloud = np.ascontiguousarray(points - points.mean(axis=0), dtype=np.float32)
+    order = _sample(cloud, n, start).astype(np.int64)
+    taken = np.zeros(total, dtype=bool)
+    taken[order] = True
+    distinct = np.count_nonzero(taken)
+    if distinct < n:  # at distance zero fpsample names one index again and again
+        order[distinct:] = np.flatnonzero(~taken)[: n - distinct]
+    return order
+
+
+def _sample(cloud: np.ndarray, n: int, start: int) -> np.ndarray:
+    """FPS of a float32 cloud from `start`: by buckets where they can be made to start there.
+
+    fpsample 0.3.3 looks up its start after it has sorted the points into the tree, so it starts
+    with whichever point came to lie at that position. We follow `start` through the sorting and
+    pass the position where it ends; should another version do otherwise, the plain loop takes over.
+    """
+    if len(cloud) >= _BUCKETS_FROM and n > 16:
+        height = 3 if len(cloud) <= 4096 else 5
+        position = _position_in_tree(cloud, height, start)
+        order = fpsample.bucket_fps_kdline_sampling(cloud, n, h=height, start_idx=position)
+        if order[0] == start:
+            return order
+    return fpsample.fps_sampling(cloud, n, start_idx=start)
+
+
+def _position_in_tree(cloud: np.ndarray, height: int, start: int) -> int:
+    """Where fpsample's tree of buckets puts point `start`.
+
+    Each level halves the part at the mean of its widest dimension by Hoare's partition: the i-th
+    large value from the left changes places with the i-th small one from the right.
+    """
+    position, offset = start, 0
+    for _ in range(height):
+        if len(cloud) == 1:
+            break
+        values = cloud[:, np.argmax(np.ptp(cloud, axis=0))]
+        mean = np.cumsum(values, dtype=np.float32)[-1] / np.float32(len(values))  # added in order
+        small = values < mean
+        split = np.count_nonzero(small)
+        order = np.arange(len(values))
+        left = np.flatnonzero(~small[:split])
+        right = split + np.flatnonzero(small[split:])[::-1]
+        order[left], order[right] = right, left
+        if position < split and not small[position]:
+            position = right[np.searchsorted(left, position)]
+        elif position >= split and small[position]:
+            position = left[len(right) - 1 - np.searchsorted(right[::-1], position)]
+        split = min(max(split, 1), len(values) - 1)
+        half = slice(0, split) if position < split else slice(split, None)
+        cloud = cloud[order[half]]
+        if position >= split:
+            position, offset = position - split, offset + split
+    return int(offset + position)
+
+
+def unit_ball(points: Float[np.ndarray, "*b points 3"]) -> Float[np.ndarray, "*b points 3"]:
+    """Clouds about their centroid, the farthest point at distance 1.
+
+    A cloud of one repeated point becomes zeros. The dtype is kept.
+    """
+    points = np.asarray(points)
+    # about the first point: the mean of copies of one point is then that point exactly
+    moved = points - points[..., :1, :]
+    moved = moved - moved.mean(axis=-2, keepdims=True)
+    radius = np.linalg.norm(moved, axis=-1).max(axis=-1)[..., None, None]
+    return moved / np.where(radius > 0, radius, 1).astype(points.dtype)
+
+
+def surface_sample(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    n: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "n 3"]:
+    """`n` points uniform on the triangles' area, float64; a face without area is never drawn.
+
+    Raises:
+        MeshError: the whole surface has no area, or a size that is not finite.
+    """
+    corners = np.asarray(vertices, dtype=np.float64)[np.asarray(faces)]  # [f, 3 corners, 3]
+    edges = corners[:, 1:] - corners[:, :1]  # [f, 2, 3]
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+    total = np.cumsum(area)
+    if len(area) == 0 or not np.isfinite(total[-1]) or not total[-1] > 0:
+        raise MeshError(
+            f"cannot sample {len(area)} faces of total area {area.sum():g} m²; "
+            "check that the mesh is not flat to a line or a point, and finite"
+        )
+    # side="right": a draw equal to a boundary goes to the face after it, so never to an empty one
+    draws = rng.random(n) * total[-1]
+    face = np.searchsorted(total, np.minimum(draws, np.nextafter(total[-1], 0)), side="right")
+    u, v = rng.random((2, n, 1))
+    outside = u + v > 1
+    u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
+    return corners[face, 0] + u * edges[face, 0] + v * edges[face, 1]

@@ -1,0 +1,102 @@
+"""Read one CAD file as a `Mesh`, or say what is wrong with it.
+
+Files are untrusted: sizes are limited, nothing outside of the file's folder is opened, and
+whatever a reader stumbles over becomes a MeshError that names the file.
+
+Axes and units are the file's own, with one exception: glTF and COLLADA say which axis is up,
+so their meshes are turned to z up (and COLLADA's are scaled to metres).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from qs3.errors import MeshError
+from qs3.meshes.formats import collada, gltf, obj, off, ply, stl
+from qs3.meshes.formats.arrays import Triangles, check_counts
+from qs3.meshes.mesh import Mesh
+
+MAX_BYTES = 1 << 30
+
+_READERS: dict[str, Callable[[bytes, Path], Triangles]] = {
+    ".off": lambda data, _: off.read(data),
+    ".obj": lambda data, _: obj.read(data),
+    ".ply": lambda data, _: ply.read(data),
+    ".stl": lambda data, _: stl.read(data),
+    ".glb": gltf.read_glb,
+    ".gltf": gltf.read_gltf,
+    ".dae": lambda data, _: collada.read(data),
+}
+
+SUFFIXES: tuple[str, ...] = tuple(_READERS)
+"""Of the files that `load_mesh` reads, in lower case."""
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Read a mesh; polygons are cut into triangles, the parts of a scene are put together.
+
+    Duplicate faces and faces of either orientation are accepted, and vertices are not merged.
+
+    Raises:
+        MeshError: the file is missing, empty, truncated, too large or damaged, or holds no
+            surface; the message names the file and the reason.
+    """
+    path = Path(path)
+    try:
+        with np.errstate(all="ignore"):  # what is not finite is found and named below
+            return _checked(*_read(path))
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}. Export the mesh again or remove the file") from error
+    except MemoryError as error:
+        raise MeshError(f"{path}: is too large for this machine's memory") from error
+    except Exception as error:  # what a reader raises on damaged bytes cannot be listed
+        raise MeshError(
+            f"{path}: cannot be read as {path.suffix[1:].upper()} "
+            f"({type(error).__name__}: {error}). Export the mesh again or remove the file"
+        ) from error
+
+
+def _read(path: Path) -> Triangles:
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise MeshError(f"is of no known format ({', '.join(SUFFIXES)})")
+    if not path.is_file():
+        raise MeshError("is no file" if path.exists() else "does not exist")
+    size = path.stat().st_size
+    if size == 0:
+        raise MeshError("is empty")
+    if size > MAX_BYTES:
+        raise MeshError(f"has {size / 2**30:.1f} GiB, more than the limit of {MAX_BYTES >> 30}")
+    return reader(path.read_bytes(), path.parent)
+
+
+def _checked(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    if len(faces) == 0:
+        raise MeshError("has no faces")
+    check_counts(len(vertices), len(faces))
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(vertices):  # before Mesh makes them 32 bits wide
+        bad = low if low < 0 else high
+        raise MeshError(f"has a face with vertex {bad}, but there are {len(vertices)} vertices")
+    mesh = Mesh(vertices, faces)
+    if not _has_area(mesh):
+        raise MeshError("has no surface: all its faces have zero area")
+    return mesh
+
+
+def _has_area(mesh: Mesh, chunk: int = 100_000) -> bool:
+    """Whether any face is more than a line, measured by the mesh's own size."""
+    low, high = mesh.bounds
+    size = float((high - low).max())
+    if not np.isfinite(size):
+        raise MeshError("has coordinates too large to compute with")
+    for start in range(0, len(mesh.faces), chunk):
+        corners = (mesh.vertices[mesh.faces[start : start + chunk]] - low) / (size or 1.0)
+        sides = corners[:, 1:] - corners[:, :1]  # [n, 2, 3]
+        doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        if (doubled > 1e-12).any():
+            return True
+    return False

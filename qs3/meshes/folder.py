@@ -1,0 +1,258 @@
+"""A folder of CAD files as a source of meshes.
+
+Two layouts are read, each class in one of them:
+
+    root/chair/train/chair_0001.off    the split is in the folders (ModelNet)
+    root/chair/chair_0001.off          the split is made here, by a hash of class and name
+
+Class folders may carry any name of `qs3.classes`, in any case: `night_stand` is `cabinet`.
+`val`, `valid` and `validation` count as train: validation sets are cut from train later, so
+that a model is selected in one way for every dataset.
+
+Hidden files, `__MACOSX` and files that are no meshes are ignored. Nothing is ignored that
+looks like a mesh and lies where it cannot be understood: that is an error.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from qs3.classes import ALIASES, CLASSES
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.meshes.files import SUFFIXES, load_mesh
+from qs3.meshes.source import MeshItem
+
+SPLITS = ("train", "test")
+SPLIT_FOLDERS = {
+    "train": "train",
+    "test": "test",
+    "val": "train",
+    "valid": "train",
+    "validation": "train",
+}
+HALVES = ("all", "first", "second")
+LAYOUTS = "expected class/train/name.off with class/test/name.off, or class/name.off"
+
+
+@dataclass(frozen=True)
+class MeshFolder:
+    """The meshes below one folder, with their classes and splits.
+
+    Attributes:
+        path: the root; its sub-folders are classes.
+        classes: the wanted ones; folders of other names are then left alone. None: all ten,
+            and a folder of another name is an error, since it may be a misspelt class.
+        test_fraction: of the meshes of a class whose folder has no splits, the part for test.
+        half: "all", or "first" or "second": two disjoint halves of every class and split, so
+            that a source and a target domain made from one folder share no shape.
+        skip: stems of files to leave out, as if they were not there.
+    """
+
+    path: Path
+    classes: tuple[str, ...] | None = None
+    test_fraction: float = 0.2
+    half: str = "all"
+    skip: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "path", Path(self.path))
+        if isinstance(self.skip, str):
+            raise ConfigError(f"skip must be a list of file stems, got the text {self.skip!r}")
+        object.__setattr__(self, "skip", tuple(self.skip))
+        if self.classes is not None:
+            object.__setattr__(self, "classes", tuple(self.classes))
+            unknown = [name for name in self.classes if name not in CLASSES]
+            if unknown or not self.classes:
+                raise ConfigError(f"classes must be among {', '.join(CLASSES)}; got {unknown}")
+        if not 0 < self.test_fraction < 1:
+            raise ConfigError(f"test_fraction must be in (0, 1), got {self.test_fraction}")
+        if self.half not in HALVES:
+            raise ConfigError(f"half must be one of {', '.join(HALVES)}; got {self.half!r}")
+
+    def items(self) -> list[MeshItem]:
+        """The meshes, sorted by class, split and stem; no file is opened.
+
+        Raises:
+            MissingDataError: the root, or a wanted class, is not there or has no mesh.
+            ConfigError: a folder or file cannot be assigned to a class and split.
+            DataError: a link leads out of the root.
+        """
+        wanted = self.classes or CLASSES
+        folders = self._class_folders()
+        found: list[MeshItem] = []
+        for cls in (name for name in CLASSES if name in wanted):
+            groups = self._groups(cls, folders.get(cls, []))
+            chosen = [
+                self._item(cls, split, stem, file)
+                for split in SPLITS
+                for stem, file in self._keep(cls, groups[split])
+            ]
+            if not chosen:
+                raise ConfigError(
+                    f"no mesh of class {cls!r} in {self.path} is left with half={self.half} and "
+                    f"{len(self.skip)} to skip: add some, or leave it out with classes=[...]"
+                )
+            found.extend(chosen)
+        return found
+
+    def _class_folders(self) -> dict[str, list[Path]]:
+        if not self.path.is_dir():
+            raise MissingDataError(f"there is no folder of meshes at {self.path}")
+        folders: dict[str, list[Path]] = {}
+        unknown = []
+        for entry in _visible(self.path):
+            if not entry.is_dir():
+                continue
+            cls = _class_of(entry.name)
+            if cls is None:
+                unknown.append(entry.name)
+            elif self.classes is None or cls in self.classes:
+                self._refuse_link_outside(entry)
+                folders.setdefault(cls, []).append(entry)
+        if unknown and self.classes is None:
+            raise ConfigError(
+                f"{self.path}: {', '.join(repr(name) for name in unknown)} is not the name of a "
+                f"class. Known: {', '.join((*CLASSES, *ALIASES))}. Rename the folder or move it "
+                "away, or name the classes that are wanted with classes=[...]: then all other "
+                "folders are left alone"
+            )
+        return folders
+
+    def _groups(self, cls: str, folders: Sequence[Path]) -> dict[str, dict[str, Path]]:
+        """Split -> stem -> file of one class, `skip` applied."""
+        given: dict[str, list[Path]] = {split: [] for split in SPLITS}
+        loose: list[Path] = []
+        for folder in folders:
+            loose += self._mesh_files(folder, allowed=tuple(SPLIT_FOLDERS))
+            for entry in _visible(folder):
+                if entry.is_dir() and entry.name.lower() in SPLIT_FOLDERS:
+                    self._refuse_link_outside(entry)
+                    given[SPLIT_FOLDERS[entry.name.lower()]] += self._mesh_files(entry)
+        if loose and any(given.values()):
+            split_file = next(file for files in given.values() for file in files)
+            raise ConfigError(
+                f"class {cls!r} in {self.path} mixes two layouts: {self._origin(loose[0])} and "
+                f"{self._origin(split_file)}. Move all files into train and test, or none"
+            )
+        if not loose and not any(given.values()):
+            what = "has no mesh" if folders else "has no folder"
+            raise MissingDataError(
+                f"class {cls!r} {what} in {self.path} ({LAYOUTS}, as {', '.join(SUFFIXES)}). "
+                "Add it, or leave it out with classes=[...]"
+            )
+        if loose:
+            return self._split(cls, self._by_stem(cls, loose))
+        return {split: self._by_stem(cls, given[split]) for split in SPLITS}
+
+    def _mesh_files(self, folder: Path, allowed: tuple[str, ...] = ()) -> list[Path]:
+        """Mesh files right in `folder`; meshes in sub-folders that are not `allowed` raise."""
+        files = []
+        for entry in _visible(folder):
+            if entry.is_dir():
+                if entry.name.lower() not in allowed and (mesh := _any_mesh_below(entry)):
+                    raise ConfigError(
+                        f"{mesh} lies in a folder that is neither a class nor a split: {LAYOUTS}"
+                    )
+            elif entry.suffix.lower() in SUFFIXES:
+                self._refuse_link_outside(entry)
+                _refuse_odd_name(entry)
+                if entry.is_file():
+                    files.append(entry)
+        return files
+
+    def _by_stem(self, cls: str, files: Sequence[Path]) -> dict[str, Path]:
+        stems: dict[str, Path] = {}
+        for file in files:
+            if file.stem in self.skip:
+                continue
+            if file.stem in stems:
+                raise ConfigError(
+                    f"class {cls!r} has two files for one object: "
+                    f"{self._origin(stems[file.stem])} and {self._origin(file)}. "
+                    "Remove or rename one of them"
+                )
+            stems[file.stem] = file
+        return stems
+
+    def _split(self, cls: str, files: dict[str, Path]) -> dict[str, dict[str, Path]]:
+        """The first `test_fraction` in the order of a hash; both splits get one if they can."""
+        order = sorted(files, key=lambda stem: _hash("split", cls, stem))
+        tests = int(len(order) * self.test_fraction + 0.5)
+        tests = max(1, min(tests, len(order) - 1)) if len(order) > 1 else 0
+        return {
+            "train": {stem: files[stem] for stem in order[tests:]},
+            "test": {stem: files[stem] for stem in order[:tests]},
+        }
+
+    def _keep(self, cls: str, files: dict[str, Path]) -> list[tuple[str, Path]]:
+        """This half of a group, by stem; the first half gets the odd one."""
+        order = sorted(files, key=lambda stem: _hash("half", cls, stem))
+        middle = (len(order) + 1) // 2
+        stems = {"all": order, "first": order[:middle], "second": order[middle:]}[self.half]
+        return [(stem, files[stem]) for stem in sorted(stems)]
+
+    def _item(self, cls: str, split: str, stem: str, file: Path) -> MeshItem:
+        return MeshItem(
+            id=f"{cls}/{split}/{stem}",
+            cls=cls,
+            split=split,
+            load=partial(load_mesh, file),
+            origin=self._origin(file),
+        )
+
+    def _origin(self, file: Path) -> str:
+        return file.relative_to(self.path).as_posix()
+
+    def _refuse_link_outside(self, entry: Path) -> None:
+        if not entry.is_symlink():
+            return
+        try:
+            target = entry.resolve(strict=True)
+        except (OSError, RuntimeError) as error:
+            raise DataError(f"{entry} is a broken link: remove or mend it") from error
+        if not target.is_relative_to(self.path.resolve()):
+            raise DataError(
+                f"{entry} is a link that leads out of {self.path}, to {target}: links outside "
+                "are not followed; put the file itself there"
+            )
+
+
+def _class_of(folder: str) -> str | None:
+    name = folder.lower().replace("-", "_").replace(" ", "_")
+    name = ALIASES.get(name, name)
+    return name if name in CLASSES else None
+
+
+def _visible(folder: Path) -> list[Path]:
+    return [
+        entry
+        for entry in sorted(folder.iterdir())
+        if not entry.name.startswith(".") and entry.name != "__MACOSX"
+    ]
+
+
+def _any_mesh_below(folder: Path) -> Path | None:
+    return next(_meshes_below(folder), None)
+
+
+def _meshes_below(folder: Path) -> Iterator[Path]:
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            if not name.startswith(".") and Path(name).suffix.lower() in SUFFIXES:
+                yield Path(parent, name)
+
+
+def _refuse_odd_name(file: Path) -> None:
+    """Names go into manifests and messages: no control characters, and valid Unicode."""
+    if not file.name.isprintable():
+        raise ConfigError(f"{str(file)!r} has unprintable characters in its name: rename it")
+
+
+def _hash(purpose: str, cls: str, stem: str) -> str:
+    """Order that depends on class and name only, not on where or in what format files lie."""
+    return hashlib.sha256(f"{purpose}/{cls}/{stem}".encode()).hexdigest()

@@ -1,0 +1,192 @@
+"""PLY, text and binary of either byte order, with polygons of any and of mixed sizes.
+
+trimesh is not used here: it refuses binary files in which triangles and quads are mixed,
+which is what Blender writes.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from qs3.errors import MeshError
+from qs3.meshes.formats.arrays import Triangles, check_counts, fan, numbers, whole
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4"},
+    **{"uint32": "u4", "int64": "i8", "uint64": "u8"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+_END = re.compile(rb"\bend_header[ \t]*(?:\r\n|\n|\r)")
+_MAX_HEADER_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    dtype: np.dtype
+    count_dtype: np.dtype | None  # of lists
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property]
+
+
+def read(data: bytes) -> Triangles:
+    """Read the elements "vertex" and "face"; all else is stepped over."""
+    elements, body = _parse_header(data)
+    counts = {element.name: element.count for element in elements}
+    check_counts(max(counts.values(), default=0), counts.get("face", 0))
+    vertices = faces = None
+    offset = 0
+    for element in elements:
+        columns, offset = _read_element(element, body, offset)
+        if element.name == "vertex":
+            missing = [axis for axis in "xyz" if axis not in columns]
+            if missing:
+                raise MeshError(f"has vertices without {', '.join(missing)}")
+            vertices = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        elif element.name == "face":
+            name = next((n for n in ("vertex_indices", "vertex_index") if n in columns), None)
+            if name is None:
+                raise MeshError("has faces without vertex_indices")
+            sizes, corners = columns[name]
+            faces = fan(sizes, whole(corners.astype(np.float64), "a vertex index"))
+        if vertices is not None and faces is not None:
+            return vertices, faces
+    raise MeshError("has no faces: it is a point cloud, or not made of triangles")
+
+
+def _parse_header(data: bytes) -> tuple[list[_Element], bytes]:
+    """Elements, and the data behind the header; text becomes binary of float64."""
+    end = _END.search(data, 0, _MAX_HEADER_BYTES)
+    if end is None or not data.startswith(b"ply"):
+        raise MeshError("is no PLY file, or cut within its header")
+    lines = [line.split() for line in data[: end.start()].decode("latin-1").splitlines()]
+    order = None
+    elements: list[_Element] = []
+    for words in lines[1:]:
+        match words:
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", str(name), _] if name in _BYTE_ORDERS:
+                order = _BYTE_ORDERS[name]
+                text = name == "ascii"
+            case ["element", name, count] if count.isdigit() and len(count) <= 12 and order:
+                elements.append(_Element(name, int(count), []))
+            case ["property", "list", count, kind, name] if elements and order:
+                elements[-1].properties.append(
+                    _Property(name, _dtype(kind, order, text), _dtype(count, order, text))
+                )
+            case ["property", kind, name] if elements and order:
+                elements[-1].properties.append(_Property(name, _dtype(kind, order, text), None))
+            case _:
+                raise MeshError(f"has a header line that PLY does not know: {' '.join(words)!r}")
+    if order is None:
+        raise MeshError("has a header without the line format")
+    body = data[end.end() :]
+    return elements, numbers(body).astype("<f8").tobytes() if text else body
+
+
+def _dtype(kind: str, order: str, text: bool) -> np.dtype:
+    if kind not in _TYPES:
+        raise MeshError(f"has a property of the unknown type {kind!r}")
+    return np.dtype("<f8") if text else np.dtype(order + _TYPES[kind])
+
+
+def _read_element(element: _Element, body: bytes, offset: int) -> tuple[dict, int]:
+    """Columns by name, lists as (sizes [N], items [sum(sizes)]); and the offset behind."""
+    sizes = _first_sizes(element, body, offset)
+    row = np.dtype(
+        [
+            field
+            for i, (p, size) in enumerate(zip(element.properties, sizes, strict=True))
+            for field in _fields(i, p, size)
+        ]
+    )
+    end = offset + element.count * row.itemsize
+    if end <= len(body):
+        table = np.frombuffer(body, row, element.count, offset)
+        if all((table[f"n{i}"] == size).all() for i, size in enumerate(sizes) if size is not None):
+            columns = {
+                p.name: table[f"p{i}"]
+                if size is None
+                else (np.full(element.count, size), table[f"p{i}"].reshape(-1))
+                for i, (p, size) in enumerate(zip(element.properties, sizes, strict=True))
+            }
+            return columns, end
+    if all(size is None for size in sizes):
+        raise _truncated(element)
+    return _read_ragged(element, body, offset)
+
+
+def _fields(index: int, prop: _Property, size: int | None) -> list[tuple]:
+    if size is None:
+        return [(f"p{index}", prop.dtype)]
+    return [(f"n{index}", prop.count_dtype), (f"p{index}", prop.dtype, (size,))]
+
+
+def _first_sizes(element: _Element, body: bytes, offset: int) -> list[int | None]:
+    """Lengths of the lists in the first row: most files have the same in all rows."""
+    sizes: list[int | None] = []
+    for prop in element.properties:
+        if prop.count_dtype is None:
+            sizes.append(None)
+            offset += prop.dtype.itemsize
+        else:
+            size = _size(element, prop.count_dtype, body, offset) if element.count else 0
+            sizes.append(size)
+            offset += prop.count_dtype.itemsize + size * prop.dtype.itemsize
+    return sizes
+
+
+def _read_ragged(element: _Element, body: bytes, offset: int) -> tuple[dict, int]:
+    """Row by row; only lists are kept, for nobody needs the scalars beside them."""
+    starts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_dtype}
+    sizes: dict[str, list[int]] = {name: [] for name in starts}
+    for _ in range(element.count):
+        for prop in element.properties:
+            if prop.count_dtype is None:
+                offset += prop.dtype.itemsize
+                continue
+            size = _size(element, prop.count_dtype, body, offset)
+            offset += prop.count_dtype.itemsize
+            starts[prop.name].append(offset)
+            sizes[prop.name].append(size)
+            offset += size * prop.dtype.itemsize
+    if offset > len(body):
+        raise _truncated(element)
+    data = np.frombuffer(body, np.uint8)
+    columns = {}
+    for prop in element.properties:
+        if prop.count_dtype is not None:
+            counts = np.array(sizes[prop.name], dtype=np.int64)
+            columns[prop.name] = counts, _gather(data, starts[prop.name], counts, prop.dtype)
+    return columns, offset
+
+
+def _gather(data: np.ndarray, starts: list[int], counts: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Items of lists that begin at the bytes `starts`."""
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    first = np.repeat(np.array(starts, dtype=np.int64), counts) + within * dtype.itemsize
+    return data[first[:, None] + np.arange(dtype.itemsize)].reshape(-1).view(dtype)
+
+
+def _size(element: _Element, dtype: np.dtype, body: bytes, offset: int) -> int:
+    if offset + dtype.itemsize > len(body):
+        raise _truncated(element)
+    size = float(np.frombuffer(body, dtype, 1, offset)[0])
+    if not (0 <= size <= len(body) and size == int(size)):
+        raise MeshError(f"has a list of {size:g} items in element {element.name!r}")
+    return int(size)
+
+
+def _truncated(element: _Element) -> MeshError:
+    return MeshError(f"is truncated: not all {element.count} of element {element.name!r} are there")

@@ -1,0 +1,28 @@
+"""Supervised on the target: the upper bound. It alone asks for the target's training labels."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from qs3.methods.base import Method
+
+
+class Supervised(Method):
+    """L = CE(net(x_t), y_t) on the target's training split.
+
+    The batch's labelled part stands at "source", as for all methods; its labels carry the name
+    of their true owner.
+    """
+
+    labels: ClassVar[str] = "target_train"
+
+    def loss(
+        self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Cross-entropy, >= 0."""
+        labelled = batch["source"]
+        return {"ce": F.cross_entropy(net(labelled["points"]), labelled["y_target_train"])}

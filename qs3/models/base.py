@@ -1,0 +1,104 @@
+"""What all backbones share: features of a cloud, and a head that turns them into logits."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.errors import DataError
+
+
+class Features(NamedTuple):
+    """What a backbone says about a batch of clouds.
+
+    Attributes:
+        global_: [B, D] one vector a cloud, D = `Backbone.feature_dim`.
+        per_point: [B, N, C] one vector a point, or None where a backbone has none.
+        regulariser: a term that a backbone wants in the loss (PointNet), unweighted.
+    """
+
+    global_: Float[Tensor, "b d"]
+    per_point: Float[Tensor, "b n c"] | None
+    regulariser: Float[Tensor, ""] | None = None
+
+
+class Backbone(nn.Module):
+    """Clouds [B, N, 3] to `Features`; subclasses set `feature_dim`."""
+
+    feature_dim: int
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
+        """Features of each cloud; the order of its points does not matter."""
+        raise NotImplementedError
+
+
+class ClassHead(nn.Sequential):
+    """Linear - BN - activation - dropout per hidden layer, and a last Linear.
+
+    Args:
+        feature_dim: D of the backbone.
+        num_classes: C.
+        hidden: widths between.
+        dropout: after every hidden layer.
+        negative_slope: of LeakyReLU; 0 is ReLU.
+        first_bias: False where the first layer is published without one.
+    """
+
+    def __init__(
+        self,
+        feature_dim: int,
+        num_classes: int,
+        *,
+        hidden: tuple[int, ...] = (512, 256),
+        dropout: float = 0.5,
+        negative_slope: float = 0.2,
+        first_bias: bool = True,
+    ) -> None:
+        widths = (feature_dim, *hidden)
+        layers: list[nn.Module] = []
+        for i, (wide, narrow) in enumerate(zip(widths, hidden, strict=False)):
+            layers += [
+                nn.Linear(wide, narrow, bias=first_bias or i > 0),
+                nn.BatchNorm1d(narrow),
+                nn.LeakyReLU(negative_slope),
+                nn.Dropout(dropout),
+            ]
+        super().__init__(*layers, nn.Linear(widths[-1], num_classes))
+
+
+class PointClassifier(nn.Module):
+    """A backbone and a head.
+
+    In train mode the head's batch norm needs two clouds at least; in eval one is enough.
+    """
+
+    def __init__(self, backbone: Backbone, head: nn.Module) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.head = head
+
+    def features(self, points: Float[Tensor, "b n 3"]) -> Features:
+        """Features of checked clouds: for heads besides the classifier's."""
+        check_points(points)
+        return self.backbone(points)
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
+        """Logits."""
+        return self.head(self.features(points).global_)
+
+
+def check_points(points: Tensor) -> None:
+    """Raise `DataError`, naming the item, unless `points` is a finite, not empty [B, N, 3]."""
+    if points.ndim != 3 or points.shape[2] != 3 or points.shape[1] == 0:
+        raise DataError(f"expected points [B, N >= 1, 3], got {list(points.shape)}")
+    if torch.isfinite(points).all():
+        return
+    bad = (~torch.isfinite(points)).flatten(1).sum(1)  # [B]
+    item = int(bad.nonzero()[0, 0])
+    raise DataError(
+        f"batch item {item} has {int(bad[item])} coordinates that are NaN or infinite "
+        f"({int((bad > 0).sum())} of {len(bad)} items have some); check the dataset behind it"
+    )

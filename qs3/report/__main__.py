@@ -1,0 +1,120 @@
+"""Tables and pictures from the command line.
+
+    python -m qs3.report table=uda [log_dir=logs] [out=logs/tables] [target=kinectsim10]
+                                   [overrides="trainer=gpu data.points=512"]
+    python -m qs3.report pictures domains=[modelnet10,specklenet10,kinectsim10]
+                                  [data_dir=data] [split=train] [out=data/pictures]
+
+A table is printed as Markdown and saved as .md, .csv and .tex. `overrides` are those that the runs
+had beyond the table's. Pictures: a contact sheet of each domain, and one that compares them; with
+out=NAME.png the latter alone. `paths.log_dir` and `paths.data_dir` are understood as well.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from qs3.errors import ConfigError, Qs3Error
+
+_TABLE = {"table", "log_dir", "data_dir", "out", "target", "overrides"}
+_PICTURES = {"domains", "data_dir", "out", "split"}
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit status."""
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(__doc__)
+        return 0
+    try:
+        if argv[0] == "pictures":
+            _pictures(_options(argv[1:], _PICTURES))
+        else:
+            _table(_options(argv, _TABLE))
+    except Qs3Error as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _options(argv: Sequence[str], known: set[str]) -> dict[str, str]:
+    """key=value words as a dict.
+
+    Raises:
+        ConfigError: another key, or no `=`.
+    """
+    found = {}
+    for word in argv:
+        key, equals, value = word.partition("=")
+        key = key.removeprefix("paths.")
+        if not equals or key not in known:
+            raise ConfigError(f"unknown argument {word!r}; known are {', '.join(sorted(known))}=")
+        found[key] = value
+    return found
+
+
+def _table(options: dict[str, str]) -> None:
+    from qs3.files import write_text
+    from qs3.report.tables import build_table, csv_text, latex, markdown, table_names
+
+    if "table" not in options:
+        raise ConfigError(f"which table? table={'|'.join(table_names())}")
+    log_dir = Path(options.get("log_dir", "logs"))
+    extra = shlex.split(options.get("overrides", ""))
+    extra += [f"paths.data_dir={options['data_dir']}"] if "data_dir" in options else []
+    table = build_table(options["table"], log_dir, extra, options.get("target"))
+    text = markdown(table)
+    name = "-".join([table.name, *([options["target"]] if "target" in options else [])])
+    at = Path(options.get("out", log_dir / "tables")) / name
+    for suffix, content in ((".md", text), (".csv", csv_text(table)), (".tex", latex(table))):
+        write_text(f"{at}{suffix}", content)
+    print(text)
+    print(f"saved {at}.md, .csv, .tex")
+
+
+def _pictures(options: dict[str, str]) -> None:
+    from hydra.utils import instantiate
+
+    from qs3.report.pictures import contact_sheet, scan_picture
+    from qs3.report.tables import composing
+
+    names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]
+    if not names:
+        raise ConfigError("which domains? domains=[modelnet10,specklenet10,kinectsim10]")
+    data_dir = Path(options.get("data_dir", "data"))
+    out, split = Path(options.get("out", data_dir / "pictures")), options.get("split", "train")
+    alone = out.suffix == ".png"
+    sets, simulated = {}, []
+    with composing() as compose:
+        for name in names:
+            cfg = compose(
+                "train", [f"domain@data.source={name}", f"paths.data_dir={data_dir.absolute()}"]
+            )
+            domain = instantiate(cfg.data.source)
+            data = domain.open()
+            words = f"{domain.title}{' (simulated)' if domain.simulated else ''}"
+            sets[f"{domain.symbol}: {words}"] = data
+            simulated += [domain.title] if domain.simulated else []
+            if alone:
+                continue
+            part = data.split(split)
+            few = max(1, min(6, *data.counts()[split].values()))  # a row a class
+            of_class = [(part.labels == k).nonzero()[0][:few] for k in range(len(data.classes))]
+            first = [i for members in of_class for i in members]
+            print(
+                contact_sheet(
+                    [part.points[i] for i in first],
+                    [part.ids[i].split("/")[-1] for i in first],
+                    out / f"{name}.png",
+                    columns=few,
+                    heading=f"{domain.label}, {split}",
+                )
+            )
+    note = f"simulated: {', '.join(simulated)}" if simulated else ""
+    print(scan_picture(sets, out if alone else out / "domains.png", split=split, note=note))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

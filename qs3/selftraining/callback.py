@@ -1,0 +1,188 @@
+"""The rounds of self-training, inside one `Trainer.fit`.
+
+    epoch:    0 ........ warmup-1 | round 0 ....... | round 1 ....... |
+              warm-up             ^                 ^
+                                  select            select (the student is now the teacher)
+
+At the end of a phase's last epoch (`on_train_epoch_end`) the teacher labels the whole target
+training split, and the selected part becomes the datamodule's next training set. Weights and
+optimiser are reset at the start of the next epoch (`on_train_epoch_start`), not before:
+checkpoints are written in between, and must hold the trained model. Whether a reset is due
+follows from the epoch alone, so there is no flag that a resume could lose.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from qs3.checkpoints import copy_weights, load, save
+from qs3.classifier import Classifier
+from qs3.data.datamodule import UdaData
+from qs3.evaluation import predict
+from qs3.selftraining.scheme import Phases, Scheme
+from qs3.selftraining.selectors import check_selection
+from qs3.selftraining.table import path_of, write_pseudo_labels
+
+log = logging.getLogger(__name__)
+
+WARMUP_SELECTED = "warmup_selected.pt"
+WARMUP_LAST = "warmup_last.pt"
+
+
+class WarmupSelection(Callback):
+    """Keeps the warm-up's weights with the best validation accuracy, the earliest on ties.
+
+    Never looks at the target. At the end of the warm-up it saves them as `warmup_selected.pt`,
+    and the last ones as `warmup_last.pt`.
+
+    Args:
+        folder: of the run.
+        phases: of the run.
+        rule: "source_val" as above, or "last".
+    """
+
+    def __init__(self, folder: Path, phases: Phases, rule: str) -> None:
+        self.folder, self.phases, self.rule = folder, phases, rule
+        self.epoch, self.accuracy = -1, -1.0
+        self._weights: dict[str, Any] | None = None  # only during the warm-up
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Compare this epoch with the best so far."""
+        assert isinstance(pl_module, Classifier)
+        epoch = trainer.current_epoch
+        if self.phases.phase(epoch) != 0:
+            return
+        accuracy = float(trainer.callback_metrics[f"{pl_module.method.labels}_val/acc"])
+        if self.rule == "last" or accuracy > self.accuracy:
+            self.epoch, self.accuracy = epoch, accuracy
+            self._weights = copy_weights(pl_module.net)
+        if self.phases.ends(epoch):
+            if trainer.is_global_zero:
+                save(self._weights, self.folder / WARMUP_SELECTED)
+                save(copy_weights(pl_module.net), self.folder / WARMUP_LAST)
+            self._weights = None
+            trainer.strategy.barrier("warm-up saved")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Best epoch so far and its weights."""
+        return {"epoch": self.epoch, "accuracy": self.accuracy, "weights": self._weights}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore `state_dict`."""
+        self.epoch, self.accuracy = state_dict["epoch"], state_dict["accuracy"]
+        self._weights = state_dict["weights"]
+
+
+class SelfTraining(Callback):
+    """Selects pseudo-labels between phases and starts each round afresh.
+
+    Args:
+        folder: of the run.
+        phases: of the run.
+        scheme: settings of the rounds.
+        classes: names in label order.
+
+    Attributes:
+        records: what `metrics.json` says about each round so far.
+    """
+
+    def __init__(
+        self, folder: Path, phases: Phases, scheme: Scheme, classes: Sequence[str]
+    ) -> None:
+        self.folder, self.phases, self.scheme = folder, phases, scheme
+        self.classes = tuple(classes)
+        self.records: list[dict[str, Any]] = []
+        self._previous: torch.Tensor | None = None  # [n] predicted labels of the round before
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """In the first epoch of a round: new optimiser state, and new weights if from scratch."""
+        assert isinstance(pl_module, Classifier)
+        phase = self.phases.phase(trainer.current_epoch)
+        if phase > 0 and self.phases.starts(trainer.current_epoch):
+            pl_module.start_phase(phase, fresh=self.scheme.init == "scratch")
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """In the last epoch of a phase: label the target and choose the next training set."""
+        assert isinstance(pl_module, Classifier)
+        phase = self.phases.phase(trainer.current_epoch)
+        if self.phases.ends(trainer.current_epoch) and phase < self.scheme.rounds:
+            self._select(trainer, pl_module, round_=phase)
+
+    def _select(self, trainer: Trainer, pl_module: Classifier, round_: int) -> None:
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        assert isinstance(data, UdaData)
+        teacher = pl_module.net
+        if round_ == 0:  # the warm-up's selected weights, not its last ones
+            teacher = pl_module.fresh_net(phase=0).to(pl_module.device)
+            teacher.load_state_dict(load(self.folder / WARMUP_SELECTED, pl_module.device))
+        # One process predicts for all: batch norm's statistics differ between processes.
+        probabilities = trainer.strategy.broadcast(
+            predict(teacher, data.target.points, data.eval_batch_size, pl_module.device)
+        )
+        confidence, predicted = probabilities.max(axis=1), probabilities.argmax(axis=1)
+        selection = self.scheme.selector.select(
+            confidence, predicted, data.target.ids, len(self.classes), self.scheme.theta_of(round_)
+        )
+        if trainer.is_global_zero:
+            write_pseudo_labels(
+                path_of(self.folder, round_),
+                data.target.ids,
+                predicted,
+                confidence,
+                selection.selected,
+                self.classes,
+            )
+        missing = check_selection(selection, self.classes, round_, self.scheme.missing_class)
+
+        labels = torch.from_numpy(predicted)
+        index = torch.from_numpy(selection.selected.nonzero()[0])
+        data.set_pseudo_labels(index, labels[index])
+        by_class = {
+            name: {key: value.item() for key, value in zip(self.classes, values, strict=True)}
+            for name, values in (
+                ("mu", selection.mu),
+                ("confident", selection.confident),
+                ("selected", selection.kept),
+            )
+        }
+        same = None if self._previous is None else float((labels == self._previous).double().mean())
+        self._previous = labels
+        self.records.append(
+            {
+                "round": round_,
+                "theta": selection.theta,
+                **by_class,
+                "total_confident": int(selection.confident.sum()),
+                "total_selected": len(index),
+                "missing_classes": missing,
+                "agreement": same,
+            }
+        )
+        if not trainer.is_global_zero:
+            return
+        log.info(
+            "round %d: theta %.3f, %d of %d target samples confident, %d selected%s",
+            round_,
+            selection.theta,
+            int(selection.confident.sum()),
+            len(labels),
+            len(index),
+            "" if same is None else f", {same:.1%} of all labels as in the round before",
+        )
+        if missing:
+            log.warning("round %d: no pseudo-label for %s", round_, ", ".join(missing))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Records so far and the last labels; the selected set is the datamodule's state."""
+        return {"records": self.records, "previous": self._previous}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore `state_dict`."""
+        self.records, self._previous = list(state_dict["records"]), state_dict["previous"]
+

@@ -1,0 +1,147 @@
+"""Which pseudo-labels to trust: pure functions on a table of predictions (numpy only).
+
+A selector sees one row a target sample: its predicted class, that class's probability and its
+id. It never sees a label. The result does not depend on the order of the rows: ties are broken
+by id.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from qs3.errors import ConfigError, SelectionError
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What a round will be trained on, and the figures that led to it (per class: [K]).
+
+    Attributes:
+        selected: [n] whether each sample is kept.
+        theta: the threshold used.
+        mu: [K] fraction of the confident samples of each class to keep.
+        confident: [K] samples above the threshold, by predicted class.
+        kept: [K] samples kept, by predicted class.
+    """
+
+    selected: Bool[np.ndarray, " n"]
+    theta: float
+    mu: Float[np.ndarray, " k"]
+    confident: Int[np.ndarray, " k"]
+    kept: Int[np.ndarray, " k"]
+
+
+class Selector(Protocol):
+    """Chooses among predictions; an object built from config group `selftraining`."""
+
+    def select(
+        self,
+        confidence: Float[np.ndarray, " n"],
+        predicted: Int[np.ndarray, " n"],
+        ids: Sequence[str],
+        classes: int,
+        theta: float,
+    ) -> Selection:
+        """Choose the samples to train on."""
+        ...
+
+
+@dataclass(frozen=True)
+class Qbst:
+    r"""Quasi-balanced self-training (QS3, section 3.2): the rarer a class, the more of it is kept.
+
+    With A = {i : p_i > theta}, n = |A| and n_k = |{i in A : k_i = k}|, class k keeps the
+    ceil(mu_k n_k) most confident of its samples in A, where mu_k = 1 - n_k / n.
+
+    Attributes:
+        mu: "balanced" as above; "one" keeps every confident sample (a control).
+        order: "descending" keeps the most confident, as the paper says; "ascending" the least
+            confident, as the released code does.
+        counts: L_k in mu_k = 1 - L_k / n. "confident" counts L_k = n_k in A, as the released code
+            does; "all" counts all target samples predicted as k, as the paper's words read. That
+            can exceed n, so mu_k is clamped at 0 there.
+    """
+
+    mu: str = "balanced"
+    order: str = "descending"
+    counts: str = "confident"
+
+    def __post_init__(self) -> None:
+        _one_of("mu", self.mu, ("balanced", "one"))
+        _one_of("order", self.order, ("descending", "ascending"))
+        _one_of("counts", self.counts, ("confident", "all"))
+
+    def select(
+        self,
+        confidence: Float[np.ndarray, " n"],
+        predicted: Int[np.ndarray, " n"],
+        ids: Sequence[str],
+        classes: int,
+        theta: float,
+    ) -> Selection:
+        """Choose the samples to train on; may choose none (the caller decides what that means)."""
+        confidence = np.asarray(confidence, dtype=np.float64)
+        above = confidence > theta
+        n_k = np.bincount(predicted[above], minlength=classes)
+        n = int(n_k.sum())
+        counted = np.bincount(predicted, minlength=classes) if self.counts == "all" else n_k
+        rest = np.full(classes, n) if self.mu == "one" else np.maximum(n - counted, 0)  # mu_k n
+        quota = -(-(rest * n_k) // max(n, 1))  # ceil(mu_k n_k), in whole numbers: no rounding error
+
+        ranked = np.lexsort((np.asarray(ids), confidence if self.order == "ascending" else -confidence))
+        selected = np.zeros(len(confidence), dtype=bool)
+        for k in range(classes):
+            of_class = ranked[above[ranked] & (predicted[ranked] == k)]
+            selected[of_class[: quota[k]]] = True
+        return Selection(
+            selected=selected,
+            theta=theta,
+            mu=rest / max(n, 1),
+            confident=n_k,
+            kept=np.bincount(predicted[selected], minlength=classes),
+        )
+
+
+def check_selection(
+    selection: Selection, class_names: Sequence[str], round_: int, missing_class: str
+) -> list[str]:
+    """Names of the classes without a pseudo-label, after checking that training is possible.
+
+    Raises:
+        SelectionError: fewer than two samples were selected (batch normalisation needs two), or
+            a class is missing and `missing_class` is "error".
+    """
+    missing = [name for name, n in zip(class_names, selection.kept, strict=True) if n == 0]
+    total = int(selection.kept.sum())
+    table = ", ".join(
+        f"{name} {kept}/{confident}"
+        for name, kept, confident in zip(
+            class_names, selection.kept, selection.confident, strict=True
+        )
+    )
+    facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
+    if total < 2:
+        one_class = int((selection.confident > 0).sum()) == 1
+        why = (
+            "all confident samples are of one class, so its mu is 0; train the teacher longer "
+            "(protocol.epochs), or set selftraining.selector.mu=one"
+            if one_class
+            else "lower selftraining.theta, or train the teacher longer (protocol.epochs)"
+        )
+        raise SelectionError(f"only {total} pseudo-labels selected in {facts}; {why}")
+    if missing and missing_class == "error":
+        raise SelectionError(
+            f"no pseudo-label for {', '.join(missing)} in {facts}; lower selftraining.theta, or "
+            "accept it with selftraining.missing_class=warn"
+        )
+    return missing
+
+
+def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ConfigError(f"selftraining.selector.{key} must be one of {allowed}, got {value!r}")

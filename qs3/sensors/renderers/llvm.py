@@ -1,0 +1,192 @@
+"""Which Mitsuba variant runs on this machine, found out without risking the process.
+
+Mitsuba's fast CPU variants compile their kernels with a system libLLVM, and some versions
+of it (14 and 16 with mitsuba 3.9.1) abort the whole process. So every candidate first
+renders a small scene in a child process. The answer is kept in the environment variable
+`QS3_MITSUBA_PROBE`, so worker processes inherit it and do not probe again.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import functools
+import glob
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+
+from qs3.errors import RenderError
+
+PROBE_VARIABLE = "QS3_MITSUBA_PROBE"
+LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
+
+_PREFERRED = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
+_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib/llvm-*/lib",
+    "/usr/lib64",
+    "/usr/lib64/llvm*/lib",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+)
+_CHILD_TIMEOUT_S = 120.0
+_CHILD_OK = "qs3-probe-ok"
+_CHILD = f"""
+import sys
+from qs3.sensors.renderers.mitsuba import render_probe_scene
+render_probe_scene(sys.argv[1])
+print("{_CHILD_OK}")
+"""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What can run.
+
+    Attributes:
+        variant: name of a Mitsuba variant.
+        llvm_path: the libLLVM it needs, None for variants that need none.
+    """
+
+    variant: str
+    llvm_path: str | None = None
+
+
+def libllvm_version(path: str) -> tuple[int, ...]:
+    """Version in the name of a libLLVM file, () if there is none: (19, 1) for libLLVM.so.19.1."""
+    name = os.path.basename(os.path.realpath(path))
+    match = re.search(r"LLVM-(\d+(?:\.\d+)*)", name) or re.search(r"\.so\.(\d+(?:\.\d+)*)", name)
+    return tuple(int(part) for part in match.group(1).split(".")) if match else ()
+
+
+def libllvm_candidates() -> list[str]:
+    """Files of libLLVM to try: the user's own choice alone, else all installed, newest first."""
+    chosen = os.environ.get(LIBRARY_VARIABLE)
+    if chosen:
+        return [chosen]
+    found: dict[str, str] = {}  # real path -> path, so that links to one file are tried once
+    for folder in _FOLDERS:
+        for pattern in ("libLLVM*.so*", "libLLVM*.dylib"):
+            for path in sorted(glob.glob(os.path.join(folder, pattern))):
+                found.setdefault(os.path.realpath(path), path)
+    return sorted(found, key=lambda real: (libllvm_version(real), real), reverse=True)
+
+
+def cuda_may_work() -> bool:
+    """Whether asking CUDA is worth a child process."""
+    hidden = os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1")
+    return not hidden and ctypes.util.find_library("cuda") is not None
+
+
+def find_variant(variant: str = "auto") -> Probe:
+    """The variant to use.
+
+    Args:
+        variant: a Mitsuba variant, or "auto": CUDA if there is a GPU that works, else LLVM
+            with the newest libLLVM that works, else `scalar_rgb` (20 to 40x slower).
+
+    Raises:
+        RenderError: the variant that was asked for cannot run here.
+    """
+    if variant == "auto":
+        return _inherited() or _remember(_first_that_works())
+    if variant.startswith("llvm_"):
+        inherited = _inherited()
+        if inherited is not None and inherited.variant == variant:
+            return inherited
+        return _remember(_probe_llvm(variant))
+    if variant.startswith("cuda_"):
+        reason = "no libcuda found" if not cuda_may_work() else try_variant(variant, None)
+        if reason is not None:
+            raise RenderError(
+                f"renderer.variant={variant} cannot run here: {reason}. It needs an NVIDIA GPU "
+                "with driver 535 or newer; variant=auto falls back to the CPU"
+            )
+    return Probe(variant)
+
+
+def try_variant(variant: str, llvm_path: str | None) -> str | None:
+    """Render a small scene in a child process.
+
+    Returns:
+        None if that worked, else the reason why not.
+    """
+    environment = dict(os.environ)
+    environment.pop(PROBE_VARIABLE, None)
+    if llvm_path is not None:
+        environment[LIBRARY_VARIABLE] = llvm_path
+    # The child finds qs3 where this process found it, installed or not.
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", _CHILD, variant],
+            env=environment,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_CHILD_TIMEOUT_S,
+        )
+    except subprocess.TimeoutExpired:
+        return f"no answer within {_CHILD_TIMEOUT_S:.0f} s"
+    if child.returncode == 0 and _CHILD_OK in child.stdout:
+        return None
+    said = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    told = next((line for line in said if "LLVM ERROR" in line), said[-1] if said else "no message")
+    how = f"killed by signal {-child.returncode}" if child.returncode < 0 else "failed"
+    return f"{how}: {told[:300]}"
+
+
+def _first_that_works() -> Probe:
+    """The best of `_PREFERRED`; the last one needs nothing and always works."""
+    cuda, llvm, scalar = _PREFERRED
+    if cuda_may_work() and try_variant(cuda, None) is None:
+        return Probe(cuda)
+    try:
+        return _probe_llvm(llvm)
+    except RenderError:
+        return Probe(scalar)
+
+
+@functools.cache
+def _probe_llvm(variant: str) -> Probe:
+    """The newest libLLVM with which `variant` renders."""
+    reasons = []
+    for path in libllvm_candidates():
+        reason = try_variant(variant, path)
+        if reason is None:
+            return Probe(variant, path)
+        reasons.append(f"{path}: {reason}")
+    tried = "; ".join(reasons) if reasons else "no libLLVM found in the usual library folders"
+    raise RenderError(
+        f"renderer.variant={variant} cannot run here ({tried}). Install a libLLVM that works, "
+        f"`apt install libllvm19` on Debian, or name one in {LIBRARY_VARIABLE}; "
+        "variant=auto falls back to scalar_rgb, which needs none but is 20 to 40x slower"
+    )
+
+
+def _inherited() -> Probe | None:
+    """The answer of an earlier probe, of this process or of its parent."""
+    text = os.environ.get(PROBE_VARIABLE)
+    if not text:
+        return None
+    try:
+        probe = Probe(**json.loads(text))
+    except (ValueError, TypeError):
+        return None
+    # A library that has gone, or one that the user has chosen since, makes the answer stale.
+    if probe.llvm_path is not None:
+        chosen = os.environ.get(LIBRARY_VARIABLE) or probe.llvm_path
+        if chosen != probe.llvm_path or not os.path.exists(probe.llvm_path):
+            return None
+    return probe
+
+
+def _remember(probe: Probe) -> Probe:
+    os.environ[PROBE_VARIABLE] = json.dumps(
+        {"variant": probe.variant, "llvm_path": probe.llvm_path}
+    )
+    return probe

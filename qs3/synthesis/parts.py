@@ -1,0 +1,132 @@
+"""The unfinished dataset: one file an object, so that an interruption loses at most one.
+
+recipe.json    what the parts were made with; another recipe is refused
+parts/         <sha256 of the id>.npz: the arrays, and a line of JSON with the rest
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.errors import ConfigError, DataError
+from qs3.files import atomic_path, remove_leftovers, write_json
+from qs3.synthesis.recipes import Cloud
+from qs3.synthesis.workers import Outcome
+
+RECIPE = "recipe.json"
+
+
+class Parts:
+    """The parts of one dataset's folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._parts = folder / "parts"
+
+    def begin(self, recipe: dict[str, Any]) -> None:
+        """Start, or check that what is there was made with the same recipe.
+
+        Raises:
+            ConfigError: it was not; the message lists the settings that differ.
+        """
+        path = self.folder / RECIPE
+        if path.is_file():
+            check_same_recipe(self.folder, recipe)
+        else:
+            write_json(path, recipe)
+        self._parts.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self._parts)
+
+    def save(self, outcome: Outcome) -> None:
+        """Write one outcome, atomically."""
+        cloud = outcome.cloud
+        note = {
+            "item_id": outcome.item_id,
+            "mesh_sha256": outcome.mesh_sha256,
+            "reason": outcome.reason,
+            "views": cloud.views if cloud else 0,
+            "valid_points": cloud.valid_points if cloud else 0,
+        }
+        arrays = dict(cloud.arrays) if cloud else {}
+        text = np.frombuffer(json.dumps(note).encode(), dtype=np.uint8)
+        with atomic_path(self._path(outcome.item_id)) as temporary:
+            np.savez(temporary, note=text, **arrays)
+
+    def load(self, item_id: str) -> Outcome | None:
+        """One outcome, or None if it is not there yet."""
+        path = self._path(item_id)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                note = json.loads(file["note"].tobytes())
+                arrays = {name: file[name] for name in file.files if name != "note"}
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
+        cloud = Cloud(arrays, note["views"], note["valid_points"]) if arrays else None
+        return Outcome(note["item_id"], note["mesh_sha256"], cloud, note["reason"], 0.0)
+
+    def done(self, item_id: str) -> bool:
+        """Whether an outcome is saved."""
+        return self._path(item_id).is_file()
+
+    def clear(self) -> None:
+        """Remove the parts; the recipe stays beside the finished dataset."""
+        shutil.rmtree(self._parts, ignore_errors=True)
+
+    def _path(self, item_id: str) -> Path:
+        return self._parts / f"{hashlib.sha256(item_id.encode()).hexdigest()[:32]}.npz"
+
+
+def check_same_recipe(folder: Path, recipe: dict[str, Any]) -> None:
+    """Raise ConfigError if `folder` was begun with another recipe.
+
+    Raises:
+        ConfigError: lists what differs, and says what to do.
+    """
+    path = folder / RECIPE
+    try:
+        there = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be read ({error}): use force=true to start over") from error
+    now = json.loads(json.dumps(recipe))
+    if there == now:
+        return
+    differences = [f"  {key}: {old} there, {new} now" for key, old, new in _differences(there, now)]
+    raise ConfigError(
+        f"{folder} was made with other settings or versions, and mixing them is refused:\n"
+        + "\n".join(differences[:12])
+        + "\nUse the same settings, another paths.data_dir, or force=true to start over."
+    )
+
+
+def _differences(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        out = []
+        for name in [*old, *(n for n in new if n not in old)]:
+            inner = f"{key}.{name}" if key else name
+            out += _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
+        return out
+    return [] if old == new else [(key, _short(old), _short(new))]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def forget(folder: Path) -> None:
+    """Delete a dataset, finished or not, and its recipe; other files are left alone."""
+    # meta.yaml first: without it the folder counts as unfinished whatever else is left.
+    for name in ("meta.yaml", RECIPE, "manifest.csv"):
+        (folder / name).unlink(missing_ok=True)
+    for path in folder.glob("*.npy"):
+        path.unlink()
+    Parts(folder).clear()

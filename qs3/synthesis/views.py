@@ -1,0 +1,127 @@
+"""Where the camera stands: the paper's pose law and a hand-held walk around the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import look_at, rotation_xyz
+
+
+@dataclass(frozen=True)
+class AnchoredViews:
+    """The paper's law (section 3.1): one random pose, and variants close to it.
+
+    The anchor looks at the origin from 3 to 5 m at an elevation of 20 to 50 degrees; the
+    other views shift it by up to 10 cm along each axis and turn it by up to 0.1 rad about
+    each of its axes, uniformly. They do not aim at the object again.
+
+    Repaired with respect to the released code: the azimuth covers the whole circle (there
+    half of it) and the spread does not grow with the view's index.
+    """
+
+    count: int = 5
+    min_distance_m: float = 3.0
+    max_distance_m: float = 5.0
+    min_elevation_deg: float = 20.0
+    max_elevation_deg: float = 50.0
+    max_shift_m: float = 0.1
+    max_turn_rad: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check(self.count, self.min_distance_m, self.max_distance_m)
+
+    def poses(self, rng: np.random.Generator, box_m: np.ndarray) -> list[np.ndarray]:
+        """`count` poses [4, 4] world_from_camera around a box [2, 3]; the first is the anchor."""
+        target_m = box_m.mean(axis=0)
+        distance = rng.uniform(self.min_distance_m, self.max_distance_m)
+        elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
+        azimuth = rng.uniform(0, 2 * np.pi)
+        anchor = look_at(target_m + distance * _direction(azimuth, elevation), target_m)
+        poses = [anchor]
+        for _ in range(self.count - 1):
+            pose = anchor.copy()
+            pose[:3, 3] += rng.uniform(-self.max_shift_m, self.max_shift_m, 3)
+            turn = rng.uniform(-self.max_turn_rad, self.max_turn_rad, 3)
+            pose[:3, :3] = anchor[:3, :3] @ rotation_xyz(turn)
+            poses.append(pose)
+        return poses
+
+
+@dataclass(frozen=True)
+class HandheldViews:
+    """Someone walks along an arc around the object and holds the camera towards it.
+
+    Attributes:
+        count: frames.
+        min_distance_m, max_distance_m: from the circle around the object's footprint, so
+            that nobody stands in a bed.
+        min_arc_deg, max_arc_deg: the frames spread over an arc drawn from this range.
+        aim_m: standard deviation of the point aimed at.
+    """
+
+    count: int = 4
+    min_distance_m: float = 0.9
+    max_distance_m: float = 2.2
+    min_elevation_deg: float = 15.0
+    max_elevation_deg: float = 45.0
+    min_arc_deg: float = 30.0
+    max_arc_deg: float = 150.0
+    aim_m: float = 0.08
+
+    def __post_init__(self) -> None:
+        _check(self.count, self.min_distance_m, self.max_distance_m)
+
+    def poses(self, rng: np.random.Generator, box_m: np.ndarray) -> list[np.ndarray]:
+        """`count` true poses [4, 4] around a box [2, 3], in the order of the walk."""
+        target_m = box_m.mean(axis=0)
+        radius = float(np.hypot(*(box_m[1] - box_m[0])[:2])) / 2
+        start = rng.uniform(0, 2 * np.pi)
+        arc = np.deg2rad(rng.uniform(self.min_arc_deg, self.max_arc_deg))
+        poses = []
+        for i in range(self.count):
+            azimuth = start + arc * (i / max(self.count - 1, 1))
+            elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
+            distance = radius + rng.uniform(self.min_distance_m, self.max_distance_m)
+            aim = target_m + rng.normal(0, self.aim_m, 3)
+            poses.append(look_at(target_m + distance * _direction(azimuth, elevation), aim))
+        return poses
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Error of the tracked camera: a random walk from frame to frame, frame 0 exact.
+
+    Attributes:
+        shift_m: standard deviation of each step along each axis.
+        turn_rad: standard deviation of each step about each axis.
+    """
+
+    shift_m: float = 0.0
+    turn_rad: float = 0.0
+
+    def believed(self, poses: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
+        """The poses that fusion uses instead of the true ones."""
+        out = []
+        error = np.eye(4)
+        for pose in poses:
+            out.append(pose @ error)
+            step = np.eye(4)
+            step[:3, :3] = rotation_xyz(rng.normal(0, self.turn_rad, 3))
+            step[:3, 3] = rng.normal(0, self.shift_m, 3)
+            error = error @ step
+        return out
+
+
+def _direction(azimuth_rad: float, elevation_rad: float) -> np.ndarray:
+    flat = np.cos(elevation_rad)
+    return np.array([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation_rad)])
+
+
+def _check(count: int, nearest_m: float, farthest_m: float) -> None:
+    if count < 1:
+        raise ConfigError(f"views must be at least 1, got {count}: set views=N on the command line")
+    if not 0 < nearest_m <= farthest_m:
+        raise ConfigError(f"distances must satisfy 0 < min <= max, got {nearest_m}, {farthest_m}")

@@ -1,0 +1,208 @@
+"""Many objects, several processes: the pool that runs a recipe over meshes.
+
+Each worker process makes its renderer once (Blender and Mitsuba are one a process) and is
+replaced after a few hundred objects, because their memory creeps. A worker that dies takes
+nothing with it: what was in flight is tried again, one object at a time, and an object that
+kills its worker twice is reported as failed.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+from qs3.errors import Qs3Error
+from qs3.meshes.source import MeshItem
+from qs3.sensors.renderers.base import Renderer
+from qs3.synthesis.recipes import Cloud, Recipe
+
+log = logging.getLogger(__name__)
+
+OBJECTS_PER_WORKER = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of one object.
+
+    Attributes:
+        item_id: of the mesh item.
+        mesh_sha256: of the mesh as loaded; empty if it could not be.
+        cloud: None if it failed; without its frames.
+        reason: why it failed; empty if it did not.
+        seconds: time it took.
+    """
+
+    item_id: str
+    mesh_sha256: str
+    cloud: Cloud | None
+    reason: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Job:
+    """What every worker needs to know once.
+
+    Attributes:
+        recipe: how a cloud is made.
+        make_renderer: picklable; called once in each worker if the recipe needs one.
+        seed: of the dataset.
+    """
+
+    recipe: Recipe
+    make_renderer: Callable[[], Renderer]
+    seed: int
+
+
+def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
+    """Make one object's cloud; failures of the object become an Outcome, not an error."""
+    start = time.perf_counter()
+    sha256 = ""
+    try:
+        mesh = item.load()
+        sha256 = mesh.sha256
+        cloud = job.recipe.make(mesh, item.id, job.seed, renderer)
+        cloud = Cloud(cloud.arrays, cloud.views, cloud.valid_points)
+        reason = ""
+    except Qs3Error as error:
+        cloud, reason = None, str(error)
+    except MemoryError:
+        cloud, reason = None, "out of memory"
+    except Exception as error:  # one odd mesh must not stop thousands
+        log.exception("%s: unexpected error", item.id)
+        cloud, reason = None, f"unexpected {type(error).__name__}: {error}"
+    return Outcome(item.id, sha256, cloud, reason, time.perf_counter() - start)
+
+
+def renderer_provenance(job: Job) -> dict[str, str]:
+    """Renderer, variant and versions, asked in a child process.
+
+    Raises:
+        RenderError: the renderer cannot be used here.
+    """
+    if not job.recipe.needs_renderer:
+        return {}
+    with _pool(job, 1) as pool:
+        provenance, found_out = pool.submit(_provenance).result()
+    # What the child found out about this machine need not be found out by every worker.
+    os.environ.update(found_out)
+    return provenance
+
+
+def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]:
+    """Outcomes in the order in which they are done.
+
+    Args:
+        job: what to do.
+        items: with which meshes.
+        workers: processes; 0 works in this one (for tests and debuggers).
+    """
+    if workers == 0:
+        renderer = job.make_renderer() if job.recipe.needs_renderer else None
+        for item in items:
+            yield scan_one(job, renderer, item)
+        return
+    chunk = OBJECTS_PER_WORKER * workers
+    for first in range(0, len(items), chunk):
+        left = {item.id: item for item in items[first : first + chunk]}
+        try:
+            for outcome in _scan_chunk(job, list(left.values()), workers):
+                del left[outcome.item_id]
+                yield outcome
+        except BrokenProcessPool:
+            log.warning("a worker process died; trying the objects that it had one at a time")
+            for item in list(left.values())[: 2 * workers]:
+                yield _scan_alone(job, item)
+                del left[item.id]
+            yield from scan_all(job, list(left.values()), workers)
+
+
+def _scan_chunk(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]:
+    pool = _pool(job, min(workers, len(items)))
+    try:
+        waiting = iter(items)
+        running: set[Future[Outcome]] = set()
+        while True:
+            # Two a worker in flight: enough that none idles, few to repeat after a crash.
+            while len(running) < 2 * workers and (item := next(waiting, None)) is not None:
+                running.add(pool.submit(_scan, item))
+            if not running:
+                return
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            # In a broken pool every future fails: keep what was done before it broke.
+            finished = [future for future in done if future.exception() is None]
+            for future in finished:
+                yield future.result()
+            for future in done:
+                future.result()
+    finally:
+        for process in list(pool._processes.values()):
+            process.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _scan_alone(job: Job, item: MeshItem) -> Outcome:
+    start = time.perf_counter()
+    try:
+        with _pool(job, 1) as pool:
+            return pool.submit(_scan, item).result()
+    except BrokenProcessPool:
+        reason = "the worker process died twice on this object (out of memory, or a crash)"
+        return Outcome(item.id, "", None, reason, time.perf_counter() - start)
+
+
+_JOB: Job | None = None
+_RENDERER: Renderer | None = None
+
+
+def _pool(job: Job, workers: int) -> ProcessPoolExecutor:
+    # Spawned, because neither Blender nor a threaded BLAS survives a fork.
+    return ProcessPoolExecutor(
+        workers,
+        mp_context=get_context("spawn"),
+        initializer=_start_worker,
+        initargs=(job, os.getpid()),
+    )
+
+
+def _start_worker(job: Job, parent: int) -> None:
+    global _JOB
+    _JOB = job
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
+    threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
+
+
+def _die_with(parent: int) -> None:
+    """A worker whose parent was killed would wait for work for ever."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
+def _renderer() -> Renderer | None:
+    global _RENDERER
+    assert _JOB is not None
+    if _RENDERER is None and _JOB.recipe.needs_renderer:
+        _RENDERER = _JOB.make_renderer()
+    return _RENDERER
+
+
+def _provenance() -> tuple[dict[str, str], dict[str, str]]:
+    renderer = _renderer()
+    assert renderer is not None
+    found_out = {name: value for name, value in os.environ.items() if name.startswith("QS3_")}
+    return renderer.provenance(), found_out
+
+
+def _scan(item: MeshItem) -> Outcome:
+    assert _JOB is not None
+    return scan_one(_JOB, _renderer(), item)

@@ -1,0 +1,236 @@
+"""The training story: data, classifier, callbacks, one `Trainer.fit`, and what came of it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import Callback, Trainer
+from omegaconf import DictConfig, OmegaConf
+
+import qs3
+from qs3 import runs
+from qs3.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
+from qs3.classifier import Classifier
+from qs3.data.datamodule import UdaData, load_clouds, without_labels
+from qs3.data.store import PointSet
+from qs3.errors import ConfigError, DataError
+from qs3.evaluation import Evaluation
+from qs3.files import remove_leftovers
+from qs3.hydra_glue import build
+from qs3.loggers import CsvHistory, EpochRows
+from qs3.methods.base import Method
+from qs3.methods.student import Student
+from qs3.runs import Run
+from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, SelfTraining, WarmupSelection
+from qs3.selftraining.table import path_of
+
+log = logging.getLogger(__name__)
+
+STUDENT = "student.pt"
+
+
+def fit(run: Run) -> dict[str, Any]:
+    """Train a run in its folder, from its last checkpoint on if there is one.
+
+    Returns:
+        The contents of `metrics.json`: the same whenever the run is repeated on this machine,
+        interrupted or not, except what stands under "times".
+    """
+    began, cfg = time.time(), run.cfg
+    _quieten()
+    torch.set_num_threads(cfg.trainer.threads or os.cpu_count() or 1)
+    source_set, target_set = run.source.open(), run.target.open()
+    _check_classes(source_set, target_set, cfg.num_classes)
+    started = _note_start(run, source_set, target_set)
+
+    # 1. Data. Target labels go to the method that asks for them by name, and to the evaluation.
+    method: Method = build(cfg.method)
+    cache = Path(cfg.data.cache_dir) if cfg.data.cache_dir else None
+    target_train = load_clouds(target_set, "train", cfg.data.points, cache)
+    supervised = method.labels == "target_train"
+    data = UdaData(
+        target_train if supervised else load_clouds(source_set, "train", cfg.data.points, cache),
+        without_labels(target_train),
+        phases=run.phases,
+        scheme=run.scheme,
+        augment=build(cfg.protocol.augment),
+        batch_size=cfg.protocol.batch_size,
+        seed=run.seed,
+        owner=method.labels,
+        val=cfg.data.val,
+        eval_batch_size=cfg.data.eval_batch_size,
+        uses_target=method.uses_target,
+    )
+    test = load_clouds(target_set, "test", cfg.data.points, cache)
+    evaluation = Evaluation(test, target_train, target_set.classes, cfg.data.eval_batch_size)
+
+    # 2. Classifier and callbacks.
+    classifier = Classifier(
+        build_net=lambda: build(cfg.model),
+        build_optimizer=build(cfg.protocol.optimizer),
+        method=method,
+        student=Student(pcm=run.scheme.pcm),
+        phases=run.phases,
+        seed=run.seed,
+    )
+    warmup = WarmupSelection(run.folder, run.phases, cfg.selection.teacher)
+    rounds = SelfTraining(run.folder, run.phases, run.scheme, target_set.classes)
+    callbacks: list[Callback] = [warmup, rounds, EpochRows(run.phases), SaveLast(run.folder)]
+
+    # 3. One fit over all phases. A checkpoint lies between two epochs; a resume repeats an epoch.
+    trainer = Trainer(
+        **_trainer_settings(cfg),
+        max_epochs=run.phases.total,
+        callbacks=[*_build_each(cfg.callbacks), *callbacks],
+        logger=[CsvHistory(run.folder), *_build_each(cfg.logger)],
+        plugins=[AtomicCheckpointIO()],
+        default_root_dir=run.folder,
+    )
+    last = run.folder / LAST
+    if last.is_file():
+        log.info("continuing the run in %s", run.folder)
+    try:
+        trainer.fit(classifier, data, ckpt_path=last if last.is_file() else None, weights_only=True)
+    finally:
+        _forget_wandb()
+
+    # 4. What came of it, from saved weights: the same after any interruption.
+    if trainer.is_global_zero:
+        save(copy_weights(classifier.net), run.folder / STUDENT)
+    trainer.strategy.barrier("student saved")
+    scores = {}
+    for name, file in (("selected", WARMUP_SELECTED), ("last", WARMUP_LAST), ("student", STUDENT)):
+        net = classifier.fresh_net(phase=0).to(classifier.device)
+        net.load_state_dict(load(run.folder / file, classifier.device))
+        scores[name] = evaluation.figures(net, classifier.device)
+    validated_on = f"{method.labels}_val"
+    teacher = f"{validated_on if warmup.rule == 'source_val' else warmup.rule}, epoch {warmup.epoch}"
+    return {
+        "experiment": cfg.experiment_name,
+        "hash": runs.config_hash(cfg),
+        "seed": run.seed,
+        "status": "finished",
+        "source": run.target.name if supervised else run.source.name,
+        "target": run.target.name,
+        "simulated": bool(run.target.simulated),
+        **_names(cfg),
+        "selection": {"teacher": teacher, "student": "last" if run.scheme.rounds else teacher},
+        "final": scores["student" if run.scheme.rounds else "selected"],
+        "warmup": {
+            "selected": {**scores["selected"], "epoch": warmup.epoch},
+            "last": {**scores["last"], "epoch": run.phases.warmup - 1},
+        },
+        "rounds": [
+            {
+                **record,
+                "with_target_labels": evaluation.pseudo_labels(
+                    path_of(run.folder, record["round"])
+                ),
+            }
+            for record in rounds.records
+        ],
+        "data": started["data"],
+        "times": {"seconds_since_last_start": round(time.time() - began, 1)},
+        "versions": started["versions"],
+    }
+
+
+def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:
+    if source.classes != target.classes:
+        raise DataError(
+            f"{source.name} has the classes {source.classes}, {target.name} {target.classes}; "
+            "they must be the same, in the same order"
+        )
+    if len(source.classes) != num_classes:
+        raise ConfigError(
+            f"num_classes is {num_classes}, but {source.name} has {len(source.classes)} classes; "
+            f"set num_classes={len(source.classes)}"
+        )
+
+
+def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
+    """Read `started.json` and compare it with today's data, or write it."""
+    now = {
+        "data": {"source": source.sha256, "target": target.sha256},
+        "versions": {
+            "qs3": qs3.__version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "lightning": lightning.__version__,
+            "numpy": np.__version__,
+        },
+        "config_hash": runs.config_hash(run.cfg),
+    }
+    if int(os.environ.get("LOCAL_RANK", 0)) > 0:
+        return now
+    remove_leftovers(run.folder)
+    started = runs.read_started(run.folder)
+    if started is None:
+        runs.write_started(run.folder, now)
+        return now
+    for role, dataset in (("source", source), ("target", target)):
+        runs.check_data(run.folder, dataset.name, started["data"][role], dataset.sha256)
+    if started["versions"] != now["versions"]:
+        log.warning(
+            "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
+            started["versions"],
+            now["versions"],
+        )
+    return started
+
+
+def _names(cfg: DictConfig) -> dict[str, str]:
+    """How method, self-training and model were called on the command line (or their classes)."""
+    choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
+    selector = cfg.selftraining.get("selector") or {"_target_": "none"}
+    names = {"method": cfg.method, "selftraining": selector, "model": cfg.model}
+    return {
+        group: str(choices.get(group) or node.get("_target_", "none").rsplit(".", 1)[-1].lower())
+        for group, node in names.items()
+    }
+
+
+def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
+    settings = OmegaConf.to_container(cfg.trainer, resolve=True)
+    assert isinstance(settings, dict)
+    return {str(key): value for key, value in settings.items() if key != "threads"} | {
+        "reload_dataloaders_every_n_epochs": 1,  # each epoch has its own order; rounds, their set
+        "use_distributed_sampler": False,  # `Batches` shares the clouds out itself
+        "num_sanity_val_steps": 0,
+        "log_every_n_steps": 1,
+        "enable_progress_bar": False,  # `qs3.progress` shows all epochs in one bar
+        "enable_model_summary": False,
+    }
+
+
+def _build_each(group: DictConfig | None) -> list[Any]:
+    return [build(node) for node in (group or {}).values() if node is not None]
+
+
+def _quieten() -> None:
+    """Leave Lightning's warnings and errors to Hydra's log; drop its tips and adverts."""
+    # Lightning 2.6.6 asks torch 2.13 in an old way; not ours to mend.
+    warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.setLevel(logging.WARNING)
+        logger.propagate = True
+
+
+def _forget_wandb() -> None:
+    """End wandb's run: it would live on into the next job of a multirun."""
+    if "wandb" in sys.modules:
+        sys.modules["wandb"].finish()
+        os.environ.pop("WANDB_MODE", None)  # set by Lightning's logger when offline

@@ -1,0 +1,165 @@
+"""Domains as Hydra makes them from conf/domain, on fixtures in the published formats."""
+
+import multiprocessing
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from qs3.classes import CLASSES
+from qs3.data.domain import Domain, check_all
+from qs3.data.importers import XyzTree
+from qs3.errors import ConfigError, DataError, MissingDataError
+from tests.fixtures import published as fixtures
+
+CONF = Path(__file__).parents[2] / "conf"
+NAMES = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
+SPLITS = {"train": 2, "test": 1}
+
+
+def domain(name, data_dir, *overrides):
+    """As train.py would mount it, in a config of our own."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose(
+            overrides=[
+                f"+domain@data.source={name}",
+                f"+paths.data_dir={data_dir}",
+                *(f"data.source.{o}" for o in overrides),
+            ]
+        )
+        return instantiate(cfg.data.source)
+
+
+def test_fixtures_cover_every_domain():
+    assert sorted(fixtures.DOMAINS) == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_missing_data_is_explained(tmp_path, name):
+    found = domain(name, tmp_path)
+    started = time.perf_counter()
+    with pytest.raises(MissingDataError) as caught:
+        found.check()
+    assert time.perf_counter() - started < 0.5
+    message = str(caught.value)
+    assert str(found.folder / "meta.yaml") in message
+    assert "Where to get it: " in message
+    assert "python generate.py domain=" in message
+    assert f"paths.data_dir={tmp_path}" in message
+    assert ("simulated" in found.label) == (name == "kinectsim10")
+    with pytest.raises(MissingDataError):
+        found.open()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_domain_opens_on_its_fixture(tmp_path, name):
+    fixtures.write_domain(name, tmp_path, SPLITS)
+    found = domain(name, tmp_path)
+    found.check()
+    data = found.open()
+    assert data.classes == CLASSES
+    assert set(data.counts()["train"].values()) == {2}
+    assert set(data.counts()["test"].values()) == {1}
+    assert data.points.shape[1:] == (
+        1024 if name in ("shapenet10", "modelnet10_arrays") else 2048,
+        3,
+    )
+    assert domain(name, tmp_path).open().sha256 == data.sha256
+
+
+def test_clean_twin_is_the_same_objects(tmp_path):
+    fixtures.write_domain("specklenet10", tmp_path, SPLITS, published=False)
+    noisy = domain("specklenet10", tmp_path).open()
+    clean = domain("specklenet10_clean", tmp_path).open()
+    assert noisy.ids == clean.ids
+    assert noisy.sha256 != clean.sha256
+    assert 0.001 < np.abs(noisy.points - clean.points).mean() < 0.01
+
+
+def test_released_specklenet_has_no_clean_twin(tmp_path):
+    fixtures.write_domain("specklenet10", tmp_path, SPLITS)
+    domain("specklenet10", tmp_path).open()
+    with pytest.raises(DataError, match=r"holds the arrays \['points'\], not 'points_clean'"):
+        domain("specklenet10_clean", tmp_path).open()
+
+
+def test_path_can_be_moved(tmp_path):
+    fixtures.write_domain("kinectsim10", tmp_path, SPLITS)
+    (tmp_path / "kinectsim10").rename(tmp_path / "mine")
+    domain("kinectsim10", tmp_path, f"path={tmp_path}/mine").open()
+
+
+def test_changed_import_settings_are_noticed(tmp_path):
+    fixtures.write_domain("scannet10", tmp_path, SPLITS)
+    data = domain("scannet10", tmp_path).open()
+    with pytest.raises(
+        DataError, match=r"\{'undo_mirror': True\}, the config says \{'undo_mirror'"
+    ):
+        domain("scannet10", tmp_path, "published.undo_mirror=false").open()
+    mirrored = domain(
+        "scannet10", tmp_path, "published.undo_mirror=false", f"path={tmp_path}/mirrored"
+    ).open()
+    np.testing.assert_array_equal(mirrored.points * np.float32([1, -1, 1]), data.points)
+
+
+def test_published_files_may_be_put_away_after_the_import(tmp_path):
+    fixtures.write_domain("modelnet10", tmp_path, SPLITS)
+    first = domain("modelnet10", tmp_path).open()
+    (tmp_path / "published").rename(tmp_path / "attic")
+    assert domain("modelnet10", tmp_path).open().sha256 == first.sha256
+
+
+def test_unfinished_generation_names_the_command_to_continue(tmp_path):
+    (tmp_path / "kinectsim10").mkdir()
+    (tmp_path / "kinectsim10" / "part").write_text("")
+    with pytest.raises(MissingDataError, match=r"(?s)begun but not finished.*Continue making it"):
+        domain("kinectsim10", tmp_path).check()
+
+
+def test_all_that_is_missing_is_told_at_once(tmp_path):
+    names = ("specklenet10", "depthscannet10", "depthscannet10")
+    with pytest.raises(MissingDataError) as caught:
+        check_all(*(domain(name, tmp_path) for name in names))
+    assert str(caught.value).count("is not there. Looked for:") == 2
+    fixtures.write_domain("specklenet10", tmp_path, SPLITS)
+    with pytest.raises(MissingDataError, match=r"^domain depthscannet10"):
+        check_all(*(domain(name, tmp_path) for name in names))
+
+
+def _open(data_dir):
+    return Domain(
+        "d", "D", "D", data_dir / "d", published=XyzTree(data_dir / "published" / "depthscannet10")
+    ).open().sha256  # fmt: skip
+
+
+def test_processes_that_open_at_once_import_once(tmp_path):
+    fixtures.write_domain("depthscannet10", tmp_path, SPLITS)
+    with multiprocessing.get_context("spawn").Pool(3) as pool:
+        assert len(set(pool.map(_open, [tmp_path] * 3))) == 1
+    assert not (tmp_path / ".d.importing").exists()
+
+
+def test_wrong_settings():
+    with pytest.raises(ConfigError, match="variant is 'noisy'"):
+        Domain("d", "D", "D", "d", variant="noisy")
+    with pytest.raises(ConfigError, match="gravity is 'y'"):
+        Domain("d", "D", "D", "d", gravity="y")
+    bad = {"_target_": "qs3.data.importers.XyzTree", "folder": "x", "points": 0}
+    with pytest.raises(ConfigError, match="`published` is wrong"):
+        Domain("d", "D", "D", "d", published=bad).check()
+
+
+def test_importing_is_light():
+    code = (
+        "import sys, qs3.data.domain\n"
+        "heavy = {'torch', 'h5py', 'lightning', 'scipy', 'matplotlib', 'bpy', 'mitsuba', 'rich'}\n"
+        "sys.exit(', '.join(sorted(heavy & set(sys.modules))) or 0)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,288 @@
+"""The store: what is written comes back, and damage anywhere is noticed."""
+
+import csv
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.data import store
+from qs3.data.store import ManifestRow, open_pointset, write_pointset
+from qs3.errors import DataError, MissingDataError, Qs3Error
+
+CLASSES = ("bed", "chair")
+
+
+def make(folder, n=6, p=5, seed=0, meta=None, **changes):
+    rng = np.random.default_rng(seed)
+    rows = [
+        ManifestRow(f"{CLASSES[i % 2]}/{i}", CLASSES[i % 2], "train" if i < n - 2 else "test", i)
+        for i in range(n)
+    ]
+    rows.insert(1, ManifestRow("bed/bad", "bed", "train", status="failed", reason="empty mesh"))
+    arguments = {
+        "name": "tiny",
+        "classes": CLASSES,
+        "arrays": {
+            "points": rng.normal(size=(n, p, 3)),
+            "points_clean": list(rng.normal(size=(n, p, 3))),
+        },
+        "rows": rows,
+        "meta": meta if meta is not None else {"config": {"views": 5}},
+    }
+    return write_pointset(folder, **{**arguments, **changes})
+
+
+def test_round_trip(tmp_path):
+    made = make(tmp_path / "d")
+    found = open_pointset(tmp_path / "d")
+    expected = np.random.default_rng(0).normal(size=(6, 5, 3)).astype("f4")
+    assert isinstance(found.points, np.memmap)
+    assert not found.points.flags.writeable
+    np.testing.assert_array_equal(found.points, expected)
+    assert found.points.dtype == np.float32
+    assert found.labels.tolist() == [0, 1, 0, 1, 0, 1]
+    assert found.labels.dtype == np.int64
+    assert found.splits.tolist() == ["train"] * 4 + ["test"] * 2
+    assert found.ids == ("bed/0", "chair/1", "bed/2", "chair/3", "bed/4", "chair/5")
+    assert found.classes == CLASSES
+    assert found.counts() == {"train": {"bed": 2, "chair": 2}, "test": {"bed": 1, "chair": 1}}
+    assert found.meta["config"] == {"views": 5}
+    assert found.meta["failed"] == 1
+    assert found.sha256 == made.sha256
+    clean = open_pointset(tmp_path / "d", "points_clean")
+    assert clean.sha256 != found.sha256
+    assert not np.array_equal(clean.points, found.points)
+    rows = store.read_manifest(tmp_path / "d", CLASSES)
+    assert [row.index for row in rows] == [0, None, 1, 2, 3, 4, 5]
+    assert rows[1].reason == "empty mesh"
+
+
+def test_split_is_a_view_and_keeps_order(tmp_path):
+    data = make(tmp_path / "d")
+    test = data.split("test")
+    assert np.shares_memory(test.points, data.points)
+    assert test.ids == ("bed/4", "chair/5")
+    assert len(test) == 2
+    assert test.sha256 == data.sha256
+    assert data.indices("test").tolist() == [4, 5]
+    with pytest.raises(DataError, match="no split 'validation'"):
+        data.split("validation")
+
+
+def test_split_of_scattered_rows(tmp_path):
+    rows = [ManifestRow(str(i), "bed", ("train", "test")[i % 2]) for i in range(4)]
+    points = np.arange(4)[:, None, None] + np.zeros((4, 2, 3))
+    data = make(tmp_path / "d", rows=rows, arrays={"points": points})
+    assert data.split("test").points[:, 0, 0].tolist() == [1, 3]
+
+
+def test_same_input_same_bytes_wherever_it_lies(tmp_path):
+    a, b = make(tmp_path / "a"), make(tmp_path / "b")
+    assert a.sha256 == b.sha256
+    for file in ("points.npy", "points_clean.npy", "manifest.csv", "meta.yaml"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_content_hash_sees_what_training_sees_and_nothing_else(tmp_path):
+    base = make(tmp_path / "0")
+    rows = store.read_manifest(tmp_path / "0", CLASSES)
+    moved = [dataclasses.replace(row, origin="elsewhere") for row in rows]
+    assert make(tmp_path / "1", rows=moved).sha256 == base.sha256
+    assert make(tmp_path / "2", meta={"other": 1}).sha256 == base.sha256
+    assert make(tmp_path / "3", seed=1).sha256 != base.sha256
+    for change in ({"cls": "chair"}, {"split": "test"}, {"id": "new"}):
+        changed = [dataclasses.replace(rows[0], **change), *rows[1:]]
+        assert make(tmp_path / "4", rows=changed).sha256 != base.sha256
+
+
+def test_unfinished_and_missing(tmp_path):
+    with pytest.raises(MissingDataError, match="no dataset folder"):
+        open_pointset(tmp_path / "d")
+    make(tmp_path / "d")
+    (tmp_path / "d" / "meta.yaml").unlink()
+    assert not store.is_finished(tmp_path / "d")
+    with pytest.raises(MissingDataError, match="run the same command again"):
+        open_pointset(tmp_path / "d")
+
+
+def test_interrupted_rewrite_is_unfinished(tmp_path, monkeypatch):
+    make(tmp_path / "d")
+
+    def stop(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(store, "write_text", stop)
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "d", seed=1)
+    monkeypatch.undo()
+    with pytest.raises(MissingDataError):
+        open_pointset(tmp_path / "d")
+    make(tmp_path / "d", seed=1)
+    open_pointset(tmp_path / "d")
+
+
+def test_unknown_variant(tmp_path):
+    make(tmp_path / "d")
+    for variant in ("points_noisy", "manifest"):
+        with pytest.raises(DataError, match=r"holds the arrays \['points', 'points_clean'\]"):
+            open_pointset(tmp_path / "d", variant)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"arrays": {"points": np.zeros((5, 5, 3))}}, "6 rows have status ok"),
+        ({"arrays": {"points": np.zeros((6, 5, 2))}}, r"expected \[N, P, 3\]"),
+        ({"arrays": {"points": np.zeros((6, 0, 3))}}, "at least one cloud"),
+        ({"arrays": {"points": np.full((6, 5, 3), np.nan)}}, "cloud 0 is not finite"),
+        ({"arrays": {"points": np.full((6, 5, 3), 1e39)}}, "cloud 0 is not finite"),
+        ({"arrays": {"clean": np.zeros((6, 5, 3))}}, "needs an array 'points'"),
+        ({"arrays": {"points": [np.zeros((5, 3)), np.zeros((4, 3))]}}, "several shapes"),
+        ({"meta": {"name": 1}}, "may not use the keys"),
+        ({"classes": ("bed",)}, "unknown class 'chair'"),
+        ({"rows": [ManifestRow("a", "bed", "dev")]}, "unknown split 'dev'"),
+        ({"rows": [ManifestRow("a", "bed", "test")] * 2}, "same id is already in line 2"),
+        ({"rows": [ManifestRow("", "bed", "test")]}, "id is empty"),
+        ({"rows": [ManifestRow("a", "bed", "test", status="failed")]}, "has a reason"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
+def test_wrong_input_is_refused_and_nothing_is_finished(tmp_path, changes, message):
+    with pytest.raises(DataError, match=message):
+        make(tmp_path / "d", **changes)
+    assert not store.is_finished(tmp_path / "d")
+
+
+def test_not_writable(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(Qs3Error, match="cannot make the folder"):
+        make(tmp_path / "file" / "d")
+
+
+@pytest.mark.parametrize("file", ["points.npy", "manifest.csv", "meta.yaml"])
+def test_truncation_anywhere_is_noticed(tmp_path, file):
+    make(tmp_path / "d", n=3, p=2)
+    path = tmp_path / "d" / file
+    data = path.read_bytes()
+    for size in range(0, len(data), 7):
+        path.write_bytes(data[:size])
+        with pytest.raises(DataError, match=file):
+            open_pointset(tmp_path / "d", verify=False)  # all this without the arrays' hashes
+    path.write_bytes(data[:-1])
+    with pytest.raises(DataError, match=file):
+        open_pointset(tmp_path / "d", verify=False)
+    path.write_bytes(data + b"\0")
+    with pytest.raises(DataError, match=file):
+        open_pointset(tmp_path / "d", verify=False)
+
+
+@pytest.mark.parametrize("file", ["points.npy", "manifest.csv", "meta.yaml"])
+def test_a_flipped_bit_anywhere_is_noticed(tmp_path, file):
+    make(tmp_path / "d", n=3, p=2)
+    path = tmp_path / "d" / file
+    data = path.read_bytes()
+    for at in range(0, len(data), 3):
+        changed = bytearray(data)
+        changed[at] ^= 1 << (at % 8)
+        path.write_bytes(changed)
+        with pytest.raises(DataError, match=file):
+            open_pointset(tmp_path / "d")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    for file in ("points.npy", "manifest.csv"):
+        make(tmp_path / "d")
+        (tmp_path / "d" / file).unlink()
+        with pytest.raises(DataError, match=f"{file} cannot be read"):
+            open_pointset(tmp_path / "d")
+
+
+def test_other_peoples_array_in_place_of_ours(tmp_path):
+    make(tmp_path / "d")
+    path = tmp_path / "d" / "points.npy"
+    for array in (
+        np.zeros((6, 5, 3), "f8"),
+        np.zeros((6, 5, 3), ">f4"),
+        np.asfortranarray(np.zeros((6, 5, 3), "f4")),
+        np.zeros((5, 6, 3), "f4"),
+        np.array([{}], dtype=object),
+    ):
+        np.save(path, array)
+        with pytest.raises(DataError, match=r"points\.npy"):
+            open_pointset(tmp_path / "d", verify=False)
+
+
+def test_nan_on_disk_is_found_without_the_hash(tmp_path):
+    make(tmp_path / "d")
+    path = tmp_path / "d" / "points.npy"
+    data = bytearray(path.read_bytes())
+    data[-4:] = np.float32(np.nan).tobytes()
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"cloud 5 \(id 'chair/5'\) is not finite"):
+        open_pointset(tmp_path / "d", verify=False)
+
+
+def test_manifest_errors_name_the_line(tmp_path):
+    make(tmp_path / "d")
+    path = tmp_path / "d" / "manifest.csv"
+    good = list(csv.reader(path.read_text().splitlines()))
+
+    def error(line, column, value):
+        rows = [list(row) for row in good]
+        rows[line - 1][good[0].index(column)] = value
+        with path.open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(rows)
+        with pytest.raises(DataError) as caught:
+            open_pointset(tmp_path / "d")
+        return str(caught.value)
+
+    assert "line 4 (id 'chair/1'): index is 7, expected 1" in error(4, "index", "7")
+    assert "line 4: index is 'x', not a number" in error(4, "index", "x")
+    assert "line 5 (id 'bed/2'): unknown class 'cat'" in error(5, "class", "cat")
+    assert "line 5 (id 'bed/0'): the same id is already in line 2" in error(5, "id", "bed/0")
+    assert "line 2 (id 'bed/0'): unknown split ''" in error(2, "split", "")
+    assert "line 1: the columns are not" in error(1, "split", "part")
+
+
+def test_another_version_of_the_format(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "FORMAT_VERSION", 2)
+        make(tmp_path / "d")
+    with pytest.raises(DataError, match="format version 2, this qs3 reads 1"):
+        open_pointset(tmp_path / "d")
+
+
+text = st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), min_size=1, max_size=9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data(), n=st.integers(1, 6), p=st.integers(1, 4))
+def test_any_manifest_round_trips(tmp_path_factory, data, n, p):
+    ids = data.draw(st.lists(text, min_size=n, max_size=n, unique=True))
+    rows = [
+        ManifestRow(
+            id=name,
+            cls=data.draw(st.sampled_from(CLASSES)),
+            split=data.draw(st.sampled_from(store.SPLITS)),
+            seed=data.draw(st.none() | st.integers(0, 2**64)),
+            origin=data.draw(text | st.sampled_from(["", 'a "b", c', "x;y"])),
+            views=data.draw(st.none() | st.integers(1, 9)),
+        )
+        for name in ids
+    ]
+    folder = tmp_path_factory.mktemp("round")
+    values = data.draw(
+        st.lists(st.floats(-(2.0**99), 2.0**99, width=32), min_size=n * p * 3, max_size=n * p * 3)
+    )
+    points = np.array(values, dtype="f4").reshape(n, p, 3)
+    made = write_pointset(
+        folder, name="any", classes=CLASSES, arrays={"points": points}, rows=rows, meta={}
+    )
+    found = store.read_manifest(folder, CLASSES)
+    assert [dataclasses.replace(row, index=None) for row in found] == rows
+    np.testing.assert_array_equal(made.points, points)
+    shutil.rmtree(folder)

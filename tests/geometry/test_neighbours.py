@@ -1,0 +1,147 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.geometry import neighbours
+from qs3.geometry.neighbours import ball_query, farthest_point_sampling, gather, knn
+from tests.geometry.test_sampling import assert_farthest
+
+
+def _distances(x: torch.Tensor) -> torch.Tensor:
+    return (x[:, :, None] - x[:, None]).square().sum(-1)
+
+
+def _assert_nearest(x: torch.Tensor, index: torch.Tensor, atol: float = 1e-9) -> None:
+    """Distances are the k smallest, in order; the points are distinct. Leaves ties open."""
+    distance = _distances(x)
+    k = index.shape[2]
+    expected = distance.sort(dim=2)[0][:, :, :k]
+    torch.testing.assert_close(distance.gather(2, index), expected, rtol=1e-6, atol=atol)
+    assert (index.sort(dim=2)[0].diff(dim=2) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("n", "c", "k"),
+    [(1, 3, 1), (30, 3, 5), (191, 4, 20), (192, 4, 20), (500, 3, 20), (333, 16, 33), (256, 8, 1)],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_knn_equals_brute_force(n: int, c: int, k: int, dtype: torch.dtype) -> None:
+    torch.manual_seed(0)
+    x = torch.randn(2, n, c, dtype=dtype)
+    index = knn(x, k)
+    _assert_nearest(x.double(), index, atol=1e-4 if dtype == torch.float32 else 1e-9)
+    assert torch.equal(index[:, :, 0], torch.arange(n).expand(2, n))  # itself
+
+
+def test_knn_is_exact_in_float64() -> None:
+    x = torch.randn(2, 400, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(knn(x, 20), _distances(x).topk(20, largest=False)[1])
+
+
+def test_knn_tree_and_dense_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = torch.randn(3, 300, 3, dtype=torch.float64)
+    dense = knn(x, 7)
+    monkeypatch.setattr(neighbours, "_TREE_FROM", 1)
+    assert torch.equal(knn(x, 7), dense)
+    assert torch.equal(knn(x, 1), dense[:, :, :1])
+
+
+@pytest.mark.parametrize("block", [1, 5000, 100_000])
+def test_knn_in_blocks(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    x = torch.randn(4, 210, 5, dtype=torch.float64)
+    whole = knn(x, 6)
+    monkeypatch.setattr(neighbours, "_CPU_BLOCK", block)
+    assert torch.equal(knn(x, 6), whole)
+
+
+def test_knn_with_k_above_n_starts_over() -> None:
+    x = torch.tensor([[[0.0], [1.0], [5.0]]])
+    assert knn(x, 5).tolist() == [[[0, 1, 2, 0, 1], [1, 0, 2, 1, 0], [2, 1, 0, 2, 1]]]
+
+
+def test_knn_of_copies_and_nan_stays_in_range() -> None:
+    for x in (torch.zeros(2, 300, 3), torch.full((1, 300, 3), torch.nan)):
+        index = knn(x, 9)
+        assert index.min() >= 0
+        assert index.max() < 300
+
+
+def test_knn_far_from_origin_and_in_half_precision() -> None:
+    x = torch.randn(1, 256, 3)
+    expected = _distances(x.double()).topk(4, largest=False)[1]
+    far = knn(x.double() + 1e4, 4)
+    assert torch.equal(far, expected)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(knn(x, 4), expected)
+    assert knn(x.bfloat16(), 4).shape == (1, 256, 4)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 260), st.integers(1, 12), st.integers(0, 10_000), st.booleans())
+def test_knn_of_anything(n: int, k: int, seed: int, grid: bool) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(2, n, 3, generator=generator, dtype=torch.float64)
+    if grid:
+        x = x.round()  # many ties and copies
+    k = min(k, n)
+    index = knn(x, k)
+    _assert_nearest(x, index)
+    if not grid:
+        order = torch.randperm(n, generator=generator)
+        assert torch.equal(order[knn(x[:, order], k)], index[:, order])  # equivariant
+
+
+def test_gather() -> None:
+    x = torch.arange(12.0).view(2, 3, 2)
+    index = torch.tensor([[[0, 2]], [[1, 1]]])
+    assert gather(x, index).tolist() == [[[[0, 1], [4, 5]]], [[[8, 9], [8, 9]]]]
+    assert gather(x, index[:, 0]).shape == (2, 2, 2)
+
+
+@pytest.mark.parametrize("sample", [farthest_point_sampling, neighbours._farthest_points])
+def test_fps_batched(sample: object) -> None:
+    torch.manual_seed(0)
+    x = torch.randn(3, 120, 3)
+    start = torch.tensor([5, 0, 119])
+    order = sample(x, 60, start)
+    assert torch.equal(order[:, 0], start)
+    for cloud, row in zip(x, order, strict=True):
+        assert len(set(row.tolist())) == 60
+        assert_farthest(cloud.double().numpy(), row.numpy())
+    repeated = sample(x, 130)
+    assert torch.equal(repeated[:, 120:], repeated[:, :10])
+    copies = sample(torch.ones(2, 6, 3), 6, 2)
+    assert copies[:, 0].tolist() == [2, 2]
+    assert torch.equal(copies.sort(1)[0], torch.arange(6).expand(2, 6))
+
+
+def test_fps_paths_agree() -> None:
+    x = torch.randn(2, 150, 3)
+    assert torch.equal(farthest_point_sampling(x, 80, 3), neighbours._farthest_points(x, 80, 3))
+
+
+def _ball_reference(x: np.ndarray, centre: np.ndarray, radius: float, k: int) -> list[int]:
+    distance = np.square(x - centre).sum(1)
+    hits = np.flatnonzero(distance < radius**2)[:k].tolist()
+    hits = hits or [int(distance.argmin())]
+    return hits + [hits[0]] * (k - len(hits))
+
+
+@pytest.mark.parametrize("block", [1, 1 << 20])
+def test_ball_query_equals_brute_force(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(neighbours, "_CPU_BLOCK", block)
+    x = torch.randn(2, 60, 3, dtype=torch.float64)
+    centres = torch.cat([x[:, :9], x[:, :1] + 100], dim=1)  # the last has nobody near
+    for k in (1, 8, 70):
+        found = ball_query(x, centres, 1.0, k)
+        for b in range(2):
+            for m in range(10):
+                expected = _ball_reference(x[b].numpy(), centres[b, m].numpy(), 1.0, k)
+                assert found[b, m].tolist() == expected
+
+
+def test_ball_query_is_strict() -> None:
+    x = torch.tensor([[[1.0, 0, 0], [0, 0, 0], [0.5, 0, 0]]])
+    assert ball_query(x, torch.zeros(1, 1, 3), 1.0, 3).tolist() == [[[1, 2, 1]]]

@@ -1,0 +1,162 @@
+import subprocess
+import sys
+from itertools import pairwise
+
+import fpsample
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import DataError, MeshError
+from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample, unit_ball
+
+
+def brute_fps(points: np.ndarray, n: int, start: int) -> np.ndarray:
+    cloud = (points - points.mean(axis=0)).astype(np.float32)
+    order, nearest = [start], np.full(len(cloud), np.inf, np.float32)
+    while len(order) < n:
+        nearest = np.minimum(nearest, np.square(cloud - cloud[order[-1]]).sum(1))
+        nearest[order] = -1
+        order.append(int(nearest.argmax()))
+    return np.array(order)
+
+
+def assert_farthest(points: np.ndarray, order: np.ndarray) -> None:
+    """Every point was one of the farthest from those before it: leaves ties open."""
+    nearest = np.full(len(points), np.inf)
+    for before, index in pairwise(order):
+        nearest = np.minimum(nearest, np.square(points - points[before]).sum(1))
+        assert nearest[index] >= nearest.max() - 1e-5
+
+
+@pytest.mark.parametrize("total", [1, 2, 17, 95, 96, 150, 500, 1024, 5000])
+def test_fps_equals_brute_force(total: int) -> None:
+    rng = np.random.default_rng(total)
+    points = rng.standard_normal((total, 3)) * [1, 2, 0.3] + 5
+    n = min(total, 300)
+    for start in {0, total // 3, total - 1}:
+        order = farthest_point_sampling_np(points, n, start)
+        assert order.dtype == np.int64
+        np.testing.assert_array_equal(order, brute_fps(points, n, start))
+
+
+@pytest.mark.parametrize("total", [50, 400, 6000])
+def test_fps_with_ties_and_copies(total: int) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.integers(0, 8, (total, 3)).astype(float)  # on a grid: ties and copies
+    n = min(total, 600)
+    for start in (0, 7, total - 1):
+        order = farthest_point_sampling_np(points, n, start)
+        assert order[0] == start
+        assert len(set(order.tolist())) == n
+        assert_farthest(points, order)
+
+
+@pytest.mark.parametrize("total", [97, 1000])
+def test_buckets_start_where_we_want(total: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("the start was not found in the tree")
+
+    monkeypatch.setattr(fpsample, "fps_sampling", never)
+    rng = np.random.default_rng(1)
+    for scale in (1.0, 0.01):
+        points = rng.standard_normal((total, 3)) * scale
+        points[::5] = points[0]
+        for start in rng.integers(total, size=30):
+            assert farthest_point_sampling_np(points, 40, int(start))[0] == start
+
+
+def test_fps_falls_back_when_buckets_start_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(2).standard_normal((200, 3))
+    expected = farthest_point_sampling_np(points, 50, 3)
+    monkeypatch.setattr("qs3.geometry.sampling._position_in_tree", lambda *_: 0)
+    np.testing.assert_array_equal(farthest_point_sampling_np(points, 50, 3), expected)
+
+
+def test_fps_of_one_repeated_point_and_of_too_few() -> None:
+    same = np.ones((200, 3))
+    assert farthest_point_sampling_np(same, 200, 5)[0] == 5
+    assert sorted(farthest_point_sampling_np(same, 200, 5)) == list(range(200))
+    square = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], dtype=float)
+    assert farthest_point_sampling_np(square, 7).tolist() == [0, 2, 1, 0, 2, 1, 0]
+    assert farthest_point_sampling_np(square, 0).tolist() == []
+
+
+@pytest.mark.parametrize(("n", "start"), [(2, 3), (2, -1), (-1, 0)])
+def test_fps_bad_arguments(n: int, start: int) -> None:
+    with pytest.raises(DataError, match="cannot take"):
+        farthest_point_sampling_np(np.zeros((3, 3)), n, start)
+    with pytest.raises(DataError, match="NaN"):
+        farthest_point_sampling_np(np.full((3, 3), np.nan), 2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(2, 200), st.integers(0, 1000))
+def test_fps_coverage_shrinks_and_prefixes_agree(total: int, seed: int) -> None:
+    points = np.random.default_rng(seed).standard_normal((total, 3))
+    order = farthest_point_sampling_np(points, total)
+    nearest, radii = np.full(total, np.inf), []
+    for index in order:
+        nearest = np.minimum(nearest, np.square(points - points[index]).sum(1))
+        radii.append(nearest.max())
+    assert np.all(np.diff(radii) <= 0)
+    half = total // 2 + 1
+    np.testing.assert_array_equal(farthest_point_sampling_np(points, half), order[:half])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_unit_ball(dtype: type) -> None:
+    points = (np.random.default_rng(0).standard_normal((4, 50, 3)) * 7 + 3).astype(dtype)
+    ball = unit_ball(points)
+    assert ball.dtype == dtype
+    np.testing.assert_allclose(ball.mean(axis=1), 0, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(ball, axis=2).max(axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(unit_ball(points[2]), ball[2], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(unit_ball(points * 9 - 4), ball, atol=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, 1e6, 1 / 3])
+def test_unit_ball_of_one_repeated_point_is_zero(value: float) -> None:
+    for dtype in (np.float32, np.float64):
+        ball = unit_ball(np.full((2, 7, 3), value, dtype=dtype))
+        assert np.array_equal(ball, np.zeros((2, 7, 3)))
+
+
+def test_surface_sample_follows_area() -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 5], [3, 0, 5], [0, 1, 5]], float)
+    faces = np.array([[0, 0, 1], [0, 1, 2], [1, 2, 1], [3, 4, 5], [5, 5, 5]])
+    points = surface_sample(vertices, faces, 20_000, np.random.default_rng(0))
+    upper = points[:, 2] == 5
+    assert np.all(upper | (points[:, 2] == 0))
+    assert abs(upper.mean() - 0.75) < 0.015  # areas 0.5 and 1.5
+    lower = points[~upper]
+    assert np.all(lower[:, :2] >= 0)
+    assert np.all(lower[:, :2].sum(1) <= 1 + 1e-12)
+    np.testing.assert_allclose(lower[:, :2].mean(0), 1 / 3, atol=0.015)  # the centroid
+    again = surface_sample(vertices, faces, 20_000, np.random.default_rng(0))
+    np.testing.assert_array_equal(points, again)
+
+
+def test_surface_sample_never_draws_a_face_without_area() -> None:
+    class Corner(np.random.Generator):
+        """Draws at the very ends of the range."""
+
+        def random(self, size: object) -> np.ndarray:  # type: ignore[override]
+            return np.array([0.0, 1.0]) if size == 2 else np.full((2, 2, 1), 0.25)
+
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [9, 9, 9]], float)
+    faces = np.array([[3, 3, 3], [0, 1, 2], [3, 3, 3]])
+    points = surface_sample(vertices, faces, 2, Corner(np.random.PCG64()))
+    np.testing.assert_allclose(points, [[0.25, 0.25, 0], [0.25, 0.25, 0]])
+
+
+@pytest.mark.parametrize("faces", [np.zeros((0, 3), int), np.array([[0, 1, 1], [0, 0, 0]])])
+def test_surface_without_area(faces: np.ndarray) -> None:
+    with pytest.raises(MeshError, match="area"):
+        surface_sample(np.eye(3), faces, 5, np.random.default_rng(0))
+
+
+def test_sampling_does_not_import_torch() -> None:
+    code = "import sys, qs3.geometry.sampling; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

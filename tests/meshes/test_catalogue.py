@@ -1,0 +1,183 @@
+"""The catalogue: whose objects it holds, that they never change, and what they are made of."""
+
+import hashlib
+import pickle
+import subprocess
+import sys
+from collections import Counter
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.classes import CLASSES
+from qs3.errors import ConfigError
+from qs3.meshes.catalogue import Catalogue, families, make, make_parts
+
+MINE = ("lamp", "monitor", "plant")
+SIZES = {"lamp": (0.2, 2.4), "monitor": (0.25, 1.8), "plant": (0.2, 2.4)}
+"""Smallest and largest length of an object's longest side, in metres."""
+
+
+def family_names(classes):
+    return [(cls, family.name) for cls in classes for family in families(cls)]
+
+
+def python(script):
+    """What a script prints in a fresh process."""
+    command = [sys.executable, "-c", script]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_items_are_ordered_by_class_split_and_index():
+    items = Catalogue(train=2, test=1, classes=("plant", "lamp")).items()
+    assert [item.id for item in items] == [
+        f"{cls}/{split}/{cls}_{i:04d}"
+        for cls in ("lamp", "plant")
+        for split, n in (("train", 2), ("test", 1))
+        for i in range(n)
+    ]
+    assert {item.origin.split("/")[0] for item in items} == {"catalogue:lamp", "catalogue:plant"}
+
+
+def test_counts_per_class_and_lists_of_classes():
+    catalogue = Catalogue(
+        train={"lamp": 3, "plant": 0, "bed": 9}, test=1, classes=["lamp", "plant"]
+    )
+    items = catalogue.items()
+    assert catalogue.classes == ("lamp", "plant")
+    assert Counter((i.cls, i.split) for i in items) == {
+        ("lamp", "train"): 3,
+        ("lamp", "test"): 1,
+        ("plant", "test"): 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"classes": ("lamp", "lampe")}, "lampe"),
+        ({"classes": ()}, "one class or more"),
+        ({"classes": ("lamp", "lamp")}, "each once"),
+        ({"train": -1}, "0 or more"),
+        ({"test": {"lamp": -2}, "classes": ("lamp",)}, "lamp must be 0 or more"),
+        ({"train": {"lamp": 1}, "classes": ("lamp", "bed")}, "no count for the class bed"),
+        ({"train": {"lamp": 1, "lampe": 1}, "classes": ("lamp",)}, "lampe"),
+        ({"train": 1.5}, "0 or more"),
+        ({"families": "some"}, "families"),
+        ({"seed": "1"}, "seed"),
+    ],
+)
+def test_impossible_settings_are_refused(settings, reason):
+    with pytest.raises(ConfigError, match=reason):
+        Catalogue(**settings)
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(ConfigError, match="unicorn"):
+        make("lamp", "unicorn", "0")
+    with pytest.raises(ConfigError, match="unicorn"):
+        families("unicorn")
+
+
+def test_more_objects_never_change_the_earlier_ones():
+    small = Catalogue(train=3, test=2, classes=MINE).items()
+    large = {item.id: item for item in Catalogue(train=9, test=5, classes=CLASSES[5:]).items()}
+    for item in small:
+        assert large[item.id].origin == item.origin
+        assert large[item.id].load().sha256 == item.load().sha256
+
+
+def test_a_split_uses_its_families_evenly():
+    items = Catalogue(train=60, test=60).items()
+    used = Counter((item.cls, item.split, item.origin.split("/")[1]) for item in items)
+    for cls in CLASSES:
+        for split in ("train", "test"):
+            counts = [used[cls, split, f.name] for f in families(cls) if f.split == split]
+            assert max(counts) - min(counts) <= 1
+            assert sum(counts) == 60  # hence no family of the other split
+
+
+def test_all_families_in_both_splits_on_demand():
+    items = Catalogue(train=40, test=40, classes=("lamp",), families="all").items()
+    for split in ("train", "test"):
+        used = {item.origin.split("/")[1] for item in items if item.split == split}
+        assert used == {family.name for family in families("lamp")}
+    assert len({item.load().sha256 for item in items}) == 80
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_every_class_has_families_for_both_splits(cls):
+    split = Counter(family.split for family in families(cls))
+    assert set(split) == {"train", "test"}
+    assert min(split.values()) >= 2
+    assert len({family.name for family in families(cls)}) == len(families(cls))
+
+
+def test_two_seeds_share_no_mesh():
+    hashes = [
+        item.load().sha256
+        for seed in (0, 1)
+        for item in Catalogue(seed=seed, train=3, test=3).items()
+    ]
+    assert len(set(hashes)) == len(hashes)
+
+
+def test_the_order_of_families_depends_on_the_seed():
+    origins = {
+        tuple(item.origin for item in Catalogue(seed=seed, train=8, classes=("lamp",)).items())
+        for seed in range(5)
+    }
+    assert len(origins) > 1
+
+
+DIGEST = """
+import hashlib
+from qs3.meshes.catalogue import Catalogue
+items = Catalogue(seed=3, train=2, test=2).items()
+text = " ".join(f"{i.id} {i.origin} {i.load().sha256}" for i in items)
+print(hashlib.sha256(text.encode()).hexdigest())
+"""
+
+
+def test_the_same_meshes_in_another_process():
+    items = Catalogue(seed=3, train=2, test=2).items()
+    text = " ".join(f"{i.id} {i.origin} {i.load().sha256}" for i in items)
+    made = subprocess.run(
+        [sys.executable, "-c", DIGEST], capture_output=True, text=True, check=True
+    )
+    assert made.stdout.strip() == hashlib.sha256(text.encode()).hexdigest()
+
+
+def test_importing_and_listing_needs_no_heavy_library():
+    script = (
+        "import sys; from qs3.meshes.catalogue import Catalogue; Catalogue().items();"
+        "print(sorted({'torch', 'bpy', 'mitsuba', 'lightning', 'scipy'} & set(sys.modules)))"
+    )
+    made = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert made.stdout.strip() == "[]"
+
+
+def test_items_travel_to_workers():
+    for item in Catalogue(train=1, test=1, classes=MINE).items():
+        assert pickle.loads(pickle.dumps(item)).load().sha256 == item.load().sha256
+
+
+@pytest.mark.parametrize(("cls", "family"), family_names(MINE))
+def test_parts_are_solid_and_objects_have_real_sizes(cls, family):
+    low, high = SIZES[cls]
+    for k in range(4):
+        parts = make_parts(cls, family, f"test/{k}")
+        for part in parts:
+            solid = trimesh.Trimesh(part.vertices, part.faces, process=False)
+            assert solid.is_watertight
+            assert solid.is_winding_consistent
+            assert solid.volume > 0
+        mesh = make(cls, family, f"test/{k}")
+        size = np.ptp(mesh.bounds, axis=0)
+        assert mesh.bounds[0, 2] == 0
+        assert low < size.max() < high
+        assert size.min() > 0.1
+        assert len(mesh.faces) < 20_000

@@ -1,0 +1,229 @@
+"""A folder of meshes: layouts, splits, halves, and what must not be in it."""
+
+import collections
+import pickle
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.classes import CLASSES
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.meshes.folder import MeshFolder
+
+OFF = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+CAD10 = Path(__file__).parents[3] / "shared" / "data" / "cad10"
+
+
+def make(root, *names):
+    """Create files; those of a mesh format hold a triangle."""
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(OFF)
+    return root
+
+
+def ids(root, **settings):
+    settings.setdefault("classes", ("chair",))
+    return [item.id for item in MeshFolder(root, **settings).items()]
+
+
+def chairs(n):
+    return [f"chair/c{i:03d}.off" for i in range(n)]
+
+
+def test_given_splits_are_kept_and_validation_is_train(tmp_path):
+    make(
+        tmp_path,
+        *("chair/Train/b.off", "chair/train/a.off", "chair/test/z.ply", "chair/val/v.OBJ"),
+        *("chair/validation/w.off", "table/train/t.off", "table/test/t.off"),
+    )
+    items = MeshFolder(tmp_path, classes=("table", "chair")).items()
+    assert [item.id for item in items] == [
+        *("chair/train/a", "chair/train/b", "chair/train/v", "chair/train/w", "chair/test/z"),
+        *("table/train/t", "table/test/t"),
+    ]
+    assert [item.origin for item in items][:3] == [
+        *("chair/train/a.off", "chair/Train/b.off", "chair/val/v.OBJ"),
+    ]
+    assert items[0].cls == "chair"
+    assert items[0].split == "train"
+    assert len(pickle.loads(pickle.dumps(items[0])).load().faces) == 1
+
+
+def test_all_ten_classes_by_default(tmp_path):
+    make(tmp_path, *(f"{name}/{split}/a.off" for name in CLASSES for split in ("train", "test")))
+    items = MeshFolder(tmp_path).items()
+    assert [item.cls for item in items] == [name for name in CLASSES for _ in range(2)]
+
+
+def test_names_of_other_datasets(tmp_path):
+    make(tmp_path, "Night_Stand/a.off", "night stand/b.off", "CABINET/c.off", "couch/d.off")
+    make(tmp_path, "shelf/e.off")
+    found = MeshFolder(tmp_path, classes=("sofa", "cabinet", "bookshelf")).items()
+    assert sorted(item.id.replace("/test/", "/train/") for item in found) == [
+        *("bookshelf/train/e", "cabinet/train/a", "cabinet/train/b", "cabinet/train/c"),
+        "sofa/train/d",
+    ]
+
+
+def test_what_is_no_mesh_is_ignored(tmp_path):
+    make(tmp_path, "README.md", "index.csv", "loose.off", ".hidden/x.off", "__MACOSX/chair/a.off")
+    make(tmp_path, "chair/a.off", "chair/a.mtl", "chair/a.txt", "chair/._a.off", "chair/.b.off")
+    make(tmp_path, "chair/textures/wood.png", "chair/.git/x.off")
+    assert ids(tmp_path) == ["chair/train/a"]
+
+
+def test_unknown_folders(tmp_path):
+    make(tmp_path, *(f"{name}/a.off" for name in CLASSES), "toilet/a.off")
+    with pytest.raises(ConfigError, match=r"'toilet'.*bathtub.*night_stand.*classes="):
+        MeshFolder(tmp_path).items()
+    assert len(MeshFolder(tmp_path, classes=CLASSES).items()) == 10
+    assert ids(tmp_path) == ["chair/train/a"]
+
+
+@pytest.mark.parametrize("settings", [{}, {"classes": ("chair", "plant")}])
+def test_missing_classes_and_roots(tmp_path, settings):
+    with pytest.raises(MissingDataError, match="no folder of meshes"):
+        MeshFolder(tmp_path / "gone", **settings).items()
+    make(tmp_path, *(f"{name}/a.off" for name in CLASSES if name != "plant"))
+    with pytest.raises(MissingDataError, match=r"'plant' has no folder.*classes="):
+        MeshFolder(tmp_path, **settings).items()
+    make(tmp_path, "plant/readme.txt")
+    with pytest.raises(MissingDataError, match=r"'plant' has no mesh.*classes="):
+        MeshFolder(tmp_path, **settings).items()
+
+
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        (["chair/a.off", "chair/train/b.off"], "mixes two layouts"),
+        (["chair/train/a.off", "chair/train/a.obj"], r"two files.*a\.obj.*a\.off"),
+        (["chair/train/a.off", "chair/val/a.off"], "two files"),
+        (["chair/a.off", "chair/a.ply"], "two files"),
+        (["Chair/a.off", "chair/a.ply"], "two files"),
+        (["chair/good/a.off"], "neither a class nor a split"),
+        (["chair/train/a.off", "chair/train/more/b.off"], "neither a class nor a split"),
+        (["chair/a.off", "chair/more/models/b.off"], "neither a class nor a split"),
+        (["chair/a\nb.off"], "unprintable"),
+        (["chair/a\udcff.off"], "unprintable"),
+    ],
+)
+def test_ambiguous_folders_are_refused(tmp_path, names, reason):
+    make(tmp_path, *names)
+    with pytest.raises(ConfigError, match=reason):
+        ids(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"test_fraction": 0.0},
+        {"test_fraction": 1.0},
+        {"test_fraction": float("nan")},
+        {"half": "third"},
+        {"classes": ("chairs",)},
+        {"classes": ()},
+        {"skip": "chair"},
+    ],
+)
+def test_settings_are_checked(tmp_path, settings):
+    with pytest.raises(ConfigError):
+        MeshFolder(tmp_path, **settings)
+
+
+def test_links_must_stay_inside(tmp_path):
+    outside = make(tmp_path / "outside", "chair/x.off", "x.off")
+    root = make(tmp_path / "root", "chair/a.off", "store/s.off")
+    (root / "chair" / "inside.off").symlink_to(root / "store" / "s.off")
+    assert len(ids(root)) == 2
+    link = root / "chair" / "x.off"
+    link.symlink_to(outside / "x.off")
+    with pytest.raises(DataError, match="leads out of"):
+        ids(root)
+    link.unlink()
+    link.symlink_to(link)
+    with pytest.raises(DataError, match="broken link"):
+        ids(root)
+    link.unlink()
+    (root / "chair" / "a.off").rename(tmp_path / "a.off")
+    (root / "table").symlink_to(outside / "chair")
+    with pytest.raises(DataError, match="leads out of"):
+        ids(root, classes=("table",))
+    (root / "bed").mkdir()
+    (root / "bed" / "train").symlink_to(outside)
+    with pytest.raises(DataError, match="leads out of"):
+        ids(root, classes=("bed",))
+    (tmp_path / "alias").symlink_to(root)  # the root itself may be a link
+    assert ids(tmp_path / "alias") == ["chair/train/inside"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(n=st.integers(1, 40), fraction=st.floats(0.01, 0.99))
+def test_split_has_the_fraction_and_leaves_neither_side_empty(tmp_path_factory, n, fraction):
+    root = make(tmp_path_factory.mktemp("split"), *chairs(n))
+    found = ids(root, test_fraction=fraction)
+    tests = sum("/test/" in name for name in found)
+    assert len(found) == n
+    assert abs(tests - n * fraction) <= 1
+    if n >= 2:
+        assert 0 < tests < n
+
+
+def test_split_depends_on_names_only_and_hardly_on_company(tmp_path):
+    first = ids(make(tmp_path / "a", *chairs(50)))
+    second = ids(make(tmp_path / "b", *(n.replace(".off", ".ply") for n in reversed(chairs(50)))))
+    assert first == second
+    more = ids(make(tmp_path / "b", "chair/another.off"))
+    assert len(set(first) - set(more)) <= 1  # at most one file changes sides
+    assert ids(tmp_path / "b", skip=("another",)) == first
+    tables = ids(
+        make(tmp_path / "c", *(n.replace("chair", "table") for n in chairs(50))), classes=("table",)
+    )
+    assert [n.replace("table", "chair") for n in tables] != first
+
+
+@pytest.mark.parametrize("n", [2, 3, 7, 50])
+def test_halves_share_nothing_and_miss_nothing(tmp_path, n):
+    make(tmp_path, *(f"chair/{split}/c{i}.off" for split in ("train", "test") for i in range(n)))
+    first, second = ids(tmp_path, half="first"), ids(tmp_path, half="second")
+    assert not set(first) & set(second)
+    assert sorted(first + second) == sorted(ids(tmp_path))
+    counts = collections.Counter(name.split("/")[1] for name in second)
+    assert counts == {"train": n // 2, "test": n // 2}
+
+
+def test_halves_are_independent_of_the_split(tmp_path):
+    make(tmp_path, *chairs(200))
+    tests = {name.split("/")[2] for name in ids(tmp_path) if "/test/" in name}
+    half = {name.split("/")[2] for name in ids(tmp_path, half="first")}
+    flat = make(tmp_path / "flat", *(f"chair/train/{stem}.off" for stem in sorted(tests | half)))
+    assert len(half & tests) == 20  # exactly, since each group is divided by itself
+    assert {name.split("/")[2] for name in ids(flat)} == tests | half
+
+
+def test_a_class_too_small_for_halves(tmp_path):
+    make(tmp_path, "chair/a.off")
+    assert ids(tmp_path, half="first") == ["chair/train/a"]
+    with pytest.raises(ConfigError, match="half=second"):
+        ids(tmp_path, half="second")
+    with pytest.raises(ConfigError, match="1 to skip"):
+        ids(tmp_path, skip=["a"])
+
+
+def test_real_meshes():
+    if not CAD10.is_dir():
+        pytest.skip(f"no {CAD10}: the CAD meshes are not part of the project")
+    items = MeshFolder(CAD10).items()
+    counts = collections.Counter(item.cls for item in items)
+    assert counts == {
+        **{"bathtub": 8, "bed": 35, "bookshelf": 47, "cabinet": 47, "chair": 86},
+        **{"lamp": 24, "monitor": 11, "plant": 35, "sofa": 32, "table": 64},
+    }
+    assert len({item.id for item in items}) == 389
+    for item in items:
+        low, high = item.load().bounds
+        assert abs(low[2]) < 1e-3, item.id  # they rest on the floor
+        assert 0.01 < (high - low).max() < 10, item.id

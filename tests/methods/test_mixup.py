@@ -1,0 +1,97 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn import functional as F
+
+from qs3.geometry.neighbours import farthest_point_sampling
+from qs3.methods.mixup import mix, pcm_loss
+
+
+def _batch(b: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Cloud i lies in [2 i, 2 i + 1], so a point tells whose it is."""
+    points = torch.rand(b, n, 3) + 2 * torch.arange(b)[:, None, None]
+    return points, torch.arange(b)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 5), st.integers(1, 40), st.integers(0, 10_000))
+def test_proportions_and_labels(b: int, n: int, seed: int) -> None:
+    points, labels = _batch(b, n)
+    mixed, own, other, lam = mix(points, labels, torch.Generator().manual_seed(seed))
+    assert mixed.shape == points.shape
+    assert torch.equal(own, labels)
+    assert sorted(other.tolist()) == labels.tolist()  # a permutation
+    assert 0 <= lam <= 1
+    owner = (mixed[:, :, 0] // 2).long()
+    for i in range(b):
+        if other[i] == i:
+            assert (owner[i] == i).all()
+        else:
+            assert (owner[i] == i).sum() == round(lam * n)
+            assert (owner[i] == other[i]).sum() == n - round(lam * n)
+        assert all(
+            (points[int(o), :] == p).all(1).any() for o, p in zip(owner[i], mixed[i], strict=True)
+        )
+
+
+def test_parts_are_farthest_point_samples() -> None:
+    points, labels = _batch(3, 50)
+    for seed in range(5):
+        mixed, _, other, lam = mix(points, labels, torch.Generator().manual_seed(seed))
+        for i in range(3):
+            if other[i] == i:
+                continue
+            owner = (mixed[i, :, 0] // 2).long()
+            for who, count in ((i, round(lam * 50)), (int(other[i]), 50 - round(lam * 50))):
+                part = {tuple(p) for p in mixed[i][owner == who].tolist()}
+                cloud = points[who]
+                samples = [
+                    {tuple(p) for p in cloud[order[:count]].tolist()}
+                    for order in farthest_point_sampling(
+                        cloud.expand(50, -1, -1), 50, torch.arange(50)
+                    )
+                ]
+                assert part in samples
+
+
+def test_all_randomness_is_the_generators() -> None:
+    points, labels = _batch(4, 30)
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    first = mix(points, labels, torch.Generator().manual_seed(3))
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(2)
+    second = mix(points, labels, torch.Generator().manual_seed(3))
+    assert all(torch.equal(a, b) for a, b in zip(first[:3], second[:3], strict=True))
+    assert first[3] == second[3]
+    third = mix(points, labels, torch.Generator().manual_seed(4))
+    assert not torch.equal(first[0], third[0])
+
+
+def test_lambda_is_uniform_and_points_are_shuffled() -> None:
+    points, labels = _batch(2, 4)
+    generator = torch.Generator().manual_seed(0)
+    draws = [mix(points, labels, generator) for _ in range(400)]
+    lams = torch.tensor([d[3] for d in draws])
+    assert abs(float(lams.mean()) - 0.5) < 0.05
+    assert abs(float(lams.var()) - 1 / 12) < 0.015
+    owners = torch.stack([d[0][0, :, 0] // 2 for d in draws if d[2][0] == 1])
+    assert (owners.mean(0) - owners.mean()).abs().max() < 0.12  # no place prefers an owner
+
+
+def test_input_is_left_alone() -> None:
+    points, labels = _batch(3, 20)
+    before = points.clone()
+    mix(points, labels, torch.Generator().manual_seed(0))
+    assert torch.equal(points, before)
+
+
+def test_pcm_loss_known_answer() -> None:
+    logits = torch.tensor([[math.log(3.0), 0.0]])  # probabilities 3/4, 1/4
+    a, b = torch.tensor([0]), torch.tensor([1])
+    expected = 0.3 * math.log(4 / 3) + 0.7 * math.log(4)
+    assert pcm_loss(logits, a, b, 0.3).item() == pytest.approx(expected, rel=1e-6)
+    torch.testing.assert_close(pcm_loss(logits, a, a, 0.2), F.cross_entropy(logits, a))

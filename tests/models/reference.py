@@ -1,0 +1,74 @@
+"""Straight implementations to compare with: short, slow, with every edge in memory."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from qs3.models.base import PointClassifier
+from qs3.models.edgeconv import EdgeConv
+
+
+def knn_reference(x: Tensor, k: int) -> Tensor:
+    """As DGCNN's authors: the whole matrix and topk."""
+    squares = x.square().sum(2)
+    distance = squares[:, :, None] - 2 * x @ x.transpose(1, 2) + squares[:, None]
+    return distance.topk(k, largest=False)[1]
+
+
+def edge_conv_reference(
+    x: Tensor, index: Tensor, weight: Tensor, norm: nn.Module, slope: float = 0.2
+) -> Tensor:
+    """1x1 convolution of (x_j - x_i, x_i), norm over [B, C, N, k], LeakyReLU, maximum over k."""
+    b, n, c = x.shape
+    k = index.shape[2]
+    flat = index.reshape(b, n * k, 1).expand(-1, -1, c)
+    neighbour = x.gather(1, flat).view(b, n, k, c)
+    centre = x[:, :, None].expand_as(neighbour)
+    edges = torch.cat([neighbour - centre, centre], dim=3).permute(0, 3, 1, 2)  # [b, 2c, n, k]
+    z = F.conv2d(edges, weight[:, :, None, None])
+    return F.leaky_relu(norm(z), slope).amax(3).transpose(1, 2)
+
+
+class NaiveEdgeConv(nn.Module):
+    """`EdgeConv` with the same parameters, the straight way."""
+
+    def __init__(self, twin: EdgeConv) -> None:
+        super().__init__()
+        d, _ = twin.linear.weight.shape
+        self.weight = nn.Parameter(twin.linear.weight.detach().clone())
+        self.bn: nn.Module
+        if twin.norm == "batch":
+            self.bn = nn.BatchNorm2d(d, dtype=self.weight.dtype)
+            self.bn.running_mean.copy_(twin.running_mean)
+            self.bn.running_var.copy_(twin.running_var)
+        else:
+            self.bn = nn.InstanceNorm2d(d, affine=True, dtype=self.weight.dtype)
+        with torch.no_grad():
+            self.bn.weight.copy_(twin.gamma)
+            self.bn.bias.copy_(twin.beta)
+
+    def forward(self, x: Tensor, index: Tensor) -> Tensor:
+        return edge_conv_reference(x, index, self.weight, self.bn)
+
+
+class NaiveDGCNN(nn.Module):
+    """The whole classifier, the straight way; weights of `twin`."""
+
+    def __init__(self, twin: PointClassifier) -> None:
+        super().__init__()
+        self.k = twin.backbone.k
+        self.edge_convs = nn.ModuleList(NaiveEdgeConv(e) for e in twin.backbone.edge_convs)
+        self.conv5, self.norm5, self.head = twin.backbone.conv5, twin.backbone.norm5, twin.head
+
+    def forward(self, points: Tensor) -> Tensor:
+        x, levels = points, []
+        k = min(self.k, points.shape[1])
+        for edge_conv in self.edge_convs:
+            x = edge_conv(x, knn_reference(x.detach(), k))
+            levels.append(x)
+        y = self.conv5(torch.cat(levels, dim=2)).transpose(1, 2)
+        if self.norm5 is not None:
+            y = F.leaky_relu(self.norm5(y), 0.2)
+        return self.head(torch.cat([y.amax(2), y.mean(2)], dim=1))

@@ -1,0 +1,163 @@
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from torch.nn import functional as F
+
+from qs3.errors import ConfigError, DataError
+from qs3.models.base import ClassHead, Features, PointClassifier, check_points
+from qs3.models.dgcnn import DGCNN, dgcnn, pooled_linear
+from tests.models.reference import NaiveDGCNN
+
+CONF = Path(__file__).parents[2] / "conf" / "model"
+
+
+def _small(k: int = 5, variant: str = "uda", norm: str = "batch") -> PointClassifier:
+    torch.manual_seed(0)
+    return dgcnn(4, k=k, variant=variant, norm=norm, dropout=0.0)
+
+
+@pytest.mark.parametrize(
+    ("classes", "variant", "expected"),
+    [(10, "uda", 1_800_330), (10, "simpleview", 1_801_866), (40, "simpleview", 1_809_576)],
+)
+@pytest.mark.parametrize("norm", ["batch", "instance"])
+def test_parameter_count(classes: int, variant: str, expected: int, norm: str) -> None:
+    model = dgcnn(classes, variant=variant, norm=norm)
+    assert sum(p.numel() for p in model.parameters()) == expected
+
+
+@pytest.mark.parametrize("variant", ["uda", "simpleview"])
+@pytest.mark.parametrize("norm", ["batch", "instance"])
+@pytest.mark.parametrize("training", [True, False])
+def test_equals_naive_network(variant: str, norm: str, training: bool) -> None:
+    torch.manual_seed(0)
+    backbone = DGCNN(k=5, variant=variant, norm=norm, widths=(8, 8, 16, 24), embedding=32)
+    model = PointClassifier(backbone, ClassHead(64, 4, hidden=(16, 8), dropout=0.0)).double()
+    twin = NaiveDGCNN(copy.deepcopy(model)).double()
+    model.train(training)
+    twin.train(training)
+    points = torch.randn(3, 24, 3, dtype=torch.float64)
+    labels = torch.tensor([0, 1, 3])
+    a, b = model(points), twin(points)
+    torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+    F.cross_entropy(a, labels).backward()
+    F.cross_entropy(b, labels).backward()
+    for mine, theirs in zip(model.backbone.edge_convs, twin.edge_convs, strict=True):
+        torch.testing.assert_close(
+            mine.linear.weight.grad, theirs.weight.grad, rtol=1e-8, atol=1e-9
+        )
+    torch.testing.assert_close(
+        model.backbone.conv5.weight.grad, twin.conv5.weight.grad, rtol=1e-8, atol=1e-9
+    )
+
+
+def test_pooled_linear_gradient() -> None:
+    torch.manual_seed(0)
+    x = torch.randn(2, 9, 5, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(7, 5, dtype=torch.float64, requires_grad=True)
+    y = x @ weight.T
+    torch.testing.assert_close(pooled_linear(x, weight), torch.cat([y.amax(1), y.mean(1)], 1))
+    assert torch.autograd.gradcheck(pooled_linear, (x, weight))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(1, 40), st.integers(0, 100))
+def test_order_of_points_does_not_matter(n: int, seed: int) -> None:
+    model = _small(k=4).double().eval()
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(2, n, 3, generator=generator, dtype=torch.float64)
+    order = torch.randperm(n, generator=generator)
+    a, b = model.features(points), model.features(points[:, order])
+    torch.testing.assert_close(a.global_, b.global_, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(a.per_point[:, order], b.per_point, rtol=1e-9, atol=1e-9)
+
+
+def test_clouds_of_a_batch_do_not_meet_in_eval() -> None:
+    model = _small().double().eval()
+    points = torch.randn(3, 30, 3, dtype=torch.float64)
+    together = model(points)
+    alone = torch.cat([model(cloud[None]) for cloud in points])
+    torch.testing.assert_close(together, alone, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("variant", ["uda", "simpleview"])
+@pytest.mark.parametrize("n", [1, 3, 50])
+def test_batch_of_one_and_fewer_points_than_k(variant: str, n: int) -> None:
+    model = _small(k=20, variant=variant).eval()
+    out = model(torch.randn(1, n, 3))
+    assert out.shape == (1, 4)
+    assert torch.isfinite(out).all()
+
+
+def test_one_repeated_point_trains() -> None:
+    model = _small()
+    points = torch.full((2, 40, 3), 0.3)
+    F.cross_entropy(model(points), torch.tensor([0, 1])).backward()
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters())
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_bad_points_name_the_item(value: float) -> None:
+    points = torch.zeros(4, 8, 3)
+    points[2, 5, 1] = value
+    with pytest.raises(DataError, match="batch item 2 has 1 coordinate"):
+        _small()(points)
+
+
+@pytest.mark.parametrize("shape", [(8, 3), (2, 8, 2), (2, 0, 3)])
+def test_bad_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(DataError, match="expected points"):
+        check_points(torch.zeros(shape))
+
+
+def test_features_have_promised_shapes() -> None:
+    backbone = DGCNN(k=4)
+    features = backbone(torch.randn(2, 12, 3))
+    assert isinstance(features, Features)
+    assert features.global_.shape == (2, backbone.feature_dim) == (2, 2048)
+    assert features.per_point.shape == (2, 12, 512)
+
+
+@pytest.mark.parametrize("setting", [{"variant": "x"}, {"norm": "layer"}, {"k": 0}])
+def test_bad_settings(setting: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(setting))):
+        DGCNN(**setting)
+
+
+@pytest.fixture
+def deterministic() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("deterministic")
+@pytest.mark.parametrize("threads", [1, 2])
+def test_same_bytes_every_time(threads: int) -> None:
+    torch.set_num_threads(threads)
+    points = torch.randn(4, 300, 3, generator=torch.Generator().manual_seed(0))
+
+    def gradients() -> list[torch.Tensor]:
+        model = _small(k=20)
+        F.cross_entropy(model(points), torch.tensor([0, 1, 2, 3])).backward()
+        return [p.grad for p in model.parameters()]
+
+    first = gradients()
+    for _ in range(2):
+        assert all(torch.equal(a, b) for a, b in zip(first, gradients(), strict=True))
+
+
+def test_config_builds_it() -> None:
+    config = OmegaConf.create({"num_classes": 7, "model": OmegaConf.load(CONF / "dgcnn.yaml")})
+    model = instantiate(config.model)
+    assert isinstance(model, PointClassifier)
+    assert model.eval()(torch.randn(2, 8, 3)).shape == (2, 7)

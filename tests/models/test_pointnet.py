@@ -1,0 +1,74 @@
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from torch.nn import functional as F
+
+from qs3.errors import DataError
+from qs3.models.base import PointClassifier
+from qs3.models.pointnet import PointNet, TNet, pointnet, transform_regulariser
+
+CONF = Path(__file__).parents[2] / "conf" / "model"
+
+
+@pytest.mark.parametrize(("classes", "expected"), [(10, 3_463_763), (40, 3_471_473)])
+def test_parameter_count(classes: int, expected: int) -> None:
+    assert sum(p.numel() for p in pointnet(classes).parameters()) == expected
+
+
+def test_order_and_copies_of_points_do_not_matter() -> None:
+    torch.manual_seed(0)
+    model = pointnet(4).double().eval()
+    points = torch.randn(2, 30, 3, dtype=torch.float64)
+    expected = model(points)
+    torch.testing.assert_close(model(points[:, torch.randperm(30)]), expected)
+    torch.testing.assert_close(model(torch.cat([points, points[:, :7]], dim=1)), expected)
+
+
+@pytest.mark.parametrize("n", [1, 20])
+def test_batch_of_one_in_eval(n: int) -> None:
+    assert pointnet(4).eval()(torch.randn(1, n, 3)).shape == (1, 4)
+
+
+def test_features_and_gradients() -> None:
+    torch.manual_seed(0)
+    model = pointnet(4)
+    points = torch.randn(3, 25, 3)
+    features = model.features(points)
+    assert features.global_.shape == (3, PointNet.feature_dim)
+    assert features.per_point.shape == (3, 25, 64)
+    loss = F.cross_entropy(model.head(features.global_), torch.tensor([0, 1, 2]))
+    (loss + 0.001 * features.regulariser).backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in model.parameters())
+
+
+def test_tnet_starts_near_what_it_is_asked_and_regulariser_is_known() -> None:
+    net = TNet(3).eval()
+    torch.nn.init.zeros_(net.cloud[-1].weight)
+    torch.nn.init.zeros_(net.cloud[-1].bias)
+    matrix = net(torch.randn(2, 8, 3))
+    assert torch.equal(matrix, torch.eye(3).expand(2, 3, 3))
+    assert transform_regulariser(matrix).item() == 0
+    # I - A A' = -3 I for A = 2 I: its norm is 3 sqrt(3)
+    assert transform_regulariser(2 * matrix).item() == pytest.approx(3 * 3**0.5)
+
+
+def test_last_layer_has_no_relu() -> None:
+    features = PointNet()(torch.randn(4, 16, 3)).global_
+    assert (features < 0).any()
+
+
+def test_bad_points_name_the_item() -> None:
+    points = torch.zeros(3, 4, 3)
+    points[1, 0, 0] = float("nan")
+    with pytest.raises(DataError, match="batch item 1"):
+        pointnet(4)(points)
+
+
+def test_config_builds_it() -> None:
+    config = OmegaConf.create({"num_classes": 7, "model": OmegaConf.load(CONF / "pointnet.yaml")})
+    model = instantiate(config.model)
+    assert isinstance(model, PointClassifier)
+    assert model.eval()(torch.randn(2, 8, 3)).shape == (2, 7)

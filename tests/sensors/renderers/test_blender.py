@@ -1,0 +1,57 @@
+import sys
+
+import numpy as np
+import pytest
+
+from qs3.errors import RenderError
+from qs3.sensors.renderers.blender import BlenderRenderer, read_exr
+
+
+def test_missing_bpy_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "bpy", None)
+    with pytest.raises(RenderError, match="pip install 'bpy"):
+        BlenderRenderer()
+
+
+def test_missing_library_names_the_packages(monkeypatch, tmp_path):
+    (tmp_path / "bpy.py").write_text(
+        "raise ImportError('libXi.so.6: cannot open shared object file: No such file')"
+    )
+    monkeypatch.delitem(sys.modules, "bpy", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(RenderError, match=r"libXi\.so\.6.*apt install.*libxi6.*libegl1"):
+        BlenderRenderer()
+
+
+def test_nothing_is_left_in_blender():
+    import bpy
+
+    from tests.sensors.renderers.scenes import busy_camera, busy_scene
+
+    renderer = BlenderRenderer(samples=1)
+    renderer.render(busy_scene(), [busy_camera()], seed=0, geometry=[True])
+    for kind in ("objects", "meshes", "materials", "lights", "cameras", "images", "worlds"):
+        assert len(getattr(bpy.data, kind)) == 0
+
+
+def test_failure_inside_blender_is_told(monkeypatch):
+    import qs3.sensors.renderers.blender as module
+    from tests.sensors.renderers.scenes import busy_camera, busy_scene
+
+    def fail(*_args):
+        raise RuntimeError("Error: cannot save")
+
+    monkeypatch.setattr(module, "_aim", fail)
+    renderer = BlenderRenderer(samples=1)
+    with pytest.raises(RenderError, match="cannot save"):
+        renderer.render(busy_scene(), [busy_camera()], seed=0, geometry=[True])
+    monkeypatch.undo()
+    (image,) = renderer.render(busy_scene(), [busy_camera()], seed=0, geometry=[True])
+    assert np.isfinite(image.depth_m).any()
+
+
+def test_file_that_is_no_exr_is_refused(tmp_path):
+    path = tmp_path / "x.exr"
+    path.write_bytes(b"\x89PNG and more")
+    with pytest.raises(RenderError, match="not an EXR"):
+        read_exr(path)

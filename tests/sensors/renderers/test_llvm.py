@@ -1,0 +1,127 @@
+import json
+import os
+import subprocess
+
+import pytest
+
+from qs3.errors import RenderError
+from qs3.sensors.renderers import llvm
+
+
+@pytest.fixture(autouse=True)
+def _fresh_probe(monkeypatch):
+    # setenv first, so that what a test stores there is undone even if it was unset before
+    monkeypatch.setenv(llvm.PROBE_VARIABLE, "")
+    monkeypatch.delenv(llvm.PROBE_VARIABLE)
+    llvm._probe_llvm.cache_clear()
+    yield
+    llvm._probe_llvm.cache_clear()
+
+
+def _children_run(monkeypatch, code):
+    monkeypatch.setattr(llvm, "_CHILD", code)
+    monkeypatch.setattr(llvm, "cuda_may_work", lambda: False)
+
+
+def _forbid_children(monkeypatch):
+    def run(*_args, **_kwargs):
+        raise AssertionError("probed again")
+
+    monkeypatch.setattr(subprocess, "run", run)
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM-15.so", (15,)),
+        ("libLLVM.so", ()),
+    ],
+)
+def test_version_is_in_the_name(tmp_path, name, version):
+    assert llvm.libllvm_version(str(tmp_path / name)) == version
+
+
+def test_candidates_are_newest_first_and_each_file_once(tmp_path, monkeypatch):
+    for name in ("libLLVM-9.so.1", "libLLVM.so.19.1", "libLLVM-15.so.1"):
+        (tmp_path / name).touch()
+    (tmp_path / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "_FOLDERS", (str(tmp_path),))
+    versions = [llvm.libllvm_version(path) for path in llvm.libllvm_candidates()]
+    assert versions == [(19, 1), (15,), (9,)]
+
+
+def test_users_own_library_is_the_only_candidate(monkeypatch):
+    monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "/opt/libLLVM.so.20")
+    assert llvm.libllvm_candidates() == ["/opt/libLLVM.so.20"]
+
+
+def test_abort_of_the_child_is_survived(monkeypatch):
+    _children_run(monkeypatch, "import os; os.abort()")
+    reason = llvm.try_variant("llvm_ad_mono", None)
+    assert reason is not None
+    assert "signal 6" in reason
+
+
+def test_hanging_child_is_given_up(monkeypatch):
+    _children_run(monkeypatch, "import time; time.sleep(60)")
+    monkeypatch.setattr(llvm, "_CHILD_TIMEOUT_S", 0.2)
+    assert "no answer" in str(llvm.try_variant("llvm_ad_mono", None))
+
+
+def test_explicit_variant_that_cannot_run_names_the_package(monkeypatch):
+    monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "/nowhere/libLLVM-14.so.1")
+    _children_run(
+        monkeypatch,
+        "import os, sys; print('LLVM ERROR: Cannot select: fmaximum', file=sys.stderr); os.abort()",
+    )
+    with pytest.raises(RenderError, match=r"libLLVM-14.*fmaximum.*libllvm19"):
+        llvm.find_variant("llvm_ad_mono")
+
+
+def test_auto_falls_back_to_scalar(monkeypatch):
+    monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "/nowhere/libLLVM-14.so.1")
+    _children_run(monkeypatch, "import os; os.abort()")
+    assert llvm.find_variant().variant == "scalar_rgb"
+    _forbid_children(monkeypatch)  # the fall back is remembered, too
+    assert llvm.find_variant().variant == "scalar_rgb"
+
+
+def test_library_that_does_not_work_is_passed_over(tmp_path, monkeypatch):
+    for name in ("libLLVM.so.19.1", "libLLVM-16.so.1"):
+        (tmp_path / name).touch()
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "_FOLDERS", (str(tmp_path),))
+    _children_run(
+        monkeypatch,
+        f"import os; '.so.19' in os.environ['{llvm.LIBRARY_VARIABLE}'] and os.abort()\n"
+        f"print('{llvm._CHILD_OK}')",
+    )
+    assert llvm.find_variant().llvm_path == str(tmp_path / "libLLVM-16.so.1")
+
+
+def test_answer_is_inherited_through_the_environment(tmp_path, monkeypatch):
+    library = tmp_path / "libLLVM.so.19.1"
+    library.touch()
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    answer = {"variant": "llvm_ad_mono", "llvm_path": str(library)}
+    monkeypatch.setenv(llvm.PROBE_VARIABLE, json.dumps(answer))
+    _forbid_children(monkeypatch)
+    assert llvm.find_variant() == llvm.Probe(**answer)
+
+
+@pytest.mark.parametrize("stale", ["not json", '{"variant": "llvm_ad_mono", "llvm_path": "/gone"}'])
+def test_stale_answer_is_not_believed(monkeypatch, stale):
+    monkeypatch.setenv(llvm.PROBE_VARIABLE, stale)
+    monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "/nowhere/libLLVM.so.19.1")
+    _children_run(monkeypatch, f"print('{llvm._CHILD_OK}')")
+    assert llvm.find_variant().llvm_path == "/nowhere/libLLVM.so.19.1"
+    assert "/nowhere" in os.environ[llvm.PROBE_VARIABLE]
+
+
+def test_cuda_without_a_gpu_says_so(monkeypatch):
+    monkeypatch.setattr(llvm, "cuda_may_work", lambda: False)
+    with pytest.raises(RenderError, match="no libcuda"):
+        llvm.find_variant("cuda_ad_mono")

@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError
+from qs3.sensors.patterns import Speckle
+
+
+def test_the_default_slide_has_the_size_and_fill_of_the_released_one():
+    slide = Speckle().slide
+    assert slide.shape == (990, 1266)
+    assert slide.dtype == np.float32
+    assert set(np.unique(slide)) == {0.0, 1.0}
+    assert slide.mean() == pytest.approx(0.111, abs=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    columns=st.integers(8, 40),
+    rows=st.integers(8, 40),
+    spacing=st.integers(0, 2),
+    seed=st.integers(0, 9),
+)
+def test_dots_keep_their_distance_across_the_seams_of_tiles(columns, rows, spacing, seed):
+    fill = 0.5 / (1 + spacing) ** 2
+    tile = Speckle(columns, rows, 1, 1, fill, spacing, seed).slide > 0
+    for dy in range(-spacing, spacing + 1):
+        for dx in range(-spacing, spacing + 1):
+            if (dy, dx) != (0, 0):
+                assert not (tile & np.roll(tile, (dy, dx), axis=(0, 1))).any()
+
+
+def test_a_tile_repeats_and_a_seed_decides():
+    slide = Speckle(20, 16, tiles=3, dot_px=2, seed=4).slide
+    assert slide.shape == (96, 120)
+    np.testing.assert_array_equal(slide[:32, :40], slide[32:64, 80:120])
+    np.testing.assert_array_equal(slide, Speckle(20, 16, tiles=3, dot_px=2, seed=4).slide)
+    assert (slide != Speckle(20, 16, tiles=3, dot_px=2, seed=5).slide).any()
+
+
+def test_a_fill_that_cannot_be_reached_is_refused():
+    with pytest.raises(ConfigError, match=r"pattern\.fill 0\.2 cannot be reached with spacing 1"):
+        Speckle(fill=0.2, spacing=1)

@@ -1,0 +1,244 @@
+"""generate.py from a folder of small meshes, with real workers and the real renderer."""
+
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hydra import compose, initialize_config_dir
+
+from qs3.data.store import open_pointset, read_manifest
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.generation import generate
+
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = [
+    "sensor=speckle_stereo_small",
+    "renderer=mitsuba",
+    "renderer.samples=2",
+    "views=2",
+    "classes=[chair,table,lamp]",
+]
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    """Three classes, two splits, two or three objects each."""
+    root = tmp_path_factory.mktemp("meshes")
+    solids = {
+        "chair": lambda i: trimesh.creation.box((0.5, 0.5, 0.9 + 0.1 * i)),
+        "table": lambda i: trimesh.creation.cylinder(0.6 + 0.1 * i, 0.7),
+        "lamp": lambda i: trimesh.creation.icosphere(1, 0.3 + 0.05 * i),
+    }
+    for cls, make in solids.items():
+        for split, count in (("train", 3), ("test", 2)):
+            folder = root / cls / split
+            folder.mkdir(parents=True)
+            for i in range(count):
+                make(i + 3 * (split == "test")).export(folder / f"{cls}_{i}.ply")
+    return root
+
+
+def config(data_dir, meshes=None, *overrides, domain="specklenet10"):
+    where = [f"paths.data_dir={data_dir}", *([f"meshes={meshes}"] if meshes else [])]
+    settings = [] if domain.startswith("modelnet") else QUICK
+    if domain.startswith("modelnet"):
+        settings = ["classes=[chair,table,lamp]"]
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("generate", [f"domain={domain}", *settings, *where, *overrides])
+
+
+def command(data_dir, meshes, *overrides):
+    return [
+        sys.executable, "generate.py", "domain=specklenet10", *QUICK,
+        f"paths.data_dir={data_dir}", f"meshes={meshes}", *overrides,
+    ]  # fmt: skip
+
+
+def fingerprint(folder):
+    """Hash of every file of a finished dataset."""
+    names = ("points.npy", "points_clean.npy", "manifest.csv", "meta.yaml")
+    return {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in names}
+
+
+@pytest.fixture(scope="module")
+def finished(meshes, tmp_path_factory):
+    """The dataset that every other way of making it must equal."""
+    data_dir = tmp_path_factory.mktemp("data")
+    pointset = generate(config(data_dir, meshes, "workers=0"))
+    return data_dir / "specklenet10", pointset
+
+
+def test_a_folder_of_meshes_becomes_a_dataset(finished):
+    folder, pointset = finished
+    assert pointset.points.shape == (15, 2048, 3)
+    assert pointset.counts()["train"]["chair"] == 3
+    assert pointset.counts()["test"]["lamp"] == 2
+    clean = open_pointset(folder, "points_clean")
+    # The unit cube and a margin of 3 cm bound the scan; the twin lies in the cube itself.
+    assert np.abs(pointset.points).max() <= np.sqrt(0.5) + 0.03 + 1e-6
+    assert np.abs(clean.points).max() <= np.sqrt(0.5) + 1e-4
+    assert not (folder / "parts").exists()
+    versions = pointset.meta["versions"]
+    assert versions["renderer"] == "mitsuba"
+    assert {"variant", "mitsuba", "opencv", "numpy"} <= set(versions)
+
+
+def test_the_scan_lies_near_the_surface_and_its_twin_on_it(finished, meshes):
+    folder, pointset = finished
+    clean = open_pointset(folder, "points_clean")
+    spheres = [i for i, name in enumerate(pointset.ids) if name.startswith("lamp")]
+    for i in spheres:
+        # A sphere fills the unit cube whatever its size: radius 0.5 about the origin.
+        noisy = np.abs(np.linalg.norm(pointset.points[i], axis=1) - 0.5)
+        true = np.abs(np.linalg.norm(clean.points[i], axis=1) - 0.5)
+        assert np.quantile(true, 0.95) < 0.05  # an icosphere's facets are inside the sphere
+        assert np.median(noisy) < 0.06
+        assert noisy.mean() > true.mean()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_number_of_workers_changes_no_byte(finished, meshes, tmp_path, workers):
+    generate(config(tmp_path, meshes, f"workers={workers}"))
+    assert fingerprint(tmp_path / "specklenet10") == fingerprint(finished[0])
+
+
+def test_fewer_objects_or_classes_are_the_same_objects(finished, meshes, tmp_path):
+    _, whole = finished
+    part = generate(config(tmp_path, meshes, "workers=0", "limit=1", "classes=[table,lamp]"))
+    assert part.counts()["train"]["table"] == 1
+    assert part.counts()["train"]["chair"] == 0
+    for i, name in enumerate(part.ids):
+        np.testing.assert_array_equal(part.points[i], whole.points[whole.ids.index(name)])
+
+
+def test_a_finished_dataset_is_left_alone_and_other_settings_are_refused(finished, meshes):
+    folder, _ = finished
+    before = (folder / "points.npy").stat().st_mtime_ns
+    generate(config(folder.parent, meshes, "workers=0"))
+    assert (folder / "points.npy").stat().st_mtime_ns == before
+    with pytest.raises(ConfigError, match=r"renderer\.samples: 2 there, 3 now") as error:
+        generate(config(folder.parent, meshes, "workers=0", "renderer.samples=3"))
+    assert "force=true" in str(error.value)
+
+
+def test_a_resume_with_another_version_is_refused(finished, meshes, tmp_path):
+    folder = tmp_path / "specklenet10"
+    folder.mkdir()
+    recipe = json.loads((finished[0] / "recipe.json").read_text())
+    recipe["versions"]["mitsuba"] = "3.8.0"
+    (folder / "recipe.json").write_text(json.dumps(recipe))
+    with pytest.raises(ConfigError, match=r"versions\.mitsuba"):
+        generate(config(tmp_path, meshes, "workers=0"))
+    forced = generate(config(tmp_path, meshes, "workers=0", "force=true"))
+    assert forced.sha256 == finished[1].sha256
+
+
+def test_broken_meshes_are_recorded_and_the_others_go_on(finished, meshes, tmp_path):
+    broken = tmp_path / "meshes"
+    for path in meshes.rglob("*.ply"):
+        copy = broken / path.relative_to(meshes)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+    whole = (broken / "chair/train/chair_0.ply").read_bytes()
+    (broken / "chair/train/chair_0.ply").write_bytes(whole[: len(whole) // 2])
+    (broken / "table/train/table_1.ply").write_bytes(b"")
+    (broken / "lamp/test/lamp_1.ply").unlink()
+    (broken / "lamp/test/lamp_1.off").write_text("OFF\n3 1 0\nnan 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    pointset = generate(config(tmp_path, broken, "workers=1"))
+    assert len(pointset.ids) == 12
+    rows = {r.id: r for r in read_manifest(tmp_path / "specklenet10", pointset.classes)}
+    for bad in ("chair/train/chair_0", "table/train/table_1", "lamp/test/lamp_1"):
+        assert rows[bad].status == "failed"
+        assert Path(bad).name in rows[bad].reason
+    with pytest.raises(DataError, match="3 of 15 objects failed"):
+        generate(config(tmp_path, broken, "workers=1", "strict=true", "force=true"))
+    for path in broken.rglob("*.*"):
+        path.write_bytes(b"")
+    with pytest.raises(DataError, match="all 15 objects failed; the first: chair/"):
+        generate(config(tmp_path, broken, "workers=0", "force=true"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "message"),
+    [
+        (["views=0"], ConfigError, "views must be at least 1, got 0"),
+        (["limit=0"], ConfigError, "limit must be at least 1"),
+        (["workers=-1"], ConfigError, "workers must be at least 0"),
+        (["classes=[chair,dragon]"], ConfigError, "dragon"),
+        (["classes=[chair,bed]"], (ConfigError, MissingDataError), "bed"),
+        (["fraction=0"], ConfigError, r"fraction must be in \(0, 1\]"),
+    ],
+)
+def test_wrong_settings_name_the_key(meshes, tmp_path, overrides, error, message):
+    with pytest.raises(error, match=message):
+        generate(config(tmp_path, meshes, "workers=0", *overrides))
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(MissingDataError, match="nowhere"):
+        generate(config(tmp_path, tmp_path / "nowhere", "workers=0"))
+
+
+def test_surface_samples_lie_on_the_surface_and_dropout_takes_regions(meshes, tmp_path):
+    whole = generate(config(tmp_path, meshes, "workers=0", domain="modelnet10"))
+    holed = generate(config(tmp_path, meshes, "workers=0", domain="modelnet10_dropout"))
+    assert whole.ids == holed.ids
+    for i, name in enumerate(whole.ids):
+        if name.startswith("lamp"):
+            for cloud in (whole.points[i], holed.points[i]):
+                np.testing.assert_allclose(np.linalg.norm(cloud, axis=1), 0.5, atol=0.05)
+            # The largest empty cap of a sphere: seen from somewhere, much is missing.
+            directions = trimesh.creation.icosphere(3).vertices
+            gap = [
+                np.degrees(np.arccos(np.clip((cloud / 0.5 @ directions.T).max(0), -1, 1))).max()
+                for cloud in (whole.points[i], holed.points[i])
+            ]
+            assert gap[1] > gap[0] + 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim", ["parent", "worker"])
+def test_kill_at_random_instants_changes_no_byte(finished, meshes, tmp_path, victim):
+    """SIGKILL to the parent or to one of its workers, again and again, until it gets through."""
+    chance = random.Random(victim)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    kills = 0
+    for _ in range(60):
+        process = subprocess.Popen(
+            command(tmp_path, meshes, "workers=2"), cwd=ROOT, env=environment,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        # Early kills hit the start, later ones the writing; a start takes about 4 s.
+        if kills < 12:
+            time.sleep(chance.uniform(0.5, 8.0))
+            kills += _kill(process.pid if victim == "parent" else _a_child(process.pid))
+        if process.wait() == 0:
+            if kills >= 10:
+                break
+            subprocess.run(["rm", "-rf", str(tmp_path / "specklenet10")], check=True)
+    else:
+        pytest.fail("it never finished")
+    assert fingerprint(tmp_path / "specklenet10") == fingerprint(finished[0])
+
+
+def _a_child(pid):
+    found = Path(f"/proc/{pid}/task/{pid}/children")
+    children = found.read_text().split() if found.exists() else []
+    return int(children[-1]) if children else None
+
+
+def _kill(pid):
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except (ProcessLookupError, TypeError):
+        return 0
+    return 1
