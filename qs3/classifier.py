@@ -1,4 +1,4 @@
-"""The LightningModule: a backbone, the method's loss in the warm-up, the student's in the rounds."""
+"""The LightningModule: a net, the method's loss in the warm-up, the student's in the rounds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from qs3.methods.base import Method
 from qs3.methods.student import Student
 from qs3.randomness import derive
 from qs3.selftraining.scheme import Phases
-
 
 # `qs3.loggers.EpochRows` hands the figures on, before the checkpoint is written.
 _PER_EPOCH: dict[str, Any] = {
@@ -94,7 +93,7 @@ class Classifier(LightningModule):
         return total
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Count the hits on held-out labelled clouds (source's, or target_train's if supervised)."""
+        """Count the hits on held-out labelled clouds."""
         labels = batch["source"][f"y_{self.method.labels}"]
         self._hits.append(self(batch["source"]["points"]).argmax(dim=1) == labels)
 

@@ -54,7 +54,7 @@ CHECKS = (
         "from qs3.sensors.renderers.llvm import find_variant\n"
         "name = find_variant().variant; print(name); raise SystemExit(name.startswith('scalar'))",
         ("libllvm19",),
-        "Mitsuba falls back to scalar_rgb, about 4 times slower",
+        "Mitsuba falls back to scalar_rgb, 20 to 40 times slower",
     ),
     Check("PyTorch", "import torch; print(torch.__version__)", (), "nothing can be trained"),
     Check("OpenCV", "import cv2; print(cv2.__version__)", (), "nothing can be matched"),

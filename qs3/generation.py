@@ -98,21 +98,19 @@ def check(cfg: DictConfig) -> None:
 
 def mesh_items(cfg: DictConfig) -> list[MeshItem]:
     """The objects to scan, from the user's folder or the embedded catalogue."""
-    classes = tuple(cfg.classes) if cfg.classes else CLASSES
+    classes = tuple(cfg.classes) if cfg.classes else None
     if cfg.meshes is not None:
-        source: Any = MeshFolder(
+        items = MeshFolder(
             path=Path(cfg.meshes).expanduser(),
             classes=classes,
             test_fraction=cfg.test_fraction,
             half=cfg.half,
-        )
-        items = source.items()
+        ).items()
+    elif cfg.half == "all":
+        items = build(cfg.catalogue, classes=classes or CLASSES).items()
     else:
-        if cfg.half != "all":
-            raise ConfigError("half= divides a folder of meshes: give one with meshes=PATH")
-        items = build(cfg.catalogue, classes=classes).items()
-    wanted = [item for item in items if item.cls in classes]
-    kept = _first_of_each(wanted, cfg.limit, cfg.fraction)
+        raise ConfigError("half= divides a folder of meshes: give one with meshes=PATH")
+    kept = _first_of_each(items, cfg.limit, cfg.fraction)
     return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]
 
 

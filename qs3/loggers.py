@@ -41,6 +41,16 @@ class EpochRows(Callback):
             logger.log_metrics(row, step=epoch)
 
 
+def wandb(**settings: Any) -> Logger:
+    """Lightning's logger for Weights & Biases; see conf/logger/wandb.yaml."""
+    from lightning.pytorch.loggers import WandbLogger
+
+    logger = WandbLogger(**settings)
+    # Lightning always passes it, and wandb 0.31 warns about it.
+    logger._wandb_init.pop("anonymous", None)
+    return logger
+
+
 class CsvHistory(Logger):
     """`history.csv` in the run's folder: one row an epoch, rewritten atomically each time."""
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from qs3.classifier import Classifier
@@ -27,14 +29,13 @@ class EpochBar(Callback):
         self.enabled = sys.stderr.isatty() if enabled is None else enabled
         self.seconds = seconds
         self._progress: Progress | None = None
+        self._handlers: list[tuple[logging.StreamHandler, Any]] = []
         self._said = time.monotonic()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Show the bar, at the epoch where a resumed run goes on."""
         if not self.enabled or not trainer.is_global_zero:
             return
-        from rich.console import Console
-
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -43,10 +44,14 @@ class EpochBar(Callback):
             TimeRemainingColumn(),
             console=Console(stderr=True),
             transient=True,
-            redirect_stdout=True,
+            redirect_stdout=sys.stdout.isatty(),
         )
         self._progress.add_task("training", total=trainer.max_epochs)
         self._progress.start()
+        # Log handlers kept the real stdout; through rich's, their lines appear above the bar.
+        for handler in logging.getLogger().handlers:
+            if type(handler) is logging.StreamHandler and handler.stream.isatty():
+                self._handlers.append((handler, handler.setStream(sys.stdout)))
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Advance."""
@@ -66,6 +71,9 @@ class EpochBar(Callback):
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Remove the bar, also after an error."""
+        for handler, stream in self._handlers:
+            handler.setStream(stream)
+        self._handlers.clear()
         if self._progress is not None:
             self._progress.stop()
             self._progress = None

@@ -36,7 +36,9 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         target=build(cfg.data.target),
     )
     if cfg.selection.teacher not in TEACHERS:
-        raise ConfigError(f"selection.teacher must be one of {TEACHERS}, got {cfg.selection.teacher!r}")
+        raise ConfigError(
+            f"selection.teacher must be one of {TEACHERS}, got {cfg.selection.teacher!r}"
+        )
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
         return _fit(run)

@@ -115,7 +115,9 @@ def fit(run: Run) -> dict[str, Any]:
         net.load_state_dict(load(run.folder / file, classifier.device))
         scores[name] = evaluation.figures(net, classifier.device)
     validated_on = f"{method.labels}_val"
-    teacher = f"{validated_on if warmup.rule == 'source_val' else warmup.rule}, epoch {warmup.epoch}"
+    teacher = (
+        f"{validated_on if warmup.rule == 'source_val' else warmup.rule}, epoch {warmup.epoch}"
+    )
     return {
         "experiment": cfg.experiment_name,
         "hash": runs.config_hash(cfg),

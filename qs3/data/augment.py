@@ -43,24 +43,25 @@ class Augment:
     ) -> Float[Tensor, "b n 3"]:
         """A new batch; the one given is left alone. `generator` is on the device of `points`."""
         b, like = len(points), {"device": points.device, "dtype": points.dtype}
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
+
         if self.rotate_z:
-            angle = 2 * math.pi * torch.rand(b, generator=generator, **like)
-            points = rotate_z(points, angle)
+            points = rotate_z(points, 2 * math.pi * uniform(b))
         if self.scale > 1.0:
             low, high = 1 / self.scale, self.scale
-            factor = low + (high - low) * torch.rand(b, 1, 3, generator=generator, **like)
-            points = points * factor
+            points = points * (low + (high - low) * uniform(b, 1, 3))
         if self.shift > 0.0:
-            points = points + self.shift * (
-                2 * torch.rand(b, 1, 3, generator=generator, **like) - 1
-            )
+            points = points + self.shift * (2 * uniform(b, 1, 3) - 1)
         if self.jitter_sigma > 0.0:
-            noise = self.jitter_sigma * torch.randn(points.shape, generator=generator, **like)
-            points = points + noise.clamp(-self.jitter_clip, self.jitter_clip)
+            noise = torch.randn(points.shape, generator=generator, device=points.device)
+            noise = (self.jitter_sigma * noise).clamp(-self.jitter_clip, self.jitter_clip)
+            points = points + noise.to(points.dtype)
         return points
 
 
-def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, "b"]) -> Float[Tensor, "b n 3"]:
+def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, " b"]) -> Float[Tensor, "b n 3"]:
     """Turn each cloud about the z axis by its angle in radians, counter-clockwise from above."""
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]  # [B, 1]
     x, y, z = points.unbind(dim=2)  # [B, N] each

@@ -1,4 +1,4 @@
-"""From a stored cloud to what a network sees: unit ball, then farthest points; done once, cached."""
+"""From a stored cloud to what a net sees: unit ball, then farthest points; done once, cached."""
 
 from __future__ import annotations
 

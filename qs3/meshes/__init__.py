@@ -1,0 +1,1 @@
+"""Meshes: files, folders, and the embedded catalogue."""

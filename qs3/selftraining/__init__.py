@@ -1,0 +1,1 @@
+"""Self-training: which pseudo-labels to trust, and the rounds that learn from them."""

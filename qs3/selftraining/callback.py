@@ -185,4 +185,3 @@ class SelfTraining(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore `state_dict`."""
         self.records, self._previous = list(state_dict["records"]), state_dict["previous"]
-

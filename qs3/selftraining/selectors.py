@@ -93,7 +93,9 @@ class Qbst:
         rest = np.full(classes, n) if self.mu == "one" else np.maximum(n - counted, 0)  # mu_k n
         quota = -(-(rest * n_k) // max(n, 1))  # ceil(mu_k n_k), in whole numbers: no rounding error
 
-        ranked = np.lexsort((np.asarray(ids), confidence if self.order == "ascending" else -confidence))
+        ranked = np.lexsort(
+            (np.asarray(ids), confidence if self.order == "ascending" else -confidence)
+        )
         selected = np.zeros(len(confidence), dtype=bool)
         for k in range(classes):
             of_class = ranked[above[ranked] & (predicted[ranked] == k)]

@@ -101,15 +101,21 @@ class ReferenceMatcher:
             [h, w] float32: u - u_reference in px, NaN where there is no match.
         """
         scores = self._scores(image, reference, left)
+        last = len(scores) - 1
         best = scores.argmax(axis=0)
-        top = np.take_along_axis(scores, best[None], axis=0)[0]
-        far = np.abs(np.arange(len(scores))[:, None, None] - best[None]) > 2
-        second = np.where(far, scores, -1).max(axis=0)
-        inner = (best > 0) & (best < len(scores) - 1)
+
+        def score_at(index: np.ndarray) -> np.ndarray:
+            return np.take_along_axis(scores, index[None], axis=0)[0]
+
+        top = score_at(best)
+        lower, upper = score_at(np.maximum(best - 1, 0)), score_at(np.minimum(best + 1, last))
+        # The runner-up: blank the winner's neighbourhood and look again.
+        for near in range(-2, 3):
+            np.put_along_axis(scores, np.clip(best + near, 0, last)[None], -1, axis=0)
+        second = scores.max(axis=0)
+        inner = (best > 0) & (best < last)
         valid = inner & (top >= self.min_score) & (top - second >= self.uniqueness)
 
-        lower = np.take_along_axis(scores, np.maximum(best - 1, 0)[None], axis=0)[0]
-        upper = np.take_along_axis(scores, np.minimum(best + 1, len(scores) - 1)[None], axis=0)[0]
         curvature = np.maximum(2 * top - lower - upper, np.float32(1e-6))
         disparity = self.min_disparity + best + (upper - lower) / (2 * curvature)
         if self.steps_per_px:

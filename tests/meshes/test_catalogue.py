@@ -14,7 +14,6 @@ from qs3.classes import CLASSES
 from qs3.errors import ConfigError
 from qs3.meshes.catalogue import Catalogue, families, make, make_parts
 
-MINE = ("lamp", "monitor", "plant")
 SIZES = {"lamp": (0.2, 2.4), "monitor": (0.25, 1.8), "plant": (0.2, 2.4)}
 """Smallest and largest length of an object's longest side, in metres."""
 
@@ -81,7 +80,7 @@ def test_unknown_names_are_refused():
 
 
 def test_more_objects_never_change_the_earlier_ones():
-    small = Catalogue(train=3, test=2, classes=MINE).items()
+    small = Catalogue(train=3, test=2, classes=tuple(SIZES)).items()
     large = {item.id: item for item in Catalogue(train=9, test=5, classes=CLASSES[5:]).items()}
     for item in small:
         assert large[item.id].origin == item.origin
@@ -161,11 +160,11 @@ def test_importing_and_listing_needs_no_heavy_library():
 
 
 def test_items_travel_to_workers():
-    for item in Catalogue(train=1, test=1, classes=MINE).items():
+    for item in Catalogue(train=1, test=1, classes=tuple(SIZES)).items():
         assert pickle.loads(pickle.dumps(item)).load().sha256 == item.load().sha256
 
 
-@pytest.mark.parametrize(("cls", "family"), family_names(MINE))
+@pytest.mark.parametrize(("cls", "family"), family_names(tuple(SIZES)))
 def test_parts_are_solid_and_objects_have_real_sizes(cls, family):
     low, high = SIZES[cls]
     for k in range(4):

@@ -12,7 +12,7 @@ from qs3.meshes.mesh import merge
 # metres: lowest and highest (longer side, shorter side, height) with doors and drawers open
 SIZES = {
     "bed": ((1.15, 0.6, 0.1), (2.9, 2.7, 2.4)),
-    "bathtub": ((0.75, 0.7, 0.4), (2.3, 1.8, 2.1)),
+    "bathtub": ((0.75, 0.64, 0.4), (2.3, 1.8, 2.1)),
     "cabinet": ((0.38, 0.3, 0.3), (2.7, 1.9, 2.5)),
     "bookshelf": ((0.3, 0.16, 0.2), (3.0, 1.3, 2.6)),
 }
@@ -64,11 +64,33 @@ def test_equal_keys_give_equal_bytes_and_others_do_not(cls, family):
     assert meshes[0].sha256 != meshes[2].sha256
 
 
+def wall_m(tub, z, directions=32):
+    """Least thickness of the wall at a height; negative where the inside has come outside."""
+    solid = trimesh.Trimesh(tub.vertices, tub.faces, process=False)
+    cut, face = trimesh.intersections.mesh_plane(solid, (0, 0, 1), (0, 0, z), return_faces=True)
+    normals = solid.face_normals[face][:, :2]
+    p, q = cut[:, 0, :2], cut[:, 1, :2]
+    centre = (p.min(axis=0) + p.max(axis=0)) / 2
+    least = np.inf
+    for angle in 0.01 + np.arange(directions) * (2 * np.pi / directions):
+        ray, across = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        u, v = (p - centre) @ across, (q - centre) @ across
+        hit = (u <= 0) != (v <= 0)
+        t = (u / np.where(hit, u - v, 1.0))[:, None]
+        radius = (p + t * (q - p) - centre) @ ray
+        outside, hit = normals @ ray > 0, hit & (radius > 0)
+        least = min(least, radius[hit & outside].max() - radius[hit & ~outside].min())
+    return least
+
+
 @pytest.mark.parametrize(
     "family", [f for cls, f in FAMILIES if cls == "bathtub"], ids=lambda f: f.name
 )
-def test_tubs_are_hollow(family):
+def test_tubs_are_hollow_and_their_walls_have_a_thickness(family):
     for seed in SEEDS:
         tub = family.build(Draw(f"hollow/{seed}"))[0]
-        volume = trimesh.Trimesh(tub.vertices, tub.faces, process=False).volume
-        assert volume < 0.75 * trimesh.Trimesh(tub.vertices, tub.faces).convex_hull.volume
+        solid = trimesh.Trimesh(tub.vertices, tub.faces, process=False)
+        assert solid.volume < 0.75 * solid.convex_hull.volume
+        low, high = tub.bounds[:, 2]
+        for share in (0.3, 0.45, 0.6):
+            assert wall_m(tub, low + share * (high - low)) > 0.008

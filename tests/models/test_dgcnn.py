@@ -144,7 +144,7 @@ def deterministic() -> Iterator[None]:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_same_bytes_every_time(threads: int) -> None:
     torch.set_num_threads(threads)
-    points = torch.randn(4, 300, 3, generator=torch.Generator().manual_seed(0))
+    points = torch.randn(4, 200, 3, generator=torch.Generator().manual_seed(0))
 
     def gradients() -> list[torch.Tensor]:
         model = _small(k=20)
@@ -152,8 +152,7 @@ def test_same_bytes_every_time(threads: int) -> None:
         return [p.grad for p in model.parameters()]
 
     first = gradients()
-    for _ in range(2):
-        assert all(torch.equal(a, b) for a, b in zip(first, gradients(), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first, gradients(), strict=True))
 
 
 def test_config_builds_it() -> None:

@@ -63,6 +63,7 @@ def write_toy(folder: Path) -> None:
 
 def overrides(root: Path, *more: str) -> list[str]:
     """What turns conf/experiment/quickstart.yaml into a toy run in `root`."""
+    rounds = ["rounds=2", "epochs=3", "batch_size=8", "theta=0.4"]
     return [
         "experiment=quickstart",
         f"paths.data_dir={root / 'data'}",
@@ -73,10 +74,7 @@ def overrides(root: Path, *more: str) -> list[str]:
         "data.points=32",
         "protocol.epochs=4",
         "protocol.optimizer.lr=0.02",
-        "selftraining.rounds=2",
-        "selftraining.epochs=3",
-        "selftraining.batch_size=8",
-        "selftraining.theta=0.4",
+        *(f"selftraining.{x}" for x in rounds if "selftraining=none" not in more),
         "trainer.threads=1",
         "callbacks=none",
         "logger=csv",

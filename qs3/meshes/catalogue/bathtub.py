@@ -72,8 +72,8 @@ def built_in(draw: Draw) -> list[Mesh]:
     front = inset - depth / 2
     kind = draw.pick("plain", "plain", "panel", "ribs", "curved")
     if kind == "panel":
-        at = (0, front, 0.06)
-        parts.append(rounded_box((0.85 * width, 0.03, top - lip - 0.12), at, radius=0.012, steps=1))
+        size = (0.85 * width, 0.03, top - lip - 0.12)
+        parts.append(rounded_box(size, (0, front, 0.06), radius=0.012, steps=1))
     elif kind == "ribs":
         for k in range(12):
             at = ((width - 0.1) * (k / 11 - 0.5), front, 0.0)

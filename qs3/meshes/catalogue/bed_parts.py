@@ -56,16 +56,20 @@ def bedding(
     Pillows may stand `upright` against a headboard.
     """
     parts = [rounded_box((width, length, thick), (0, 0, z), radius=0.05, crown=0.012)]
+    reach = z + thick - 0.01  # no cover hangs through the floor
     if draw.chance(0.85):
         parts += pillows(draw, width, length / 2, z + thick, upright)
     kind, foot = draw.pick("duvet", "duvet", "duvet", "throw", "bare"), -length / 2
     if kind == "duvet":
-        drop, end = draw.between(0.4, 1.3) * thick, foot + draw.between(0.62, 0.8) * length
+        drop, end = (
+            min(reach, draw.between(0.4, 1.3) * thick),
+            foot + draw.between(0.62, 0.8) * length,
+        )
         parts.append(cover(draw, width + 0.05, z + thick - drop, z + thick, foot - 0.025, end))
         if draw.chance(0.3):  # turned down
             parts.append(cover(draw, width + 0.055, z + thick, z + thick + 0.03, end - 0.3, end))
     elif kind == "throw":
-        end, drop = foot + draw.between(0.45, 0.7), draw.between(0.5, 1.2) * thick
+        end, drop = foot + draw.between(0.45, 0.7), min(reach, draw.between(0.5, 1.2) * thick)
         start = foot + draw.between(0.05, 0.2)
         parts.append(cover(draw, width + 0.03, z + thick - drop, z + thick - 0.01, start, end))
     return parts

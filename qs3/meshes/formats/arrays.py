@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -16,6 +17,13 @@ Triangles = tuple[np.ndarray, np.ndarray]
 """Vertices [V, 3] float64 and faces [F, 3] int64; indices are not checked yet."""
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+def lines(data: bytes) -> Iterator[bytes]:
+    """Lines one by one, whatever ends them: a list of all takes several times the file."""
+    if b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
+    return iter(io.BytesIO(data))
 
 
 def numbers(text: bytes) -> np.ndarray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats.arrays import Triangles, fan, numbers
+from qs3.meshes.formats.arrays import Triangles, fan, lines, numbers
 
 
 def read(data: bytes) -> Triangles:
@@ -21,7 +21,7 @@ def read(data: bytes) -> Triangles:
     coordinates: list[bytes] = []
     corners: list[int] = []
     sizes: list[int] = []
-    for line in data.splitlines():
+    for line in lines(data):
         tokens = line.split(b"#", 1)[0].split()
         if not tokens:
             continue

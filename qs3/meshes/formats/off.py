@@ -10,7 +10,7 @@ import re
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats.arrays import Triangles, check_counts, fan, numbers, whole
+from qs3.meshes.formats.arrays import Triangles, check_counts, fan, lines, numbers, whole
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)(4?n?)OFF[ \t]*(BINARY)?")
 _COUNTS = re.compile(rb"\s*(\d{1,12})[ \t]+(\d{1,12})(?:[ \t]+-?\d{1,12})?(?=\s|$)")
@@ -57,22 +57,22 @@ def _plain_triangles(body: bytes, vertex_count: int, face_count: int) -> Triangl
 
 def _by_lines(body: bytes, vertex_count: int, face_count: int) -> Triangles:
     """Polygons, colours and all else that takes lines to be told apart."""
-    lines = [line for line in body.splitlines() if line and not line.isspace()]
-    if len(lines) < vertex_count + face_count:
+    rows = [line for line in lines(body) if not line.isspace()]
+    if len(rows) < vertex_count + face_count:
         raise MeshError(
             f"is truncated: {vertex_count} vertices and {face_count} faces were promised, "
-            f"{len(lines)} lines are there"
+            f"{len(rows)} lines are there"
         )
-    columns = [line.split(None, 3)[:3] for line in lines[:vertex_count]]
+    columns = [row.split(None, 3)[:3] for row in rows[:vertex_count]]
     coordinates = numbers(b" ".join(token for row in columns for token in row))
     if len(coordinates) != 3 * vertex_count:
         raise MeshError("has a vertex with fewer than three coordinates")
     sizes, corners = [], []
-    for line in lines[vertex_count : vertex_count + face_count]:
-        tokens = line.split()
+    for row in rows[vertex_count : vertex_count + face_count]:
+        tokens = row.split()
         size = int(tokens[0]) if tokens[0].isdigit() else -1
         if not 0 <= size < len(tokens):
-            raise MeshError(f"has a broken face line: {line[:60].decode('ascii', 'replace')!r}")
+            raise MeshError(f"has a broken face line: {row[:60].decode('ascii', 'replace')!r}")
         sizes.append(size)
         corners += tokens[1 : size + 1]
     flat = whole(numbers(b" ".join(corners)), "a vertex index")

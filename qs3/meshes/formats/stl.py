@@ -7,7 +7,7 @@ import struct
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats.arrays import Triangles, check_counts, numbers
+from qs3.meshes.formats.arrays import Triangles, check_counts, lines, numbers
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _FACET_KEYWORDS = [b"facet", b"outer", *[b"vertex"] * 3, b"endloop", b"endfacet"]
@@ -31,8 +31,8 @@ def read(data: bytes) -> Triangles:
 def _text(data: bytes) -> np.ndarray:
     solids: list[bytes] = []
     corners: list[bytes] = []
-    lines = 0
-    for line in data.splitlines():
+    keywords = 0
+    for line in lines(data):
         tokens = line.split()
         if not tokens:
             continue
@@ -40,14 +40,14 @@ def _text(data: bytes) -> np.ndarray:
         if keyword in (b"solid", b"endsolid"):
             solids.append(keyword)
             continue
-        if keyword != _FACET_KEYWORDS[lines % len(_FACET_KEYWORDS)]:
+        if keyword != _FACET_KEYWORDS[keywords % len(_FACET_KEYWORDS)]:
             raise MeshError("is truncated or no STL: its facets are not triangles")
-        lines += 1
+        keywords += 1
         if keyword == b"vertex":
             if len(tokens) != 4:
                 raise MeshError("has a vertex that is not three numbers")
             corners += tokens[1:]
-    if solids != [b"solid", b"endsolid"] * (len(solids) // 2) or lines % len(_FACET_KEYWORDS):
+    if solids != [b"solid", b"endsolid"] * (len(solids) // 2) or keywords % len(_FACET_KEYWORDS):
         raise MeshError("is truncated or no STL: its last facet or endsolid is missing")
     check_counts(len(corners) // 3, len(corners) // 9)
     return numbers(b" ".join(corners))

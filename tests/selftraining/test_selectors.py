@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError, SelectionError
+from qs3.selftraining.selectors import Qbst, check_selection
+
+# Worked by hand for theta = 0.8. Confident: class 0: a b c d e (5), class 1: g h (2),
+# class 2: j (1); n = 8, mu = 3/8, 6/8, 7/8; quotas ceil(15/8) = 2, ceil(12/8) = 2, ceil(7/8) = 1.
+TABLE = [
+    ("a", 0, 0.95),
+    ("b", 0, 0.99),
+    ("c", 0, 0.95),  # ties with a: the smaller id goes first
+    ("d", 0, 0.85),
+    ("e", 0, 0.81),
+    ("f", 0, 0.80),  # not above the threshold
+    ("g", 1, 0.90),
+    ("h", 1, 0.82),
+    ("i", 1, 0.50),
+    ("j", 2, 0.83),
+    ("k", 2, 0.10),
+]
+
+
+def select(table, theta=0.8, classes=3, **settings):
+    ids, predicted, confidence = zip(*table, strict=True)
+    selection = Qbst(**settings).select(
+        np.array(confidence), np.array(predicted), ids, classes, theta
+    )
+    return selection, "".join(sorted(np.array(ids)[selection.selected]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, "abghj"),
+        ({"order": "ascending"}, "deghj"),
+        ({"mu": "one"}, "abcdeghj"),
+        # L_k of all samples: 6, 3, 2; mu = 2/8, 5/8, 6/8; quotas ceil(10/8), ceil(10/8), ceil(6/8)
+        ({"counts": "all"}, "abghj"),
+    ],
+)
+def test_table_worked_by_hand(settings, expected):
+    assert select(TABLE, **settings)[1] == expected
+
+
+def test_figures_of_the_table():
+    selection, _ = select(TABLE)
+    assert selection.confident.tolist() == [5, 2, 1]
+    assert selection.kept.tolist() == [2, 2, 1]
+    assert selection.mu.tolist() == [3 / 8, 6 / 8, 7 / 8]
+
+
+def test_more_predicted_than_confident_is_clamped():
+    table = [("a", 0, 0.9), ("b", 1, 0.9), *((f"z{i}", 0, 0.1) for i in range(9))]
+    selection, kept = select(table, classes=2, counts="all")
+    assert selection.mu.tolist() == [0.0, 0.5]
+    assert kept == "b"
+
+
+def test_the_paper_s_example_of_a_perfect_teacher():
+    """ScanNet10's 80 % part, all confident: the specs give mu = .58 for chair and 3740 in all."""
+    sizes = [80, 270, 388, 517, 2070, 130, 164, 71, 391, 807]
+    predicted = np.repeat(np.arange(10), sizes)
+    ids = [f"{i:05d}" for i in range(len(predicted))]
+    selection = Qbst().select(np.full(len(predicted), 0.9), predicted, ids, 10, 0.8)
+    assert selection.kept[4] == 1194
+    assert abs(int(selection.kept.sum()) - 3740) <= 10
+    exact = [math.ceil((1 - Fraction(n, 4888)) * n) for n in sizes]
+    assert selection.kept.tolist() == exact
+
+
+def test_one_class_only_is_an_error_that_says_so():
+    selection, kept = select([("a", 1, 0.9), ("b", 1, 0.95)])
+    assert kept == ""
+    with pytest.raises(SelectionError, match=r"round 3 with theta=0\.8.*y 0/2.*of one class"):
+        check_selection(selection, ("x", "y", "z"), 3, "warn")
+
+
+def test_nothing_confident_is_an_error_with_counts():
+    selection, _ = select(TABLE, theta=0.995)
+    with pytest.raises(SelectionError, match=r"only 0 .*theta=0\.995.*x 0/0.*lower selftraining"):
+        check_selection(selection, ("x", "y", "z"), 0, "warn")
+
+
+def test_missing_class():
+    selection, _ = select([row for row in TABLE if row[1] != 2])
+    assert check_selection(selection, ("x", "y", "z"), 0, "warn") == ["z"]
+    with pytest.raises(SelectionError, match="no pseudo-label for z"):
+        check_selection(selection, ("x", "y", "z"), 0, "error")
+
+
+@pytest.mark.parametrize("settings", [{"mu": "two"}, {"order": "up"}, {"counts": "some"}])
+def test_wrong_setting_names_the_key(settings):
+    (key,) = settings
+    with pytest.raises(ConfigError, match=f"selftraining.selector.{key}"):
+        Qbst(**settings)
+
+
+tables = st.lists(
+    st.tuples(st.integers(0, 3), st.sampled_from([0.1, 0.5, 0.8, 0.801, 0.9, 0.95, 1.0])),
+    max_size=60,
+).map(lambda rows: [(f"{i:02d}", k, p) for i, (k, p) in enumerate(rows)])
+settings = st.fixed_dictionaries(
+    {
+        "mu": st.sampled_from(["balanced", "one"]),
+        "order": st.sampled_from(["descending", "ascending"]),
+        "counts": st.sampled_from(["confident", "all"]),
+    }
+)
+
+
+@given(tables.filter(bool), settings, st.randoms(use_true_random=False))
+def test_the_order_of_samples_does_not_matter(table, chosen, rng):
+    shuffled = rng.sample(table, len(table))
+    assert select(table, classes=4, **chosen)[1] == select(shuffled, classes=4, **chosen)[1]
+
+
+@given(tables.filter(bool), settings)
+def test_never_below_theta_never_above_the_quota(table, chosen):
+    selection, _ = select(table, classes=4, **chosen)
+    confidence = np.array([p for _, _, p in table])
+    assert (confidence[selection.selected] > 0.8).all()
+    quota = np.ceil(selection.mu * selection.confident + 1e-9)
+    assert (selection.kept <= quota).all()
+    assert selection.kept.sum() == selection.selected.sum()
+
+
+@given(tables.filter(bool))
+def test_mu_falls_as_a_class_grows(table):
+    selection, _ = select(table, classes=4)
+    if selection.confident.sum():
+        order = np.argsort(selection.confident, kind="stable")
+        assert (np.diff(selection.mu[order]) <= 0).all()
+
+
+@given(tables.filter(bool))
+def test_kept_are_the_most_confident(table):
+    selection, _ = select(table, classes=4)
+    p, k = np.array([r[2] for r in table]), np.array([r[1] for r in table])
+    for cls in range(4):
+        kept = p[selection.selected & (k == cls)]
+        left = p[~selection.selected & (k == cls)]
+        assert not len(kept) or not len(left) or kept.min() >= left.max()

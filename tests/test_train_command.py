@@ -1,0 +1,157 @@
+"""The command itself, as a user types it: speed, messages, multirun."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+import qs3.hydra_glue  # noqa: F401 (registers the resolvers)
+from qs3.hydra_glue import build
+from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
+from tests.training.toy import CONF, overrides
+
+ROOT = Path(__file__).parents[1]
+EXPERIMENTS = sorted(
+    path.stem
+    for path in (CONF / "experiment").glob("*.yaml")
+    if "train.py" in path.read_text().splitlines()[1]
+)
+
+
+def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def quickest(folder: Path, *arguments: str) -> tuple[float, subprocess.CompletedProcess]:
+    """Best of three: other work on this machine must not fail a test."""
+    times = []
+    for _ in range(3):
+        began = time.perf_counter()
+        result = command(folder, *arguments)
+        times.append(time.perf_counter() - began)
+        if times[-1] < 2:
+            break
+    return min(times), result
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_composes(name):
+    text = (CONF / "experiment" / f"{name}.yaml").read_text().splitlines()
+    assert text[0] == "# @package _global_"
+    assert text[1].startswith(f"# python train.py experiment={name} ")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("train", [f"experiment={name}"])
+    assert cfg.experiment_name == name
+    for node in (cfg.selftraining, cfg.data.source, cfg.data.target, cfg.method):
+        build(node)
+    build(cfg.protocol.augment)
+    build(cfg.protocol.optimizer)
+
+
+@pytest.mark.parametrize(
+    "override",
+    ["domain@data.source=modelnet10", "domain@data.target=scannet10", "model=dgcnn"]
+    + [f"method={name}" for name in ("source_only", "supervised", "pcm")]
+    + [f"selftraining={name}" for name in ("none", "qbst")]
+    + [f"trainer={name}" for name in ("cpu", "gpu", "ddp")]
+    + [f"logger={name}" for name in ("csv", "wandb")]
+    + ["protocol=paper", "debug=fast", "seed=7", "force=true"],
+)
+def test_names_on_the_command_line(override):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        compose("train", ["experiment=qs3_s2d", override])
+
+
+def test_help_is_quick(tmp_path):
+    seconds, result = quickest(tmp_path, "--help")
+    assert result.returncode == 0
+    assert seconds < 2
+
+
+def test_missing_data_is_said_quickly_and_plainly(tmp_path):
+    seconds, result = quickest(tmp_path, "experiment=qs3_s2d")
+    assert seconds < 2
+    assert result.returncode == 1
+    assert "specklenet10" in result.stderr
+    assert "meta.yaml" in result.stderr
+    assert "generate.py" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_no_torch_before_the_data_are_there():
+    code = "import sys, qs3.run, qs3.hydra_glue; print('torch' in sys.modules)"
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "False"
+
+
+def test_misspelt_key(tmp_path):
+    result = command(tmp_path, "experiment=qs3_s2d", "selftraining.thetaa=1")
+    assert result.returncode == 1
+    assert "thetaa" in result.stderr
+
+
+def test_ddp_is_refused_in_a_multirun(tmp_path):
+    result = command(tmp_path, "experiment=qs3_s2d", "trainer=ddp", "seed=0,1", "-m")
+    assert result.returncode == 1
+    assert "hydra/launcher=joblib" in result.stderr
+
+
+def test_multirun_then_one_seed(tmp_path, toy_data):  # noqa: F811
+    arguments = overrides(tmp_path, f"paths.data_dir={toy_data}", "selftraining=none")
+    sweep = command(tmp_path, *arguments, "seed=0,1", "-m")
+    assert sweep.returncode == 0, sweep.stderr
+    assert re.search(r"quickstart .* ± .* 2", sweep.stdout)
+    assert "simulated" in sweep.stdout
+    zero, one = sorted((tmp_path / "logs" / "quickstart").iterdir())
+    assert (zero / ".hydra" / "config.yaml").is_file()
+    assert not (zero / "wandb").exists()
+
+    seconds, again = quickest(tmp_path, *arguments, "seed=1")
+    assert seconds < 2
+    assert "already finished" in again.stdout
+    alone = command(tmp_path, *arguments, "seed=1", f"paths.log_dir={tmp_path / 'alone'}")
+    assert alone.returncode == 0, alone.stderr
+    (folder,) = (tmp_path / "alone" / "quickstart").iterdir()
+    assert folder.name == one.name
+    assert result_of(folder) == result_of(one)
+
+
+def test_csv_logger_does_not_import_wandb(tmp_path, toy_data):  # noqa: F811
+    code = (
+        "import sys; from pathlib import Path; import qs3.hydra_glue; from qs3.run import train; "
+        "from tests.training.toy import toy_config; "
+        "train(toy_config(Path(sys.argv[1]), sys.argv[2], 'selftraining=none')); "
+        "print('wandb' in sys.modules)"
+    )
+    arguments = [sys.executable, "-c", code, str(tmp_path), f"paths.data_dir={toy_data}"]
+    result = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "False"
+
+
+@pytest.mark.slow
+def test_two_processes(tmp_path, toy_data):  # noqa: F811
+    """DDP on the CPU: finishes, and an interrupted one goes on (from the last checkpoint)."""
+    arguments = overrides(tmp_path, f"paths.data_dir={toy_data}", "trainer.devices=2")
+    result = command(tmp_path, *arguments, "trainer.strategy=ddp")
+    assert result.returncode == 0, result.stderr
+    (folder,) = (tmp_path / "logs" / "quickstart").iterdir()
+    expected = result_of(folder)
+    (folder / "metrics.json").unlink()
+    assert command(tmp_path, *arguments, "trainer.strategy=ddp").returncode == 0
+    assert result_of(folder) == expected

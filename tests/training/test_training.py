@@ -1,0 +1,298 @@
+"""Whole runs on the toy problem: seeds, skipping, labels that must stay hidden, errors."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra.errors import ConfigCompositionException
+
+from qs3 import runs
+from qs3.checkpoints import load
+from qs3.classifier import Classifier
+from qs3.data.store import ManifestRow, open_pointset, write_pointset
+from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
+from qs3.run import train
+from tests.training.conftest import result_of
+from tests.training.toy import CLASSES, toy_config
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def test_metrics_and_files(finished):
+    metrics = runs.read_metrics(finished)
+    assert metrics is not None
+    assert metrics["status"] == "finished"
+    assert (metrics["source"], metrics["target"]) == ("specklenet10", "kinectsim10")
+    assert metrics["simulated"] is True
+    assert metrics["selection"]["student"] == "last"
+    assert metrics["selection"]["teacher"].startswith("source_val, epoch ")
+    assert [r["round"] for r in metrics["rounds"]] == [0, 1]
+    assert [r["theta"] for r in metrics["rounds"]] == [0.4, 0.405]
+    assert metrics["final"]["n"] == 24
+    assert metrics["final"]["majority_rate"] == pytest.approx(1 / 3)
+    rows = table(finished / "history.csv")
+    assert [int(row["epoch"]) for row in rows] == list(range(10))
+    assert [int(row["phase"]) for row in rows] == [0] * 4 + [1] * 3 + [2] * 3
+
+
+def test_it_learns(finished):
+    assert runs.read_metrics(finished)["final"]["accuracy"] > 0.6
+
+
+def test_selected_labels_match_the_table(finished):
+    metrics = runs.read_metrics(finished)
+    rows = table(finished / "round_00" / "pseudo_labels.csv")
+    assert len(rows) == 72
+    kept = [row for row in rows if row["selected"] == "1"]
+    assert len(kept) == metrics["rounds"][0]["total_selected"]
+    assert all(float(row["confidence"]) > 0.4 for row in kept)
+
+
+def test_checkpoint_of_a_phase_holds_the_trained_student(finished):
+    """The reset comes after the checkpoint: the last one equals the student that is reported."""
+    last = load(finished / "last.ckpt")["state_dict"]
+    for name, value in load(finished / "student.pt").items():
+        assert torch.equal(last[f"net.{name}"], value)
+
+
+def test_same_seed_same_result(toy, finished):
+    cfg = toy()
+    train(cfg)
+    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+
+
+def test_seed_1_alone_equals_seed_1_after_seed_0(toy, toy_data, tmp_path):
+    for seed in (0, 1):  # as the basic launcher does: one process
+        torch.manual_seed(123)
+        train(toy(f"seed={seed}"))
+    after = result_of(runs.run_folder(toy("seed=1")))
+    alone = toy("seed=1", f"paths.log_dir={tmp_path / 'alone'}")
+    torch.rand(7)
+    np.random.rand(3)  # noqa: NPY002 (disturbs the global state on purpose)
+    train(alone)
+    assert result_of(runs.run_folder(alone)) == after
+    zero = result_of(runs.run_folder(toy("seed=0")))
+    assert zero["history.csv"] != after["history.csv"]
+
+
+def test_finished_run_is_skipped_and_force_repeats_it(toy, monkeypatch):
+    cfg = toy("selftraining=none", "method=source_only")
+    first = train(cfg)
+    folder = runs.run_folder(cfg)
+    stamp = (folder / "last.ckpt").stat().st_mtime_ns
+    assert train(cfg) == first
+    assert (folder / "last.ckpt").stat().st_mtime_ns == stamp
+    again = train(toy("selftraining=none", "method=source_only", "force=true"))
+    assert (folder / "last.ckpt").stat().st_mtime_ns != stamp
+    assert {**again, "times": 0} == {**first, "times": 0}
+
+
+def test_without_self_training_the_selected_warmup_is_reported(toy):
+    metrics = train(toy("selftraining=none"))
+    assert metrics["rounds"] == []
+    assert metrics["selection"]["student"] == metrics["selection"]["teacher"]
+    selected = {k: v for k, v in metrics["warmup"]["selected"].items() if k != "epoch"}
+    assert metrics["final"] == selected
+
+
+def test_the_warmup_of_self_training_is_the_run_without_it(toy, finished):
+    """So the table row of PCM can be read off the run of PCM + QBST."""
+    metrics = train(toy("selftraining=none"))
+    assert metrics["warmup"] == runs.read_metrics(finished)["warmup"]
+
+
+def test_wandb_offline_beside_csv(toy, finished):
+    import os
+
+    cfg = toy("logger=wandb")
+    train(cfg)
+    folder = runs.run_folder(cfg)
+    assert list((folder / "wandb").glob("offline-run-*"))
+    assert result_of(folder) == result_of(finished)
+    assert "WANDB_MODE" not in os.environ
+
+
+def test_continued_student_with_source_and_pcm(toy):
+    metrics = train(
+        toy("selftraining.init=continue", "selftraining.use_source=true", "selftraining.pcm=true")
+    )
+    assert len(metrics["rounds"]) == 2
+
+
+def test_supervised_is_validated_on_target_training_clouds(toy):
+    metrics = train(toy("method=supervised", "selftraining=none"))
+    assert metrics["selection"]["teacher"].startswith("target_train_val, epoch ")
+    assert metrics["source"] == "kinectsim10"
+
+
+# --- target labels stay hidden ---------------------------------------------------------------
+
+
+def copy_with_other_labels(data: Path, folder: Path) -> None:
+    """The same target clouds and ids under other labels, in both splits."""
+    old = open_pointset(data / "kinectsim10")
+    labels = (old.labels + 1) % 3
+    rows = [
+        ManifestRow(id=i, cls=CLASSES[y], split=s)
+        for i, y, s in zip(old.ids, labels, old.splits, strict=True)
+    ]
+    write_pointset(
+        folder,
+        name="kinectsim10",
+        classes=CLASSES,
+        arrays={"points": old.points},
+        rows=rows,
+        meta={},
+    )
+
+
+def test_other_target_labels_change_the_figures_and_nothing_else(toy, toy_data, tmp_path, finished):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "specklenet10").symlink_to(toy_data / "specklenet10")
+    copy_with_other_labels(toy_data, tmp_path / "other" / "kinectsim10")
+    cfg = toy(f"paths.data_dir={tmp_path / 'other'}")
+    metrics = train(cfg)
+    ours, theirs = result_of(runs.run_folder(cfg)), result_of(finished)
+    assert ours.pop("metrics") != theirs.pop("metrics")
+    assert ours == theirs  # history and all pseudo-labels
+    assert metrics["final"]["accuracy"] < 0.5
+    student = load(runs.run_folder(cfg) / "student.pt")
+    for name, value in load(finished / "student.pt").items():
+        assert torch.equal(student[name], value)
+
+
+def reachable(thing: object, truth: list[torch.Tensor], name: str, seen: set, depth: int = 0):
+    """Names of all tensors and arrays hanging on `thing` that equal one of `truth`."""
+    if id(thing) in seen or depth > 8:
+        return
+    seen.add(id(thing))
+    if isinstance(thing, np.ndarray | torch.Tensor):
+        if any(tuple(thing.shape) == tuple(y.shape) for y in truth):
+            values = np.asarray(thing)
+            if any(values.shape == tuple(y.shape) and (values == y.numpy()).all() for y in truth):
+                yield name
+    elif isinstance(thing, dict):
+        for key, value in list(thing.items()):
+            yield from reachable(value, truth, f"{name}[{key!r}]", seen, depth + 1)
+    elif isinstance(thing, list | tuple):
+        for i, value in enumerate(list(thing)[:50]):
+            yield from reachable(value, truth, f"{name}[{i}]", seen, depth + 1)
+    elif hasattr(thing, "__dict__") and not isinstance(thing, type(np)):
+        for key, value in list(vars(thing).items()):
+            yield from reachable(value, truth, f"{name}.{key}", seen, depth + 1)
+
+
+def test_no_target_label_within_reach_of_training(toy, toy_data, monkeypatch):
+    """Search all that hangs on the trainer for the target's labels; see what the batches hold."""
+    target = open_pointset(toy_data / "kinectsim10")
+    truth = [torch.tensor(target.split(name).labels) for name in ("train", "test")]
+    found: list[str] = []
+    controls: list[str] = []
+    owners: set[str] = set()
+
+    def spy(self, batch, batch_idx, real=Classifier.training_step):
+        owners.update(key for part in batch.values() if isinstance(part, dict) for key in part)
+        if batch_idx == 0:
+            found.extend(reachable(self.trainer, truth, "trainer", set()))
+            self.trainer.datamodule.target.__dict__["planted"] = truth[0].numpy()
+            controls.extend(reachable(self.trainer, truth, "trainer", set()))
+            del self.trainer.datamodule.target.__dict__["planted"]
+        return real(self, batch, batch_idx)
+
+    monkeypatch.setattr(Classifier, "training_step", spy)
+    train(toy("selftraining.rounds=1"))
+    assert found == []
+    assert len(controls) == 7  # the search does find what is planted, in each epoch
+    assert owners == {"points", "y_source", "y_pseudo"}
+
+
+# --- errors ----------------------------------------------------------------------------------
+
+
+def test_misspelt_key():
+    with pytest.raises(ConfigCompositionException, match="thetaa"):
+        toy_config(Path(), "selftraining.thetaa=0.9")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("selftraining.theta=1.5", r"selftraining\.theta must lie in \(0, 1\), got 1\.5"),
+        ("seed=null", "seed must be a whole number"),
+        ("protocol.epochs=0", r"protocol\.epochs"),
+        ("protocol.batch_size=1", r"protocol\.batch_size"),
+        ("data.points=65", r"data\.points is 65"),
+        ("data.val=other", r"data\.val"),
+        ("num_classes=10", r"num_classes is 10.*set num_classes=3"),
+        ("selection.teacher=best", r"selection\.teacher"),
+    ],
+)
+def test_wrong_setting_names_the_key(toy, override, message):
+    with pytest.raises(ConfigError, match=message):
+        train(toy(override))
+
+
+def test_empty_selection(toy):
+    with pytest.raises(SelectionError, match=r"round 0 with theta=0\.9999.*ball 0/0.*lower"):
+        train(toy("selftraining.theta=0.9999", "selftraining.epsilon=0"))
+
+
+def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
+    def only_two(net, points, batch_size, device="cpu"):
+        table = np.full((len(points), 3), 0.02)
+        table[np.arange(len(points)), np.arange(len(points)) % 2] = 0.96
+        return table
+
+    monkeypatch.setattr("qs3.selftraining.callback.predict", only_two)
+    with caplog.at_level(logging.WARNING):
+        metrics = train(toy())
+    assert "no pseudo-label for slab" in caplog.text
+    assert metrics["rounds"][0]["missing_classes"] == ["slab"]
+    with pytest.raises(SelectionError, match="no pseudo-label for slab"):
+        train(toy("selftraining.missing_class=error"))
+
+
+def test_missing_data(toy, tmp_path):
+    with pytest.raises(MissingDataError, match=r"specklenet10.*\n.*meta\.yaml"):
+        train(toy(f"paths.data_dir={tmp_path / 'nowhere'}"))
+
+
+def test_two_runs_in_one_folder(toy):
+    cfg = toy()
+    with (
+        runs.locked(runs.run_folder(cfg)),
+        pytest.raises(Qs3Error, match="another process is training"),
+    ):
+        train(cfg)
+
+
+def test_changed_data_are_refused(toy, toy_data, tmp_path):
+    cfg = toy("selftraining=none")
+    train(cfg)
+    folder = runs.run_folder(cfg)
+    for name in ("metrics.json", "started.json"):
+        value = json.loads((folder / name).read_text())
+        value["data"]["target"] = "0" * 64
+        (folder / name).write_text(json.dumps(value))
+    with pytest.raises(DataError, match=r"another version of kinectsim10.*force=true"):
+        train(cfg)
+    (folder / "metrics.json").unlink()
+    with pytest.raises(DataError, match=r"another version of kinectsim10.*force=true"):
+        train(cfg)
+
+
+def test_damaged_checkpoint(toy, tmp_path):
+    cfg = toy()
+    folder = runs.run_folder(cfg)
+    folder.mkdir(parents=True)
+    (folder / "last.ckpt").write_bytes(b"not a checkpoint")
+    with pytest.raises(DataError, match=r"last\.ckpt cannot be read.*force=true"):
+        train(cfg)
