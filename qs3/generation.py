@@ -122,6 +122,7 @@ def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     settings = {key: plain[key] for key in ("seed", "recipe")}
     settings["domain"] = cfg.domain.path and Path(cfg.domain.path).name
+    settings["version"] = plain.get("version", 1)  # of the recipe, where it is a benchmark
     settings["meshes"] = plain.get("catalogue") if cfg.meshes is None else "folder"
     if renderer:
         settings["renderer"] = plain["renderer"]

@@ -98,8 +98,9 @@ def fit(run: Run) -> dict[str, Any]:
         default_root_dir=run.folder,
     )
     last = run.folder / LAST
-    if last.is_file():
-        log.info("continuing the run in %s", run.folder)
+    log.info(
+        "%s, %d epochs", "fitting, continued" if last.is_file() else "fitting", run.phases.total
+    )
     try:
         trainer.fit(classifier, data, ckpt_path=last if last.is_file() else None, weights_only=True)
     finally:

@@ -36,7 +36,7 @@ def meshes(tmp_path_factory):
     solids = {
         "chair": lambda i: trimesh.creation.box((0.5, 0.5, 0.9 + 0.1 * i)),
         "table": lambda i: trimesh.creation.cylinder(0.6 + 0.1 * i, 0.7),
-        "lamp": lambda i: trimesh.creation.icosphere(1, 0.3 + 0.05 * i),
+        "lamp": lambda i: trimesh.creation.icosphere(3, 0.3 + 0.05 * i),
     }
     for cls, make in solids.items():
         for split, count in (("train", 3), ("test", 2)):
@@ -100,9 +100,9 @@ def test_the_scan_lies_near_the_surface_and_its_twin_on_it(finished, meshes):
         # A sphere fills the unit cube whatever its size: radius 0.5 about the origin.
         noisy = np.abs(np.linalg.norm(pointset.points[i], axis=1) - 0.5)
         true = np.abs(np.linalg.norm(clean.points[i], axis=1) - 0.5)
-        assert np.quantile(true, 0.95) < 0.05  # an icosphere's facets are inside the sphere
+        assert true.max() < 0.01  # facets are a little inside the sphere
         assert np.median(noisy) < 0.06
-        assert noisy.mean() > true.mean()
+        assert noisy.mean() > 2 * true.mean()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
