@@ -5,8 +5,11 @@ Importing this module registers the resolvers `${qs3.run_name:}` and `${qs3.wand
 
 from __future__ import annotations
 
+import atexit
 import logging
+import os
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -77,27 +80,28 @@ class SummaryOfSeeds(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Begin a new list."""
-        import tempfile
-
         handle, name = tempfile.mkstemp(prefix="qs3-multirun-", suffix=".txt")
-        import os
-
         os.close(handle)
         self.journal = Path(name)
+        # Hydra leaves a sweep by the first failed job's exception, past `on_multirun_end`; the
+        # finished seeds are worth a table nevertheless.
+        atexit.register(self._summarise)
 
     def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
-        """Add this job's folder (or say what went wrong: Hydra shows the first error only)."""
+        """Add this job's folder (and say what went wrong: Hydra shows the first error only)."""
         if self.journal is None:
             return
         error = getattr(job_return, "_return_value", None)
         if isinstance(error, Exception):
             log.error("%s failed: %s", " ".join(job_return.overrides), error)
-            return
         with open(self.journal, "a", encoding="utf-8") as file:  # one short write: atomic
             file.write(f"{config.hydra.runtime.output_dir}\n")
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the summary."""
+        self._summarise()
+
+    def _summarise(self) -> None:
         if self.journal is None:
             return
         folders = [Path(line) for line in self.journal.read_text(encoding="utf-8").splitlines()]

@@ -9,6 +9,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from qs3 import runs
+from qs3.data.domain import check_all
 from qs3.data.store import is_finished
 from qs3.errors import ConfigError
 from qs3.hydra_glue import build, in_multirun
@@ -70,8 +71,7 @@ def headline(metrics: dict[str, Any]) -> str:
 
 
 def _fit(run: Run) -> dict[str, Any]:
-    run.source.check()
-    run.target.check()
+    check_all(run.source, run.target)
     from qs3.training import fit  # torch and Lightning from here on
 
     return fit(run)

@@ -1,0 +1,1 @@
+"""Methods of domain adaptation, one paper a file: losses on a shared classifier."""

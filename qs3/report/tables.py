@@ -33,6 +33,8 @@ class Cell:
         row, column: its place.
         overrides: of train.py, without the seed.
         paper: mean and SEM in percent as published, or None.
+        take: "final", or "warmup": the run's teacher before self-training. It equals the
+            final result of the same run with selftraining=none, which need not be trained.
         group: our runs; None if there are none yet.
         missing: why the cell cannot be run at all ("" if it can).
     """
@@ -41,6 +43,7 @@ class Cell:
     column: str
     overrides: tuple[str, ...]
     paper: tuple[float, float] | None
+    take: str = "final"
     group: Group | None = None
     missing: str = ""
 
@@ -51,7 +54,8 @@ class Cell:
 
     def ours(self, metric: str) -> Stat | None:
         """Our mean of a metric; None if there is none."""
-        return self.group.stat("final", metric) if self.group else None
+        where = ("warmup", "selected") if self.take == "warmup" else ("final",)
+        return self.group.stat(*where, metric) if self.group else None
 
     def text(self, metric: str) -> str:
         """What the table shows: the number, or why there is none."""
@@ -130,6 +134,7 @@ def build_table(
                 column,
                 (*shlex.split(row[column]["run"]), *more),
                 None if target or "paper" not in row[column] else tuple(row[column]["paper"]),
+                row[column].get("take", "final"),
             )
             for row in spec["rows"]
             for column in spec["columns"]

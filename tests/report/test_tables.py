@@ -59,24 +59,29 @@ def test_the_papers_numbers(empty):
 
 def test_cells_differ(empty):
     for name in EXPECTED:
-        commands = [c.overrides for c in empty[name].cells if c.row != "Supervised"]
+        commands = [(c.overrides, c.take) for c in empty[name].cells if c.row != "Supervised"]
         assert len(set(commands)) == len(commands)
 
 
 def test_quickstart_filled(tmp_path):
     empty = build_table("quickstart", tmp_path)
-    assert "python train.py experiment=quickstart selftraining=none" in markdown(empty)
+    # PCM is the warm-up of QS3: one command fills both rows.
+    assert markdown(empty).count("python train.py experiment=quickstart") == 3
     assert markdown(empty).count("not run") == 8
-    for cell in empty.cells[:3]:
+    for cell in empty.cells[:2]:
         run_cell(tmp_path, cell)
-    run_cell(tmp_path, empty.cells[3], seeds=(0,), accuracy=0.7)
+    warmup = {"selected": {"accuracy": 0.52, "balanced_accuracy": 0.42, "epoch": 7}}
+    run_cell(tmp_path, empty.cells[3], seeds=(0,), accuracy=0.7, warmup=warmup)
     text = markdown(build_table("quickstart", tmp_path))
     lines = text.splitlines()
     assert lines[2].split("|")[1:-1] == [
         " method                           ", " accuracy % ", " balanced accuracy % ", " seeds   ",
     ]  # fmt: skip
     assert (
-        "| PCM, speckle scans               | 51.0 ± 0.6 | 41.0 ± 0.6          | 0, 1, 2 |" in text
+        "| source only, speckle scans (S)   | 51.0 ± 0.6 | 41.0 ± 0.6          | 0, 1, 2 |" in text
+    )
+    assert (
+        "| PCM, speckle scans               | 52.0 (n=1) | 42.0 (n=1)          | 0       |" in text
     )
     assert (
         "| QS3 = PCM + QBST, speckle scans  | 70.0 (n=1) | 60.0 (n=1)          | 0       |" in text

@@ -1,0 +1,42 @@
+"""Every experiment file really runs: two batches an epoch, on files in the published formats."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from qs3 import runs
+from qs3.run import train
+from tests.fixtures.published import write_all
+
+ROOT = Path(__file__).resolve().parents[1]
+EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("published")
+    write_all(folder)
+    return folder
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_experiment_runs(experiment, data_dir, tmp_path):
+    lines = (ROOT / "conf" / "experiment" / f"{experiment}.yaml").read_text().splitlines()
+    assert lines[1].startswith(f"# python train.py experiment={experiment} ")
+    overrides = [
+        f"experiment={experiment}", "debug=fast", "data.points=128", "logger=csv", "trainer.threads=1",
+        f"paths.data_dir={data_dir}", f"paths.log_dir={tmp_path}", "seed=0",
+    ]  # fmt: skip
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("train", overrides)
+        rounds = cfg.selftraining.get("rounds", 0)
+        if rounds:
+            cfg = compose("train", [*overrides, "selftraining.rounds=2"])
+    metrics = train(cfg)
+    assert metrics["experiment"] == experiment
+    assert metrics == json.loads((runs.run_folder(cfg) / "metrics.json").read_text())
+    assert len(metrics["rounds"]) == min(rounds, 2)
+    assert metrics["final"]["n"] == 20  # two test clouds of each of ten classes
+    assert metrics["simulated"] == (metrics["target"] == "kinectsim10")
