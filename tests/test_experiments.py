@@ -26,8 +26,8 @@ def test_experiment_runs(experiment, data_dir, tmp_path):
     lines = (ROOT / "conf" / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[1].startswith(f"# python train.py experiment={experiment} ")
     overrides = [
-        f"experiment={experiment}", "debug=fast", "data.points=128", "logger=csv", "trainer.threads=1",
-        f"paths.data_dir={data_dir}", f"paths.log_dir={tmp_path}", "seed=0",
+        f"experiment={experiment}", "debug=fast", "data.points=128", "logger=csv", "seed=0",
+        "trainer.threads=1", f"paths.data_dir={data_dir}", f"paths.log_dir={tmp_path}",
     ]  # fmt: skip
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("train", overrides)
