@@ -93,7 +93,7 @@ class SummaryOfSeeds(Callback):
             return
         error = getattr(job_return, "_return_value", None)
         if isinstance(error, Exception):
-            log.error("%s failed: %s", " ".join(job_return.overrides), error)
+            log.error("%s failed: %s", " ".join(job_return.overrides), str(error).splitlines()[0])
         with open(self.journal, "a", encoding="utf-8") as file:  # one short write: atomic
             file.write(f"{config.hydra.runtime.output_dir}\n")
 

@@ -19,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 
-from qs3.errors import Qs3Error
+from qs3.errors import Qs3Error, RenderError
 from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
 from qs3.synthesis.recipes import Cloud, Recipe
@@ -27,6 +27,7 @@ from qs3.synthesis.recipes import Cloud, Recipe
 log = logging.getLogger(__name__)
 
 OBJECTS_PER_WORKER = 200
+DIED = "the worker process died twice on this object (out of memory, or a crash)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +92,14 @@ def renderer_provenance(job: Job) -> dict[str, str]:
     """
     if not job.recipe.needs_renderer:
         return {}
-    with _pool(job, 1) as pool:
-        provenance, found_out = pool.submit(_provenance).result()
+    try:
+        with _pool(job, 1) as pool:
+            provenance, found_out = pool.submit(_provenance).result()
+    except BrokenProcessPool as error:
+        raise RenderError(
+            "the renderer's process died at its start (out of memory, killed, or a library that "
+            "does not fit): run again, and see `python -m qs3.doctor` if it happens again"
+        ) from error
     # What the child found out about this machine need not be found out by every worker.
     os.environ.update(found_out)
     return provenance
@@ -105,6 +112,9 @@ def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]
         job: what to do.
         items: with which meshes.
         workers: processes; 0 works in this one (for tests and debuggers).
+
+    Raises:
+        RenderError: one object after the other kills its worker; it is not the objects.
     """
     if workers == 0:
         renderer = job.make_renderer() if job.recipe.needs_renderer else None
@@ -120,9 +130,16 @@ def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]
                 yield outcome
         except BrokenProcessPool:
             log.warning("a worker process died; trying the objects that it had one at a time")
-            for item in list(left.values())[: 2 * workers]:
-                yield _scan_alone(job, item)
-                del left[item.id]
+            alone = [_scan_alone(job, left[i]) for i in list(left)[: max(2 * workers, 3)]]
+            survived = [outcome for outcome in alone if outcome.reason != DIED]
+            if len(alone) > 2 and not survived:
+                raise RenderError(
+                    f"{len(alone)} objects in a row ended their worker process: this machine lacks "
+                    "memory, or the renderer does not work here (python -m qs3.doctor)"
+                ) from None
+            for outcome in alone:
+                del left[outcome.item_id]
+                yield outcome
             yield from scan_all(job, list(left.values()), workers)
 
 
@@ -156,8 +173,7 @@ def _scan_alone(job: Job, item: MeshItem) -> Outcome:
         with _pool(job, 1) as pool:
             return pool.submit(_scan, item).result()
     except BrokenProcessPool:
-        reason = "the worker process died twice on this object (out of memory, or a crash)"
-        return Outcome(item.id, "", None, reason, time.perf_counter() - start)
+        return Outcome(item.id, "", None, DIED, time.perf_counter() - start)
 
 
 _JOB: Job | None = None
