@@ -27,7 +27,7 @@ doctor: install ## what works here, and which system package would help
 	@$(RUN) -m qs3.doctor
 
 quickstart: install ## the main job on embedded data, about a quarter of an hour on 2 cores
-	@$(RUN) -m qs3.quickstart out=$(OUT)
+	@$(RUN) -m qs3.quickstart --out $(OUT)
 
 test: install ## lint, types and all tests that are not slow
 	$(VENV)/bin/ruff check .

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -11,6 +11,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 
 from qs3.data.batches import generator_of
+from qs3.errors import ConfigError
 from qs3.methods.base import Method
 from qs3.methods.student import Student
 from qs3.randomness import derive
@@ -66,14 +67,17 @@ class Classifier(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """One optimiser, one schedule: a cosine in each phase."""
-        optimizer = self.build_optimizer(self.parameters())
+        try:
+            optimizer = self.build_optimizer(self.parameters())
+        except (TypeError, ValueError) as error:  # e.g. a negative learning rate
+            raise ConfigError(f"protocol.optimizer: {error}") from error
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.phases.cosine)
         return {"optimizer": optimizer, "lr_scheduler": schedule}
 
-    def start_phase(self, phase: int, fresh: bool) -> None:
-        """Forget the optimiser's moments and, if `fresh`, the weights (start of a round)."""
-        if fresh:
-            self.net.load_state_dict(self.fresh_net(phase).state_dict())
+    def start_phase(self, weights: Mapping[str, Tensor] | None) -> None:
+        """Forget the optimiser's moments; go on with `weights`, or with the net's if None."""
+        if weights is not None:
+            self.net.load_state_dict(weights)
         optimizer = self.optimizers()
         assert isinstance(optimizer, torch.optim.Optimizer)
         optimizer.state.clear()

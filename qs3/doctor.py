@@ -81,9 +81,11 @@ def main() -> None:
 
 def run(check: Check) -> tuple[bool, str]:
     """Whether it works, and its last line of output."""
-    done = subprocess.run(
-        [sys.executable, "-c", check.code], capture_output=True, text=True, timeout=300, check=False
-    )
+    command = [sys.executable, "-c", check.code]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    except subprocess.TimeoutExpired:
+        return False, "no answer within 5 minutes"
     lines = (done.stdout.strip() or done.stderr.strip()).splitlines()
     return done.returncode == 0, lines[-1] if lines else f"ended with status {done.returncode}"
 

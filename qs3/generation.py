@@ -6,15 +6,8 @@ Light to import: renderers live in worker processes only.
 from __future__ import annotations
 
 import logging
-import math
-import platform
 import time
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -22,9 +15,16 @@ from omegaconf import DictConfig, OmegaConf
 from qs3.classes import CLASSES
 from qs3.data.domain import Domain
 from qs3.data.store import ManifestRow, PointSet, is_finished, open_pointset, write_pointset
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
+from qs3.generation_plan import (
+    benchmark,
+    check,
+    check_recipe,
+    describe,
+    mesh_items,
+    mesh_root,
+)
 from qs3.hydra_glue import build
-from qs3.meshes.folder import MeshFolder
 from qs3.meshes.source import MeshItem
 from qs3.runs import locked
 from qs3.synthesis.parts import Parts, check_same_recipe, forget
@@ -58,19 +58,23 @@ def generate(cfg: DictConfig) -> PointSet:
         make_renderer=partial(_make_renderer, OmegaConf.to_container(cfg.renderer, resolve=True)),
         seed=cfg.seed,
     )
-    with locked(folder):
+    check_recipe(job.recipe, cfg)
+    with locked(
+        folder, doing="making the dataset in", advice="wait for it, or give another paths.data_dir"
+    ):
+        parts = Parts(folder)
         if cfg.force:
             forget(folder)
         recipe = describe(cfg, items, renderer_provenance(job))
         if is_finished(folder):
             check_same_recipe(folder, recipe)
+            parts.clear()  # a kill after the last write leaves them
             log.info("%s is already there: %s", domain.label, folder)
             return open_pointset(folder, domain.variant)
         start = time.perf_counter()
-        parts = Parts(folder)
         parts.begin(recipe)
-        _scan_missing(job, items, parts, cfg.workers, domain.label)
-        pointset = _assemble(domain, items, parts, recipe, cfg)
+        passing = _scan_missing(job, items, parts, cfg.workers, domain.label)
+        pointset = _assemble(domain, items, parts, passing, recipe, cfg)
         parts.clear()
     _report(pointset, items, time.perf_counter() - start)
     failed = len(items) - len(pointset.ids)
@@ -79,110 +83,50 @@ def generate(cfg: DictConfig) -> PointSet:
     return pointset
 
 
-def check(cfg: DictConfig) -> None:
-    """Raise ConfigError for settings that no later step would explain as well."""
-    if not isinstance(cfg.seed, int) or cfg.seed < 0:
-        raise ConfigError(f"seed must be a whole number >= 0, got {cfg.seed!r}")
-    if cfg.workers < 0:
-        raise ConfigError(f"workers must be at least 0, got {cfg.workers}")
-    if cfg.limit is not None and cfg.limit < 1:
-        raise ConfigError(f"limit must be at least 1, got {cfg.limit}")
-    if cfg.scans < 1:
-        raise ConfigError(f"scans must be at least 1, got {cfg.scans}")
-    if not 0 < cfg.fraction <= 1:
-        raise ConfigError(f"fraction must be in (0, 1], got {cfg.fraction}")
-    unknown = sorted(set(cfg.classes or ()) - set(CLASSES))
-    if unknown:
-        raise ConfigError(f"classes: {unknown} are not among the known {', '.join(CLASSES)}")
-
-
-def mesh_items(cfg: DictConfig) -> list[MeshItem]:
-    """The objects to scan, from the user's folder or the embedded catalogue."""
-    classes = tuple(cfg.classes) if cfg.classes else None
-    if cfg.meshes is not None:
-        items = MeshFolder(
-            path=Path(cfg.meshes).expanduser(),
-            classes=classes,
-            test_fraction=cfg.test_fraction,
-            half=cfg.half,
-        ).items()
-    elif cfg.half == "all":
-        items = build(cfg.catalogue, classes=classes or CLASSES).items()
-    else:
-        raise ConfigError("half= divides a folder of meshes: give one with meshes=PATH")
-    kept = _first_of_each(items, cfg.limit, cfg.fraction)
-    return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]
-
-
-def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -> dict[str, Any]:
-    """All that decides the bytes of a dataset: what a resume is compared with.
-
-    A folder of meshes is described by what is in it, not by where it lies.
-    """
-    plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    settings = {key: plain[key] for key in ("seed", "recipe")}
-    settings["domain"] = cfg.domain.path and Path(cfg.domain.path).name
-    settings["version"] = plain.get("version", 1)  # of the recipe, where it is a benchmark
-    settings["meshes"] = plain.get("catalogue") if cfg.meshes is None else "folder"
-    if renderer:
-        settings["renderer"] = plain["renderer"]
-    return {
-        "settings": settings,
-        "objects": [f"{item.id} {item.origin}" for item in items],
-        "versions": {
-            **renderer,
-            "numpy": version("numpy"),
-            "opencv": version("opencv-python-headless"),
-            "machine": platform.machine(),
-        },
-    }
-
-
 def _make_renderer(settings: Any) -> Any:
     return build(settings)
 
 
-def _scan_of(item: MeshItem, scan: int) -> MeshItem:
-    """The same mesh under another id, so with other randomness; scan 0 keeps its id."""
-    return item if scan == 0 else replace(item, id=f"{item.id}~{scan}")
+def _scan_missing(
+    job: Job, items: list[MeshItem], parts: Parts, workers: int, label: str
+) -> dict[str, Outcome]:
+    """Scan what has no part yet; the failures that are not the objects' fault, by id.
 
-
-def _first_of_each(items: Sequence[MeshItem], limit: int | None, fraction: float) -> list[MeshItem]:
-    totals = Counter((item.cls, item.split) for item in items)
-    seen: Counter[tuple[str, str]] = Counter()
-    kept = []
-    for item in items:
-        group = (item.cls, item.split)
-        wanted = math.ceil(fraction * totals[group] - 1e-9)
-        if seen[group] < min(wanted, limit or wanted):
-            kept.append(item)
-        seen[group] += 1
-    return kept
-
-
-def _scan_missing(job: Job, items: list[MeshItem], parts: Parts, workers: int, label: str) -> None:
+    Those get no part: should this run be interrupted, the next one tries them again.
+    """
     missing = [item for item in items if not parts.done(item.id)]
+    passing = {}
     if len(missing) < len(items):
         log.info("continuing: %d of %d objects are done", len(items) - len(missing), len(items))
     with progress_bar(label, total=len(items), done=len(items) - len(missing)) as advance:
         for outcome in scan_all(job, missing, workers):
-            parts.save(outcome)
+            if outcome.lasting:
+                parts.save(outcome)
+            else:
+                passing[outcome.item_id] = outcome
             advance()
             if outcome.cloud is None:
                 log.warning("%s: %s", outcome.item_id, outcome.reason)
+    return passing
 
 
 def _assemble(
-    domain: Domain, items: list[MeshItem], parts: Parts, recipe: dict[str, Any], cfg: DictConfig
+    domain: Domain,
+    items: list[MeshItem],
+    parts: Parts,
+    passing: dict[str, Outcome],
+    recipe: dict[str, Any],
+    cfg: DictConfig,
 ) -> PointSet:
     outcomes: list[Outcome] = []
     for item in items:
-        outcome = parts.load(item.id)
+        outcome = passing.get(item.id) or parts.load(item.id)
         if outcome is None:
             raise DataError(f"the part of {item.id} is gone: run the same command again")
         outcomes.append(outcome)
     good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
     if not good:
+        forget(domain.folder)  # nothing is lost, and mended settings are not refused
         raise DataError(
             f"all {len(items)} objects failed; the first: {items[0].id}: {outcomes[0].reason}"
         )
@@ -197,7 +141,7 @@ def _assemble(
             views=outcome.cloud.views if outcome.cloud else None,
             valid_points=outcome.cloud.valid_points if outcome.cloud else None,
             status="ok" if outcome.cloud else "failed",
-            reason=outcome.reason,
+            reason=_without_root(outcome.reason, cfg),
         )
         for item, outcome in zip(items, outcomes, strict=True)
     ]
@@ -209,10 +153,19 @@ def _assemble(
         rows=rows,
         meta={
             "simulated": domain.simulated,
+            "benchmark": benchmark(cfg, recipe),
             "settings": recipe["settings"],
             "versions": recipe["versions"],
         },
     )
+
+
+def _without_root(reason: str, cfg: DictConfig) -> str:
+    """The reason with paths relative to the mesh folder: a manifest is the same anywhere."""
+    if cfg.meshes is None:
+        return reason
+    root = mesh_root(cfg)
+    return reason.replace(f"{root.resolve()}/", "").replace(f"{root}/", "")
 
 
 def _report(pointset: PointSet, items: list[MeshItem], seconds: float) -> None:
@@ -222,4 +175,6 @@ def _report(pointset: PointSet, items: list[MeshItem], seconds: float) -> None:
     failed = len(items) - len(pointset.ids)
     if failed:
         log.warning("%d objects failed; manifest.csv says why", failed)
+    if kind := pointset.meta.get("benchmark"):
+        log.info("this is %s", kind)
     log.info("content hash %s, %.0f s", pointset.sha256[:16], seconds)

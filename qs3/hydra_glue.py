@@ -6,8 +6,10 @@ Importing this module registers the resolvers `${qs3.run_name:}` and `${qs3.wand
 from __future__ import annotations
 
 import atexit
+import json
 import logging
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable
@@ -22,7 +24,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from qs3 import runs
-from qs3.errors import Qs3Error
+from qs3.errors import ConfigError, Qs3Error
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +42,12 @@ OmegaConf.register_new_resolver("qs3.wandb_id", _wandb_id, replace=True)
 
 
 def build(node: Any, **more: Any) -> Any:
-    """`instantiate` with plain containers, and with our own errors as they were raised."""
+    """`instantiate` with plain containers, and with our own errors as they were raised.
+
+    Raises:
+        ConfigError: the target does not take what stands in the config (a TypeError or ValueError
+            of its own); names the place in the config.
+    """
     try:
         return instantiate(node, _convert_="all", **more)
     except InstantiationException as error:
@@ -49,6 +56,10 @@ def build(node: Any, **more: Any) -> Any:
             if isinstance(cause, Qs3Error):
                 raise cause from None
             cause = cause.__cause__ or cause.__context__
+        if isinstance(error.__cause__, TypeError | ValueError):
+            place = re.search(r"^full_key: (.+)$", str(error), re.MULTILINE)
+            where = place[1] if place else str(error).splitlines()[0]
+            raise ConfigError(f"{where}: {error.__cause__}") from error
         raise
 
 
@@ -71,8 +82,8 @@ def in_multirun() -> bool:
 class SummaryOfSeeds(Callback):
     """After a multirun: mean and SEM over the seeds of each config.
 
-    The list of folders is a file, because jobs may run in other processes (joblib, submitit);
-    its name travels to them inside this object.
+    The list of folders and errors is a file, because jobs may run in other processes (joblib,
+    submitit); its name travels to them inside this object.
     """
 
     def __init__(self) -> None:
@@ -88,14 +99,19 @@ class SummaryOfSeeds(Callback):
         atexit.register(self._summarise)
 
     def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
-        """Add this job's folder (and say what went wrong: Hydra shows the first error only)."""
+        """Add this job's folder (and say what went wrong: Hydra shows the first error only).
+
+        What all jobs lack, say the data, is said once.
+        """
         if self.journal is None:
             return
         error = getattr(job_return, "_return_value", None)
-        if isinstance(error, Exception):
-            log.error("%s failed: %s", " ".join(job_return.overrides), str(error).splitlines()[0])
+        text = (str(error) or type(error).__name__) if isinstance(error, Exception) else ""
+        if text and text not in (entry["error"] for entry in self._entries()):
+            log.error("%s failed: %s", " ".join(job_return.overrides), text.splitlines()[0])
+        entry = {"folder": str(config.hydra.runtime.output_dir), "error": text}
         with open(self.journal, "a", encoding="utf-8") as file:  # one short write: atomic
-            file.write(f"{config.hydra.runtime.output_dir}\n")
+            file.write(json.dumps(entry) + "\n")
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the summary."""
@@ -104,11 +120,15 @@ class SummaryOfSeeds(Callback):
     def _summarise(self) -> None:
         if self.journal is None:
             return
-        folders = [Path(line) for line in self.journal.read_text(encoding="utf-8").splitlines()]
+        folders = sorted({Path(entry["folder"]) for entry in self._entries()})
         self.journal.unlink(missing_ok=True)
         self.journal = None
-        if folders:
-            sys.stdout.write(summarise(sorted(set(folders))) + "\n")
+        if any((folder / runs.METRICS).is_file() for folder in folders):
+            sys.stdout.write(summarise(folders) + "\n")
+
+    def _entries(self) -> list[dict[str, str]]:
+        assert self.journal is not None
+        return [json.loads(line) for line in self.journal.read_text(encoding="utf-8").splitlines()]
 
 
 def summarise(folders: list[Path]) -> str:

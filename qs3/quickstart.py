@@ -19,14 +19,14 @@ from omegaconf import OmegaConf
 ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "conf" / "table" / "quickstart.yaml"
 
-MESHES = "limit=28"
+MESHES = "limit=24"
 """Objects a class and split of the source domains (the catalogue has 100)."""
 
 DATASETS = (
     f"generate.py domain=modelnet10 {MESHES}",
     f"generate.py domain=specklenet10 {MESHES} views=3"
     " sensor=speckle_stereo_small renderer=mitsuba renderer.samples=4",
-    "generate.py domain=kinectsim10 fraction=0.7 views=3 renderer.samples=4",
+    "generate.py domain=kinectsim10 fraction=0.6 views=3 renderer.samples=4",
 )
 
 

@@ -15,10 +15,12 @@ from qs3.errors import ConfigError
 from qs3.hydra_glue import build, in_multirun
 from qs3.runs import Run
 from qs3.selftraining.scheme import Phases, Scheme
+from qs3.settings import number, one_of, whole
 
 log = logging.getLogger(__name__)
 
 TEACHERS = ("source_val", "last")
+_SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
 
 
 def train(cfg: DictConfig) -> dict[str, Any]:
@@ -26,6 +28,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
 
     Everything that can be wrong with the settings or the data is found before torch is imported.
     """
+    _check_settings(cfg)
     scheme: Scheme = build(cfg.selftraining)
     run = Run(
         cfg=cfg,
@@ -36,14 +39,12 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         source=build(cfg.data.source),
         target=build(cfg.data.target),
     )
-    if cfg.selection.teacher not in TEACHERS:
-        raise ConfigError(
-            f"selection.teacher must be one of {TEACHERS}, got {cfg.selection.teacher!r}"
-        )
+    _refuse_rounds_of_upper_bound(run)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
         return _fit(run)
 
+    _warn_of_one_domain(run)
     with runs.locked(run.folder):
         if cfg.force:
             runs.clear(run.folder)
@@ -52,6 +53,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
             metrics = _fit(run)
             runs.write_metrics(run.folder, metrics)
         else:
+            runs.check_config(run.folder, metrics.get("config_sha256"), runs.config_sha256(cfg))
             _refuse_other_data(run, metrics["data"])
             log.info("already finished (force=true repeats it)")
     log.info("%s", headline(metrics))
@@ -75,6 +77,40 @@ def _fit(run: Run) -> dict[str, Any]:
     from qs3.training import fit  # torch and Lightning from here on
 
     return fit(run)
+
+
+def _check_settings(cfg: DictConfig) -> None:
+    """Raise ConfigError for settings that would otherwise fail late, and without their key."""
+    one_of("selection.teacher", cfg.selection.teacher, TEACHERS)
+    whole("data.points", cfg.data.points, 1)
+    whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
+    whole("protocol.batch_size", cfg.protocol.batch_size, 2)  # batch norm needs two clouds
+    if "lr" in cfg.protocol.optimizer:
+        number("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
+    if cfg.trainer.threads is not None:
+        whole("trainer.threads", cfg.trainer.threads, 1)
+
+
+def _is_upper_bound(cfg: DictConfig) -> bool:
+    return cfg.method.get("_target_") == _SUPERVISED
+
+
+def _refuse_rounds_of_upper_bound(run: Run) -> None:
+    if _is_upper_bound(run.cfg) and run.scheme.rounds:
+        raise ConfigError(
+            "method=supervised trains on the target's labels and has no use for pseudo-labels; "
+            "set selftraining=none"
+        )
+
+
+def _warn_of_one_domain(run: Run) -> None:
+    if run.source.folder == run.target.folder and not _is_upper_bound(run.cfg):
+        log.warning(
+            "data.source (%s) and data.target (%s) are the same dataset: the target's training "
+            "labels are used, so this is no adaptation",
+            run.source.name,
+            run.target.name,
+        )
 
 
 def _refuse_other_data(run: Run, hashes: dict[str, str]) -> None:

@@ -6,7 +6,7 @@ written last, and atomically: it is the mark of a finished run.
 
     <paths.log_dir>/<experiment_name>/seed<seed>-<hash>/
         .hydra/config.yaml   the composed config
-        started.json         the hashes of the datasets, the versions, the config hash
+        started.json         the hashes of the datasets and the config, the versions
         last.ckpt            everything needed to continue
         warmup_selected.pt   weights of the teacher of round 0;  warmup_last.pt, student.pt likewise
         round_03/pseudo_labels.csv
@@ -24,21 +24,22 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.data.domain import Domain
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.files import write_json
+from qs3.files import make_folder, write_json
 from qs3.selftraining.scheme import Phases, Scheme
+from qs3.settings import whole
 
 METRICS = "metrics.json"
 STARTED = "started.json"
 
 # Keys that do not change a result: where things lie, what is shown, how data would be made, and the
 # seed, which is in the folder's name. Everything else is hashed, so two different runs never share
-# a folder. (Data made in another way have another hash, which `started.json` guards.)
+# a folder. (Other data, wherever they lie, have another hash, which `started.json` guards.)
 _UNHASHED = (
     "seed",
     "paths",
@@ -46,12 +47,17 @@ _UNHASHED = (
     "hydra",
     "force",
     "callbacks.progress",
+    "data.cache_dir",
     *(
         f"data.{domain}.{key}"
         for domain in ("source", "target")
-        for key in ("synthesis", "how_to_get", "make", "stand_in")
+        for key in (
+            *("path", "published.folder", "title", "symbol"),
+            *("synthesis", "how_to_get", "make", "stand_in"),
+        )
     ),
 )
+_NO_ROUNDS = "qs3.selftraining.scheme.no_rounds"
 _KEPT_WHEN_CLEARED = (".hydra", ".lock")
 
 
@@ -68,8 +74,8 @@ class Run:
     target: Domain
 
 
-def config_hash(cfg: DictConfig) -> str:
-    """8 hex digits over the composed config, without the keys that do not change a result.
+def config_sha256(cfg: DictConfig) -> str:
+    """64 hex digits over the composed config, without the keys that do not change a result.
 
     Interpolations are hashed as they are written: what they point to is hashed at its own place,
     or does not matter (`${paths.data_dir}/...`).
@@ -79,11 +85,18 @@ def config_hash(cfg: DictConfig) -> str:
         *parents, leaf = key.split(".")
         node = plain
         for parent in parents:
-            node = (node or {}).get(parent)
+            node = node.get(parent) if isinstance(node, dict) else None
         if isinstance(node, dict):
             node.pop(leaf, None)
+    if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
+        plain["selftraining"] = None
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:8]
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def config_hash(cfg: DictConfig) -> str:
+    """The first 8 digits of `config_sha256`, for names (`check_config` compares all 64)."""
+    return config_sha256(cfg)[:8]
 
 
 def run_name(cfg: DictConfig) -> str:
@@ -102,9 +115,7 @@ def check_seed(seed: Any) -> int:
     Raises:
         ConfigError: it is not.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ConfigError(f"seed must be a whole number >= 0, got {seed!r}; e.g. seed=0")
-    return seed
+    return whole("seed", seed, 0)
 
 
 def read_metrics(folder: str | Path) -> dict[str, Any] | None:
@@ -141,6 +152,20 @@ def check_data(folder: Path, domain: str, expected: str, found: str) -> None:
         )
 
 
+def check_config(folder: Path, expected: str | None, found: str) -> None:
+    """Refuse to continue, or to reuse, the run of another config (of the same 8 digits).
+
+    Raises:
+        ConfigError: the hashes differ.
+    """
+    if found != expected:
+        raise ConfigError(
+            f"{folder} holds a run with other settings (config hash {expected}, now {found}; they "
+            "are in .hydra/config.yaml); choose another experiment_name, or start again with "
+            "force=true"
+        )
+
+
 def clear(folder: str | Path) -> None:
     """Delete what an earlier run left, except what Hydra has just written there."""
     folder = Path(folder)
@@ -156,23 +181,43 @@ def clear(folder: str | Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(folder: str | Path) -> Iterator[None]:
+def locked(
+    folder: str | Path,
+    doing: str = "training in",
+    advice: str = "wait for it, stop it, or choose another seed or experiment_name",
+) -> Iterator[None]:
     """Own the folder until the block, or the process, ends (however it ends).
 
+    Args:
+        folder: made if it is not there.
+        doing: what the other process does to the folder, for the message.
+        advice: what to do about it.
+
     Raises:
-        Qs3Error: another process is training there.
+        Qs3Error: another process owns it, or it cannot be made or written to.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    with open(folder / ".lock", "ab") as file:
+    folder = make_folder(folder)
+    with _open_lock(folder / ".lock") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise Qs3Error(
-                f"another process is training in {folder}; wait for it, stop it, "
-                "or choose another seed or experiment_name"
-            ) from error
+            raise Qs3Error(f"another process is {doing} {folder}; {advice}") from error
         yield
+
+
+def _open_lock(path: Path) -> BinaryIO:
+    try:
+        return open(path, "ab")
+    except OSError as error:
+        raise Qs3Error(
+            f"cannot write {path} ({error}); check the permissions or choose another folder"
+        ) from error
+
+
+def _without_rounds(selftraining: Any) -> bool:
+    if not isinstance(selftraining, dict):
+        return True
+    return selftraining.get("_target_") == _NO_ROUNDS or selftraining.get("rounds") == 0
 
 
 def _read_json(path: Path) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 
 import qs3
@@ -23,6 +24,7 @@ from qs3 import runs
 from qs3.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
 from qs3.classifier import Classifier
 from qs3.data.datamodule import UdaData, load_clouds, without_labels
+from qs3.data.prepare import remove_old_leftovers
 from qs3.data.store import PointSet
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation import Evaluation
@@ -89,8 +91,8 @@ def fit(run: Run) -> dict[str, Any]:
     callbacks: list[Callback] = [warmup, rounds, EpochRows(run.phases), SaveLast(run.folder)]
 
     # 3. One fit over all phases. A checkpoint lies between two epochs; a resume repeats an epoch.
-    trainer = Trainer(
-        **_trainer_settings(cfg),
+    trainer = _make_trainer(
+        cfg,
         max_epochs=run.phases.total,
         callbacks=[*_build_each(cfg.callbacks), *callbacks],
         logger=[CsvHistory(run.folder), *_build_each(cfg.logger)],
@@ -122,12 +124,13 @@ def fit(run: Run) -> dict[str, Any]:
     return {
         "experiment": cfg.experiment_name,
         "hash": runs.config_hash(cfg),
+        "config_sha256": runs.config_sha256(cfg),
         "seed": run.seed,
         "status": "finished",
         "source": run.target.name if supervised else run.source.name,
         "target": run.target.name,
         "simulated": bool(run.target.simulated),
-        **_names(cfg),
+        **_names(run),
         "selection": {"teacher": teacher, "student": "last" if run.scheme.rounds else teacher},
         "final": scores["student" if run.scheme.rounds else "selected"],
         "warmup": {
@@ -164,7 +167,7 @@ def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None
 
 def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
     """Read `started.json` and compare it with today's data, or write it."""
-    now = {
+    now: dict[str, Any] = {
         "data": {"source": source.sha256, "target": target.sha256},
         "versions": {
             "qs3": qs3.__version__,
@@ -173,15 +176,19 @@ def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
             "lightning": lightning.__version__,
             "numpy": np.__version__,
         },
-        "config_hash": runs.config_hash(run.cfg),
+        "config_sha256": runs.config_sha256(run.cfg),
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:
         return now
-    remove_leftovers(run.folder)
+    for folder in (run.folder, *run.folder.glob("round_*")):
+        remove_leftovers(folder)
+    if run.cfg.data.cache_dir:
+        remove_old_leftovers(Path(run.cfg.data.cache_dir))
     started = runs.read_started(run.folder)
     if started is None:
         runs.write_started(run.folder, now)
         return now
+    runs.check_config(run.folder, started.get("config_sha256"), now["config_sha256"])
     for role, dataset in (("source", source), ("target", target)):
         runs.check_data(run.folder, dataset.name, started["data"][role], dataset.sha256)
     if started["versions"] != now["versions"]:
@@ -193,15 +200,25 @@ def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
     return started
 
 
-def _names(cfg: DictConfig) -> dict[str, str]:
+def _names(run: Run) -> dict[str, str]:
     """How method, self-training and model were called on the command line (or their classes)."""
+    cfg = run.cfg
     choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
     selector = cfg.selftraining.get("selector") or {"_target_": "none"}
     names = {"method": cfg.method, "selftraining": selector, "model": cfg.model}
-    return {
+    called = {
         group: str(choices.get(group) or node.get("_target_", "none").rsplit(".", 1)[-1].lower())
         for group, node in names.items()
     }
+    return called if run.scheme.rounds else {**called, "selftraining": "none"}
+
+
+def _make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
+    try:
+        return Trainer(**_trainer_settings(cfg), **more)
+    except (MisconfigurationException, TypeError, ValueError) as error:
+        hint = "" if cfg.trainer.accelerator == "cpu" else "; without a GPU use trainer=cpu"
+        raise ConfigError(f"trainer: {error}{hint}") from error
 
 
 def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
@@ -15,8 +16,18 @@ BASE = {
     "paths": {"data_dir": "data", "log_dir": "logs"},
     "data": {
         "points": 1024,
-        "source": {"path": "${paths.data_dir}/s", "variant": "points", "make": "do this"},
+        "cache_dir": "cache",
+        "source": {
+            "name": "s",
+            "title": "S",
+            "path": "${paths.data_dir}/s",
+            "variant": "points",
+            "make": "do this",
+            "published": {"folder": "published", "points": 2048},
+        },
+        "target": {"published": None},
     },
+    "selftraining": {"_target_": "qs3.selftraining.scheme.Scheme", "rounds": 2, "theta": 0.8},
     "logger": {"csv": None},
     "callbacks": {"progress": {"enabled": True}},
 }
@@ -38,6 +49,8 @@ def config(**changes):
         "callbacks.progress.enabled",
         "data.source.make",
         "data.source.synthesis",
+        "data.cache_dir",
+        *(f"data.source.{name}" for name in ("path", "title", "symbol", "published.folder")),
     ],
 )
 def test_hash_ignores_what_does_not_change_the_result(key):
@@ -45,10 +58,37 @@ def test_hash_ignores_what_does_not_change_the_result(key):
 
 
 @pytest.mark.parametrize(
-    "key", ["experiment_name", "data.points", "data.source.variant", "callbacks.mine", "new_key"]
+    "key",
+    [
+        "experiment_name",
+        "data.points",
+        *(f"data.source.{name}" for name in ("name", "variant", "published.points")),
+        "callbacks.mine",
+        "selftraining.theta",
+        "new_key",
+    ],
 )
 def test_hash_sees_everything_else(key):
     assert runs.config_hash(config(**{key: 7})) != runs.config_hash(config())
+
+
+@pytest.mark.parametrize("none", [{"rounds": 0}, {"_target_": "qs3.selftraining.scheme.no_rounds"}])
+def test_hash_ignores_settings_of_rounds_that_there_are_not(none):
+    changes = {f"selftraining.{key}": value for key, value in none.items()}
+    expected = runs.config_hash(config(**changes))
+    assert expected != runs.config_hash(config())
+    assert runs.config_hash(config(**changes, **{"selftraining.theta": 0.5})) == expected
+
+
+def test_hash_in_names_is_the_beginning_of_the_whole_one():
+    whole = runs.config_sha256(config())
+    assert len(whole) == 64
+    assert runs.config_hash(config()) == whole[:8]
+    runs.check_config(Path("run"), whole, whole)
+    with pytest.raises(ConfigError, match=r"run holds a run with other settings.*force=true"):
+        runs.check_config(Path("run"), whole[:8] + "0" * 56, whole)
+    with pytest.raises(ConfigError, match="other settings"):
+        runs.check_config(Path("run"), None, whole)
 
 
 def test_hash_does_not_depend_on_the_order_of_keys():
@@ -89,6 +129,24 @@ def test_lock(tmp_path):
     ):
         pass
     with runs.locked(tmp_path / "run"):
+        pass
+
+
+def test_lock_says_what_the_other_process_does(tmp_path):
+    with (
+        runs.locked(tmp_path),
+        pytest.raises(Qs3Error, match=rf"another process is making {tmp_path}; wait for it"),
+        runs.locked(tmp_path, doing="making", advice="wait for it"),
+    ):
+        pass
+
+
+def test_lock_where_there_can_be_no_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(Qs3Error, match="cannot make the folder"), runs.locked(tmp_path / "file/x"):
+        pass
+    (tmp_path / "x" / ".lock").mkdir(parents=True)
+    with pytest.raises(Qs3Error, match="cannot write"), runs.locked(tmp_path / "x"):
         pass
 
 

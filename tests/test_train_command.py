@@ -80,6 +80,12 @@ def test_help_is_quick(tmp_path):
     seconds, result = quickest(tmp_path, "--help")
     assert result.returncode == 0
     assert seconds < 2
+    lines = result.stdout.splitlines()
+    assert len(lines) < 40
+    assert max(map(len, lines)) <= 100
+    for group in ("domain", "experiment", "logger", "method", "model", "selftraining", "trainer"):
+        for path in (CONF / group).glob("*.yaml"):
+            assert re.search(rf"\b{path.stem}\b", result.stdout), path
 
 
 def test_missing_data_is_said_quickly_and_plainly(tmp_path):
@@ -90,6 +96,29 @@ def test_missing_data_is_said_quickly_and_plainly(tmp_path):
     assert "meta.yaml" in result.stderr
     assert "generate.py" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_missing_data_in_a_multirun_are_said_once(tmp_path):
+    result = command(tmp_path, "experiment=qs3_s2d", "seed=0,1", "-m")
+    assert result.returncode == 1
+    assert (result.stdout + result.stderr).count("failed: MissingDataError") == 1
+    assert "majority" not in result.stdout
+
+
+def test_upper_bound_with_rounds_is_refused_before_torch_is_imported():
+    code = (
+        "import sys; from pathlib import Path; import qs3.hydra_glue, qs3.run\n"
+        "from hydra import compose, initialize_config_dir\n"
+        "with initialize_config_dir(sys.argv[1], version_base='1.3'):\n"
+        "    cfg = compose('train', ['experiment=qs3_s2d', 'method=supervised'])\n"
+        "try: qs3.run.train(cfg)\n"
+        "except qs3.run.ConfigError as error: print(error, 'torch' in sys.modules)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code, str(CONF)], cwd=ROOT, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert result.stdout.strip().endswith("set selftraining=none False")
 
 
 def test_no_torch_before_the_data_are_there():

@@ -6,6 +6,7 @@ The target's test clouds do not come here at all: only `qs3.evaluation` holds th
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ from qs3.data.augment import Augment
 from qs3.data.batches import Batches, Table, generator_of
 from qs3.data.prepare import prepare
 from qs3.data.store import PointSet
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.selftraining.scheme import Phases, Scheme
+from qs3.settings import one_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,23 +61,29 @@ def without_labels(clouds: Labelled) -> Unlabelled:
 
 
 def split_lineage(clouds: Labelled) -> tuple[Labelled, Labelled]:
-    """(train, validation): of the list sorted by id, positions with i % 10 >= 8 validate.
+    """(train, validation): of the objects sorted by id, positions with i % 10 >= 8 validate.
 
     The rule of DefRec, GAST and QS3. Ids begin with the class, so each class is split 4 : 1.
+    Further scans of an object (`generate.py scans=N` calls them id~1, id~2, ...) go where it
+    goes: else training would see the validation shapes.
 
     Raises:
-        DataError: fewer than ten clouds, so that there is nothing to validate on.
+        DataError: fewer than nine objects, so that there is nothing to validate on.
     """
     order = np.argsort(np.array(clouds.ids), kind="stable")
-    validation = np.arange(len(order)) % 10 >= 8
+    objects, place = np.unique(
+        [_FURTHER_SCAN.sub("", name) for name in clouds.ids], return_inverse=True
+    )
+    validation = place[order] % 10 >= 8
     if not validation.any():
         raise DataError(
-            f"only {len(order)} labelled training clouds; at least 9 are needed, so that every "
+            f"only {len(objects)} labelled training objects; at least 9 are needed, so that every "
             "ninth and tenth can validate"
         )
     return clouds.at(order[~validation]), clouds.at(order[validation])
 
 
+_FURTHER_SCAN = re.compile(r"~\d+$")
 _SPLITS = {"lineage": split_lineage}
 
 
@@ -90,7 +98,7 @@ class UdaData(LightningDataModule):
         phases: which epoch belongs to which phase.
         scheme: settings of the rounds.
         augment: applied to every training batch, on its device.
-        batch_size: of the warm-up.
+        batch_size: of the warm-up, at least 2 (batch norm).
         seed: of the run.
         val: rule that takes a validation set from `labelled`.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
@@ -112,11 +120,8 @@ class UdaData(LightningDataModule):
         uses_target: bool = False,
     ) -> None:
         super().__init__()
-        if val not in _SPLITS:
-            raise ConfigError(f"data.val must be one of {sorted(_SPLITS)}, got {val!r}")
-        if batch_size < 2:
-            raise ConfigError(f"protocol.batch_size must be >= 2 (batch norm), got {batch_size}")
-        self.labelled, self.validation = _SPLITS[val](labelled)
+        split = _SPLITS[one_of("data.val", val, sorted(_SPLITS))]
+        self.labelled, self.validation = split(labelled)
         self.target = target
         self.owner, self.uses_target = owner, uses_target
         self.phases, self.scheme, self.augment = phases, scheme, augment

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import time
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, Qs3Error
 from qs3.files import write_npy
 
 log = logging.getLogger(__name__)
 
+_DAY = 24 * 3600  # seconds
 _VERSION = 1  # part of the cache's name: raise it when the numbers below would change
 
 
@@ -48,8 +51,19 @@ def prepare(
         cloud = np.asarray(unit_ball(np.asarray(points[i])), dtype=np.float32)
         result[i] = cloud[farthest_point_sampling_np(cloud, count, 0)] if count < stored else cloud
     if cache is not None:
-        write_npy(cache, result)
+        try:
+            write_npy(cache, result)
+        except Qs3Error as error:  # the data may lie where only others may write
+            log.warning("%s (paths.cache_dir, or data.cache_dir=null to keep none)", error)
     return result
+
+
+def remove_old_leftovers(cache_dir: Path) -> None:
+    """Delete what killed processes have left half written: if a day old, for others write here."""
+    for path in cache_dir.glob(".*.npy.*.tmp.npy"):
+        with contextlib.suppress(OSError):  # another run was quicker, or may and we may not
+            if time.time() - path.stat().st_mtime > _DAY:
+                path.unlink()
 
 
 def _read(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:

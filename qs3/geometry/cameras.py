@@ -132,25 +132,3 @@ def project(points_m: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
     u = k.focal_px * local[:, 0] / safe + k.cx_px
     v = k.focal_px * local[:, 1] / safe + k.cy_px
     return np.stack([u, v], axis=1), depth
-
-
-def backproject(depth_m: np.ndarray, camera: Camera, *, step_px: float = 1.0) -> np.ndarray:
-    """Depth image of the camera's rendered window to world points.
-
-    Args:
-        depth_m: [H, W]; pixels that are not finite or not positive are left out.
-        step_px: spacing of the samples in full-resolution pixels; sample (r, c) is at the
-            centre of its step x step block, so 1 is the image itself and 4 a block mean.
-
-    Returns:
-        [M, 3] float64 points in the world, in row-major order of the valid pixels.
-    """
-    valid = np.isfinite(depth_m) & (depth_m > 0)
-    rows, cols = np.nonzero(valid)
-    window, k = camera.rendered, camera.intrinsics
-    u = window.left + cols * step_px + (step_px - 1) / 2
-    v = window.top + rows * step_px + (step_px - 1) / 2
-    z = depth_m[rows, cols].astype(np.float64)
-    local = np.stack([(u - k.cx_px) / k.focal_px * z, (v - k.cy_px) / k.focal_px * z, z], axis=1)
-    pose = camera.world_from_camera
-    return local @ pose[:3, :3].T + pose[:3, 3]

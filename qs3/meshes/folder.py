@@ -203,6 +203,7 @@ class MeshFolder:
             split=split,
             load=partial(load_mesh, file),
             origin=self._origin(file),
+            path=file,
         )
 
     def _origin(self, file: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from qs3.meshes.mesh import Mesh
 
@@ -18,6 +19,7 @@ class MeshItem:
         split: "train" or "test".
         load: makes or reads the mesh; raises MeshError with the reason. Picklable.
         origin: what the user would look for: a file name or a family of the catalogue.
+        path: the file it is read from; None if it is made.
     """
 
     id: str
@@ -25,3 +27,4 @@ class MeshItem:
     split: str
     load: Callable[[], Mesh]
     origin: str
+    path: Path | None = None

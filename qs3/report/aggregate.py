@@ -222,7 +222,7 @@ def summarise(folders: list[Path]) -> str:
                 accuracy.percent() if accuracy else "-",
                 balanced.percent() if balanced else "-",
                 f"{len(g.finished)}{' (!)' if few else ''}",
-                majority.percent() if majority else "-",
+                f"{100 * majority.mean:.1f}" if majority else "-",  # of the data: no SEM
             )
         )
         notes += [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]

@@ -9,6 +9,9 @@ training split, and the selected part becomes the datamodule's next training set
 optimiser are reset at the start of the next epoch (`on_train_epoch_start`), not before:
 checkpoints are written in between, and must hold the trained model. Whether a reset is due
 follows from the epoch alone, so there is no flag that a resume could lose.
+
+With `init=continue` round 0 goes on with the teacher that labelled it, which is the warm-up's
+selected epoch and seldom its last; each further round goes on with the student before.
 """
 
 from __future__ import annotations
@@ -101,11 +104,11 @@ class SelfTraining(Callback):
         self._previous: torch.Tensor | None = None  # [n] predicted labels of the round before
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """In the first epoch of a round: new optimiser state, and new weights if from scratch."""
+        """In the first epoch of a round: new optimiser state, and the weights to begin with."""
         assert isinstance(pl_module, Classifier)
         phase = self.phases.phase(trainer.current_epoch)
         if phase > 0 and self.phases.starts(trainer.current_epoch):
-            pl_module.start_phase(phase, fresh=self.scheme.init == "scratch")
+            pl_module.start_phase(self._first_weights(pl_module, phase))
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """In the last epoch of a phase: label the target and choose the next training set."""
@@ -113,6 +116,14 @@ class SelfTraining(Callback):
         phase = self.phases.phase(trainer.current_epoch)
         if self.phases.ends(trainer.current_epoch) and phase < self.scheme.rounds:
             self._select(trainer, pl_module, round_=phase)
+
+    def _first_weights(self, classifier: Classifier, phase: int) -> dict[str, Any] | None:
+        """What a round begins with; None goes on with the student of the round before."""
+        if self.scheme.init == "scratch":
+            return classifier.fresh_net(phase).state_dict()
+        if phase == 1:
+            return load(self.folder / WARMUP_SELECTED, classifier.device)
+        return None
 
     def _select(self, trainer: Trainer, pl_module: Classifier, round_: int) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]

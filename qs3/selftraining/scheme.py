@@ -11,6 +11,7 @@ from decimal import Decimal
 from typing import Any
 
 from qs3.errors import ConfigError
+from qs3.settings import number, one_of, whole
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,7 @@ class Phases:
     epochs: int = 0
 
     def __post_init__(self) -> None:
-        if self.warmup < 1:
-            raise ConfigError(f"protocol.epochs must be >= 1, got {self.warmup}")
+        whole("protocol.epochs", self.warmup, 1)
 
     @property
     def total(self) -> int:
@@ -71,7 +71,8 @@ class Scheme:
         batch_size: of each round.
         theta: confidence that a pseudo-label must exceed, in round 0.
         epsilon: added to theta in each further round.
-        init: "scratch" draws new weights each round, "continue" goes on with the old ones.
+        init: "scratch" draws new weights each round; "continue" begins round 0 with the weights of
+            the teacher that labelled it, and each further round with the student before.
         use_source: whether labelled source clouds are trained on in the rounds, too.
         pcm: whether the student's clouds are mixed (see `qs3.methods.pcm`).
         missing_class: what to do if a class has no pseudo-label: "warn" or "error".
@@ -89,15 +90,17 @@ class Scheme:
     missing_class: str = "warn"
 
     def __post_init__(self) -> None:
-        _at_least("rounds", self.rounds, 0)
+        whole("selftraining.rounds", self.rounds, 0)
         if self.rounds == 0:
             return
         if not hasattr(self.selector, "select"):
             raise ConfigError("selftraining.rounds > 0 needs a selector, e.g. selftraining=qbst")
-        _at_least("epochs", self.epochs, 1)
-        _at_least("batch_size", self.batch_size, 2)  # batch norm needs two clouds
-        _one_of("init", self.init, ("scratch", "continue"))
-        _one_of("missing_class", self.missing_class, ("warn", "error"))
+        whole("selftraining.epochs", self.epochs, 1)
+        whole("selftraining.batch_size", self.batch_size, 2)  # batch norm needs two clouds
+        one_of("selftraining.init", self.init, ("scratch", "continue"))
+        one_of("selftraining.missing_class", self.missing_class, ("warn", "error"))
+        number("selftraining.theta", self.theta)
+        number("selftraining.epsilon", self.epsilon)
         if not 0.0 < self.theta < 1.0:
             raise ConfigError(f"selftraining.theta must lie in (0, 1), got {self.theta}")
         last = self.theta_of(self.rounds - 1)
@@ -115,13 +118,3 @@ class Scheme:
 def no_rounds(**ignored: Any) -> Scheme:
     """No self-training, whatever an experiment file has set for the rounds it would have had."""
     return Scheme(rounds=0)
-
-
-def _at_least(key: str, value: int, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ConfigError(f"selftraining.{key} must be a whole number >= {least}, got {value!r}")
-
-
-def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ConfigError(f"selftraining.{key} must be one of {allowed}, got {value!r}")

@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.errors import ConfigError, SelectionError
+from qs3.errors import SelectionError
+from qs3.settings import one_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +73,9 @@ class Qbst:
     counts: str = "confident"
 
     def __post_init__(self) -> None:
-        _one_of("mu", self.mu, ("balanced", "one"))
-        _one_of("order", self.order, ("descending", "ascending"))
-        _one_of("counts", self.counts, ("confident", "all"))
+        one_of("selftraining.selector.mu", self.mu, ("balanced", "one"))
+        one_of("selftraining.selector.order", self.order, ("descending", "ascending"))
+        one_of("selftraining.selector.counts", self.counts, ("confident", "all"))
 
     def select(
         self,
@@ -142,8 +143,3 @@ def check_selection(
             "accept it with selftraining.missing_class=warn"
         )
     return missing
-
-
-def _one_of(key: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ConfigError(f"selftraining.selector.{key} must be one of {allowed}, got {value!r}")

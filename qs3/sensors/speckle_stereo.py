@@ -104,7 +104,7 @@ class SpeckleStereo:
                 Camera(intrinsics, right.world_from_camera, right_window),
             ],
             seed=int(rng.integers(2**31)),
-            geometry=[True, True],
+            geometry=[True, False],  # only the left image gets a depth
         )
 
         canvas = self._canvas(left_window, right_window)

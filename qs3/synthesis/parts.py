@@ -40,6 +40,7 @@ class Parts:
         if path.is_file():
             check_same_recipe(self.folder, recipe)
         else:
+            self.clear()  # parts without a recipe: nobody knows what they were made with
             write_json(path, recipe)
         self._parts.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self._parts)
@@ -71,7 +72,7 @@ class Parts:
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
         cloud = Cloud(arrays, note["views"], note["valid_points"]) if arrays else None
-        return Outcome(note["item_id"], note["mesh_sha256"], cloud, note["reason"], 0.0)
+        return Outcome(note["item_id"], note["mesh_sha256"], cloud, note["reason"])
 
     def done(self, item_id: str) -> bool:
         """Whether an outcome is saved."""
@@ -79,7 +80,8 @@ class Parts:
 
     def clear(self) -> None:
         """Remove the parts; the recipe stays beside the finished dataset."""
-        shutil.rmtree(self._parts, ignore_errors=True)
+        if self._parts.is_dir():
+            shutil.rmtree(self._parts)
 
     def _path(self, item_id: str) -> Path:
         return self._parts / f"{hashlib.sha256(item_id.encode()).hexdigest()[:32]}.npz"
@@ -114,7 +116,18 @@ def _differences(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]
             inner = f"{key}.{name}" if key else name
             out += _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
         return out
-    return [] if old == new else [(key, _short(old), _short(new))]
+    if old == new:
+        return []
+    if isinstance(old, list) and isinstance(new, list) and key == "objects":
+        gone, come = sorted(set(old) - set(new)), sorted(set(new) - set(old))
+        return [
+            (
+                key,
+                f"{len(old)}{f', among them {gone[0]!r}' if gone else ''}",
+                f"{len(new)}{f', among them {come[0]!r}' if come else ''}",
+            )
+        ]
+    return [(key, _short(old), _short(new))]
 
 
 def _short(value: Any) -> str:
@@ -124,9 +137,9 @@ def _short(value: Any) -> str:
 
 def forget(folder: Path) -> None:
     """Delete a dataset, finished or not, and its recipe; other files are left alone."""
-    # meta.yaml first: without it the folder counts as unfinished whatever else is left.
-    for name in ("meta.yaml", RECIPE, "manifest.csv"):
-        (folder / name).unlink(missing_ok=True)
-    for path in folder.glob("*.npy"):
-        path.unlink()
+    # meta.yaml first: without it the folder counts as unfinished whatever else is left. The
+    # recipe last: as long as a part is left, it says what the part was made with.
+    (folder / "meta.yaml").unlink(missing_ok=True)
     Parts(folder).clear()
+    for path in [folder / "manifest.csv", *folder.glob("*.npy"), folder / RECIPE]:
+        path.unlink(missing_ok=True)

@@ -39,14 +39,15 @@ class Outcome:
         mesh_sha256: of the mesh as loaded; empty if it could not be.
         cloud: None if it failed; without its frames.
         reason: why it failed; empty if it did not.
-        seconds: time it took.
+        lasting: whether it would fail again: the object is to blame, and not the machine or a
+            defect of ours. Other failures are tried again at the next start.
     """
 
     item_id: str
     mesh_sha256: str
     cloud: Cloud | None
     reason: str
-    seconds: float
+    lasting: bool = True
 
 
 @dataclass(frozen=True)
@@ -66,22 +67,20 @@ class Job:
 
 def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
     """Make one object's cloud; failures of the object become an Outcome, not an error."""
-    start = time.perf_counter()
-    sha256 = ""
+    sha256, lasting = "", True
     try:
         mesh = item.load()
         sha256 = mesh.sha256
         cloud = job.recipe.make(mesh, item.id, job.seed, renderer)
-        cloud = Cloud(cloud.arrays, cloud.views, cloud.valid_points)
-        reason = ""
+        return Outcome(item.id, sha256, Cloud(cloud.arrays, cloud.views, cloud.valid_points), "")
     except Qs3Error as error:
-        cloud, reason = None, str(error)
+        reason = str(error)
     except MemoryError:
-        cloud, reason = None, "out of memory"
+        reason, lasting = "out of memory", False
     except Exception as error:  # one odd mesh must not stop thousands
         log.exception("%s: unexpected error", item.id)
-        cloud, reason = None, f"unexpected {type(error).__name__}: {error}"
-    return Outcome(item.id, sha256, cloud, reason, time.perf_counter() - start)
+        reason, lasting = f"unexpected {type(error).__name__}: {error}", False
+    return Outcome(item.id, sha256, None, reason, lasting)
 
 
 def renderer_provenance(job: Job) -> dict[str, str]:
@@ -168,12 +167,11 @@ def _scan_chunk(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outco
 
 
 def _scan_alone(job: Job, item: MeshItem) -> Outcome:
-    start = time.perf_counter()
     try:
         with _pool(job, 1) as pool:
             return pool.submit(_scan, item).result()
     except BrokenProcessPool:
-        return Outcome(item.id, "", None, DIED, time.perf_counter() - start)
+        return Outcome(item.id, "", None, DIED, lasting=False)
 
 
 _JOB: Job | None = None

@@ -19,6 +19,7 @@ from tests.fixtures import published as fixtures
 
 CONF = Path(__file__).parents[2] / "conf"
 NAMES = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
+NOT_YET = ("blensor10",)  # neither published, nor made by generate.py
 SPLITS = {"train": 2, "test": 1}
 
 
@@ -49,8 +50,9 @@ def test_missing_data_is_explained(tmp_path, name):
     message = str(caught.value)
     assert str(found.folder / "meta.yaml") in message
     assert "Where to get it: " in message
-    assert "python generate.py domain=" in message
-    assert f"paths.data_dir={tmp_path}" in message
+    assert ("python generate.py domain=" in message) == (name not in NOT_YET)
+    assert (f"paths.data_dir={tmp_path}" in message) == (name not in NOT_YET)
+    assert ("not available yet" in message) == (name in NOT_YET)
     assert ("simulated" in found.label) == (name == "kinectsim10")
     with pytest.raises(MissingDataError):
         found.open()
@@ -71,6 +73,19 @@ def test_every_domain_opens_on_its_fixture(tmp_path, name):
         3,
     )
     assert domain(name, tmp_path).open().sha256 == data.sha256
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_command_that_a_message_names_composes(tmp_path, name):
+    found = domain(name, tmp_path)
+    for command in filter(None, (found.make, found.stand_in)):
+        python, script, *overrides = command.partition("#")[0].split()
+        assert (python, script) == ("python", "generate.py")
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            cfg = compose("generate", overrides)
+        assert cfg.paths.data_dir == str(tmp_path)
+        instantiate(cfg.domain)
+        instantiate(cfg.recipe)
 
 
 def test_clean_twin_is_the_same_objects(tmp_path):

@@ -484,7 +484,7 @@ def test_the_real_modelnet10(tmp_path):
     importer = NamedArrays(SHARED, points=1024, file="modelnet10_points.npz")
     import_into(tmp_path / "m", importer, name="modelnet10", classes=CLASSES)
     counts = open_pointset(tmp_path / "m").counts()
-    expected = {  # specs/uda.md, section 3
+    expected = {  # the official split of these classes of ModelNet40
         "train": [106, 515, 572, 200, 889, 124, 465, 240, 680, 392],
         "test": [50, 100, 100, 86, 100, 20, 100, 100, 100, 100],
     }

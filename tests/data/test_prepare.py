@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
 import qs3.geometry.sampling
-from qs3.data.prepare import prepare
+from qs3.data.prepare import prepare, remove_old_leftovers
 from qs3.errors import ConfigError
 
 CLOUDS = np.random.default_rng(0).normal(size=(3, 40, 3)).astype(np.float32) + 5
@@ -35,3 +37,22 @@ def test_damaged_cache_is_redone(tmp_path):
 def test_too_many_points():
     with pytest.raises(ConfigError, match=r"data\.points is 41.*40 points"):
         prepare(CLOUDS, 41)
+
+
+def test_a_file_where_the_cache_should_be(tmp_path, caplog):
+    (tmp_path / "cache").write_text("")
+    assert np.array_equal(prepare(CLOUDS, 10, tmp_path / "cache", "key"), prepare(CLOUDS, 10))
+    assert "data.cache_dir=null" in caplog.text
+
+
+def test_only_old_leftovers_are_removed(tmp_path):
+    prepare(CLOUDS, 10, tmp_path, "key")
+    (kept,) = tmp_path.iterdir()
+    names = (f".{kept.name}.old.tmp.npy", f".{kept.name}.new.tmp.npy", ".other.old.tmp.csv")
+    for name in names:
+        (tmp_path / name).write_text("")
+        if "old" in name:
+            os.utime(tmp_path / name, (1, 1))
+    remove_old_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {kept.name, *names[1:]}
+    remove_old_leftovers(tmp_path / "absent")

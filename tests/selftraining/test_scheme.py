@@ -36,7 +36,10 @@ def test_theta_grows_without_rounding_error():
         ({"theta": 0.0}, r"theta must lie in \(0, 1\), got 0.0"),
         ({"theta": 1.0}, r"theta must lie in \(0, 1\)"),
         ({"theta": 0.9, "epsilon": 0.02, "rounds": 6}, r"theta \+ epsilon .* got 1.0"),
+        ({"theta": "abc"}, r"selftraining\.theta must be a number, got 'abc'"),
+        ({"epsilon": None}, r"selftraining\.epsilon must be a number"),
         ({"rounds": -1}, "selftraining.rounds"),
+        ({"rounds": "abc"}, r"selftraining\.rounds .* got 'abc'"),
         ({"epochs": 0}, "selftraining.epochs"),
         ({"batch_size": 1}, "selftraining.batch_size"),
         ({"init": "warm"}, "selftraining.init"),
@@ -53,6 +56,7 @@ def test_none_ignores_what_an_experiment_set_for_rounds():
     assert no_rounds(rounds=3, epochs=2).rounds == 0
 
 
-def test_warmup_needs_an_epoch():
-    with pytest.raises(ConfigError, match=r"protocol\.epochs"):
-        Phases(warmup=0)
+@pytest.mark.parametrize("epochs", [0, "abc", 1.5])
+def test_warmup_needs_an_epoch(epochs):
+    with pytest.raises(ConfigError, match=r"protocol\.epochs must be a whole number >= 1"):
+        Phases(warmup=epochs)

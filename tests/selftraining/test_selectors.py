@@ -65,7 +65,7 @@ def test_more_predicted_than_confident_is_clamped():
 
 
 def test_the_paper_s_example_of_a_perfect_teacher():
-    """ScanNet10's 80 % part, all confident: the specs give mu = .58 for chair and 3740 in all."""
+    """ScanNet10's 80 % part, all confident: mu = .58 for chair and 3740 in all."""
     sizes = [80, 270, 388, 517, 2070, 130, 164, 71, 391, 807]
     predicted = np.repeat(np.arange(10), sizes)
     ids = [f"{i:05d}" for i in range(len(predicted))]

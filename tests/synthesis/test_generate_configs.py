@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from qs3 import quickstart
 from qs3.classes import CLASSES
-from qs3.generation import check, mesh_items
+from qs3.generation_plan import benchmark, check, describe, mesh_items
 from qs3.hydra_glue import build
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,6 +68,19 @@ def test_the_stand_in_has_the_class_frequencies_of_scannet10():
     train = config("domain=kinectsim10").catalogue.train
     for name, count in scannet.items():
         assert train[name] == max(12, round(count / 10))
+
+
+def plan(*overrides):
+    cfg = config("domain=kinectsim10", *overrides)
+    return benchmark(cfg, describe(cfg, mesh_items(cfg), {}))
+
+
+def test_the_benchmark_knows_itself():
+    """A change of any setting is another version: give it a new number and a new hash."""
+    assert plan() == "kinectsim10 v1"
+    assert plan("renderer.threads=2", "renderer.variant=scalar_rgb", "workers=1") == plan()
+    for other in ("fraction=0.5", "views=3", "renderer.samples=4", "recipe.min_points=100"):
+        assert plan(other).startswith("like kinectsim10 v1, but not it")
 
 
 def test_smaller_keeps_the_frequencies():

@@ -18,6 +18,9 @@ from hydra import compose, initialize_config_dir
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation import generate
+from qs3.synthesis.parts import Parts
+from qs3.synthesis.recipes import Cloud
+from qs3.synthesis.workers import Outcome
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = [
@@ -142,6 +145,43 @@ def test_a_resume_with_another_version_is_refused(finished, meshes, tmp_path):
     assert forced.sha256 == finished[1].sha256
 
 
+def test_parts_without_a_recipe_are_not_taken_over(finished, meshes, tmp_path):
+    parts = tmp_path / "specklenet10" / "parts"
+    parts.mkdir(parents=True)
+    made = Parts(tmp_path / "specklenet10")
+    other = Outcome(
+        "chair/train/chair_0", "", Cloud({"points": np.ones((2048, 3), "f4")}, 1, 1), ""
+    )
+    made.save(other)
+    assert generate(config(tmp_path, meshes, "workers=0")).sha256 == finished[1].sha256
+
+
+def test_a_mended_mesh_is_noticed(meshes, tmp_path):
+    mine = tmp_path / "meshes" / "chair" / "train"
+    mine.mkdir(parents=True)
+    good = (meshes / "chair/train/chair_0.ply").read_bytes()
+    for split in ("train", "test"):
+        (mine.parent / split).mkdir(exist_ok=True)
+        for i in range(2):
+            (mine.parent / split / f"c{i}.ply").write_bytes(good)
+    (mine / "c0.ply").write_bytes(good[:200])
+    only = ["workers=0", "classes=[chair]"]
+    first = generate(config(tmp_path, tmp_path / "meshes", *only))
+    assert len(first.ids) == 3
+    row = read_manifest(tmp_path / "specklenet10", first.classes)
+    assert str(tmp_path) not in "".join(r.reason for r in row)
+    (mine / "c0.ply").write_bytes(good)
+    with pytest.raises(ConfigError, match=r"objects: 4, among them 'chair/train/c0"):
+        generate(config(tmp_path, tmp_path / "meshes", *only))
+    assert len(generate(config(tmp_path, tmp_path / "meshes", *only, "force=true")).ids) == 4
+
+
+def test_if_all_fail_nothing_is_left_in_the_way(meshes, tmp_path):
+    with pytest.raises(DataError, match="all 15 objects failed"):
+        generate(config(tmp_path, meshes, "workers=0", "recipe.min_points=1000000"))
+    assert len(generate(config(tmp_path, meshes, "workers=0", "limit=1")).ids) == 6
+
+
 def test_broken_meshes_are_recorded_and_the_others_go_on(finished, meshes, tmp_path):
     broken = tmp_path / "meshes"
     for path in meshes.rglob("*.ply"):
@@ -171,16 +211,26 @@ def test_broken_meshes_are_recorded_and_the_others_go_on(finished, meshes, tmp_p
     ("overrides", "error", "message"),
     [
         (["views=0"], ConfigError, "views must be at least 1, got 0"),
-        (["limit=0"], ConfigError, "limit must be at least 1"),
-        (["workers=-1"], ConfigError, "workers must be at least 0"),
+        (["limit=0"], ConfigError, "limit must be a whole number >= 1, got 0"),
+        (["workers=-1"], ConfigError, "workers must be a whole number >= 0, got -1"),
         (["classes=[chair,dragon]"], ConfigError, "dragon"),
         (["classes=[chair,bed]"], (ConfigError, MissingDataError), "bed"),
         (["fraction=0"], ConfigError, r"fraction must be in \(0, 1\]"),
+        (["limit=abc"], ConfigError, "limit must be a whole number >= 1, got 'abc'"),
+        (["views=1.5"], ConfigError, r"views must be a whole number >= 0, got 1\.5"),
     ],
 )
 def test_wrong_settings_name_the_key(meshes, tmp_path, overrides, error, message):
     with pytest.raises(error, match=message):
         generate(config(tmp_path, meshes, "workers=0", *overrides))
+
+
+@pytest.mark.parametrize("key", ["sensor", "renderer"])
+def test_looking_needs_a_sensor_and_a_renderer(tmp_path, key):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("generate", [f"{key}=none", f"paths.data_dir={tmp_path}"])
+    with pytest.raises(ConfigError, match=f"{key}=none does not do"):
+        generate(cfg)
 
 
 def test_a_missing_folder_is_named(tmp_path):

@@ -13,7 +13,7 @@ import torch
 from hydra.errors import ConfigCompositionException
 
 from qs3 import runs
-from qs3.checkpoints import load
+from qs3.checkpoints import copy_weights, load
 from qs3.classifier import Classifier
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
@@ -127,10 +127,50 @@ def test_continued_student_with_source_and_pcm(toy):
     assert len(metrics["rounds"]) == 2
 
 
+def test_continue_begins_with_the_teacher_that_labelled(toy, monkeypatch):
+    """Round 0 with the selected weights of the warm-up, round 1 with the student of round 0."""
+    first: dict[int, dict[str, torch.Tensor]] = {}
+    last: dict[int, dict[str, torch.Tensor]] = {}
+
+    def spy(self, batch, batch_idx, real=Classifier.training_step):
+        first.setdefault(self.current_epoch, copy_weights(self.net))
+        return real(self, batch, batch_idx)
+
+    def end(self, real=Classifier.on_validation_epoch_end):
+        last[self.current_epoch] = copy_weights(self.net)
+        real(self)
+
+    def worse_and_worse(self, *args, real=Classifier.log, **kwargs):
+        if args[0] == "source_val/acc":  # so that the selected epoch is not the last
+            args = (args[0], 1.0 / (1 + self.current_epoch))
+        real(self, *args, **kwargs)
+
+    monkeypatch.setattr(Classifier, "training_step", spy)
+    monkeypatch.setattr(Classifier, "on_validation_epoch_end", end)
+    monkeypatch.setattr(Classifier, "log", worse_and_worse)
+    cfg = toy("selftraining.init=continue", "selftraining.theta=0.35")
+    metrics = train(cfg)
+    assert metrics["warmup"]["selected"]["epoch"] == 0
+    selected = load(runs.run_folder(cfg) / "warmup_selected.pt")
+    for name in selected:
+        assert torch.equal(first[4][name], selected[name]), name
+        assert torch.equal(first[7][name], last[6][name]), name
+    assert any(not torch.equal(selected[name], last[3][name]) for name in selected)
+
+
 def test_supervised_is_validated_on_target_training_clouds(toy):
     metrics = train(toy("method=supervised", "selftraining=none"))
     assert metrics["selection"]["teacher"].startswith("target_train_val, epoch ")
     assert metrics["source"] == "kinectsim10"
+
+
+def test_one_domain_as_source_and_target(toy, caplog):
+    same = ("domain@data.source=kinectsim10", "selftraining=none", "protocol.epochs=1")
+    train(toy(*same))
+    assert "the target's training labels are used" in caplog.text
+    caplog.clear()
+    train(toy(*same, "method=supervised"))
+    assert "are the same dataset" not in caplog.text
 
 
 # --- target labels stay hidden ---------------------------------------------------------------
@@ -233,6 +273,15 @@ def test_misspelt_key():
         ("data.val=other", r"data\.val"),
         ("num_classes=10", r"num_classes is 10.*set num_classes=3"),
         ("selection.teacher=best", r"selection\.teacher"),
+        ("protocol.epochs=abc", r"protocol\.epochs .* got 'abc'"),
+        ("protocol.batch_size=0", r"protocol\.batch_size .* got 0"),
+        ("protocol.optimizer.lr=abc", r"protocol\.optimizer\.lr must be a number, got 'abc'"),
+        ("protocol.optimizer.lr=-1", r"protocol\.optimizer: Invalid learning rate"),
+        ("selftraining.theta=abc", r"selftraining\.theta must be a number"),
+        ("selftraining.rounds=abc", r"selftraining\.rounds .* got 'abc'"),
+        ("data.points=abc", r"data\.points .* got 'abc'"),
+        ("trainer.threads=abc", r"trainer\.threads"),
+        ("method=supervised", r"method=supervised .* selftraining=none"),
     ],
 )
 def test_wrong_setting_names_the_key(toy, override, message):
@@ -272,6 +321,39 @@ def test_two_runs_in_one_folder(toy):
         pytest.raises(Qs3Error, match="another process is training"),
     ):
         train(cfg)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_gpu_that_is_not_there(toy):
+    with pytest.raises(ConfigError, match=r"trainer: .*use trainer=cpu"):
+        train(toy("trainer=gpu"))
+
+
+def test_other_config_of_the_same_eight_digits_is_refused(toy):
+    cfg = toy("selftraining=none", "protocol.epochs=1")
+    metrics = train(cfg)
+    folder = runs.run_folder(cfg)
+    assert metrics["config_sha256"] == runs.config_sha256(cfg)
+    for name in ("metrics.json", "started.json"):
+        value = json.loads((folder / name).read_text())
+        value["config_sha256"] = value["config_sha256"][:8] + "0" * 56
+        (folder / name).write_text(json.dumps(value))
+    with pytest.raises(ConfigError, match=r"other settings.*force=true"):
+        train(cfg)
+    (folder / "metrics.json").unlink()
+    with pytest.raises(ConfigError, match=r"other settings.*force=true"):
+        train(cfg)
+
+
+def test_leftovers_of_a_kill_are_removed(toy):
+    cfg = toy("selftraining.rounds=1", "protocol.epochs=1", "selftraining.epochs=1")
+    folder = runs.run_folder(cfg)
+    leftovers = [folder / ".last.ckpt.x.tmp.ckpt", folder / "round_00" / ".p.csv.x.tmp.csv"]
+    for path in leftovers:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+    train(cfg)
+    assert not any(path.exists() for path in leftovers)
 
 
 def test_changed_data_are_refused(toy, toy_data, tmp_path):
