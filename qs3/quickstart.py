@@ -32,9 +32,11 @@ DATASETS = (
 
 def main() -> int:
     """Run all steps; a step that was finished by an earlier call is skipped by the step itself."""
-    out = Path(
-        dict(argument.split("=", 1) for argument in sys.argv[1:]).get("out", "out/quickstart")
-    )
+    parser = argparse.ArgumentParser(prog="python -m qs3.quickstart", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/quickstart"), help="where it all goes")
+    out = parser.parse_args().out
+    if " " in str(out):
+        parser.error(f"--out {out}: a path without spaces, please")
     paths = f"paths.data_dir={out / 'data'} paths.log_dir={out / 'logs'}"
     start = time.monotonic()
     _say(

@@ -109,6 +109,14 @@ def test_every_command_of_the_quickstart_composes():
         assert cfg.experiment_name == "quickstart"
 
 
+def test_quickstart_starts():
+    done = subprocess.run(
+        [sys.executable, "-m", "qs3.quickstart", "--help"], cwd=ROOT, capture_output=True,
+        text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert "--out" in done.stdout
+
+
 def test_help_is_short_and_answers_quickly():
     done = subprocess.run(
         [sys.executable, "generate.py", "--help"], cwd=ROOT, capture_output=True, text=True,
