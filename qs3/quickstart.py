@@ -6,6 +6,7 @@ chosen to fit into 20 minutes on 2 cores; the paper's are in conf/experiment/qs3
 
 from __future__ import annotations
 
+import argparse
 import os
 import resource
 import shlex
@@ -33,7 +34,9 @@ DATASETS = (
 def main() -> int:
     """Run all steps; a step that was finished by an earlier call is skipped by the step itself."""
     parser = argparse.ArgumentParser(prog="python -m qs3.quickstart", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("out/quickstart"), help="where it all goes")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/quickstart"), help="where it all goes"
+    )
     out = parser.parse_args().out
     if " " in str(out):
         parser.error(f"--out {out}: a path without spaces, please")
