@@ -23,6 +23,7 @@ from qs3.generation_plan import (
     describe,
     mesh_items,
     mesh_root,
+    stated_hash,
 )
 from qs3.hydra_glue import build
 from qs3.meshes.source import MeshItem
@@ -77,6 +78,12 @@ def generate(cfg: DictConfig) -> PointSet:
         pointset = _assemble(domain, items, parts, passing, recipe, cfg)
         parts.clear()
     _report(pointset, items, time.perf_counter() - start)
+    stated = stated_hash(cfg, recipe)
+    if stated and stated != pointset.sha256:
+        log.warning(
+            "the stated content hash is %s: another processor or library version made other bytes",
+            stated[:16],
+        )
     failed = len(items) - len(pointset.ids)
     if cfg.strict and failed:
         raise DataError(f"{failed} of {len(items)} objects failed; see {folder / 'manifest.csv'}")

@@ -124,6 +124,14 @@ def benchmark(cfg: DictConfig, recipe: dict[str, Any]) -> str:
     return name if same else f"like {name}, but not it (other settings or objects)"
 
 
+def stated_hash(cfg: DictConfig, recipe: dict[str, Any]) -> str:
+    """Content hash that the benchmark should have with this renderer variant; empty if unknown."""
+    stated = cfg.get("benchmark")
+    if stated is None or plan_hash(recipe) != stated.plan_sha256:
+        return ""
+    return str(stated.content_sha256.get(recipe["versions"].get("variant"), ""))
+
+
 def plan_hash(recipe: dict[str, Any]) -> str:
     """Hash of settings and objects, without versions and without the renderer's variant."""
     plan = {"settings": dict(recipe["settings"]), "objects": recipe["objects"]}
