@@ -4,6 +4,7 @@ import os
 import pickle
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -199,9 +200,12 @@ def test_turning_is_a_rotation():
     assert (matrix @ [0, 1, 0]).tolist() == [0, 0, 1]
 
 
+TRAP = Path(tempfile.gettempdir()) / "qs3-test-trap"
+
+
 class Trap:
     def __reduce__(self):
-        return (os.mkdir, ("/tmp/qs3-test-trap",))
+        return (os.mkdir, (str(TRAP),))
 
 
 def test_pickled_arrays_are_refused_unopened(tmp_path):
@@ -212,7 +216,7 @@ def test_pickled_arrays_are_refused_unopened(tmp_path):
     path.write_bytes(pickle.dumps(Trap()))
     with pytest.raises(DataError, match=r"not a readable \.npy"):
         read_npy(path)
-    assert not Path("/tmp/qs3-test-trap").exists()
+    assert not TRAP.exists()
 
 
 def test_npy_damage_anywhere(tmp_path):
@@ -369,7 +373,7 @@ def test_named_arrays(tmp_path):
 def test_named_arrays_of_other_things(tmp_path, changes, message):
     with pytest.raises(DataError, match=r"points\.npz.*" + message):
         NamedArrays(npz(tmp_path, **changes), points=2).read(TWO)
-    assert not Path("/tmp/qs3-test-trap").exists()
+    assert not TRAP.exists()
 
 
 def test_damaged_npz(tmp_path):
