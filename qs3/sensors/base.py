@@ -25,6 +25,10 @@ class DepthFrame:
         depth_m: [h, w] float32 as measured, NaN where nothing was.
         clean_m: [h, w] float32 true depth at the same pixels, inf where nothing is hit.
         label: [h, w] uint8, Body.label of what is seen, 0 where nothing is.
+        cosine: [h, w] float32, cosine of the angle of incidence on what is seen, 0 where
+            nothing is.
+        reason: [h, w] uint8 `Reason`, why a sample has a depth or none. Shadow and occlusion
+            are told apart from other causes only if the scan was asked to `explain`.
         images: intermediate pictures by name ("left", "right", "disparity", ...), for
             looking at; their size is that of the matched canvas, not of `depth_m`.
     """
@@ -36,6 +40,8 @@ class DepthFrame:
     depth_m: np.ndarray
     clean_m: np.ndarray
     label: np.ndarray
+    cosine: np.ndarray
+    reason: np.ndarray
     images: dict[str, np.ndarray] = field(default_factory=dict)
 
     def points(self, depth_m: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
@@ -67,6 +73,7 @@ class DepthSensor(Protocol):
         world_from_camera: np.ndarray,
         renderer: Renderer,
         rng: np.random.Generator,
+        explain: bool = False,
     ) -> DepthFrame | None:
         """Take one frame.
 
@@ -77,6 +84,8 @@ class DepthSensor(Protocol):
             world_from_camera: [4, 4] true pose.
             renderer: makes the images.
             rng: all randomness of this frame.
+            explain: render also who sees and who lights each surface, for `DepthFrame.reason`
+                and the images "lit" and "seen". Costs renders and changes nothing else.
 
         Returns:
             The frame, or None if the box is outside the view.

@@ -16,10 +16,13 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.filters import PostFilter, Quantiser
 from qs3.sensors.infrared import InfraredCamera
-from qs3.sensors.matching import ReferenceMatcher
+from qs3.sensors.matching import Matcher, ReferenceMatcher
 from qs3.sensors.patterns import Speckle
 from qs3.sensors.renderers.base import Body, Projector, Renderer, Scene
+from qs3.sensors.triangulation import Triangulation
+from qs3.sensors.visibility import explained, reached_from
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class ReferenceSpeckle:
         min_depth_m, max_depth_m: depths outside are dropped.
         tan_half_width: half the width of the slide at distance 1.
         ambient: as in SpeckleStereo, relative to the pattern on white at `reference_m`.
+        pattern, matcher, infrared, quantiser, filters: as in SpeckleStereo; ReferenceMatcher
+            has a quantiser of its own.
     """
 
     width_px: int = 640
@@ -50,10 +55,12 @@ class ReferenceSpeckle:
     pattern: Speckle = field(
         default_factory=lambda: Speckle(columns=211, rows=165, tiles=3, dot_px=1, seed=1)
     )
-    matcher: ReferenceMatcher = field(default_factory=ReferenceMatcher)
+    matcher: Matcher = field(default_factory=ReferenceMatcher)
     infrared: InfraredCamera = field(
         default_factory=lambda: InfraredCamera(electrons_at_white=4000.0, read_noise_e=40.0)
     )
+    quantiser: Quantiser = field(default_factory=Quantiser)
+    filters: tuple[PostFilter, ...] = ()
 
     def __post_init__(self) -> None:
         if not 0 < self.min_depth_m < self.max_depth_m:
@@ -77,7 +84,16 @@ class ReferenceSpeckle:
 
     def depth_step_m(self, depth_m: float) -> float:
         """Depth that one step of the quantiser makes: Z^2 / (steps f b)."""
-        return depth_m**2 / (self.matcher.steps_per_px * self.focal_px * self.baseline_m)
+        steps = self.quantiser.steps_per_px or getattr(self.matcher, "steps_per_px", 0)
+        return depth_m**2 / (steps * self.focal_px * self.baseline_m) if steps else 0.0
+
+    @property
+    def triangulation(self) -> Triangulation:
+        """From disparity to depth; a point at `reference_m` has disparity 0."""
+        offset = self.focal_px * self.baseline_m / self.reference_m
+        return Triangulation(
+            self.focal_px, self.baseline_m, offset, self.min_depth_m, self.max_depth_m
+        )
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -115,10 +131,11 @@ class ReferenceSpeckle:
         world_from_camera: np.ndarray,
         renderer: Renderer,
         rng: np.random.Generator,
+        explain: bool = False,
     ) -> DepthFrame | None:
         """Take one frame; see qs3.sensors.base.DepthSensor."""
         camera = Camera(self.intrinsics, world_from_camera)
-        window = window_of(box_m, camera, margin_px=self.matcher.window_px)
+        window = window_of(box_m, camera, margin_px=2 * self.matcher.reach_px + 1)
         if window is None:
             return None
         projector = Projector(
@@ -136,11 +153,14 @@ class ReferenceSpeckle:
         gain = self.infrared.gain(image.radiance, np.isfinite(image.depth_m))
         grey = self.infrared.expose(image.radiance, gain, rng)
         rows, _ = window.slices
-        disparity = self.matcher.match(grey, self.reference[rows], window.left)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = disparity / np.float32(self.focal_px * self.baseline_m)
-            depth = (1 / (inverse + np.float32(1 / self.reference_m))).astype(np.float32)
-            depth[~((depth > self.min_depth_m) & (depth < self.max_depth_m))] = np.nan
+        match = self.matcher.match(grey, self.reference[rows], window.left)
+        depth, disparity, reason = self.triangulation.depth(match, self.quantiser, self.filters)
+        pictures = {"left": grey, "disparity": disparity, "clean": image.depth_m}
+        if explain:
+            here = Camera(self.intrinsics, world_from_camera, window)
+            lit = reached_from(bodies, here, projector.world_from_projector, renderer)
+            reason = explained(reason, image.depth_m, lit, None)
+            pictures["lit"] = lit
         return DepthFrame(
             camera=camera,
             left=window.left,
@@ -149,5 +169,7 @@ class ReferenceSpeckle:
             depth_m=depth,
             clean_m=image.depth_m,
             label=image.label,
-            images={"left": grey, "disparity": disparity, "clean": image.depth_m},
+            cosine=image.cosine,
+            reason=reason,
+            images=pictures,
         )

@@ -18,10 +18,13 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.filters import PostFilter, Quantiser
 from qs3.sensors.infrared import InfraredCamera
-from qs3.sensors.matching import StereoBlockMatcher
+from qs3.sensors.matching import Matcher, StereoBlockMatcher
 from qs3.sensors.patterns import Speckle
 from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
+from qs3.sensors.triangulation import Triangulation
+from qs3.sensors.visibility import explained, reached_from
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,11 @@ class SpeckleStereo:
         tan_half_width: half the width of the projected slide at distance 1.
         ambient: radiance of the fill light relative to the pattern's on a white surface
             at 4 m; it lowers the contrast.
+        pattern: the slide.
+        matcher: finds the left image in the right one.
+        infrared: from radiance to grey values.
+        quantiser: step of the disparity; StereoBM's own is 1/16 px.
+        filters: applied to the disparity in this order, before the quantiser.
     """
 
     width_px: int = 1080
@@ -48,8 +56,10 @@ class SpeckleStereo:
     tan_half_width: float = 0.625
     ambient: float = 0.15
     pattern: Speckle = field(default_factory=Speckle)
-    matcher: StereoBlockMatcher = field(default_factory=StereoBlockMatcher)
+    matcher: Matcher = field(default_factory=StereoBlockMatcher)
     infrared: InfraredCamera = field(default_factory=InfraredCamera)
+    quantiser: Quantiser = field(default_factory=Quantiser)
+    filters: tuple[PostFilter, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.baseline_m > 0:
@@ -61,16 +71,25 @@ class SpeckleStereo:
                 "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
                 f"{self.min_depth_m} and {self.max_depth_m}"
             )
-        if self.focal_px * self.baseline_m / self.min_depth_m > self.matcher.num_disparities:
-            nearest = self.focal_px * self.baseline_m / self.matcher.num_disparities
+        end = self.matcher.min_disparity + self.matcher.num_disparities
+        if self.focal_px * self.baseline_m / self.min_depth_m > end:
+            nearest = self.focal_px * self.baseline_m / end
             raise ConfigError(
                 f"sensor.min_depth_m {self.min_depth_m} is nearer than the matcher reaches: "
-                f"with {self.matcher.num_disparities} disparities it is {nearest:.2f} m"
+                f"with disparities up to {end} it is {nearest:.2f} m"
             )
 
+    @property
+    def triangulation(self) -> Triangulation:
+        """From disparity to depth."""
+        return Triangulation(
+            self.focal_px, self.baseline_m, 0.0, self.min_depth_m, self.max_depth_m
+        )
+
     def depth_step_m(self, depth_m: float) -> float:
-        """Depth that one step of the matcher (1/16 px) makes: Z^2 / (16 f b)."""
-        return depth_m**2 / (16 * self.focal_px * self.baseline_m)
+        """Depth that one step of the disparity makes: Z^2 q / (f b); OpenCV's q is 1/16 px."""
+        steps = self.quantiser.steps_per_px or 16
+        return depth_m**2 / (steps * self.focal_px * self.baseline_m)
 
     def scan(
         self,
@@ -79,20 +98,22 @@ class SpeckleStereo:
         world_from_camera: np.ndarray,
         renderer: Renderer,
         rng: np.random.Generator,
+        explain: bool = False,
     ) -> DepthFrame | None:
         """Take one frame; see qs3.sensors.base.DepthSensor."""
         intrinsics = Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
         left = Camera(intrinsics, world_from_camera)
         right = left.moved((self.baseline_m, 0.0, 0.0))
         # Fattening puts values up to half a block outside the silhouette.
-        reach = self.matcher.block_size // 2 + 1
+        reach = self.matcher.reach_px
         left_window = window_of(box_m, left, margin_px=reach)
         right_window = window_of(box_m, right, margin_px=reach)
         if left_window is None or right_window is None:
             return None
 
+        middle = left.moved((self.baseline_m / 2, 0.0, 0.0)).world_from_camera
         projector = Projector(
-            left.moved((self.baseline_m / 2, 0.0, 0.0)).world_from_camera,
+            middle,
             self.pattern.slide,
             self.tan_half_width,
             strength=16.0,  # white at 4 m has radiance 1
@@ -113,47 +134,57 @@ class SpeckleStereo:
             self.infrared.expose(_place(image, window, canvas), gain, rng)
             for image, window in zip(images, (left_window, right_window), strict=True)
         ]
-        disparity = self.matcher.match(grey[0], grey[1])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.float32(self.focal_px * self.baseline_m) / disparity
-            depth[~((depth > self.min_depth_m) & (depth < self.max_depth_m))] = np.nan
+        match = self.matcher.match(grey[0], grey[1])
+        depth, disparity, reason = self.triangulation.depth(match, self.quantiser, self.filters)
 
-        # Samples lie on one grid over the whole image, whatever the window.
-        offset = self.step_px // 2
-        first_col = _first_on_grid(left_window.left, self.step_px, offset)
-        first_row = _first_on_grid(left_window.top, self.step_px, offset)
-        rows = slice(first_row - left_window.top, None, self.step_px)
-        cols = slice(first_col - left_window.left, None, self.step_px)
         inside = Window(
             left_window.left - canvas.left,
             left_window.top - canvas.top,
             left_window.width,
             left_window.height,
+        ).slices
+        pictures = {
+            "left": grey[0][inside],
+            "right": grey[1][inside],
+            "disparity": disparity[inside],
+            "clean": images[0].depth_m,
+        }
+        reason = reason[inside]
+        if explain:
+            camera = Camera(intrinsics, left.world_from_camera, left_window)
+            lit = reached_from(bodies, camera, middle, renderer)
+            seen = reached_from(bodies, camera, right.world_from_camera, renderer)
+            reason = explained(reason, images[0].depth_m, lit, seen)
+            pictures |= {"lit": lit, "seen": seen}
+
+        # Samples lie on one grid over the whole image, whatever the window.
+        offset = self.step_px // 2
+        first_col = _first_on_grid(left_window.left, self.step_px, offset)
+        first_row = _first_on_grid(left_window.top, self.step_px, offset)
+        grid = (
+            slice(first_row - left_window.top, None, self.step_px),
+            slice(first_col - left_window.left, None, self.step_px),
         )
         return DepthFrame(
             camera=left,
             left=first_col,
             top=first_row,
             step_px=self.step_px,
-            depth_m=depth[inside.slices][rows, cols],
-            clean_m=images[0].depth_m[rows, cols],
-            label=images[0].label[rows, cols],
-            images={
-                "left": grey[0][inside.slices],
-                "right": grey[1][inside.slices],
-                "disparity": disparity[inside.slices],
-                "clean": images[0].depth_m,
-            },
+            depth_m=depth[inside][grid],
+            clean_m=images[0].depth_m[grid],
+            label=images[0].label[grid],
+            cosine=images[0].cosine[grid],
+            reason=reason[grid],
+            images=pictures,
         )
 
     def _canvas(self, left: Window, right: Window) -> Window:
-        """Where both images lie side by side with room for the whole search on the left.
+        """Where both images lie side by side, with room for the matcher's reach around them.
 
-        StereoBM gives no value in the first num_disparities columns. What is outside the
-        rendered windows is dark, as it is in the render: nothing is there.
+        What is outside the rendered windows is dark, as it is in the render: nothing is there.
         """
-        margin = self.matcher.block_size
-        first = min(left.left, right.left) - self.matcher.num_disparities - margin
+        margin = 2 * self.matcher.reach_px
+        first = min(left.left, right.left) - margin
         last = max(left.left + left.width, right.left + right.width) + margin
         top = min(left.top, right.top) - margin
         bottom = max(left.top + left.height, right.top + right.height) + margin

@@ -27,7 +27,7 @@ def test_block_matching_finds_a_known_disparity_without_bias(true):
     texture = dots(120, 400, seed=1)
     left = shifted(texture, true).astype(np.uint8)
     right = shifted(texture, 0.0).astype(np.uint8)
-    found = StereoBlockMatcher(64, 19).match(left, right)[20:-20, 120:-40]
+    found = StereoBlockMatcher(64, 19).match(left, right).disparity[20:-20, 120:-40]
     assert np.isfinite(found).mean() > 0.95
     assert np.nanmedian(found) == pytest.approx(true, abs=0.06)
 
@@ -35,17 +35,17 @@ def test_block_matching_finds_a_known_disparity_without_bias(true):
 def test_removing_the_bias_of_stereobm_is_a_switch():
     texture = dots(60, 300, seed=2)
     left, right = (shifted(texture, d).astype(np.uint8) for d in (12.0, 0.0))
-    with_bias = StereoBlockMatcher(32, 11, remove_bias=False).match(left, right)
-    without = StereoBlockMatcher(32, 11).match(left, right)
+    with_bias = StereoBlockMatcher(32, 11, remove_bias=False).match(left, right).disparity
+    without = StereoBlockMatcher(32, 11).match(left, right).disparity
     both = np.isfinite(with_bias)
     np.testing.assert_allclose((with_bias - without)[both], STEREOBM_BIAS_PX, atol=1e-5)
 
 
 def test_a_dark_image_matches_nowhere():
     dark = np.zeros((60, 200), np.uint8)
-    assert np.isnan(StereoBlockMatcher(32, 11).match(dark, dark)).all()
+    assert np.isnan(StereoBlockMatcher(32, 11).match(dark, dark).disparity).all()
     reference = np.random.default_rng(0).random((60, 200)).astype(np.float32) * 255
-    assert np.isnan(ReferenceMatcher().match(dark, reference, left=0)).all()
+    assert np.isnan(ReferenceMatcher().match(dark, reference).disparity).all()
 
 
 @pytest.mark.parametrize("true", [-7.5, 0.0, 4.25, 11.625])
@@ -54,7 +54,7 @@ def test_reference_matching_finds_a_known_disparity_at_its_steps(true):
     reference = shifted(texture, 0.0).astype(np.float32)
     image = shifted(texture, true).astype(np.uint8)
     part, left = image[:, 100:260], 100
-    found = ReferenceMatcher().match(part, reference, left)[8:-8, 8:-8]
+    found = ReferenceMatcher().match(part, reference, left).disparity[8:-8, 8:-8]
     assert np.isfinite(found).mean() > 0.95
     assert np.nanmedian(found) == pytest.approx(true, abs=0.125)
     steps = found[np.isfinite(found)] * 8
@@ -66,8 +66,8 @@ def test_reference_matching_ignores_gain_and_offset():
     reference = shifted(texture, 0.0).astype(np.float32)
     image = shifted(texture, 3.0)
     matcher = ReferenceMatcher(steps_per_px=0)
-    plain = matcher.match(image.astype(np.uint8), reference, 0)
-    dim = matcher.match((image * 0.4 + 30).astype(np.uint8), reference, 0)
+    plain = matcher.match(image.astype(np.uint8), reference).disparity
+    dim = matcher.match((image * 0.4 + 30).astype(np.uint8), reference).disparity
     both = np.isfinite(plain) & np.isfinite(dim)
     assert both[8:-8, 20:-20].mean() > 0.9
     # Rounding to whole grey values moves a match a little, and a few to another dot.
@@ -79,7 +79,7 @@ def test_scores_equal_a_brute_force_correlation():
     reference = (rng.random((30, 60)) * 255).astype(np.float32)
     image = (rng.random((30, 40)) * 255).astype(np.uint8)
     matcher = ReferenceMatcher(window_px=5, min_disparity=-4, num_disparities=9)
-    scores = matcher._scores(image, reference, left=10)
+    scores = matcher._scores(image, reference, first=10)
     grey = image.astype(float)
     for k, row, col in [(0, 15, 20), (4, 10, 9), (8, 20, 31)]:
         window = grey[row - 2 : row + 3, col - 2 : col + 3]

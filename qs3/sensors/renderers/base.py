@@ -97,11 +97,25 @@ class Image:
         depth_m: [h, w] float32, along the optical axis at the pixel's centre, inf where
             nothing is hit.
         label: [h, w] uint8, `Body.label` of what the pixel's centre sees, 0 where nothing is.
+        cosine: [h, w] float32 in 0..1, cosine of the angle between the surface's normal and
+            the ray through the pixel's centre, 0 where nothing is.
     """
 
     radiance: np.ndarray
     depth_m: np.ndarray
     label: np.ndarray
+    cosine: np.ndarray
+
+    @staticmethod
+    def without_geometry(radiance: np.ndarray) -> Image:
+        """An image for which no geometry was wanted."""
+        shape = radiance.shape
+        return Image(
+            radiance,
+            np.full(shape, np.inf, dtype=np.float32),
+            np.zeros(shape, dtype=np.uint8),
+            np.zeros(shape, dtype=np.float32),
+        )
 
 
 class Renderer(Protocol):
@@ -116,8 +130,8 @@ class Renderer(Protocol):
             scene: what is there.
             cameras: where it is seen from.
             seed: of the sampling pattern; the same call gives the same bytes.
-            geometry: for each camera, whether depth_m and label are wanted; where not,
-                they are filled with inf and 0.
+            geometry: for each camera, whether depth_m, label and cosine are wanted; where
+                not, they are filled with inf and 0.
 
         Returns:
             One image a camera.

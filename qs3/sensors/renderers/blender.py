@@ -97,7 +97,7 @@ class BlenderRenderer:
             layer = target.view_layers[0]
             for index, (camera, wanted) in enumerate(zip(cameras, geometry, strict=True)):
                 _aim(target, eye, camera)
-                layer.use_pass_z = layer.use_pass_object_index = wanted
+                layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_normal = wanted
                 # Cameras of one call must not share their sampling noise.
                 target.cycles.seed = (seed + 0x9E3779B9 * index) % 2**31
                 path = folder / f"{index}.exr"
@@ -371,9 +371,20 @@ def _image(channels: dict[str, np.ndarray], camera: Camera) -> Image:
         raise RenderError(f"Blender rendered {radiance.shape} pixels instead of {shape}")
     depth, label = named.get("Depth.Z"), named.get("IndexOB.X")
     if depth is None or label is None:
-        return Image(radiance, np.full(shape, np.inf, np.float32), np.zeros(shape, np.uint8))
+        return Image.without_geometry(radiance)
     depth = np.where(depth < _BACKGROUND_M, depth, np.float32(np.inf))
-    return Image(radiance, depth, label.astype(np.uint8))
+    normal = np.stack([named[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
+    return Image(radiance, depth, label.astype(np.uint8), _cosine(normal, depth, camera))
+
+
+def _cosine(normal: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """[h, w] float32, cosine of incidence from world normals [h, w, 3] at the pixels' centres."""
+    window, k = camera.rendered, camera.intrinsics
+    x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
+    y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
+    nx, ny, nz = np.moveaxis(normal @ camera.world_from_camera[:3, :3], -1, 0)
+    cosine = np.abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1)
+    return np.where(np.isfinite(depth), np.minimum(cosine, 1), 0).astype(np.float32)
 
 
 def _remove_everything(bpy: Any) -> None:

@@ -85,8 +85,11 @@ class MitsubaRenderer:
                 # Cameras of one call must not share their sampling noise.
                 camera_seed = (seed + 0x9E3779B9 * index) % 2**32
                 radiance = built.radiance(camera, self.settings.samples, camera_seed)
-                depth_m, label = built.geometry(camera) if wanted else _no_geometry(camera)
-                images.append(Image(radiance, depth_m, label))
+                if wanted:
+                    depth_m, face = built.geometry(camera)
+                    images.append(Image(radiance, depth_m, *built.faces.seen(camera, face)))
+                else:
+                    images.append(Image.without_geometry(radiance))
         except RuntimeError as error:
             raise RenderError(f"Mitsuba ({self.variant}) failed: {error}") from error
         return images
@@ -151,11 +154,6 @@ def _import_mitsuba() -> Any:
     return mitsuba
 
 
-def _no_geometry(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    shape = (camera.rendered.height, camera.rendered.width)
-    return np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=np.uint8)
-
-
 @dataclass(frozen=True, eq=False)
 class _Faces:
     """All bodies as one mesh: one shape means one kernel, however many bodies there are.
@@ -191,6 +189,18 @@ class _Faces:
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
 
+    def seen(self, camera: Camera, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Label and cosine of incidence, [h, w], where a camera's pixels see `face` (-1: none)."""
+        valid, window, k = face >= 0, camera.rendered, camera.intrinsics
+        face = np.where(valid, face, 0)
+        label = np.where(valid, self.label[face], 0).astype(np.uint8)
+        x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
+        y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
+        normals = (self.normals() @ camera.world_from_camera[:3, :3]).astype(np.float32)
+        nx, ny, nz = np.moveaxis(normals[face], -1, 0)
+        cosine = np.abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1)
+        return label, np.where(valid, np.minimum(cosine, 1), 0).astype(np.float32)
+
 
 def _mi_mesh(mi: Any, faces: _Faces, properties: Any) -> Any:
     """The mesh in Mitsuba, filled but not yet in a scene."""
@@ -213,14 +223,14 @@ class _JitScene:
         import drjit as dr
 
         self._mi, self._dr = mi, dr
-        self._faces = _Faces.of(scene.bodies)
-        mesh = _mi_mesh(mi, self._faces, mi.Properties())
+        self.faces = _Faces.of(scene.bodies)
+        mesh = _mi_mesh(mi, self.faces, mi.Properties())
         self._scene = mi.load_dict({"type": "scene", "bodies": mesh})
-        self._normal = mi.Float(self._faces.normals().astype(np.float32).ravel())
-        self._albedo = mi.Float(self._faces.albedo)
+        self._normal = mi.Float(self.faces.normals().astype(np.float32).ravel())
+        self._albedo = mi.Float(self.faces.albedo)
         self._ambient = self._opaque(scene.ambient)
         self._epsilon = self._opaque(
-            _RAY_EPSILON * (1 + float(np.abs(self._faces.mesh.vertices).max()))
+            _RAY_EPSILON * (1 + float(np.abs(self.faces.mesh.vertices).max()))
         )
         self._projector = scene.projector
         if scene.projector is not None:
@@ -267,7 +277,7 @@ class _JitScene:
         return np.array(mean, dtype=np.float32).reshape(window.height, window.width)
 
     def geometry(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Depth and label, [h, w], at the pixels' centres."""
+        """Depth, and index of the face (-1: none), [h, w], at the pixels' centres."""
         u, v, ray_of = self._pixels(camera)
         hit = self._scene.ray_intersect_preliminary(ray_of(u, v), coherent=True)
         self._dr.eval(hit.t, hit.prim_index)
@@ -275,9 +285,7 @@ class _JitScene:
         # The direction of a ray has length 1 along the optical axis, so t is the depth.
         depth = np.array(hit.t, dtype=np.float32).reshape(window.height, window.width)
         face = np.array(hit.prim_index).reshape(depth.shape)
-        valid = np.isfinite(depth)
-        label = np.where(valid, self._faces.label[np.where(valid, face, 0)], 0)
-        return depth, label.astype(np.uint8)
+        return depth, np.where(np.isfinite(depth), face.astype(np.int64), -1)
 
     def _shade(self, ray: Any) -> Any:
         """Radiance along a ray, 0 where nothing is hit."""
@@ -343,14 +351,14 @@ class _ScalarScene:
 
     def __init__(self, mi: Any, scene: Scene) -> None:
         self._mi = mi
-        self._faces = _Faces.of(scene.bodies)
+        self.faces = _Faces.of(scene.bodies)
         self._ambient = scene.ambient
         properties = mi.Properties()
         reflectance = {"type": "mesh_attribute", "name": "face_albedo"}
         diffuse = {"type": "diffuse", "reflectance": reflectance}
         properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": diffuse})
-        mesh = _mi_mesh(mi, self._faces, properties)
-        mesh.add_attribute("face_albedo", 3, np.repeat(self._faces.albedo, 3))
+        mesh = _mi_mesh(mi, self.faces, properties)
+        mesh.add_attribute("face_albedo", 3, np.repeat(self.faces.albedo, 3))
         self._has_projector = scene.projector is not None
         parts = {"type": "scene", "bodies": mesh}
         if scene.projector is not None:
@@ -372,7 +380,7 @@ class _ScalarScene:
         return total
 
     def geometry(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Depth and label, [h, w], at the pixels' centres."""
+        """Depth, and index of the face (-1: none), [h, w], at the pixels' centres."""
         # One sample without jitter is at the centre.
         sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
         aovs = {"type": "aov", "aovs": "f:prim_index,t:depth"}
@@ -380,8 +388,7 @@ class _ScalarScene:
         face, valid = found[..., 0].astype(np.int64), found[..., 1] > 0
         depth = np.full(valid.shape, np.inf, dtype=np.float32)
         depth[valid] = self._plane_depth(camera, face)[valid]
-        label = np.where(valid, self._faces.label[np.where(valid, face, 0)], 0)
-        return depth, label.astype(np.uint8)
+        return depth, np.where(valid, face, -1)
 
     def _plane_depth(self, camera: Camera, face: np.ndarray) -> np.ndarray:
         """[h, w] depth of the face's plane along the ray through a pixel's centre.
@@ -393,8 +400,8 @@ class _ScalarScene:
         x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
         y = (window.top + np.arange(window.height) - k.cy_px) / k.focal_px
         rotation, origin = camera.world_from_camera[:3, :3], camera.world_from_camera[:3, 3]
-        normal = (self._faces.normals() @ rotation)[face]  # [h, w, 3], camera axes
-        corners = np.stack([(corner - origin) @ rotation for corner in self._faces.corners()])
+        normal = (self.faces.normals() @ rotation)[face]  # [h, w, 3], camera axes
+        corners = np.stack([(corner - origin) @ rotation for corner in self.faces.corners()])
         depths = corners[:, :, 2]
         along = normal[..., 0] * x + normal[..., 1] * y[:, None] + normal[..., 2]
         plane = np.einsum("hwc,hwc->hw", normal, corners[0][face])

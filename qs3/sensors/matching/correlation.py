@@ -1,4 +1,4 @@
-"""From images to disparity: block matching of a stereo pair, and against a reference image."""
+"""Matching by normalised correlation, of two images or against a stored one."""
 
 from __future__ import annotations
 
@@ -8,56 +8,8 @@ import cv2
 import numpy as np
 
 from qs3.errors import ConfigError
-
-STEREOBM_BIAS_PX = 7.5 / 256
-"""OpenCV's StereoBM computes 1/256 px, adds 15 and shifts by 4 bits: it rounds up to the
-next 1/16 px, which is on average 7.5/256 px too much (modules/calib3d/src/stereobm.cpp)."""
-
-
-@dataclass(frozen=True)
-class StereoBlockMatcher:
-    """OpenCV's StereoBM: sum of absolute differences on x-Sobel images, 1/16 px.
-
-    Attributes:
-        num_disparities: search range 0..num_disparities-1 px, a multiple of 16.
-        block_size: side of the block in px, odd, 5..255.
-        texture_threshold, uniqueness_ratio: as in OpenCV.
-        remove_bias: subtract STEREOBM_BIAS_PX (the released code does not).
-    """
-
-    num_disparities: int = 160
-    block_size: int = 19
-    texture_threshold: int = 10
-    uniqueness_ratio: int = 15
-    remove_bias: bool = True
-
-    def __post_init__(self) -> None:
-        if self.num_disparities < 16 or self.num_disparities % 16:
-            raise ConfigError(
-                f"num_disparities must be a positive multiple of 16, got {self.num_disparities}"
-            )
-        if self.block_size % 2 == 0 or not 5 <= self.block_size <= 255:
-            raise ConfigError(f"block_size must be odd and in 5..255, got {self.block_size}")
-
-    def match(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Disparity of the left image.
-
-        Args:
-            left, right: [h, w] uint8, rectified. The first num_disparities +
-                block_size / 2 columns can get no value: pad on the left.
-
-        Returns:
-            [h, w] float32 in px, NaN where there is no match. Zero disparity (a point at
-            infinity) counts as no match, as in the released code.
-        """
-        matcher = cv2.StereoBM.create(self.num_disparities, self.block_size)
-        matcher.setTextureThreshold(self.texture_threshold)
-        matcher.setUniquenessRatio(self.uniqueness_ratio)
-        disparity = matcher.compute(left, right).astype(np.float32) / 16
-        disparity[disparity <= 0] = np.nan
-        if self.remove_bias:
-            disparity -= np.float32(STEREOBM_BIAS_PX)
-        return disparity
+from qs3.sensors.matching.base import Match
+from qs3.sensors.reasons import Reason
 
 
 @dataclass(frozen=True)
@@ -89,18 +41,14 @@ class ReferenceMatcher:
         if self.num_disparities < 3:
             raise ConfigError(f"num_disparities must be >= 3, got {self.num_disparities}")
 
-    def match(self, image: np.ndarray, reference: np.ndarray, left: int) -> np.ndarray:
-        """Disparity of a part of the camera's image.
+    @property
+    def reach_px(self) -> int:
+        """Half a window."""
+        return self.window_px // 2
 
-        Args:
-            image: [h, w] uint8, rows of the whole image's rows that `reference` holds too.
-            reference: [h, W] float32, the same rows of the stored image, whole width.
-            left: column of the whole image at which `image` starts.
-
-        Returns:
-            [h, w] float32: u - u_reference in px, NaN where there is no match.
-        """
-        scores = self._scores(image, reference, left)
+    def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
+        """Disparities; see `Matcher.match`."""
+        scores = self._scores(image, other.astype(np.float32, copy=False), first)
         last = len(scores) - 1
         best = scores.argmax(axis=0)
 
@@ -120,9 +68,14 @@ class ReferenceMatcher:
         disparity = self.min_disparity + best + (upper - lower) / (2 * curvature)
         if self.steps_per_px:
             disparity = np.rint(disparity * self.steps_per_px) / self.steps_per_px
-        return np.where(valid, disparity, np.nan).astype(np.float32)
+        why_not = np.select(
+            [top <= -1, top < self.min_score, inner],
+            [np.uint8(Reason.OUTSIDE), np.uint8(Reason.UNMATCHED), np.uint8(Reason.AMBIGUOUS)],
+            np.uint8(Reason.UNMATCHED),
+        )
+        return Match.of(np.where(valid, disparity, np.nan).astype(np.float32), why_not)
 
-    def _scores(self, image: np.ndarray, reference: np.ndarray, left: int) -> np.ndarray:
+    def _scores(self, image: np.ndarray, reference: np.ndarray, first: int) -> np.ndarray:
         """[num_disparities, h, w] float32 normalised correlation; -1 outside the reference."""
         size = (self.window_px, self.window_px)
         height, width = image.shape
@@ -143,13 +96,13 @@ class ReferenceMatcher:
 
         scores = np.full((self.num_disparities, height, width), -1, dtype=np.float32)
         for k in range(self.num_disparities):
-            # Column c of the part is u = left + c; it is compared with u - disparity.
-            start = left - (self.min_disparity + k)
-            first, last = max(0, -start), min(width, whole - start)
-            if last - first < self.window_px:
+            # Column c meets column first + c - disparity of the other image.
+            start = first - (self.min_disparity + k)
+            low, high = max(0, -start), min(width, whole - start)
+            if high - low < self.window_px:
                 continue
-            here = slice(first, last)
-            there = slice(start + first, start + last)
+            here = slice(low, high)
+            there = slice(start + low, start + high)
             product = mean(grey[:, here] * reference[:, there])
             covariance = product - mean_i[:, here] * mean_r[:, there]
             scores[k, :, here] = covariance / (spread_i[:, here] * spread_r[:, there])

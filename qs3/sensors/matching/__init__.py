@@ -1,0 +1,7 @@
+"""From images to disparity: matchers that any sensor can use."""
+
+from qs3.sensors.matching.base import Match, Matcher
+from qs3.sensors.matching.block import STEREOBM_BIAS_PX, StereoBlockMatcher
+from qs3.sensors.matching.correlation import ReferenceMatcher
+
+__all__ = ["STEREOBM_BIAS_PX", "Match", "Matcher", "ReferenceMatcher", "StereoBlockMatcher"]

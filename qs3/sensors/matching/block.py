@@ -1,0 +1,66 @@
+"""Block matching of two images by the sum of absolute differences: OpenCV's StereoBM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from qs3.errors import ConfigError
+from qs3.sensors.matching.base import Match, side_by_side
+
+STEREOBM_BIAS_PX = 7.5 / 256
+"""OpenCV's StereoBM computes 1/256 px, adds 15 and shifts by 4 bits: it rounds up to the
+next 1/16 px, which is on average 7.5/256 px too much (modules/calib3d/src/stereobm.cpp)."""
+
+
+@dataclass(frozen=True)
+class StereoBlockMatcher:
+    """OpenCV's StereoBM: sum of absolute differences on x-Sobel images, 1/16 px.
+
+    Attributes:
+        num_disparities: how many disparities are searched, a multiple of 16.
+        block_size: side of the block in px, odd, 5..255.
+        texture_threshold, uniqueness_ratio: as in OpenCV.
+        remove_bias: subtract STEREOBM_BIAS_PX (the released code does not).
+        min_disparity: where the search begins. With 0, a disparity of 0 (a point at infinity)
+            counts as no match, as in the released code.
+    """
+
+    num_disparities: int = 160
+    block_size: int = 19
+    texture_threshold: int = 10
+    uniqueness_ratio: int = 15
+    remove_bias: bool = True
+    min_disparity: int = 0
+
+    def __post_init__(self) -> None:
+        if self.num_disparities < 16 or self.num_disparities % 16:
+            raise ConfigError(
+                f"num_disparities must be a positive multiple of 16, got {self.num_disparities}"
+            )
+        if self.block_size % 2 == 0 or not 5 <= self.block_size <= 255:
+            raise ConfigError(f"block_size must be odd and in 5..255, got {self.block_size}")
+
+    @property
+    def reach_px(self) -> int:
+        """Half a block and a pixel of the Sobel filter."""
+        return self.block_size // 2 + 1
+
+    def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
+        """Disparities; see `Matcher.match`."""
+        low, high = self.min_disparity, self.min_disparity + self.num_disparities - 1
+        left, right, start = side_by_side(image, other, first, low, high, self.block_size)
+        matcher = cv2.StereoBM.create(self.num_disparities, self.block_size)
+        matcher.setMinDisparity(low)
+        matcher.setTextureThreshold(self.texture_threshold)
+        matcher.setUniquenessRatio(self.uniqueness_ratio)
+        found = matcher.compute(left, right)[:, start : start + image.shape[1]]
+        disparity = found.astype(np.float32) / 16
+        disparity[disparity <= low - 1] = np.nan  # OpenCV's mark for no match
+        if low == 0:
+            disparity[disparity <= 0] = np.nan  # a point at infinity, as in the released code
+        if self.remove_bias:
+            disparity -= np.float32(STEREOBM_BIAS_PX)
+        return Match.of(disparity)
