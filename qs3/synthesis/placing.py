@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -10,11 +11,19 @@ from qs3.errors import MeshError
 from qs3.meshes.mesh import Mesh
 
 
+class Placing(Protocol):
+    """Puts a mesh into the world."""
+
+    def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str) -> Mesh:
+        """A scaled, moved and turned copy; `object_id` for those who look it up in a list."""
+        ...
+
+
 @dataclass(frozen=True)
 class UnitCube:
     """The paper's placing: largest side 1 m, box centred on the origin, random yaw."""
 
-    def place(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A scaled, centred and turned copy."""
         return _place(mesh, 1 / _largest_side(mesh), on_floor=False, rng=rng)
 
@@ -31,7 +40,7 @@ class RealSize:
     max_side_m: float = 4.0
     fallback_side_m: float = 1.0
 
-    def place(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A turned copy on the floor."""
         side = _largest_side(mesh)
         plausible = self.min_side_m <= side <= self.max_side_m

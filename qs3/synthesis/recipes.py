@@ -19,10 +19,10 @@ from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Renderer
-from qs3.synthesis.placing import RealSize, UnitCube
+from qs3.synthesis.placing import Placing, UnitCube
 from qs3.synthesis.randomness import object_rng
-from qs3.synthesis.scenes import Alone, Room
-from qs3.synthesis.views import AnchoredViews, Drift, HandheldViews
+from qs3.synthesis.scenes import Alone, Surroundings
+from qs3.synthesis.views import AnchoredViews, Drift, Views
 
 
 class TooFewPointsError(DataError):
@@ -54,6 +54,18 @@ class Recipe(Protocol):
 
     def make(self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None) -> Cloud:
         """Make the cloud; TooFewPointsError, MeshError or RenderError say why not."""
+        ...
+
+
+class Crop(Protocol):
+    """Which measurements belong to the object."""
+
+    def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
+        """[h, w] bool in the image; None keeps all."""
+        ...
+
+    def inside(self, points: np.ndarray, box_m: np.ndarray) -> np.ndarray:
+        """[M] bool for points [M, 3] in the world and the object's box [2, 3]."""
         ...
 
 
@@ -132,11 +144,11 @@ class Mesh2Point:
     """
 
     sensor: DepthSensor
-    placing: UnitCube | RealSize = field(default_factory=UnitCube)
-    scene: Alone | Room = field(default_factory=Alone)
-    views: AnchoredViews | HandheldViews = field(default_factory=AnchoredViews)
+    placing: Placing = field(default_factory=UnitCube)
+    scene: Surroundings = field(default_factory=Alone)
+    views: Views = field(default_factory=AnchoredViews)
     drift: Drift = field(default_factory=Drift)
-    crop: BoxCrop | MaskCrop = field(default_factory=BoxCrop)
+    crop: Crop = field(default_factory=BoxCrop)
     points: int = 2048
     min_points: int = 128
     min_view_points: int = 1
@@ -152,10 +164,10 @@ class Mesh2Point:
         if renderer is None:
             raise ConfigError("Mesh2Point needs a renderer: set renderer=mitsuba or blender")
         rng = object_rng(seed, object_id, 0)
-        placed = self.placing.place(mesh, rng)
+        placed = self.placing.place(mesh, rng, object_id)
         box = placed.bounds
         pose_rng = object_rng(seed, object_id, 1)
-        true_poses = self.views.poses(pose_rng, box)
+        true_poses = self.views.poses(pose_rng, box, object_id)
         bodies = self.scene.bodies(placed, np.stack(true_poses)[:, :3, 3], rng)
         believed_poses = self.drift.believed(true_poses, pose_rng)
 
@@ -223,7 +235,7 @@ class RegionDropout:
 class SurfaceSamples:
     """Uniform samples of the whole surface, as in ModelNet10 (M) and its dropout (M_d)."""
 
-    placing: UnitCube | RealSize = field(default_factory=UnitCube)
+    placing: Placing = field(default_factory=UnitCube)
     dropout: RegionDropout | None = None
     points: int = 2048
     needs_renderer: bool = False
@@ -231,7 +243,7 @@ class SurfaceSamples:
     def make(self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None) -> Cloud:
         """See Recipe.make."""
         rng = object_rng(seed, object_id, 0)
-        placed = self.placing.place(mesh, rng)
+        placed = self.placing.place(mesh, rng, object_id)
         # Regions take up to 75 % of the cloud; five times as many samples leave enough.
         drawn = self.points if self.dropout is None else 5 * self.points
         points = surface_sample(placed.vertices, placed.faces, drawn, rng)

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from qs3.meshes.mesh import Mesh, merge
 from qs3.sensors.renderers.base import Body
+
+
+class Surroundings(Protocol):
+    """What stands around the object."""
+
+    def bodies(self, mesh: Mesh, eyes_m: np.ndarray, rng: np.random.Generator) -> tuple[Body, ...]:
+        """The object first (label 1), then the rest (label 0)."""
+        ...
 
 
 @dataclass(frozen=True)

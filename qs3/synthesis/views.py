@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import look_at, rotation_xyz
+
+
+class Views(Protocol):
+    """Where the camera stands."""
+
+    @property
+    def count(self) -> int:
+        """Number of views."""
+        ...
+
+    def poses(
+        self, rng: np.random.Generator, box_m: np.ndarray, object_id: str
+    ) -> list[np.ndarray]:
+        """`count` poses [4, 4] world_from_camera around a box [2, 3]."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -33,7 +49,9 @@ class AnchoredViews:
     def __post_init__(self) -> None:
         _check(self.count, self.min_distance_m, self.max_distance_m)
 
-    def poses(self, rng: np.random.Generator, box_m: np.ndarray) -> list[np.ndarray]:
+    def poses(
+        self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
+    ) -> list[np.ndarray]:
         """`count` poses [4, 4] world_from_camera around a box [2, 3]; the first is the anchor."""
         target_m = box_m.mean(axis=0)
         distance = rng.uniform(self.min_distance_m, self.max_distance_m)
@@ -74,7 +92,9 @@ class HandheldViews:
     def __post_init__(self) -> None:
         _check(self.count, self.min_distance_m, self.max_distance_m)
 
-    def poses(self, rng: np.random.Generator, box_m: np.ndarray) -> list[np.ndarray]:
+    def poses(
+        self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
+    ) -> list[np.ndarray]:
         """`count` true poses [4, 4] around a box [2, 3], in the order of the walk."""
         target_m = box_m.mean(axis=0)
         radius = float(np.hypot(*(box_m[1] - box_m[0])[:2])) / 2
