@@ -23,9 +23,18 @@ from qs3.hydra_glue import build
 from qs3.meshes.folder import MeshFolder
 from qs3.meshes.source import MeshItem
 from qs3.settings import whole
+from qs3.synthesis.keeping import Keep
+from qs3.synthesis.parts import VIEWS
+from qs3.synthesis.released.poses import read_poses
 
 _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
+_SWITCHES = ("provenance", "keep_views", "force", "strict")
+# Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
+_OF_LOOKING = ("scene", "tracking", "crop")
+_PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
+# Of a config: where things lie, and what never changes a byte.
+_UNSTORED = ("paths", "workers", "force", "strict")
 
 
 def check(cfg: DictConfig) -> None:
@@ -40,15 +49,36 @@ def check(cfg: DictConfig) -> None:
             raise ConfigError(f"classes is a list: classes=[{cfg.classes}]")
         if unknown := sorted(set(cfg.classes) - set(CLASSES)):
             raise ConfigError(f"classes: {unknown} are not among the known {', '.join(CLASSES)}")
+    for key in _SWITCHES:
+        if not isinstance(cfg[key], bool):
+            raise ConfigError(f"{key} must be true or false, got {cfg[key]!r}")
+    if cfg.paths.data_dir is None or not str(cfg.paths.data_dir).strip():
+        raise ConfigError(f"paths.data_dir must name a folder, got {cfg.paths.data_dir!r}")
     if cfg.meshes is None and cfg.half != "all":
         raise ConfigError("half= divides a folder of meshes: give one with meshes=PATH")
+    for key in ("released", "poses"):
+        if cfg.get(key) and "poses" not in cfg.recipe:
+            raise ConfigError(
+                f"{key}= is for domain=specklenet10, and where it fits for blensor10, as the "
+                f"authors made them; leave it out for domain={cfg.domain.name}"
+            )
 
 
 def check_recipe(recipe: Any, cfg: DictConfig) -> None:
-    """Raise ConfigError if sensor or renderer are missing where the recipe needs them."""
+    """Raise ConfigError if sensor or renderer are missing where the recipe needs them.
+
+    And if something is asked for that a domain without views cannot give.
+    """
     if not recipe.needs_renderer:
+        for key in (*_OF_LOOKING, "provenance", "keep_views"):
+            if cfg.get(key):
+                raise ConfigError(
+                    f"domain {cfg.domain.name} looks at nothing, so {key}= says nothing to it: "
+                    "leave it out"
+                )
         return
-    for key, part in (("sensor", recipe.sensor), ("renderer", cfg.renderer)):
+    parts = {"sensor": recipe.sensor, "renderer": cfg.renderer}
+    for key, part in (*parts.items(), *((key, cfg[key]) for key in _OF_LOOKING if key in cfg)):
         if not part:
             raise ConfigError(
                 f"domain {cfg.domain.name} looks at meshes: {key}=none does not do, choose another"
@@ -76,12 +106,30 @@ def mesh_root(cfg: DictConfig) -> Path:
     return Path(cfg.meshes).expanduser()
 
 
+def keep(cfg: DictConfig, items: Sequence[MeshItem], folder: Path) -> Keep:
+    """What is wanted besides the clouds: provenance, views, and previews of some objects."""
+    seen: Counter[str] = Counter()
+    previews = []
+    for item in items:
+        if seen[item.cls] < _PREVIEWS:
+            previews.append(item.id)
+        seen[item.cls] += 1
+    return Keep(
+        provenance=cfg.provenance,
+        views=folder / VIEWS if cfg.keep_views else None,
+        previews=frozenset(previews),
+    )
+
+
 def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -> dict[str, Any]:
     """All that decides the bytes of a dataset: what a resume is compared with.
 
     A folder of meshes is described by the content of its files, not by where it lies.
     """
+    # Only what was asked for: a dataset without it is described as it always was.
+    kept = [key for key in ("provenance", "keep_views") if cfg[key]]
     return {
+        **({"kept": kept} if kept else {}),
         "settings": settings(cfg),
         "objects": [_name_and_content(item) for item in items],
         "versions": {
@@ -101,12 +149,36 @@ def settings(cfg: DictConfig) -> dict[str, Any]:
     chosen = {
         "domain": Path(plain["domain"]["path"]).name,
         "seed": plain["seed"],
-        "recipe": plain["recipe"],
+        "recipe": _with_content_of_poses(plain["recipe"]),
         "meshes": "folder" if plain["meshes"] else plain["catalogue"],
     }
     if plain["renderer"]:
         chosen["renderer"] = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}
     return chosen
+
+
+def _with_content_of_poses(recipe: dict[str, Any]) -> dict[str, Any]:
+    """The recipe with a hash of the poses in place of their path; without them, with nothing."""
+    poses = dict(recipe.get("poses") or {})
+    path = poses.pop("path", None)
+    rest = {key: value for key, value in recipe.items() if key != "poses"}
+    if path is None:
+        return rest
+    return {**rest, "poses": {**poses, "sha256": read_poses(Path(path).expanduser()).sha256}}
+
+
+def stored_config(cfg: DictConfig) -> dict[str, Any]:
+    """The composed config as meta.yaml holds it: all but places and what changes no byte."""
+    plain: Any = OmegaConf.to_container(cfg, resolve=False)
+    for key in _UNSTORED:
+        plain.pop(key, None)
+    for key in _NOT_DECISIVE:
+        plain["renderer"].pop(key, None)
+    if plain["meshes"] is not None:
+        plain["meshes"] = "folder"
+    if plain.get("poses") is not None:
+        plain["poses"] = "file"
+    return plain
 
 
 def benchmark(cfg: DictConfig, recipe: dict[str, Any]) -> str:

@@ -1,17 +1,20 @@
 """What Hydra needs from us: the run folder as a resolver, instantiation, the multirun summary.
 
-Importing this module registers the resolvers `${qs3.run_name:}` and `${qs3.wandb_id:}`.
+Importing this module registers the resolvers `${qs3.run_name:}` and `${qs3.wandb_id:}`, and for
+help texts `${qs3.choices:GROUP}` and `${qs3.described:GROUP}`.
 """
 
 from __future__ import annotations
 
 import atexit
+import itertools
 import json
 import logging
 import os
 import re
 import sys
 import tempfile
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,6 +40,39 @@ def _wandb_id(*, _root_: DictConfig) -> str:
     return runs.run_name(_root_).replace("/", "-")
 
 
+def _choices(group: str) -> str:
+    """The choices of a config group, as `a | b`; `none` goes without saying."""
+    return " | ".join(path.stem for path in _files(group))
+
+
+def _described(group: str, also: str = "") -> str:
+    """A line for each choice of a config group: its name and the first sentence of its file.
+
+    With `also` only the choices that another group has, too.
+    """
+    files = _files(group)
+    if also:
+        files = [path for path in files if path.name in {other.name for other in _files(also)}]
+    width = max((len(path.stem) for path in files), default=0)
+    lines = []
+    for path in files:
+        head = itertools.takewhile(
+            lambda line: line.startswith("#"), path.read_text("utf-8").splitlines()
+        )
+        words = " ".join(line[1:].strip() for line in head if not line.startswith("# @package"))
+        sentence = re.split(r"(?<=[.;])\s", words, maxsplit=1)[0].rstrip(";.")
+        short = textwrap.shorten(sentence, 100 - width, placeholder=" ...")
+        lines.append(f"  {path.stem:<{width}}  {short}".rstrip())
+    return "\n".join(lines)
+
+
+def _files(group: str) -> list[Path]:
+    folder = Path(__file__).resolve().parents[1] / "conf" / group
+    return sorted(path for path in folder.glob("*.yaml") if path.stem != "none")
+
+
+OmegaConf.register_new_resolver("qs3.choices", _choices, replace=True)
+OmegaConf.register_new_resolver("qs3.described", _described, replace=True)
 OmegaConf.register_new_resolver("qs3.run_name", _run_name, replace=True)
 OmegaConf.register_new_resolver("qs3.wandb_id", _wandb_id, replace=True)
 

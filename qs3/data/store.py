@@ -2,6 +2,7 @@ r"""Point clouds on disk: one folder a dataset, written atomically, checked when
 
     points.npy         float32 [N, P, 3], C order, metres or the published unit; read as a memmap
     points_clean.npy   optional further arrays of the same shape (here the clean twin)
+    provenance.npy     optional tables, float32 [N, P, columns]: what is known of each point
     manifest.csv       one row an object; those with status "ok" are the N clouds, in order
     meta.yaml          name, classes, hashes, and how it was made; written last
 
@@ -46,6 +47,7 @@ __all__ = [
     "is_begun",
     "is_finished",
     "open_pointset",
+    "open_table",
     "read_manifest",
     "read_meta",
     "write_pointset",
@@ -146,6 +148,7 @@ def write_pointset(
     arrays: Mapping[str, np.ndarray | Sequence[np.ndarray]],
     rows: Sequence[ManifestRow],
     meta: Mapping[str, Any],
+    tables: Mapping[str, Sequence[str]] | None = None,
 ) -> PointSet:
     """Write a dataset and open it again, checked.
 
@@ -160,6 +163,8 @@ def write_pointset(
             stored as float32.
         rows: one an object; the k-th one with status "ok" describes cloud k.
         meta: plain values (numbers, strings, lists, dicts): sensor, renderer, versions, config.
+        tables: which of the arrays are no clouds but say something of each point, with the names
+            of their columns: they are [N, P, columns], and no variant to train on.
 
     Returns:
         The dataset, variant "points".
@@ -169,11 +174,11 @@ def write_pointset(
         Qs3Error: the folder cannot be written.
     """
     folder = Path(folder)
-    rows, classes = number(rows), tuple(classes)
+    rows, classes, tables = number(rows), tuple(classes), dict(tables or {})
     check_rows(rows, classes, where=f"rows of dataset {name!r}")
     stacked = {key: _stack(name, key, value) for key, value in arrays.items()}
     clouds = sum(row.status == OK for row in rows)
-    shape = _check_arrays(name, stacked, clouds)
+    shape = _check_arrays(name, stacked, clouds, tables)
 
     make_folder(folder)
     (folder / _META).unlink(missing_ok=True)
@@ -181,7 +186,7 @@ def write_pointset(
     hashes = {}
     for key, array in stacked.items():
         with atomic_path(folder / f"{key}.npy") as temporary, open(temporary, "wb") as file:
-            file.write(_header(shape))
+            file.write(_header(array.shape))
             file.write(array.data.cast("B"))
         hashes[key] = sha256_file(folder / f"{key}.npy")
     write_text(folder / MANIFEST, to_csv(rows))
@@ -196,6 +201,8 @@ def write_pointset(
         "failed": len(rows) - clouds,
         "sha256": {**hashes, "manifest": sha256_file(folder / MANIFEST)},
     }
+    if tables:
+        document["tables"] = {key: list(columns) for key, columns in tables.items()}
     if clash := sorted(set(document) & set(meta)):
         raise DataError(f"meta of dataset {name!r} may not use the keys {clash}")
     text = yaml.safe_dump({**document, **meta}, sort_keys=False, allow_unicode=True, width=100)
@@ -217,17 +224,10 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         DataError: a file is damaged or does not fit the others; names file and row.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise MissingDataError(f"there is no dataset folder {folder}")
-    if not is_finished(folder):
-        raise MissingDataError(
-            f"{folder} has no {_META}: the generation or import was not finished; "
-            "run the same command again and it continues"
-        )
-    meta = read_meta(folder)
+    meta = _meta_of_finished(folder)
     classes, hashes = tuple(meta["classes"]), meta["sha256"]
-    if variant not in hashes or variant == "manifest":
-        have = sorted(set(hashes) - {"manifest"})
+    have = sorted(set(hashes) - {"manifest", *meta.get("tables", {})})
+    if variant not in have:
         raise DataError(
             f"{folder} holds the arrays {have}, not {variant!r}; generate the dataset again with "
             "it, or choose another variant"
@@ -239,11 +239,8 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
             f"{folder / MANIFEST} has {len(kept)} rows with status ok, but {_META} promises "
             f"{meta['clouds']} clouds; generate or import the dataset again"
         )
-    path = folder / f"{variant}.npy"
-    points = _map(path, (meta["clouds"], meta["points"], 3))
-    if verify and sha256_file(path) != hashes[variant]:
-        raise DataError(f"{path} is damaged (its SHA-256 is not the one in {_META}); {AGAIN}")
-    _check_finite(path, points, [row.id for row in kept])
+    points = _open_array(folder, variant, meta, 3, verify)
+    _check_finite(folder / f"{variant}.npy", points, [row.id for row in kept])
     position = {name: label for label, name in enumerate(classes)}
     return PointSet(
         name=meta["name"],
@@ -255,6 +252,57 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         sha256=_content_hash(hashes[variant], classes, kept),
         meta=meta,
     )
+
+
+def open_table(
+    folder: str | Path, name: str = "provenance", verify: bool = True
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Open what a dataset knows of each point of its variant "points".
+
+    Args:
+        folder: of the dataset.
+        name: of the table, by file stem.
+        verify: also compare the file's SHA-256 with meta.yaml.
+
+    Returns:
+        [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names
+        of the columns. For "provenance" see `qs3.synthesis.keeping.provenance_of`.
+
+    Raises:
+        MissingDataError: there is no such folder, or it was not finished.
+        DataError: the dataset has no such table, or its file is damaged.
+    """
+    folder = Path(folder)
+    meta = _meta_of_finished(folder)
+    tables = meta.get("tables", {})
+    if name not in tables:
+        raise DataError(
+            f"{folder} holds the tables {sorted(tables)}, not {name!r}; generate the dataset again "
+            "with it (for provenance: provenance=true)"
+        )
+    columns = tuple(tables[name])
+    return _open_array(folder, name, meta, len(columns), verify), columns
+
+
+def _meta_of_finished(folder: Path) -> dict[str, Any]:
+    if not folder.is_dir():
+        raise MissingDataError(f"there is no dataset folder {folder}")
+    if not is_finished(folder):
+        raise MissingDataError(
+            f"{folder} has no {_META}: the generation or import was not finished; "
+            "run the same command again and it continues"
+        )
+    return read_meta(folder)
+
+
+def _open_array(
+    folder: Path, name: str, meta: Mapping[str, Any], columns: int, verify: bool
+) -> np.ndarray:
+    path = folder / f"{name}.npy"
+    array = _map(path, (meta["clouds"], meta["points"], columns))
+    if verify and sha256_file(path) != meta["sha256"][name]:
+        raise DataError(f"{path} is damaged (its SHA-256 is not the one in {_META}); {AGAIN}")
+    return array
 
 
 def read_meta(folder: str | Path) -> dict[str, Any]:
@@ -298,19 +346,28 @@ def _stack(name: str, key: str, value: np.ndarray | Sequence[np.ndarray]) -> np.
     return np.ascontiguousarray(value, dtype="<f4")
 
 
-def _check_arrays(name: str, arrays: Mapping[str, np.ndarray], clouds: int) -> tuple[int, int, int]:
-    """The common shape of all arrays, after checking that they fit the manifest."""
+def _check_arrays(
+    name: str,
+    arrays: Mapping[str, np.ndarray],
+    clouds: int,
+    tables: Mapping[str, Sequence[str]],
+) -> tuple[int, int, int]:
+    """The common shape of all clouds, after checking that all arrays fit the manifest."""
+    if "points" in tables or (unknown := sorted(set(tables) - set(arrays))):
+        wrong = "'points' is no table" if "points" in tables else f"tables {unknown} are no arrays"
+        raise DataError(f"dataset {name!r}: {wrong}; arrays are {sorted(arrays)}")
     if "points" not in arrays:
         raise DataError(f"dataset {name!r} needs an array 'points', got {sorted(arrays)}")
     for key, array in arrays.items():
         if not key.isidentifier() or key in ("manifest", "meta"):
             raise DataError(f"an array of dataset {name!r} cannot be called {key!r}")
-        if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
+        width = len(tables[key]) if key in tables else 3
+        if array.ndim != 3 or array.shape[2] != width or 0 in array.shape:
             raise DataError(
-                f"array {key!r} of dataset {name!r} has shape {array.shape}, expected [N, P, 3] "
-                "with at least one cloud of one point"
+                f"array {key!r} of dataset {name!r} has shape {array.shape}, expected "
+                f"[N, P, {width}] with at least one cloud of one point"
             )
-        if array.shape != arrays["points"].shape or len(array) != clouds:
+        if array.shape[:2] != arrays["points"].shape[:2] or len(array) != clouds:
             raise DataError(
                 f"array {key!r} of dataset {name!r} has shape {array.shape}, 'points' has "
                 f"{arrays['points'].shape}, and {clouds} rows have status ok"
@@ -322,7 +379,7 @@ def _check_arrays(name: str, arrays: Mapping[str, np.ndarray], clouds: int) -> t
     return n, p, 3
 
 
-def _header(shape: tuple[int, int, int]) -> bytes:
+def _header(shape: tuple[int, ...]) -> bytes:
     """The .npy header of a float32 C-order array: the only one this format has."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(

@@ -11,17 +11,19 @@ after its down-sampling, by up to two), and StereoBM's bias of 0.029 px.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.filmic import FilmicCamera
 from qs3.sensors.filters import PostFilter, Quantiser
 from qs3.sensors.infrared import InfraredCamera
 from qs3.sensors.matching import Matcher, StereoBlockMatcher
 from qs3.sensors.patterns import Speckle
+from qs3.sensors.reasons import Reason
 from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
 from qs3.sensors.triangulation import Triangulation
 from qs3.sensors.visibility import explained, reached_from
@@ -44,6 +46,15 @@ class SpeckleStereo:
         infrared: from radiance to grey values.
         quantiser: step of the disparity; StereoBM's own is 1/16 px.
         filters: applied to the disparity in this order, before the quantiser.
+        projector_strength: radiance of a white surface under a lit dot at 1 m; at 16, white at
+            4 m has radiance 1. `ambient` is in the same units.
+        sample_offset_px: first column and row that are kept; null: the middle of each step.
+        centre_error_px: error of the principal point in back-projection, right and down. The
+            released code has 0.5: it takes pixel centres for integers where they are halves,
+            which shifts clouds by 0.5 Z / f (1.3 mm at 4 m).
+        blind_left_px: columns at the left of the image that give no depth. OpenCV's StereoBM
+            leaves num_disparities - 1 + block_size // 2 (168 px) empty; here the images are
+            padded, so it loses none.
     """
 
     width_px: int = 1080
@@ -57,9 +68,13 @@ class SpeckleStereo:
     ambient: float = 0.15
     pattern: Speckle = field(default_factory=Speckle)
     matcher: Matcher = field(default_factory=StereoBlockMatcher)
-    infrared: InfraredCamera = field(default_factory=InfraredCamera)
+    infrared: InfraredCamera | FilmicCamera = field(default_factory=InfraredCamera)
     quantiser: Quantiser = field(default_factory=Quantiser)
     filters: tuple[PostFilter, ...] = ()
+    projector_strength: float = 16.0
+    sample_offset_px: int | None = None
+    centre_error_px: float = 0.0
+    blind_left_px: int = 0
 
     def __post_init__(self) -> None:
         if not self.baseline_m > 0:
@@ -70,6 +85,19 @@ class SpeckleStereo:
             raise ConfigError(
                 "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
                 f"{self.min_depth_m} and {self.max_depth_m}"
+            )
+        if not self.projector_strength > 0:
+            raise ConfigError(
+                f"sensor.projector_strength must be positive, got {self.projector_strength}"
+            )
+        if self.sample_offset_px is not None and not 0 <= self.sample_offset_px < self.step_px:
+            raise ConfigError(
+                f"sensor.sample_offset_px must be null or in 0..{self.step_px - 1} (step_px is "
+                f"{self.step_px}), got {self.sample_offset_px}"
+            )
+        if not 0 <= self.blind_left_px < self.width_px:
+            raise ConfigError(
+                f"sensor.blind_left_px must be in 0..{self.width_px - 1}, got {self.blind_left_px}"
             )
         end = self.matcher.min_disparity + self.matcher.num_disparities
         if self.focal_px * self.baseline_m / self.min_depth_m > end:
@@ -116,7 +144,7 @@ class SpeckleStereo:
             middle,
             self.pattern.slide,
             self.tan_half_width,
-            strength=16.0,  # white at 4 m has radiance 1
+            strength=self.projector_strength,
         )
         images = renderer.render(
             Scene(bodies, projector, self.ambient),
@@ -135,6 +163,9 @@ class SpeckleStereo:
             for image, window in zip(images, (left_window, right_window), strict=True)
         ]
         match = self.matcher.match(grey[0], grey[1])
+        if self.blind_left_px:
+            blind = slice(0, max(0, self.blind_left_px - canvas.left))
+            match.reason[:, blind], match.disparity[:, blind] = Reason.OUTSIDE, np.nan
         depth, disparity, reason = self.triangulation.depth(match, self.quantiser, self.filters)
 
         inside = Window(
@@ -158,7 +189,9 @@ class SpeckleStereo:
             pictures |= {"lit": lit, "seen": seen}
 
         # Samples lie on one grid over the whole image, whatever the window.
-        offset = self.step_px // 2
+        offset = self.sample_offset_px
+        if offset is None:
+            offset = self.step_px // 2
         first_col = _first_on_grid(left_window.left, self.step_px, offset)
         first_row = _first_on_grid(left_window.top, self.step_px, offset)
         grid = (
@@ -166,7 +199,7 @@ class SpeckleStereo:
             slice(first_col - left_window.left, None, self.step_px),
         )
         return DepthFrame(
-            camera=left,
+            camera=Camera(self._believed, left.world_from_camera),
             left=first_col,
             top=first_row,
             step_px=self.step_px,
@@ -177,6 +210,13 @@ class SpeckleStereo:
             reason=reason[grid],
             images=pictures,
         )
+
+    @property
+    def _believed(self) -> Intrinsics:
+        """What back-projection takes for the intrinsics."""
+        true = Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
+        error = self.centre_error_px
+        return replace(true, cx_px=true.cx_px + error, cy_px=true.cy_px + error)
 
     def _canvas(self, left: Window, right: Window) -> Window:
         """Where both images lie side by side, with room for the matcher's reach around them.

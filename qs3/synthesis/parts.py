@@ -7,6 +7,7 @@ parts/         <sha256 of the id>.npz: the arrays, and a line of JSON with the r
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import shutil
 import zipfile
@@ -16,11 +17,13 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import ConfigError, DataError
-from qs3.files import atomic_path, remove_leftovers, write_json
+from qs3.files import make_folder, remove_leftovers, write_bytes, write_json
 from qs3.synthesis.recipes import Cloud
 from qs3.synthesis.workers import Outcome
 
 RECIPE = "recipe.json"
+CLOUDS, INFRARED, CONFIG, VIEWS = "clouds.png", "infrared.png", "config.yaml", "views"
+_PREVIEW = "preview_"
 
 
 class Parts:
@@ -42,7 +45,7 @@ class Parts:
         else:
             self.clear()  # parts without a recipe: nobody knows what they were made with
             write_json(path, recipe)
-        self._parts.mkdir(parents=True, exist_ok=True)
+        make_folder(self._parts)
         remove_leftovers(self._parts)
 
     def save(self, outcome: Outcome) -> None:
@@ -56,9 +59,13 @@ class Parts:
             "valid_points": cloud.valid_points if cloud else 0,
         }
         arrays = dict(cloud.arrays) if cloud else {}
+        if cloud:
+            arrays |= {_PREVIEW + name: image for name, image in cloud.preview.items()}
         text = np.frombuffer(json.dumps(note).encode(), dtype=np.uint8)
-        with atomic_path(self._path(outcome.item_id)) as temporary:
-            np.savez(temporary, note=text, **arrays)
+        # In memory first: a zip file that a full disk breaks off complains once more at its end.
+        file = io.BytesIO()
+        np.savez(file, note=text, **arrays)
+        write_bytes(self._path(outcome.item_id), file.getvalue())
 
     def load(self, item_id: str) -> Outcome | None:
         """One outcome, or None if it is not there yet."""
@@ -66,17 +73,30 @@ class Parts:
         try:
             with np.load(path, allow_pickle=False) as file:
                 note = json.loads(file["note"].tobytes())
-                arrays = {name: file[name] for name in file.files if name != "note"}
+                found = {name: file[name] for name in file.files if name != "note"}
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
-        cloud = Cloud(arrays, note["views"], note["valid_points"]) if arrays else None
+        arrays = {name: array for name, array in found.items() if not name.startswith(_PREVIEW)}
+        preview = {
+            name.removeprefix(_PREVIEW): array
+            for name, array in found.items()
+            if name.startswith(_PREVIEW)
+        }
+        cloud = None
+        if arrays:
+            cloud = Cloud(arrays, note["views"], note["valid_points"], preview=preview)
         return Outcome(note["item_id"], note["mesh_sha256"], cloud, note["reason"])
 
     def done(self, item_id: str) -> bool:
         """Whether an outcome is saved."""
         return self._path(item_id).is_file()
+
+    def state(self, total: int) -> str:
+        """How much is done, as a sentence."""
+        done = len(list(self._parts.glob("*.npz"))) if self._parts.is_dir() else 0
+        return f"{done} of {total} objects are done and kept."
 
     def clear(self) -> None:
         """Remove the parts; the recipe stays beside the finished dataset."""
@@ -141,5 +161,8 @@ def forget(folder: Path) -> None:
     # recipe last: as long as a part is left, it says what the part was made with.
     (folder / "meta.yaml").unlink(missing_ok=True)
     Parts(folder).clear()
-    for path in [folder / "manifest.csv", *folder.glob("*.npy"), folder / RECIPE]:
+    if (folder / VIEWS).is_dir():
+        shutil.rmtree(folder / VIEWS)
+    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG)
+    for path in [*(folder / name for name in names), *folder.glob("*.npy"), folder / RECIPE]:
         path.unlink(missing_ok=True)

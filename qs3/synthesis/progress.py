@@ -61,7 +61,7 @@ def _rich_bar(label: str, total: int, done: int) -> Iterator[Callable[[], None]]
             nonlocal steps
             steps += 1
             rate = steps / max(time.monotonic() - start, 1e-9)
-            bar.update(task, advance=1, rate=f"{rate:.1f}/s")
+            bar.update(task, advance=1, rate=_speed(rate))
 
         yield advance
 
@@ -82,4 +82,10 @@ class _LogLines:
         self.last = now
         rate = (self.done - self.first) / max(now - self.start, 1e-9)
         left = (self.total - self.done) / rate if rate else float("nan")
-        log.info("%s: %d of %d, %.1f/s, %.0f s left", self.label, self.done, self.total, rate, left)
+        log.info(
+            "%s: %d of %d, %s, %.0f s left", self.label, self.done, self.total, _speed(rate), left
+        )
+
+
+def _speed(rate: float) -> str:
+    return f"{rate:.1f}/s" if rate >= 1 or rate == 0 else f"{1 / rate:.1f} s each"

@@ -19,10 +19,16 @@ from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Renderer
+from qs3.synthesis.keeping import Keep, preview_of, provenance_of
 from qs3.synthesis.placing import Placing, UnitCube
 from qs3.synthesis.randomness import object_rng
+from qs3.synthesis.released.placing import PoseFile
+from qs3.synthesis.released.views import box_of_corners
 from qs3.synthesis.scenes import Alone, Surroundings
+from qs3.synthesis.view_files import save_view
 from qs3.synthesis.views import AnchoredViews, Drift, Views
+
+_NOTHING = Keep()
 
 
 class TooFewPointsError(DataError):
@@ -34,16 +40,19 @@ class Cloud:
     """What a recipe makes of one mesh.
 
     Attributes:
-        arrays: [P, 3] float32 by name; "points", and "points_clean" where there is a twin.
+        arrays: [P, 3] float32 by name; "points", and "points_clean" where there is a twin;
+            where it was asked for also "provenance" [P, 5] of "points".
         views: frames that gave points.
         valid_points: points before sampling.
         frames: the depth frames, for looking at (empty where there are none).
+        preview: small pictures of the first view by name, where they were asked for.
     """
 
     arrays: dict[str, np.ndarray]
     views: int
     valid_points: int
     frames: tuple[DepthFrame, ...] = ()
+    preview: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class Recipe(Protocol):
@@ -52,8 +61,18 @@ class Recipe(Protocol):
     points: int
     needs_renderer: bool
 
-    def make(self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None) -> Cloud:
-        """Make the cloud; TooFewPointsError, MeshError or RenderError say why not."""
+    def make(
+        self,
+        mesh: Mesh,
+        object_id: str,
+        seed: int,
+        renderer: Renderer | None,
+        keep: Keep = _NOTHING,
+    ) -> Cloud:
+        """Make the cloud; TooFewPointsError, MeshError or RenderError say why not.
+
+        `keep` asks for more than the cloud and never changes it.
+        """
         ...
 
 
@@ -141,6 +160,11 @@ class Mesh2Point:
         min_points: objects with fewer measured points over all views are recorded as failed.
         min_view_points: frames with fewer points are left out.
         clean: also make the twin from the true depth at the same views (the paper's S_c).
+        min_clean_points: as `min_points`, of the twin; None: the same. A thin lamp may give
+            few: a matcher's patches make thin parts wide, the true depth does not.
+        poses: from a file, in place of `placing` and of `views` (whose count is kept).
+        box_of_corners: crop by the box of the turned corners of the mesh's own box, as the
+            released code does, and not by the object's own axis-aligned box.
     """
 
     sensor: DepthSensor
@@ -153,57 +177,87 @@ class Mesh2Point:
     min_points: int = 128
     min_view_points: int = 1
     clean: bool = True
+    min_clean_points: int | None = None
+    poses: PoseFile | None = None
+    box_of_corners: bool = False
     needs_renderer: bool = True
 
     def __post_init__(self) -> None:
         if self.points < 1:
             raise ConfigError(f"points must be at least 1, got {self.points}")
+        if self.poses is not None:
+            object.__setattr__(self, "placing", self.poses.placing)
+            object.__setattr__(self, "views", self.poses.views(self.views.count))
 
-    def make(self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None) -> Cloud:
+    def make(
+        self,
+        mesh: Mesh,
+        object_id: str,
+        seed: int,
+        renderer: Renderer | None,
+        keep: Keep = _NOTHING,
+    ) -> Cloud:
         """See Recipe.make."""
         if renderer is None:
             raise ConfigError("Mesh2Point needs a renderer: set renderer=mitsuba or blender")
         rng = object_rng(seed, object_id, 0)
         placed = self.placing.place(mesh, rng, object_id)
         box = placed.bounds
+        crop_box = box_of_corners(mesh, placed) if self.box_of_corners else box
         pose_rng = object_rng(seed, object_id, 1)
         true_poses = self.views.poses(pose_rng, box, object_id)
         bodies = self.scene.bodies(placed, np.stack(true_poses)[:, :3, 3], rng)
         believed_poses = self.drift.believed(true_poses, pose_rng)
 
-        noisy, clean, frames = [], [], []
+        noisy, clean, frames, origins = [], [], [], []
         for i, (pose, believed) in enumerate(zip(true_poses, believed_poses, strict=True)):
             view_rng = object_rng(seed, object_id, 2 + i)
-            frame = self.sensor.scan(bodies, box, pose, renderer, view_rng)
+            frame = self.sensor.scan(
+                bodies, box, pose, renderer, view_rng, explain=keep.views is not None
+            )
             if frame is None:
                 continue
             frames.append(frame)
+            if keep.views is not None:
+                save_view(keep.views, object_id, i, frame, pose, believed)
             mask = self.crop.keep(frame, view_rng)
             depth = frame.depth_m if mask is None else np.where(mask, frame.depth_m, np.nan)
             points = frame.points(depth, believed)
             # A box is known in the world; with drift the cloud and the box part company,
             # as they do when a scan is cropped by an annotation made on the fused model.
-            points = points[self.crop.inside(points, box)]
+            inside = self.crop.inside(points, crop_box)
+            points = points[inside]
             if len(points) >= self.min_view_points:
                 noisy.append(points)
+                if keep.provenance:
+                    origins.append(provenance_of(frame, depth, i)[inside])
             if self.clean:
                 seen = np.where(frame.label == 1, frame.clean_m, np.nan)
                 clean.append(frame.points(seen, pose))
 
-        arrays = {"points": self._sample(noisy, "the sensor")}
+        fused, order = self._sample(noisy, "the sensor", "min_points")
+        arrays = {"points": fused[order]}
         if self.clean:
-            arrays["points_clean"] = self._sample(clean, "the true depth")
-        return Cloud(arrays, len(noisy), sum(map(len, noisy)), tuple(frames))
+            least = "min_points" if self.min_clean_points is None else "min_clean_points"
+            true, true_order = self._sample(clean, "the true depth", least)
+            arrays["points_clean"] = true[true_order]
+        if keep.provenance:
+            arrays["provenance"] = np.concatenate(origins)[order]
+        preview = preview_of(frames[0]) if object_id in keep.previews else {}
+        return Cloud(arrays, len(noisy), sum(map(len, noisy)), tuple(frames), preview)
 
-    def _sample(self, parts: list[np.ndarray], what: str) -> np.ndarray:
-        total = sum(map(len, parts))
-        if total < max(self.min_points, 1):
+    def _sample(
+        self, parts: list[np.ndarray], what: str, least: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """All points [M, 3] float32, and which of them make the cloud: [P] indices."""
+        total, wanted = sum(map(len, parts)), getattr(self, least)
+        if total < max(wanted, 1):
             raise TooFewPointsError(
                 f"{what} gave {total} points over {self.views.count} views, fewer than "
-                f"min_points={self.min_points}"
+                f"recipe.{least}={wanted}"
             )
         fused = np.concatenate(parts).astype(np.float32)
-        return fused[farthest_point_sampling_np(fused, self.points)]
+        return fused, farthest_point_sampling_np(fused, self.points)
 
 
 @dataclass(frozen=True)
@@ -240,7 +294,14 @@ class SurfaceSamples:
     points: int = 2048
     needs_renderer: bool = False
 
-    def make(self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None) -> Cloud:
+    def make(
+        self,
+        mesh: Mesh,
+        object_id: str,
+        seed: int,
+        renderer: Renderer | None,
+        keep: Keep = _NOTHING,
+    ) -> Cloud:
         """See Recipe.make."""
         rng = object_rng(seed, object_id, 0)
         placed = self.placing.place(mesh, rng, object_id)

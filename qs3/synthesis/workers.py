@@ -16,13 +16,15 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 
 from qs3.errors import Qs3Error, RenderError
 from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
+from qs3.synthesis.keeping import Keep
 from qs3.synthesis.recipes import Cloud, Recipe
+from qs3.synthesis.view_files import DiskError
 
 log = logging.getLogger(__name__)
 
@@ -58,21 +60,29 @@ class Job:
         recipe: how a cloud is made.
         make_renderer: picklable; called once in each worker if the recipe needs one.
         seed: of the dataset.
+        keep: what is wanted besides the clouds.
     """
 
     recipe: Recipe
     make_renderer: Callable[[], Renderer]
     seed: int
+    keep: Keep = field(default_factory=Keep)
 
 
 def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
-    """Make one object's cloud; failures of the object become an Outcome, not an error."""
+    """Make one object's cloud; failures of the object become an Outcome, not an error.
+
+    Raises:
+        DiskError: the views cannot be written; it would be the same with every object.
+    """
     sha256, lasting = "", True
     try:
         mesh = item.load()
         sha256 = mesh.sha256
-        cloud = job.recipe.make(mesh, item.id, job.seed, renderer)
-        return Outcome(item.id, sha256, Cloud(cloud.arrays, cloud.views, cloud.valid_points), "")
+        cloud = job.recipe.make(mesh, item.id, job.seed, renderer, job.keep)
+        return Outcome(item.id, sha256, replace(cloud, frames=()), "")
+    except DiskError:
+        raise
     except Qs3Error as error:
         reason = str(error)
     except MemoryError:

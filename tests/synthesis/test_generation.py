@@ -1,12 +1,10 @@
 """generate.py from a folder of small meshes, with real workers and the real renderer."""
 
-import hashlib
 import json
 import os
 import random
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -21,63 +19,7 @@ from qs3.generation import generate
 from qs3.synthesis.parts import Parts
 from qs3.synthesis.recipes import Cloud
 from qs3.synthesis.workers import Outcome
-
-ROOT = Path(__file__).resolve().parents[2]
-QUICK = [
-    "sensor=speckle_stereo_small",
-    "renderer=mitsuba",
-    "renderer.samples=2",
-    "views=2",
-    "classes=[chair,table,lamp]",
-]
-
-
-@pytest.fixture(scope="module")
-def meshes(tmp_path_factory):
-    """Three classes, two splits, two or three objects each."""
-    root = tmp_path_factory.mktemp("meshes")
-    solids = {
-        "chair": lambda i: trimesh.creation.box((0.5, 0.5, 0.9 + 0.1 * i)),
-        "table": lambda i: trimesh.creation.cylinder(0.6 + 0.1 * i, 0.7),
-        "lamp": lambda i: trimesh.creation.icosphere(3, 0.3 + 0.05 * i),
-    }
-    for cls, make in solids.items():
-        for split, count in (("train", 3), ("test", 2)):
-            folder = root / cls / split
-            folder.mkdir(parents=True)
-            for i in range(count):
-                make(i + 3 * (split == "test")).export(folder / f"{cls}_{i}.ply")
-    return root
-
-
-def config(data_dir, meshes=None, *overrides, domain="specklenet10"):
-    where = [f"paths.data_dir={data_dir}", *([f"meshes={meshes}"] if meshes else [])]
-    settings = [] if domain.startswith("modelnet") else QUICK
-    if domain.startswith("modelnet"):
-        settings = ["classes=[chair,table,lamp]"]
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("generate", [f"domain={domain}", *settings, *where, *overrides])
-
-
-def command(data_dir, meshes, *overrides):
-    return [
-        sys.executable, "generate.py", "domain=specklenet10", *QUICK,
-        f"paths.data_dir={data_dir}", f"meshes={meshes}", *overrides,
-    ]  # fmt: skip
-
-
-def fingerprint(folder):
-    """Hash of every file of a finished dataset."""
-    names = ("points.npy", "points_clean.npy", "manifest.csv", "meta.yaml")
-    return {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in names}
-
-
-@pytest.fixture(scope="module")
-def finished(meshes, tmp_path_factory):
-    """The dataset that every other way of making it must equal."""
-    data_dir = tmp_path_factory.mktemp("data")
-    pointset = generate(config(data_dir, meshes, "workers=0"))
-    return data_dir / "specklenet10", pointset
+from tests.synthesis.generating import ROOT, command, config, fingerprint
 
 
 def test_a_folder_of_meshes_becomes_a_dataset(finished):
@@ -225,7 +167,7 @@ def test_wrong_settings_name_the_key(meshes, tmp_path, overrides, error, message
         generate(config(tmp_path, meshes, "workers=0", *overrides))
 
 
-@pytest.mark.parametrize("key", ["sensor", "renderer"])
+@pytest.mark.parametrize("key", ["sensor", "renderer", "scene", "tracking", "crop"])
 def test_looking_needs_a_sensor_and_a_renderer(tmp_path, key):
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("generate", [f"{key}=none", f"paths.data_dir={tmp_path}"])
@@ -256,15 +198,17 @@ def test_surface_samples_lie_on_the_surface_and_dropout_takes_regions(meshes, tm
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("keep", [[], ["keep_views=true", "provenance=true"]], ids=["", "views"])
 @pytest.mark.parametrize("victim", ["parent", "worker"])
-def test_kill_at_random_instants_changes_no_byte(finished, meshes, tmp_path, victim):
+def test_kill_at_random_instants_changes_no_byte(meshes, tmp_path, victim, keep):
     """SIGKILL to the parent or to one of its workers, again and again, until it gets through."""
+    generate(config(tmp_path / "whole", meshes, "workers=0", *keep))
     chance = random.Random(victim)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     kills = 0
     for _ in range(60):
         process = subprocess.Popen(
-            command(tmp_path, meshes, "workers=2"), cwd=ROOT, env=environment,
+            command(tmp_path, meshes, "workers=2", *keep), cwd=ROOT, env=environment,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
         # Early kills hit the start, later ones the writing; a start takes about 4 s.
@@ -277,7 +221,16 @@ def test_kill_at_random_instants_changes_no_byte(finished, meshes, tmp_path, vic
             subprocess.run(["rm", "-rf", str(tmp_path / "specklenet10")], check=True)
     else:
         pytest.fail("it never finished")
-    assert fingerprint(tmp_path / "specklenet10") == fingerprint(finished[0])
+    whole = {
+        path.relative_to(tmp_path / "whole"): path.read_bytes()
+        for path in (tmp_path / "whole").rglob("*")
+        if path.is_file()
+    }
+    assert len(whole) == (9 if not keep else 10 + 15 * 2 * 2)
+    for path, content in whole.items():
+        if path.name != "config.yaml":  # which holds the folder
+            assert (tmp_path / path).read_bytes() == content, path
+    assert not list((tmp_path / "specklenet10").rglob("*.tmp*"))
 
 
 def _a_child(pid):

@@ -13,6 +13,7 @@ from qs3.errors import MeshError, RenderError
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
 from qs3.synthesis.recipes import Cloud
+from qs3.synthesis.view_files import DiskError
 from qs3.synthesis.workers import DIED, Job, renderer_provenance, scan_all
 
 
@@ -37,9 +38,13 @@ class Moody:
     points: int = 4
     needs_renderer: bool = False
 
-    def make(self, mesh, object_id, seed, renderer):
+    def make(self, mesh, object_id, seed, renderer, keep=None):
         if self.deadly in object_id:
             os.kill(os.getpid(), signal.SIGKILL)
+        if "dark" in object_id:
+            raise RenderError("the renderer gave no image")
+        if "full" in object_id:
+            raise DiskError("cannot write view_0.npz: No space left on device")
         if "odd" in object_id:
             raise ZeroDivisionError("a defect")
         value = float(sum(map(ord, object_id)) + seed)
@@ -56,12 +61,22 @@ JOB = Job(Moody(), no_renderer, seed=3)
 @pytest.mark.parametrize("workers", [0, 2])
 def test_failures_of_objects_are_outcomes(workers):
     bad = MeshItem("bad", "chair", "train", unreadable, "bad")
-    outcomes = {o.item_id: o for o in scan_all(JOB, [*items("a", "odd", "b"), bad], workers)}
+    outcomes = {
+        o.item_id: o for o in scan_all(JOB, [*items("a", "odd", "dark", "b"), bad], workers)
+    }
     assert outcomes["a"].cloud is not None
     assert outcomes["b"].cloud.arrays["points"][0, 0] == ord("b") + 3
     assert outcomes["bad"].reason == "chair_3.off: no faces"
+    assert outcomes["dark"].reason == "the renderer gave no image"
     assert outcomes["odd"].reason == "unexpected ZeroDivisionError: a defect"
     assert len(outcomes["a"].mesh_sha256) == 64
+
+
+def test_a_full_disk_is_not_the_objects_fault():
+    """It stops the run, from any process, and does not become one object's failure."""
+    for workers in (0, 1):
+        with pytest.raises(DiskError, match="No space left"):
+            list(scan_all(JOB, items("a", "full", "b"), workers))
 
 
 def test_an_object_that_kills_its_worker_costs_only_itself():

@@ -1,0 +1,38 @@
+"""How the tests of this folder call generate.py."""
+
+import hashlib
+import sys
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = [
+    "sensor=speckle_stereo_small",
+    "renderer=mitsuba",
+    "renderer.samples=2",
+    "views=2",
+    "classes=[chair,table,lamp]",
+]
+
+
+def config(data_dir, meshes=None, *overrides, domain="specklenet10"):
+    where = [f"paths.data_dir={data_dir}", *([f"meshes={meshes}"] if meshes else [])]
+    settings = [] if domain.startswith("modelnet") else QUICK
+    if domain.startswith("modelnet"):
+        settings = ["classes=[chair,table,lamp]"]
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("generate", [f"domain={domain}", *settings, *where, *overrides])
+
+
+def command(data_dir, meshes, *overrides):
+    return [
+        sys.executable, "generate.py", "domain=specklenet10", *QUICK,
+        f"paths.data_dir={data_dir}", f"meshes={meshes}", *overrides,
+    ]  # fmt: skip
+
+
+def fingerprint(folder):
+    """Hash of every file of a finished dataset."""
+    names = ("points.npy", "points_clean.npy", "manifest.csv", "meta.yaml")
+    return {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in names}
