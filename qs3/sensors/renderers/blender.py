@@ -1,4 +1,4 @@
-"""Blender's Cycles on the CPU: the renderer of the paper, our reference.
+"""Blender's Cycles, on the CPU or a GPU: the renderer of the paper, our reference.
 
 The only place that imports bpy. One process holds one Blender with global state; every call
 builds its own data, renders, and removes it, so nothing is left for the next call.
@@ -11,7 +11,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,9 @@ import numpy as np
 
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera
+from qs3.sensors.renderers import blender_devices, memory
 from qs3.sensors.renderers.base import Body, Image, Projector, RendererSettings, Scene
+from qs3.sensors.renderers.exr import read_exr
 
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
 _WATT_PER_RADIANCE = 4 * math.pi**2
@@ -35,21 +37,30 @@ class BlenderRenderer:
 
     Attributes:
         settings: samples a pixel and threads.
+        device: on what it renders.
     """
 
-    def __init__(self, samples: int = 16, threads: int = 1, name: str = "blender") -> None:
+    def __init__(
+        self, samples: int = 16, threads: int = 1, device: str = "auto", name: str = "blender"
+    ) -> None:
         """Start Blender inside this process.
 
         Args:
             samples: samples a pixel.
             threads: 0 is all cores.
+            device: "auto" (a GPU if Blender lists one for OptiX or CUDA, else the CPU), "cpu"
+                or "gpu". The two make different bytes, so a dataset's recipe says which it was.
             name: what the configuration calls it; taken so that its node can be instantiated.
 
         Raises:
-            RenderError: Blender is not installed, or a library that it needs is missing.
+            RenderError: Blender is not installed, a library that it needs is missing, or a GPU
+                is wanted and none is there.
         """
         self.settings = RendererSettings(samples, threads)
-        self._bpy = _import_bpy()
+        with _one_cpu() if threads == 1 else nullcontext():
+            self._bpy = _import_bpy()
+        listed = {} if device == "cpu" else blender_devices.list_gpus(self._bpy)
+        self.device = blender_devices.choose(device, listed)
 
     def render(
         self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
@@ -68,12 +79,15 @@ class BlenderRenderer:
 
     def provenance(self) -> dict[str, str]:
         """Renderer, variant and library versions; see `Renderer.provenance`."""
-        return {
+        found = {
             "renderer": "blender",
-            "variant": "cycles_cpu",
+            "variant": self.device.variant,
             "bpy": self._bpy.app.version_string,
             "samples": str(self.settings.samples),
         }
+        if self.device.name:
+            found["device"] = self.device.name
+        return found
 
     def _render(
         self, scene: Scene, cameras: list[Camera], seed: int, geometry: list[bool], folder: Path
@@ -84,6 +98,7 @@ class BlenderRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         target = bpy.context.scene
         _configure(target, self.settings)
+        blender_devices.use(bpy, target.cycles, self.device)
         images = []
         try:
             bodies = [_add_body(bpy, target, body, scene.ambient) for body in scene.bodies]
@@ -108,46 +123,8 @@ class BlenderRenderer:
         finally:
             target.render.use_persistent_data = False
             _remove_everything(bpy)
+            memory.give_back()
         return images
-
-
-def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Channels of an EXR file as Blender writes it here: scan lines, float32, not compressed.
-
-    Neither bpy nor OpenCV hands out the channels of a multilayer file.
-
-    Returns:
-        Full channel name -> [h, w] float32.
-    """
-    data = path.read_bytes()
-    if data[:4] != b"\x76\x2f\x31\x01":
-        raise RenderError(f"{path}: not an EXR file")
-    attributes: dict[str, bytes] = {}
-    at = 8
-    while data[at]:
-        name_end = data.index(0, at)
-        type_end = data.index(0, name_end + 1)
-        size = int.from_bytes(data[type_end + 1 : type_end + 5], "little")
-        start = type_end + 5
-        attributes[data[at:name_end].decode()] = data[start : start + size]
-        at = start + size
-    if attributes["compression"] != b"\0":
-        raise RenderError(f"{path}: the EXR file is compressed")
-    x0, y0, x1, y1 = np.frombuffer(attributes["dataWindow"], "<i4")
-    width, height = int(x1 - x0) + 1, int(y1 - y0) + 1
-
-    names, listing, spot = [], attributes["channels"], 0
-    while listing[spot]:
-        name_end = listing.index(0, spot)
-        if listing[name_end + 1 : name_end + 5] != b"\2\0\0\0":
-            raise RenderError(f"{path}: channels are not float32")
-        names.append(listing[spot:name_end].decode())
-        spot = name_end + 17  # type, linearity and sampling: 16 bytes
-    # A line: its number, its size, then all of channel 0, all of channel 1, ...
-    line = np.dtype([("y", "<i4"), ("size", "<i4"), ("value", "<f4", (len(names), width))])
-    first = at + 1 + 8 * height  # behind the table of line offsets
-    lines = np.frombuffer(data, line, count=height, offset=first)
-    return {name: lines["value"][:, i] for i, name in enumerate(names)}
 
 
 def _import_bpy() -> Any:
@@ -162,6 +139,29 @@ def _import_bpy() -> Any:
             f"Blender cannot be loaded: {error}. On Debian, apt install {_PACKAGES}"
         ) from error
     return bpy
+
+
+@contextmanager
+def _one_cpu() -> Iterator[None]:
+    """Let this process see a single processor.
+
+    Blender's thread library makes a helper thread for every other processor that it sees when
+    it is loaded. They have nothing to do where one thread renders, but they wait in a busy loop:
+    two workers on two processors took turns with two such threads, and were half as fast.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    everywhere = os.sched_getaffinity(0)
+    # Workers that start at the same time start on different processors.
+    os.sched_setaffinity(0, {sorted(everywhere)[os.getpid() % len(everywhere)]})
+    try:
+        yield
+    finally:
+        # Threads that were started meanwhile are as bound as we were.
+        for thread in os.listdir("/proc/self/task"):
+            with suppress(ProcessLookupError):
+                os.sched_setaffinity(int(thread), everywhere)
 
 
 @contextmanager
@@ -186,7 +186,6 @@ def _configure(target: Any, settings: RendererSettings) -> None:
     """Direct light, a box filter, no randomness but the seed's; the output is raw float32."""
     target.render.engine = "CYCLES"
     cycles = target.cycles
-    cycles.device = "CPU"
     cycles.samples = settings.samples
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = False

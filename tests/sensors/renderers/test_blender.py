@@ -1,10 +1,14 @@
+import json
+import os
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 
 from qs3.errors import RenderError
-from qs3.sensors.renderers.blender import BlenderRenderer, read_exr
+from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.exr import read_exr
 
 
 def test_missing_bpy_says_what_to_install(monkeypatch):
@@ -55,3 +59,34 @@ def test_file_that_is_no_exr_is_refused(tmp_path):
     path.write_bytes(b"\x89PNG and more")
     with pytest.raises(RenderError, match="not an EXR"):
         read_exr(path)
+
+
+_ALONE = """
+import json, os, sys
+from qs3.sensors.renderers.blender import BlenderRenderer
+from tests.sensors.renderers.scenes import busy_camera, busy_scene
+before = os.sched_getaffinity(0)
+renderer = BlenderRenderer(samples=1, threads=int(sys.argv[1]))
+renderer.render(busy_scene(), [busy_camera()], seed=0, geometry=[False])
+threads = os.listdir("/proc/self/task")
+bound = [thread for thread in threads if os.sched_getaffinity(int(thread)) != before]
+print(json.dumps([len(threads), bound]))
+"""
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
+    reason="needs Linux and two processors",
+)
+def test_one_thread_starts_no_helpers():
+    """Blender's idle helpers wait in a busy loop, and took a second worker's processor."""
+    found = []
+    for threads in ("1", "0"):
+        child = subprocess.run(
+            [sys.executable, "-c", _ALONE, threads], capture_output=True, text=True
+        )
+        assert child.returncode == 0, child.stderr
+        count, bound = json.loads(child.stdout.splitlines()[-1])
+        assert bound == []  # loading binds the process to one processor, and this is undone
+        found.append(count)
+    assert found[0] < found[1]

@@ -1,0 +1,150 @@
+"""Mitsuba's compiled variants (LLVM, CUDA): one kernel of ours for the whole measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from qs3.geometry.cameras import Camera
+from qs3.sensors.renderers.base import Scene
+from qs3.sensors.renderers.faces import Faces, mitsuba_mesh
+
+# Offset of a shadow ray's origin along the normal, relative to 1 + the largest coordinate.
+# Mitsuba's own rule for single precision, so that both paths have the same contact shadows.
+_RAY_EPSILON = 1500 * 2.0**-24
+
+
+class JitScene:
+    """A scene for the compiled variants, with our own kernel.
+
+    Everything that may differ between two calls is an opaque variable and not a constant
+    in the code, so that the kernels of the first call serve all others.
+    """
+
+    def __init__(self, mi: Any, scene: Scene) -> None:
+        import drjit as dr
+
+        self._mi, self._dr = mi, dr
+        self.faces = Faces.of(scene.bodies)
+        mesh = mitsuba_mesh(mi, self.faces, mi.Properties())
+        self._scene = mi.load_dict({"type": "scene", "bodies": mesh})
+        self._normal = mi.Float(self.faces.normals().astype(np.float32).ravel())
+        self._albedo = mi.Float(self.faces.albedo)
+        self._ambient = self._opaque(scene.ambient)
+        self._epsilon = self._opaque(
+            _RAY_EPSILON * (1 + float(np.abs(self.faces.mesh.vertices).max()))
+        )
+        self._projector = scene.projector
+        if scene.projector is not None:
+            slide = scene.projector.slide
+            self._slide = mi.Texture2f(
+                mi.TensorXf(np.ascontiguousarray(slide[..., None])),
+                wrap_mode=dr.WrapMode.Clamp,
+                filter_mode=dr.FilterMode.Linear,
+            )
+            self._slide_axes, self._slide_origin = self._pose(scene.projector.world_from_projector)
+            tan_x = scene.projector.tan_half_width
+            self._slide_scale = mi.Vector2f(
+                self._opaque(0.5 / tan_x),
+                self._opaque(0.5 / (tan_x * slide.shape[0] / slide.shape[1])),
+            )
+            self._strength = self._opaque(scene.projector.strength)
+
+    def radiance(self, camera: Camera, samples: int, seed: int) -> np.ndarray:
+        """[h, w] float32: mean over the samples of a pixel."""
+        mi, dr = self._mi, self._dr
+        u, v, ray_of = self._pixels(camera)
+        # Where a pixel samples depends on the seed and its place in the whole image, not on
+        # the window or the threads: an R2 sequence, shifted at random in every pixel.
+        place = mi.UInt32(u) + mi.UInt32(v) * dr.opaque(mi.UInt32, camera.intrinsics.width_px)
+        shift_u, shift_v = mi.sample_tea_32(place, dr.opaque(mi.UInt32, seed))
+        # The golden ratio's counterpart for two dimensions, in 32 bit fixed point.
+        step_u, step_v = mi.UInt32(3242174889), mi.UInt32(2447445414)
+        to_unit = 2.0**-32
+
+        def body(index: Any, total: Any) -> tuple[Any, Any]:
+            du = mi.Float(shift_u + index * step_u) * to_unit - 0.5
+            dv = mi.Float(shift_v + index * step_v) * to_unit - 0.5
+            return index + 1, total + self._shade(ray_of(u + du, v + dv))
+
+        count = dr.opaque(mi.UInt32, samples)
+        _, total = dr.while_loop(
+            state=(dr.zeros(mi.UInt32, dr.width(u)), dr.zeros(mi.Float, dr.width(u))),
+            cond=lambda index, total: index < count,
+            body=body,
+            labels=("index", "total"),
+        )
+        window = camera.rendered
+        mean = total / mi.Float(count)
+        return np.array(mean, dtype=np.float32).reshape(window.height, window.width)
+
+    def geometry(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Depth, and index of the face (-1: none), [h, w], at the pixels' centres."""
+        u, v, ray_of = self._pixels(camera)
+        hit = self._scene.ray_intersect_preliminary(ray_of(u, v), coherent=True)
+        self._dr.eval(hit.t, hit.prim_index)
+        window = camera.rendered
+        # The direction of a ray has length 1 along the optical axis, so t is the depth.
+        depth = np.array(hit.t, dtype=np.float32).reshape(window.height, window.width)
+        face = np.array(hit.prim_index).reshape(depth.shape)
+        return depth, np.where(np.isfinite(depth), face.astype(np.int64), -1)
+
+    def _shade(self, ray: Any) -> Any:
+        """Radiance along a ray, 0 where nothing is hit."""
+        mi, dr = self._mi, self._dr
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        valid = hit.is_valid()
+        albedo = dr.gather(mi.Float, self._albedo, hit.prim_index, valid)
+        light = dr.select(valid, self._ambient, 0)
+        if self._projector is None:
+            return albedo * light
+
+        normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, valid)
+        point = ray.o + hit.t * ray.d
+        to_light = self._slide_origin - point
+        x, y, z = (-dr.dot(axis, to_light) for axis in self._slide_axes)
+        place = mi.Point2f(x, y) / z * self._slide_scale + 0.5
+        lit = valid & (z > 0) & dr.all((place >= 0) & (place <= 1))
+        slide = self._slide.eval(place, lit)[0]
+        cosine = dr.dot(normal, to_light)  # times the distance
+        lit &= (slide > 0) & (cosine * dr.dot(normal, -ray.d) > 0)
+
+        start = point + normal * (self._epsilon * dr.sign(cosine))
+        shadow_ray = mi.Ray3f(start, self._slide_origin - start)
+        shadow_ray.maxt = 1 - 1e-4
+        lit &= ~self._scene.ray_test(shadow_ray, coherent=True, active=lit)
+        # strength / z^2 on a plane that faces the projector, elsewhere times the cosine of
+        # incidence (cosine / distance) over that plane's (z / distance).
+        return albedo * (
+            light + dr.select(lit, self._strength * slide * dr.abs(cosine) / (z * z * z), 0)
+        )
+
+    def _pixels(self, camera: Camera) -> tuple[Any, Any, Callable[[Any, Any], Any]]:
+        """Pixel centres (u, v) of the window, row by row, and the ray through a place (u, v)."""
+        mi, dr = self._mi, self._dr
+        window, k = camera.rendered, camera.intrinsics
+        index = dr.arange(mi.UInt32, window.width * window.height)
+        width = dr.opaque(mi.UInt32, window.width)
+        row = index // width
+        u = mi.Float(index - row * width + dr.opaque(mi.UInt32, window.left))
+        v = mi.Float(row + dr.opaque(mi.UInt32, window.top))
+        axes, origin = self._pose(camera.world_from_camera)
+        cx, cy, per_focal = map(self._opaque, (k.cx_px, k.cy_px, 1 / k.focal_px))
+
+        def ray_of(u: Any, v: Any) -> Any:
+            x, y = (u - cx) * per_focal, (v - cy) * per_focal
+            return mi.Ray3f(origin, mi.Vector3f(axes[0] * x + axes[1] * y + axes[2]))
+
+        return u, v, ray_of
+
+    def _pose(self, world_from_local: np.ndarray) -> tuple[list[Any], Any]:
+        """The three axes and the origin of a frame, in the world."""
+        mi = self._mi
+        columns = np.asarray(world_from_local, dtype=np.float64)[:3].T
+        axes = [mi.Vector3f(*map(self._opaque, column)) for column in columns[:3]]
+        return axes, mi.Point3f(*map(self._opaque, columns[3]))
+
+    def _opaque(self, value: float) -> Any:
+        return self._dr.opaque(self._mi.Float, float(value))

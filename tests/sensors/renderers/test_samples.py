@@ -1,0 +1,47 @@
+"""Samples a pixel change the cost, not the noise of the depth: that is the sensor model's."""
+
+import numpy as np
+import pytest
+
+from qs3.meshes.mesh import Mesh
+from qs3.sensors.infrared import InfraredCamera
+from qs3.sensors.renderers.base import Body
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from qs3.sensors.speckle_stereo import SpeckleStereo
+
+PHASES = 6  # planes at evenly spaced sub-pixel disparities, or pixel locking decides
+
+
+def subpixel_rms_px(depth_m, samples, sensor):
+    """RMS of f b / Z - f b / Z_plane over planes near `depth_m`, without the outer 0.5 %.
+
+    The definition of librealsense's depth quality tool; the plane is the true one.
+    """
+    renderer = MitsubaRenderer(samples=samples)
+    px_m, errors = sensor.focal_px * sensor.baseline_m, []
+    for phase in range(PHASES):
+        z = 1 / (1 / depth_m + phase / PHASES / px_m)
+        h = 0.35
+        corners = np.array([[-h, -h, z], [h, -h, z], [h, h, z], [-h, h, z]])
+        mesh = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+        frame = sensor.scan(
+            (Body(mesh),), mesh.bounds, np.eye(4), renderer, np.random.default_rng(phase)
+        )
+        inner = frame.depth_m[10:-10, 10:-10]
+        error = px_m / inner[np.isfinite(inner)] - px_m / z
+        low, high = np.percentile(error, [0.5, 99.5])
+        errors.append(error[(error >= low) & (error <= high)])
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+@pytest.mark.parametrize("depth_m", [3.0, 4.0, 5.0])
+def test_4_samples_are_as_noisy_as_16(depth_m, record_property):
+    few, many = (subpixel_rms_px(depth_m, samples, SpeckleStereo()) for samples in (4, 16))
+    record_property("subpixel_rms_px", {4: few, 16: many, "ratio": few / many})
+    assert few / many == pytest.approx(1, abs=0.1)
+
+
+def test_the_measure_sees_noise():
+    """It would not agree if the noise were another, as that of a camera with more read noise."""
+    loud = SpeckleStereo(infrared=InfraredCamera(read_noise_e=500.0))
+    assert subpixel_rms_px(4.0, 4, loud) > 1.15 * subpixel_rms_px(4.0, 4, SpeckleStereo())
