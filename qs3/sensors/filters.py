@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from qs3.errors import ConfigError
@@ -37,3 +38,131 @@ class PostFilter(Protocol):
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """[h, w] float32 px with NaN -> the same, changed; dropped values are NaN."""
         ...
+
+
+@dataclass(frozen=True)
+class SmallRegions:
+    """Drop islands: connected regions of similar disparity with few pixels.
+
+    Attributes:
+        max_size_px: regions with at most so many pixels go.
+        max_step_px: neighbours (of 4) belong together if they differ by at most this.
+    """
+
+    max_size_px: int = 50
+    max_step_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.max_size_px < 0 or not self.max_step_px > 0:
+            raise ConfigError(
+                "SmallRegions needs max_size_px >= 0 and max_step_px > 0, got "
+                f"{self.max_size_px} and {self.max_step_px}"
+            )
+
+    def apply(self, disparity: np.ndarray) -> np.ndarray:
+        """See `PostFilter.apply`."""
+        valid = np.isfinite(disparity)
+        if not valid.any():
+            return disparity
+        # OpenCV works on 16 bit integers; 1/32 px is finer than any threshold here.
+        scale = min(32.0, 30_000 / max(float(np.abs(disparity[valid]).max()), 1.0))
+        fixed = np.full(disparity.shape, -32_768, dtype=np.int16)
+        fixed[valid] = np.rint(disparity[valid] * scale)
+        cv2.filterSpeckles(fixed, -32_768, self.max_size_px, self.max_step_px * scale)
+        return np.where(fixed == -32_768, np.float32(np.nan), disparity).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Median:
+    """Replace each value by the median of the valid ones in a window; holes stay holes.
+
+    Attributes:
+        size_px: side of the window, odd.
+    """
+
+    size_px: int = 3
+
+    def __post_init__(self) -> None:
+        if self.size_px % 2 == 0 or self.size_px < 3:
+            raise ConfigError(f"Median.size_px must be odd and >= 3, got {self.size_px}")
+
+    def apply(self, disparity: np.ndarray) -> np.ndarray:
+        """See `PostFilter.apply`."""
+        stack = np.sort(_shifts(disparity, self.size_px), axis=0)  # NaN come last
+        count = np.isfinite(stack).sum(axis=0)
+        last = np.maximum(count - 1, 0)
+        low, high = (
+            np.take_along_axis(stack, place[None], axis=0)[0]
+            for place in (last // 2, -(-last // 2))
+        )
+        return np.where(np.isfinite(disparity), (low + high) / 2, np.nan).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class NeighbourCheck:
+    """Drop values that too few neighbours agree with.
+
+    Attributes:
+        size_px: side of the window, odd.
+        max_step_px: a neighbour agrees if it differs by at most this.
+        min_share: share of the window's other pixels that must agree; missing ones do not.
+    """
+
+    size_px: int = 5
+    max_step_px: float = 1.0
+    min_share: float = 0.4
+
+    def __post_init__(self) -> None:
+        if self.size_px % 2 == 0 or self.size_px < 3:
+            raise ConfigError(f"NeighbourCheck.size_px must be odd and >= 3, got {self.size_px}")
+        if not 0 <= self.min_share <= 1:
+            raise ConfigError(f"NeighbourCheck.min_share must be in [0, 1], got {self.min_share}")
+
+    def apply(self, disparity: np.ndarray) -> np.ndarray:
+        """See `PostFilter.apply`."""
+        near = np.abs(_shifts(disparity, self.size_px) - disparity) <= self.max_step_px
+        others = self.size_px**2 - 1
+        enough = near.sum(axis=0) - 1 >= self.min_share * others
+        return np.where(enough, disparity, np.float32(np.nan)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class FillHoles:
+    """Fill small holes by the farther side's disparity, as many drivers do.
+
+    Attributes:
+        max_width_px: gaps of a row that are wider stay.
+    """
+
+    max_width_px: int = 5
+
+    def __post_init__(self) -> None:
+        if self.max_width_px < 1:
+            raise ConfigError(f"FillHoles.max_width_px must be >= 1, got {self.max_width_px}")
+
+    def apply(self, disparity: np.ndarray) -> np.ndarray:
+        """See `PostFilter.apply`."""
+        height, width = disparity.shape
+        valid = np.isfinite(disparity)
+        columns = np.arange(width)
+        before = np.maximum.accumulate(np.where(valid, columns, -1), axis=1)
+        after = np.minimum.accumulate(np.where(valid, columns, width)[:, ::-1], axis=1)[:, ::-1]
+        fill = ~valid & (before >= 0) & (after < width) & (after - before - 1 <= self.max_width_px)
+        rows = np.arange(height)[:, None]
+        left = disparity[rows, np.maximum(before, 0)]
+        right = disparity[rows, np.minimum(after, width - 1)]
+        return np.where(fill, np.fmin(left, right), disparity).astype(np.float32)
+
+
+def _shifts(image: np.ndarray, size_px: int) -> np.ndarray:
+    """[size * size, h, w]: the image shifted to every place of the window, NaN from outside."""
+    half = size_px // 2
+    height, width = image.shape
+    padded = np.pad(image, half, constant_values=np.nan)
+    return np.stack(
+        [
+            padded[dy : dy + height, dx : dx + width]
+            for dy in range(size_px)
+            for dx in range(size_px)
+        ]
+    )

@@ -9,10 +9,57 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Protocol
 
+import cv2
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
+
+_MAX_PICTURE_PX = 64_000_000
+
+
+class Slide(Protocol):
+    """What a projector throws."""
+
+    @property
+    def slide(self) -> np.ndarray:
+        """[H, W] float32 in 0..1, row 0 at the top."""
+        ...
+
+
+@dataclass(frozen=True)
+class PictureSlide:
+    """A pattern of one's own, from an image file.
+
+    Attributes:
+        path: PNG, JPEG or TIFF; colours are averaged, 8 or 16 bits scaled to 0..1.
+    """
+
+    path: str
+
+    @cached_property
+    def slide(self) -> np.ndarray:
+        """[H, W] float32 in 0..1.
+
+        Raises:
+            DataError: the file is not there, is no image, or is larger than 64 megapixels.
+        """
+        path = Path(self.path).expanduser()
+        if not path.is_file():
+            raise DataError(f"pattern.path: there is no file {path}")
+        image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise DataError(f"pattern.path: {path} is no image that OpenCV can read")
+        if image.size > _MAX_PICTURE_PX:
+            raise DataError(f"pattern.path: {path} has {image.size} pixels, 64 million at most")
+        white = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65_535}.get(image.dtype)
+        if white is None:
+            raise DataError(f"pattern.path: {path} has {image.dtype} values, 8 or 16 bits expected")
+        out = np.ascontiguousarray(image, dtype=np.float32) / np.float32(white)
+        out.flags.writeable = False
+        return out
 
 
 @dataclass(frozen=True)
@@ -27,6 +74,8 @@ class Speckle:
         fill: share of lit positions (the released slide: 0.111).
         spacing: lit positions keep at least this distance (in positions, Chebyshev).
         seed: of the pattern; a device has one pattern, so it belongs to the sensor.
+        brightness_spread: lit dots have a brightness uniform in 1 - spread .. 1, as those of a
+            diffractive element have (Reichinger 2011, of Kinect v1).
     """
 
     columns: int = 633
@@ -36,8 +85,13 @@ class Speckle:
     fill: float = 0.111
     spacing: int = 1
     seed: int = 0
+    brightness_spread: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.brightness_spread <= 1:
+            raise ConfigError(
+                f"pattern.brightness_spread must be in [0, 1], got {self.brightness_spread}"
+            )
         if min(self.columns, self.rows, self.tiles, self.dot_px) < 1:
             raise ConfigError("a speckle pattern needs columns, rows, tiles and dot_px >= 1")
         densest = 1 / (1 + self.spacing) ** 2
@@ -52,6 +106,8 @@ class Speckle:
         """[rows * tiles * dot_px, columns * tiles * dot_px] float32, 0 dark or 1 lit."""
         rng = np.random.default_rng([0x5BEC, self.seed])
         tile = _spaced_dots(self.rows, self.columns, self.fill, self.spacing, rng)
+        if self.brightness_spread:
+            tile = tile * (1 - self.brightness_spread * rng.random(tile.shape))
         image = np.tile(tile, (self.tiles, self.tiles))
         image = image.repeat(self.dot_px, axis=0).repeat(self.dot_px, axis=1)
         image = np.ascontiguousarray(image, dtype=np.float32)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 
 from qs3.errors import ConfigError
@@ -19,7 +20,7 @@ from qs3.sensors.base import DepthFrame, window_of
 from qs3.sensors.filters import PostFilter, Quantiser
 from qs3.sensors.infrared import InfraredCamera
 from qs3.sensors.matching import Matcher, ReferenceMatcher
-from qs3.sensors.patterns import Speckle
+from qs3.sensors.patterns import Slide, Speckle
 from qs3.sensors.renderers.base import Body, Projector, Renderer, Scene
 from qs3.sensors.triangulation import Triangulation
 from qs3.sensors.visibility import explained, reached_from
@@ -52,7 +53,7 @@ class ReferenceSpeckle:
     max_depth_m: float = 6.0
     tan_half_width: float = 0.62
     ambient: float = 0.25
-    pattern: Speckle = field(
+    pattern: Slide = field(
         default_factory=lambda: Speckle(columns=211, rows=165, tiles=3, dot_px=1, seed=1)
     )
     matcher: Matcher = field(default_factory=ReferenceMatcher)
@@ -122,6 +123,8 @@ class ReferenceSpeckle:
         in_col, in_row = (col >= 0) & (col < cols), (row >= 0) & (row < rows)
         seen[np.ix_(in_row, in_col)] = slide[np.ix_(row[in_row], col[in_col])]
         image = seen.reshape(self.height_px, fine, self.width_px, fine).mean(axis=(1, 3))
+        if self.infrared.psf_px:  # it was stored through the same lens
+            image = cv2.GaussianBlur(image, (0, 0), self.infrared.psf_px)
         return np.ascontiguousarray(image * 255, dtype=np.float32)
 
     def scan(

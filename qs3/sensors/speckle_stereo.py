@@ -22,7 +22,7 @@ from qs3.sensors.filmic import FilmicCamera
 from qs3.sensors.filters import PostFilter, Quantiser
 from qs3.sensors.infrared import InfraredCamera
 from qs3.sensors.matching import Matcher, StereoBlockMatcher
-from qs3.sensors.patterns import Speckle
+from qs3.sensors.patterns import Slide, Speckle
 from qs3.sensors.reasons import Reason
 from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
 from qs3.sensors.triangulation import Triangulation
@@ -66,7 +66,7 @@ class SpeckleStereo:
     max_depth_m: float = 6.0
     tan_half_width: float = 0.625
     ambient: float = 0.15
-    pattern: Speckle = field(default_factory=Speckle)
+    pattern: Slide = field(default_factory=Speckle)
     matcher: Matcher = field(default_factory=StereoBlockMatcher)
     infrared: InfraredCamera | FilmicCamera = field(default_factory=InfraredCamera)
     quantiser: Quantiser = field(default_factory=Quantiser)

@@ -9,6 +9,7 @@ import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.sensors.matching.base import Match, side_by_side
+from qs3.sensors.reasons import Reason
 
 STEREOBM_BIAS_PX = 7.5 / 256
 """OpenCV's StereoBM computes 1/256 px, adds 15 and shifts by 4 bits: it rounds up to the
@@ -26,6 +27,8 @@ class StereoBlockMatcher:
         remove_bias: subtract STEREOBM_BIAS_PX (the released code does not).
         min_disparity: where the search begins. With 0, a disparity of 0 (a point at infinity)
             counts as no match, as in the released code.
+        max_difference_px: matching the other way round must give the same disparity to so many
+            px; -1 switches the check off, as in the paper's sensor.
     """
 
     num_disparities: int = 160
@@ -34,6 +37,7 @@ class StereoBlockMatcher:
     uniqueness_ratio: int = 15
     remove_bias: bool = True
     min_disparity: int = 0
+    max_difference_px: int = -1
 
     def __post_init__(self) -> None:
         if self.num_disparities < 16 or self.num_disparities % 16:
@@ -56,6 +60,7 @@ class StereoBlockMatcher:
         matcher.setMinDisparity(low)
         matcher.setTextureThreshold(self.texture_threshold)
         matcher.setUniquenessRatio(self.uniqueness_ratio)
+        matcher.setDisp12MaxDiff(self.max_difference_px)
         found = matcher.compute(left, right)[:, start : start + image.shape[1]]
         disparity = found.astype(np.float32) / 16
         disparity[disparity <= low - 1] = np.nan  # OpenCV's mark for no match
@@ -63,4 +68,15 @@ class StereoBlockMatcher:
             disparity[disparity <= 0] = np.nan  # a point at infinity, as in the released code
         if self.remove_bias:
             disparity -= np.float32(STEREOBM_BIAS_PX)
-        return Match.of(disparity)
+        dark = self._texture(left) < self.texture_threshold
+        why_not = np.where(dark, np.uint8(Reason.DARK), np.uint8(Reason.UNMATCHED))
+        return Match.of(disparity, why_not[:, start : start + image.shape[1]])
+
+    def _texture(self, canvas: np.ndarray) -> np.ndarray:
+        """[h, w] float32: what OpenCV compares with texture_threshold.
+
+        The sum over the block of the x-Sobel response, clipped to the pre-filter's cap of 31.
+        """
+        response = np.abs(np.clip(cv2.Sobel(canvas, cv2.CV_32F, 1, 0), -31, 31))
+        size = (self.block_size, self.block_size)
+        return cv2.boxFilter(response, cv2.CV_32F, size, normalize=False)

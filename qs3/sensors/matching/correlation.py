@@ -13,25 +13,24 @@ from qs3.sensors.reasons import Reason
 
 
 @dataclass(frozen=True)
-class ReferenceMatcher:
-    """One camera against a stored image of the pattern, as in Kinect v1.
+class NormalisedCorrelation:
+    """Normalised correlation over a square window, winner takes all.
 
-    Normalised correlation over a square window, winner takes all, a parabola through the
-    best score and its neighbours, and the device's quantiser. Konolige and Mihelich (ROS,
-    kinect_calibration/technical) give a 9 x 9 or 9 x 7 window, 64 px of search and 1/8 px.
+    A parabola goes through the best score and its two neighbours. Gain and offset of the
+    images do not matter.
 
     Attributes:
         window_px: side of the window, odd.
-        min_disparity, num_disparities: search range in px, relative to the reference.
-        steps_per_px: quantiser; 8 is 1/8 px, 0 switches it off.
+        min_disparity, num_disparities: search range in px.
+        steps_per_px: quantiser of the matcher itself; 0 is none.
         min_score: matches with a lower correlation are dropped.
         uniqueness: the best score beats every score more than 2 px away by this much.
     """
 
     window_px: int = 9
-    min_disparity: int = -24
+    min_disparity: int = 0
     num_disparities: int = 64
-    steps_per_px: int = 8
+    steps_per_px: int = 0
     min_score: float = 0.35
     uniqueness: float = 0.04
 
@@ -107,3 +106,15 @@ class ReferenceMatcher:
             covariance = product - mean_i[:, here] * mean_r[:, there]
             scores[k, :, here] = covariance / (spread_i[:, here] * spread_r[:, there])
         return scores
+
+
+@dataclass(frozen=True)
+class ReferenceMatcher(NormalisedCorrelation):
+    """One camera against a stored image of the pattern, as in Kinect v1.
+
+    Konolige and Mihelich (ROS, kinect_calibration/technical) give a 9 x 9 or 9 x 7 window,
+    64 px of search and 1/8 px.
+    """
+
+    min_disparity: int = -24
+    steps_per_px: int = 8
