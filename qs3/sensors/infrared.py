@@ -29,6 +29,7 @@ class InfraredCamera:
         psf_px: standard deviation of the lens's point spread, a Gaussian; 0 is a perfect lens.
         fixed_gain: grey values per unit of radiance; null is automatic exposure. White at the
             sensor's reference distance has radiance 1.
+        speckle_grain_px: side of the square grains that share a value; 1 is a pixel.
     """
 
     white_quantile: float = 0.98
@@ -38,6 +39,7 @@ class InfraredCamera:
     speckle_contrast: float = 0.0
     psf_px: float = 0.0
     fixed_gain: float | None = None
+    speckle_grain_px: int = 1
 
     def __post_init__(self) -> None:
         if not 0 < self.white_quantile <= 1:
@@ -48,6 +50,8 @@ class InfraredCamera:
             raise ConfigError("electrons_at_white must be positive and read_noise_e >= 0")
         if not 0 <= self.speckle_contrast <= 1:
             raise ConfigError(f"speckle_contrast must be in [0, 1], got {self.speckle_contrast}")
+        if self.speckle_grain_px < 1:
+            raise ConfigError(f"speckle_grain_px must be >= 1, got {self.speckle_grain_px}")
         if not 0 <= self.psf_px <= 10:
             raise ConfigError(f"psf_px must be in [0, 10], got {self.psf_px}")
         if self.fixed_gain is not None and not self.fixed_gain > 0:
@@ -74,9 +78,7 @@ class InfraredCamera:
         """
         per_grey = self.electrons_at_white / 255.0
         if self.speckle_contrast:  # before the lens: grains are as small as its blur or smaller
-            shape = 1 / self.speckle_contrast**2
-            grain = rng.standard_gamma(shape, radiance.shape, dtype=np.float32)
-            radiance = radiance * (grain / np.float32(shape))
+            radiance = radiance * self._grains(radiance.shape, rng)
         if self.psf_px:
             radiance = cv2.GaussianBlur(radiance, (0, 0), self.psf_px)
         electrons = radiance * np.float32(gain * per_grey)
@@ -85,3 +87,10 @@ class InfraredCamera:
         sigma = np.sqrt(np.maximum(electrons, 0) + np.float32(self.read_noise_e**2))
         noisy = electrons + sigma * rng.standard_normal(radiance.shape, dtype=np.float32)
         return np.clip(np.rint(noisy / np.float32(per_grey)), 0, 255).astype(np.uint8)
+
+    def _grains(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+        """[h, w] float32 Gamma variables with mean 1."""
+        (height, width), side = shape, self.speckle_grain_px
+        k = 1 / self.speckle_contrast**2
+        few = rng.standard_gamma(k, (-(-height // side), -(-width // side)), dtype=np.float32)
+        return (few / np.float32(k)).repeat(side, axis=0).repeat(side, axis=1)[:height, :width]

@@ -4,10 +4,9 @@ from qs3.sensors.matching.base import Match, Matcher
 from qs3.sensors.matching.block import STEREOBM_BIAS_PX, StereoBlockMatcher
 from qs3.sensors.matching.census import CensusMatcher
 from qs3.sensors.matching.correlation import NormalisedCorrelation, ReferenceMatcher
-from qs3.sensors.matching.sgbm import SGBM_BIAS_PX, SemiGlobalMatcher
+from qs3.sensors.matching.sgbm import SemiGlobalMatcher
 
 __all__ = [
-    "SGBM_BIAS_PX",
     "STEREOBM_BIAS_PX",
     "CensusMatcher",
     "Match",

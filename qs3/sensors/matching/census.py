@@ -32,7 +32,7 @@ class CensusMatcher:
 
     The semi-global sums choose the whole disparity; sub-pixels come from the costs before that,
     because penalties between neighbours pull them to whole pixels. Measured on synthetic dots
-    at 16 phases, block 7: bias at most 0.01 px and an RMS of 0.03 to 0.06 px; from the path
+    at 16 phases, block 7: bias at most 0.015 px and an RMS of 0.03 to 0.06 px; from the path
     sums the bias is 0.10 px (V) to 0.19 px (parabola).
 
     Attributes:
@@ -130,7 +130,7 @@ class CensusMatcher:
             return volume.reshape(-1)[row_of_costs + place].astype(np.float32)
 
         source = total if self.path_phase else cost
-        phase = offset(*(at(source, step) for step in (-1, 0, 1)), self.fit)
+        phase = offset(at(source, -1), at(source, 0), at(source, 1), self.fit)
         a_factor = A_FACTORS[self.fit] if self.a_factor is None else self.a_factor
         disparity = most - best - linearised(phase, a_factor)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.sensors.matching.base import Match
+from qs3.sensors.matching.subpixel import linearised
 from qs3.sensors.reasons import Reason
 
 
@@ -25,6 +26,10 @@ class NormalisedCorrelation:
         steps_per_px: quantiser of the matcher itself; 0 is none.
         min_score: matches with a lower correlation are dropped.
         uniqueness: the best score beats every score more than 2 px away by this much.
+        max_difference_px: how far the whole disparities found from `image` and from `other` may
+            be apart; -1 switches the check off.
+        a_factor: see `linearised`; 0 leaves the parabola's locking, up to 0.02 to 0.04 px on
+            synthetic dots at 16 phases. 0.18 takes it below 0.01 px there.
     """
 
     window_px: int = 9
@@ -33,12 +38,18 @@ class NormalisedCorrelation:
     steps_per_px: int = 0
     min_score: float = 0.35
     uniqueness: float = 0.04
+    max_difference_px: int = -1
+    a_factor: float = 0.0
 
     def __post_init__(self) -> None:
         if self.window_px % 2 == 0 or self.window_px < 3:
             raise ConfigError(f"window_px must be odd and >= 3, got {self.window_px}")
         if self.num_disparities < 3:
             raise ConfigError(f"num_disparities must be >= 3, got {self.num_disparities}")
+        if self.steps_per_px < 0:
+            raise ConfigError(f"steps_per_px must be >= 0, got {self.steps_per_px}")
+        if not -1 <= self.a_factor <= 1:
+            raise ConfigError(f"a_factor must be in -1..1, got {self.a_factor}")
 
     @property
     def reach_px(self) -> int:
@@ -56,23 +67,47 @@ class NormalisedCorrelation:
 
         top = score_at(best)
         lower, upper = score_at(np.maximum(best - 1, 0)), score_at(np.minimum(best + 1, last))
+        consistent = self._agrees(scores, best)
         # The runner-up: blank the winner's neighbourhood and look again.
         for near in range(-2, 3):
             np.put_along_axis(scores, np.clip(best + near, 0, last)[None], -1, axis=0)
         second = scores.max(axis=0)
         inner = (best > 0) & (best < last)
-        valid = inner & (top >= self.min_score) & (top - second >= self.uniqueness)
+        unique = top - second >= self.uniqueness
+        valid = inner & (top >= self.min_score) & unique & consistent
 
         curvature = np.maximum(2 * top - lower - upper, np.float32(1e-6))
-        disparity = self.min_disparity + best + (upper - lower) / (2 * curvature)
+        phase = linearised((upper - lower) / (2 * curvature), self.a_factor)
+        disparity = self.min_disparity + best + phase
         if self.steps_per_px:
             disparity = np.rint(disparity * self.steps_per_px) / self.steps_per_px
         why_not = np.select(
-            [top <= -1, top < self.min_score, inner],
-            [np.uint8(Reason.OUTSIDE), np.uint8(Reason.UNMATCHED), np.uint8(Reason.AMBIGUOUS)],
+            [top <= -1, top < self.min_score, inner & ~unique, inner & ~consistent],
+            [
+                np.uint8(Reason.OUTSIDE),
+                np.uint8(Reason.UNMATCHED),
+                np.uint8(Reason.AMBIGUOUS),
+                np.uint8(Reason.INCONSISTENT),
+            ],
             np.uint8(Reason.UNMATCHED),
         )
         return Match.of(np.where(valid, disparity, np.nan).astype(np.float32), why_not)
+
+    def _agrees(self, scores: np.ndarray, best: np.ndarray) -> np.ndarray:
+        """[h, w] bool: whether the pixel found in the other image finds back."""
+        if self.max_difference_px < 0:
+            return np.ones(best.shape, dtype=bool)
+        count, height, width = scores.shape
+        # Column u meets, at place k, column u + count - 1 - k counted from the leftmost one.
+        top = np.full((height, width + count - 1), -np.inf, dtype=np.float32)
+        back = np.zeros(top.shape, dtype=np.intp)
+        for k, score in enumerate(scores):
+            met = slice(count - 1 - k, count - 1 - k + width)
+            better = score > top[:, met]
+            top[:, met][better] = score[better]
+            back[:, met][better] = k
+        there = np.take_along_axis(back, np.arange(width) + count - 1 - best, axis=1)
+        return np.abs(there - best) <= self.max_difference_px
 
     def _scores(self, image: np.ndarray, reference: np.ndarray, first: int) -> np.ndarray:
         """[num_disparities, h, w] float32 normalised correlation; -1 outside the reference."""

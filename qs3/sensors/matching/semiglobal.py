@@ -96,7 +96,7 @@ def _modulated(
 ) -> np.ndarray:
     """[lines, places, 1] uint16 P2 for the step to each place; on the first line any."""
     steps = np.full(grey.shape, large, dtype=np.uint16)
-    lines, places = grey.shape
+    places = grey.shape[1]
     to = slice(max(0, shift), places + min(0, shift))
     of = slice(max(0, -shift), places + min(0, -shift))
     change = np.abs(grey[1:, to] - grey[:-1, of])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 
 from qs3.errors import ConfigError
 
 
-class Fit(str, Enum):
+class Fit(StrEnum):
     """Curve through the cost of the best disparity and its two neighbours.
 
     PARABOLA: right where costs grow with the square of the distance (squared differences,
