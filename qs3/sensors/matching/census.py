@@ -47,8 +47,8 @@ class CensusMatcher:
         small_step, large_step: P1 and P2 in bits.
         paths: 4 or 8; 0 chooses by block costs alone.
         edge_grey: difference of grey values at which P2 is halved; 0 is off.
-        uniqueness_percent: every other cost but the neighbours' is at least this much above
-            the best.
+        uniqueness_percent: every other cost but the neighbours' is more than this above the
+            best.
         max_difference_px: how far the whole disparities found from `image` and from `other` may
             be apart; -1 switches the check off.
         min_texture: standard deviation of the grey values that the census window needs.
@@ -146,7 +146,7 @@ class CensusMatcher:
         for step in (-1, 0, 1):  # blank the winner and look again
             place = np.clip(best + step, 0, count - 1)
             total.reshape(-1)[row_of_costs + place] = np.iinfo(total.dtype).max
-        unique = total.min(axis=2) >= top * np.float32(1 + self.uniqueness_percent / 100)
+        unique = total.min(axis=2) > top * np.float32(1 + self.uniqueness_percent / 100)
 
         valid = within & textured & inner & unique & consistent
         why_not = np.select(
