@@ -1,0 +1,75 @@
+"""Published laws of the noise of real depth cameras, to lay beside ours. Depths in metres.
+
+Only formulas and constants; each function names where they come from.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+NGUYEN_WITHIN_DEG = 60.0
+"""Up to this angle of incidence Nguyen's axial noise does not depend on it."""
+
+INTEL_SUBPIXEL_PX = (0.032, 0.08)
+"""Sub-pixel RMS of a D400 on a well-textured wall: what is possible, and what to count on
+(Grunnet-Jepsen, librealsense #3904)."""
+
+D400_BAND_PX = (0.03, 0.10)
+"""Sub-pixel RMS that we allow a D400 preset; the upper end is what simulators of it assume."""
+
+
+def nguyen_axial_m(depth_m: np.ndarray | float, angle_deg: float = 0.0) -> np.ndarray:
+    """Axial noise of Kinect v1, one standard deviation.
+
+    Nguyen, Izadi and Lovell, 3DIMPVT 2012: 0.0012 + 0.0019 (z - 0.4)^2 up to 60 degrees,
+    beyond with 0.0001 / sqrt(z) theta^2 / (pi / 2 - theta)^2 on top.
+    """
+    z = np.asarray(depth_m, dtype=np.float64)
+    sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    if angle_deg > NGUYEN_WITHIN_DEG:
+        theta = np.deg2rad(angle_deg)
+        sigma = sigma + 0.0001 / np.sqrt(z) * theta**2 / (np.pi / 2 - theta) ** 2
+    return sigma
+
+
+def nguyen_lateral_px(angle_deg: float) -> float:
+    """Lateral noise of Kinect v1 at an edge: 0.8 + 0.035 theta / (pi / 2 - theta), same paper."""
+    theta = np.deg2rad(angle_deg)
+    return float(0.8 + 0.035 * theta / (np.pi / 2 - theta))
+
+
+def khoshelham_m(depth_m: np.ndarray | float) -> np.ndarray:
+    """Random error of Kinect v1: 1.425e-6 Z^2 with Z in mm (Khoshelham and Elberink 2012)."""
+    return 1.425e-3 * np.asarray(depth_m, dtype=np.float64) ** 2
+
+
+def kinect_step_m(depth_m: np.ndarray | float) -> np.ndarray:
+    """Depth step of Kinect v1, twice the random error (same paper): 2.85e-6 Z^2 in mm."""
+    return 2 * khoshelham_m(depth_m)
+
+
+def kotsonis_d435_m(depth_m: np.ndarray | float) -> np.ndarray:
+    """Axial noise of a D435 as measured by L. Kotsonis (elevation_mapping, 0.2 to 3.25 m)."""
+    z = np.asarray(depth_m, dtype=np.float64)
+    return 0.000611 + 0.003587 * (z - 0.3515) ** 2
+
+
+def triangulation_m(
+    depth_m: np.ndarray | float, focal_px: float, baseline_m: float, subpixel_px: float
+) -> np.ndarray:
+    """Z^2 / (f B) times the error of the disparity: Intel's formula for the RMS of a D400."""
+    z = np.asarray(depth_m, dtype=np.float64)
+    return z**2 * subpixel_px / (focal_px * baseline_m)
+
+
+def ramp_px(window_px: int, baseline_m: float, depth_m: float, tilt_deg: float) -> float:
+    """By how much the disparity changes across a window on a plane tilted along the baseline.
+
+    w B tan(theta) / Z: with more than a pixel or two of it, no single shift fits the window.
+    """
+    return window_px * baseline_m * float(np.tan(np.deg2rad(tilt_deg))) / depth_m
+
+
+def ramp_angle_deg(window_px: int, baseline_m: float, depth_m: float, ramp: float = 1.0) -> float:
+    """The tilt at which `ramp_px` reaches `ramp` px."""
+    return float(np.rad2deg(np.arctan(ramp * depth_m / (window_px * baseline_m))))

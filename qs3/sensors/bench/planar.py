@@ -1,0 +1,259 @@
+"""The planar-target bench: one sensor before planes of known depth and tilt."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from qs3.errors import ConfigError
+from qs3.sensors.base import DepthFrame, DepthSensor
+from qs3.sensors.bench import metrics
+from qs3.sensors.bench.own_laws import stated_sigma_m
+from qs3.sensors.bench.still import StillRenderer
+from qs3.sensors.bench.subject import Subject
+from qs3.sensors.bench.targets import POSE, TiltedPlane
+from qs3.sensors.renderers.base import Renderer
+
+_GOLDEN = (5**0.5 - 1) / 2
+
+
+@dataclass(frozen=True)
+class PlanarCondition:
+    """Planes around one depth, at one tilt.
+
+    Attributes:
+        depth_m: in the middle of the depths of this condition.
+        tilt_deg: angle of incidence, 0..85; both signs of it are pooled.
+        across: the plane recedes along the baseline, else across it.
+        phases: how many planes; their disparities are spread over one whole pixel, so that
+            every sub-pixel place of a match counts alike.
+        half_px: half the side of the region that is measured, in samples of the depth image.
+        repeats: frames of the same scene for the noise over time; 0 leaves it out.
+    """
+
+    depth_m: float
+    tilt_deg: float = 0.0
+    across: bool = True
+    phases: int = 16
+    half_px: int = 24
+    repeats: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.depth_m > 0 or not 0 <= self.tilt_deg <= 85:
+            raise ConfigError("a bench plane needs depth_m > 0 and tilt_deg in 0..85")
+        if self.phases < 4:
+            raise ConfigError(f"phases must be at least 4, got {self.phases}")
+
+    @property
+    def name(self) -> str:
+        """For file names and messages."""
+        axis = "" if self.tilt_deg == 0 else ("-across" if self.across else "-along")
+        return f"plane-{self.depth_m:g}m-{self.tilt_deg:g}deg{axis}"
+
+    def depths_m(self, focal_baseline: float | None) -> np.ndarray:
+        """[phases] depths: whole disparity pixels for a sensor that triangulates.
+
+        Evenly spread with a shift of the golden ratio within each slot, so that they fall on
+        every place within the steps of a quantiser, too. Others get +-2 % of the depth.
+        """
+        k = np.arange(self.phases)
+        place = (k + (k * _GOLDEN) % 1) / self.phases - 0.5  # -0.5 .. 0.5
+        if focal_baseline is None:
+            return self.depth_m * (1 + 0.04 * place)
+        return focal_baseline / (focal_baseline / self.depth_m + place)
+
+
+@dataclass
+class _Pool:
+    """What the frames of one condition add to."""
+
+    error_m: list[np.ndarray] = field(default_factory=list)
+    error_px: list[np.ndarray] = field(default_factory=list)
+    disparity: list[np.ndarray] = field(default_factory=list)
+    planes: list[metrics.PlaneFit] = field(default_factory=list)
+    bias_px: list[float] = field(default_factory=list)
+    law_m: list[float] = field(default_factory=list)
+    wanted: int = 0
+    valid: int = 0
+    reasons: np.ndarray = field(default_factory=lambda: np.zeros(32, dtype=np.int64))
+
+
+def measure(
+    subject: Subject, condition: PlanarCondition, renderer: Renderer, seed: int = 0
+) -> dict[str, Any]:
+    """Render and measure one condition.
+
+    Args:
+        subject: the sensor and what is known about it.
+        condition: which planes.
+        renderer: makes the images.
+        seed: of all noise; the same call gives the same numbers.
+
+    Returns:
+        The metrics by name, plain numbers and lists (None where there is no such thing).
+    """
+    fb = subject.focal_baseline
+    pool, stills = _Pool(), []
+    depths = condition.depths_m(fb)
+    for k, depth in enumerate(depths):
+        # Elsewhere in the image for each plane: other dots of the pattern.
+        angle, away = 2 * np.pi * _GOLDEN * k, 12.0 + 24.0 * (k % 4) / 4
+        centre = (away * np.cos(angle) * subject.step_px, away * np.sin(angle) * subject.step_px)
+        sign = 1 if k % 2 else -1
+        plane = TiltedPlane(float(depth), sign * condition.tilt_deg, condition.across, centre)
+        rng = np.random.default_rng([seed, k])
+        if k < 3 and condition.repeats:
+            still = StillRenderer(renderer, seed=k)
+            noise = [np.random.default_rng([seed, k, i]) for i in range(condition.repeats)]
+            frames = [_take(subject, plane, condition, still, r) for r in noise]
+            stills.append(np.stack([frame.depth_m[part] for frame, part in frames]))
+        frame, part = _take(subject, plane, condition, renderer, rng)
+        _add(pool, frame, part, subject)
+        law = stated_sigma_m(subject.sensor, float(depth), frame)
+        if law is not None and condition.tilt_deg == 0:
+            pool.law_m.append(law)
+    return _summary(subject, condition, pool, depths, stills)
+
+
+def _take(
+    subject: Subject,
+    plane: TiltedPlane,
+    condition: PlanarCondition,
+    renderer: Renderer,
+    rng: np.random.Generator,
+) -> tuple[DepthFrame, tuple[slice, slice]]:
+    """A frame, and the samples of it that lie in the region."""
+    k, step = subject.intrinsics, subject.step_px
+    region = plane.region(k, condition.half_px * step, step)
+    bodies, box = plane.scene(k, region, subject.margin_px)
+    sensor: DepthSensor = subject.sensor
+    if isinstance(renderer, StillRenderer):
+        renderer.rewind()
+    frame = sensor.scan(bodies, box, POSE, renderer, rng)
+    if frame is None:
+        raise ConfigError(f"{condition.name}: the plane is outside the sensor's view")
+    rows = _samples(region.top, region.height, frame.top, frame.step_px)
+    cols = _samples(region.left, region.width, frame.left, frame.step_px)
+    return frame, (rows, cols)
+
+
+def _samples(start: int, length: int, first: int, step: int) -> slice:
+    """Samples at first + i step that lie in [start, start + length)."""
+    low = max(0, -(-(start - first) // step))
+    return slice(low, (start + length - 1 - first) // step + 1)
+
+
+def _add(pool: _Pool, frame: DepthFrame, part: tuple[slice, slice], subject: Subject) -> None:
+    depth, clean = (a[part].astype(np.float64) for a in (frame.depth_m, frame.clean_m))
+    wanted = np.isfinite(clean)
+    valid = wanted & np.isfinite(depth)
+    pool.wanted += int(wanted.sum())
+    pool.valid += int(valid.sum())
+    pool.reasons += np.bincount(frame.reason[part][wanted], minlength=32)
+    rows, cols = np.nonzero(valid)
+    k = frame.camera.intrinsics
+    x = (frame.left + (cols + part[1].start) * frame.step_px - k.cx_px) / k.focal_px
+    y = (frame.top + (rows + part[0].start) * frame.step_px - k.cy_px) / k.focal_px
+    z, truth = depth[valid], clean[valid]
+    pool.error_m.append(z - truth)
+    fb = subject.focal_baseline
+    pool.planes.append(metrics.fit_plane(z, x, y, fb))
+    if fb is not None:
+        pool.error_px.append(fb / z - fb / truth)
+        pool.disparity.append(fb / z)
+        pool.bias_px.append(metrics.median(pool.error_px[-1]))
+
+
+def _summary(
+    subject: Subject,
+    condition: PlanarCondition,
+    pool: _Pool,
+    depths: np.ndarray,
+    stills: list[np.ndarray],
+) -> dict[str, Any]:
+    fb = subject.focal_baseline
+    error = np.concatenate(pool.error_m)
+    kept = metrics.trimmed(error)
+    out: dict[str, Any] = {
+        "condition": asdict(condition),
+        "frames": len(depths),
+        "pixels": pool.wanted,
+        "fill": pool.valid / pool.wanted if pool.wanted else 0.0,
+        "sigma_m": float(np.std(kept)) if kept.size else None,
+        "bias_m": metrics.median(error),
+        "accuracy": metrics.median(error) / condition.depth_m,
+        "plane_rms_m": _pooled([plane.rms_m for plane in pool.planes]),
+        "reasons": {str(i): int(n) for i, n in enumerate(pool.reasons) if n},
+        "law_m": _pooled(pool.law_m),
+    }
+    if stills:
+        spread = [_temporal(stack) for stack in stills]
+        out["temporal"] = metrics.median(np.concatenate(spread))
+        out["temporal_std_m"] = [float(np.nanmean(_over_time(stack))) for stack in stills]
+    if fb is not None:
+        error_px = np.concatenate(pool.error_px)
+        phase = (fb / depths - subject.whole_px) % 1
+        bias = np.array(pool.bias_px)
+        mean = np.array([float(np.mean(e)) if e.size else np.nan for e in pool.error_px])
+        out |= {
+            "subpixel_rms_px": _pooled([plane.subpixel_rms_px for plane in pool.planes]),
+            "sigma_px": float(np.std(metrics.trimmed(error_px))),
+            "bias_px": metrics.median(error_px),
+            "outliers": float(np.mean(np.abs(error_px) > 1)) if error_px.size else None,
+            "phase": phase.tolist(),
+            "phase_bias_px": bias.tolist(),
+            "locking_px": metrics.locking_px(phase, mean) if condition.tilt_deg == 0 else None,
+            "phase_histogram": _histogram(np.concatenate(pool.disparity) - subject.whole_px),
+        }
+        out |= _levels(subject, np.concatenate(pool.disparity), fb / depths)
+    return _plain(out)
+
+
+def _levels(subject: Subject, disparity: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    """Distinct depths between the nearest and the farthest plane, and how many there should be."""
+    if not subject.steps_per_px:
+        return {}
+    low, high = float(truth.min()), float(truth.max())
+    found = metrics.levels(disparity[(disparity >= low) & (disparity <= high)])
+    offset = subject.level_offset_px
+    return {
+        "levels": len(found),
+        "levels_expected": metrics.expected_levels(low, high, subject.steps_per_px, offset),
+    }
+
+
+def _pooled(values: list[float]) -> float | None:
+    """Root of the mean of the squares of each frame's."""
+    finite = np.array([v for v in values if np.isfinite(v)])
+    return metrics.rms(finite) if finite.size else None
+
+
+def _temporal(stack: np.ndarray) -> np.ndarray:
+    """[frames, h, w] -> std / median of every pixel that is always valid."""
+    good = np.isfinite(stack).all(axis=0)
+    return _over_time(stack) / np.median(stack[:, good].astype(np.float64), axis=0)
+
+
+def _over_time(stack: np.ndarray) -> np.ndarray:
+    """[frames, h, w] -> std of every pixel that is always valid, in metres."""
+    good = np.isfinite(stack).all(axis=0)
+    return stack[:, good].astype(np.float64).std(axis=0, ddof=1)
+
+
+def _histogram(disparity: np.ndarray, bins: int = 32) -> list[float]:
+    """Shares of measured disparities by their fraction of a pixel, in bins around i / bins."""
+    counts, _ = np.histogram((disparity + 0.5 / bins) % 1, bins=bins, range=(0, 1))
+    return (counts / max(counts.sum(), 1)).tolist()
+
+
+def _plain(value: Any) -> Any:
+    """NaN becomes None, so that JSON can hold it."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

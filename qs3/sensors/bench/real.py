@@ -1,0 +1,230 @@
+"""What real Kinect v1 clouds show, and the same measured on simulated ones.
+
+Depth steps, holes, the side of the shadow, and the noise of the table's plane; everything is
+measured on a depth image alone, so that real and simulated ones are treated alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.sensors.bench import metrics
+
+FOCAL_PX = 525.0
+"""Focal length of the published clouds: u - 319.5 = 525 x / z holds to 1e-5 px in all eight."""
+
+FOCAL_BASELINE = 580.0 * 0.075
+"""f B of the device's infrared camera (Konolige and Mihelich), px m."""
+
+
+@dataclass(frozen=True, eq=False)
+class TableStatistics:
+    """Measured on one depth image of a table.
+
+    Attributes:
+        levels: distinct depths beyond 0.8 m, where a step is larger than the file's 1 mm.
+        step_focal_baseline: f B in px m that fits the steps of 1 / Z at 1/8 px.
+        step_residual: RMS distance of the levels from that grid, in steps; 0.29 is no grid.
+        level_use: standard deviation over the eighths of a pixel of how often a depth falls on
+            them, 0 if all are used alike: the trace of pixel locking.
+        table_rms_m, table_subpixel_px: of the table about a smooth surface; local, see `table`.
+        holes: share of pixels without depth within the outline of what has depth.
+        runs_px: [N] lengths of the holes along rows.
+        left_share: share of the holes' pixels beside an edge that lie left of the nearer
+            surface.
+    """
+
+    levels: int
+    step_focal_baseline: float
+    step_residual: float
+    level_use: float
+    table_rms_m: float
+    table_subpixel_px: float
+    holes: float
+    runs_px: np.ndarray
+    left_share: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers; of the runs the median and the 90 % quantile."""
+        runs = self.runs_px
+        return {
+            "levels": self.levels,
+            "step_focal_baseline": self.step_focal_baseline,
+            "step_residual": self.step_residual,
+            "level_use": self.level_use,
+            "table_rms_m": self.table_rms_m,
+            "table_subpixel_px": self.table_subpixel_px,
+            "holes": self.holes,
+            "run_median_px": metrics.median(runs),
+            "run_90_px": float(np.quantile(runs, 0.9)) if runs.size else float("nan"),
+            "left_share": self.left_share,
+        }
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    """[480, 640] depth in metres with NaN of an organised cloud."""
+    from qs3.clouds.pcd import read_pcd
+
+    return np.asarray(read_pcd(path).image("z"), dtype=np.float32)
+
+
+def statistics(depth_m: np.ndarray) -> TableStatistics:
+    """All of one depth image.
+
+    Args:
+        depth_m: [h, w] metres with NaN, camera with FOCAL_PX and the principal point centred.
+    """
+    flat = depth_m[np.isfinite(depth_m)].astype(np.float64)
+    values = np.unique(np.rint(flat[flat > 0.8] * 1000)) / 1000
+    fb, residual = fit_steps(values)
+    rms_m, subpixel = table_noise(depth_m)
+    inside = outline(depth_m)
+    gaps = inside & ~np.isfinite(depth_m)
+    return TableStatistics(
+        levels=len(values),
+        step_focal_baseline=fb,
+        step_residual=residual,
+        level_use=uneven_levels(flat[(flat > 0.8) & (flat < 1.3)], fb),
+        table_rms_m=rms_m,
+        table_subpixel_px=subpixel,
+        holes=float(gaps.sum() / max(inside.sum(), 1)),
+        runs_px=metrics.runs(gaps),
+        left_share=shadow_side(depth_m, gaps),
+    )
+
+
+def fit_steps(depths_m: np.ndarray, steps_per_px: int = 8) -> tuple[float, float]:
+    """The f B for which the levels 1 / Z lie best on a grid of 1 / (steps f B).
+
+    Args:
+        depths_m: [N] distinct depths, rounded to whole millimetres by the file.
+
+    Returns:
+        f B in px m; RMS distance of the levels from the grid in steps (0.29 if there is none).
+    """
+    if len(depths_m) < 20:
+        return float("nan"), float("nan")
+    inverse = 1 / depths_m
+    best = (np.inf, np.nan)
+    for fb in np.arange(35.0, 55.0, 0.01):
+        phase = inverse * fb * steps_per_px
+        # The offset of the grid is free: the circular mean of the phases.
+        angle = 2 * np.pi * phase
+        offset = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()) / (2 * np.pi)
+        off = (phase - offset + 0.5) % 1 - 0.5
+        best = min(best, (metrics.rms(off), float(fb)))
+    return best[1], best[0]
+
+
+def uneven_levels(depths_m: np.ndarray, focal_baseline: float, steps_per_px: int = 8) -> float:
+    """Standard deviation of the relative use of the steps within a pixel.
+
+    Each level's count is divided by the mean count of the pixel of disparity around it, and
+    averaged over all levels with the same fraction of a pixel.
+    """
+    if not np.isfinite(focal_baseline) or not depths_m.size:
+        return float("nan")
+    phase = steps_per_px * focal_baseline / depths_m
+    angle = 2 * np.pi * phase
+    offset = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()) / (2 * np.pi)
+    level = np.rint(phase - offset).astype(int)
+    counts = np.bincount(level - level.min()).astype(np.float64)
+    around = np.convolve(counts, np.ones(steps_per_px) / steps_per_px, mode="same")
+    inner = np.arange(steps_per_px, len(counts) - steps_per_px)
+    inner = inner[around[inner] > 0]
+    share = counts[inner] / around[inner]
+    use = [share[inner % steps_per_px == i].mean() for i in range(steps_per_px)]
+    return float(np.std(use))
+
+
+def outline(depth_m: np.ndarray) -> np.ndarray:
+    """[h, w] bool: between the first and the last pixel with a depth, in its row and its column.
+
+    The outer 4 pixels are left out: there the cut of the table is ragged.
+    """
+    valid = np.isfinite(depth_m)
+    out = np.ones_like(valid)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(valid, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(valid, axis), axis=axis), axis)
+        out &= before & after
+    import cv2
+
+    return cv2.erode(out.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+
+
+def shadow_side(depth_m: np.ndarray, gaps: np.ndarray) -> float:
+    """Of the hole pixels between two depths 3 cm apart or more: the share left of the nearer."""
+    left_px = right_px = 0
+    for row, line in zip(depth_m, gaps, strict=True):
+        edges = np.flatnonzero(np.diff(np.pad(line.astype(np.int8), 1)))
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            if start == 0 or end == len(row):
+                continue
+            before, after = row[start - 1], row[end]
+            if before - after > 0.03:
+                left_px += end - start
+            elif after - before > 0.03:
+                right_px += end - start
+    total = left_px + right_px
+    return left_px / total if total else float("nan")
+
+
+def table_noise(depth_m: np.ndarray, block: int = 24) -> tuple[float, float]:
+    """Noise of the table, free of its bow and of the device's distortion.
+
+    Planes are fitted to blocks of `block` px that lie on the table as a whole; the rest is what
+    depth noise does at short range.
+
+    Returns:
+        RMS distance to the planes in metres, and sub-pixel RMS with the infrared camera's f B.
+    """
+    height, width = depth_m.shape
+    normal, distance = table_plane(depth_m)
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    x, y = (u - (width - 1) / 2) / FOCAL_PX, (v - (height - 1) / 2) / FOCAL_PX
+    off = depth_m * (normal[0] * x + normal[1] * y + normal[2]) - distance
+    on_table = np.abs(off) < 0.015
+    fits = []
+    for top in range(0, height - block, block):
+        for left in range(0, width - block, block):
+            part = (slice(top, top + block), slice(left, left + block))
+            if on_table[part].mean() > 0.98:
+                good = on_table[part]
+                fits.append(
+                    metrics.fit_plane(
+                        depth_m[part][good], x[part][good], y[part][good], FOCAL_BASELINE
+                    )
+                )
+    rms_m = np.array([fit.rms_m for fit in fits])
+    return metrics.rms(rms_m), metrics.rms(np.array([fit.subpixel_rms_px for fit in fits]))
+
+
+def table_plane(depth_m: np.ndarray, seed: int = 0) -> tuple[np.ndarray, float]:
+    """The plane that most points lie on (RANSAC, then least squares): unit normal, distance."""
+    rows, cols = np.nonzero(np.isfinite(depth_m))
+    height, width = depth_m.shape
+    z = depth_m[rows, cols].astype(np.float64)
+    x, y = (cols - (width - 1) / 2) / FOCAL_PX, (rows - (height - 1) / 2) / FOCAL_PX
+    points = np.stack([x * z, y * z, z], axis=1)
+    some = points[:: max(1, len(points) // 20_000)]
+    rng = np.random.default_rng(seed)
+    best, count = (np.array([0, 0, 1.0]), 0.0), -1
+    for _ in range(200):
+        a, b, c = some[rng.choice(len(some), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-9:
+            continue
+        normal /= length
+        near = int((np.abs((some - a) @ normal) < 0.008).sum())
+        if near > count:
+            best, count = (normal, float(a @ normal)), near
+    on = points[np.abs(points @ best[0] - best[1]) < 0.01]
+    centre = on.mean(axis=0)
+    normal = np.linalg.svd((on - centre)[:: max(1, len(on) // 20_000)], full_matrices=False)[2][2]
+    return normal, float(centre @ normal)

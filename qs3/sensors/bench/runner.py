@@ -1,0 +1,213 @@
+"""Which conditions a bench has, and running them so that an interruption loses one of them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf
+
+from qs3.errors import ConfigError
+from qs3.files import write_json
+from qs3.hydra_glue import build
+from qs3.sensors.bench import edges, planar
+from qs3.sensors.bench.subject import Subject
+from qs3.sensors.renderers.base import Renderer
+
+log = logging.getLogger(__name__)
+
+ROOT = Path(__file__).resolve().parents[3]
+CONF = ROOT / "conf"
+DEFAULT_SENSORS = (
+    "kinect_v1",
+    "structure_sensor",
+    "realsense_d415",
+    "realsense_d435",
+    "speckle_stereo",
+    "time_of_flight",
+    "fringe",
+    "kinect_like",
+    "blensor_kinect",
+    "blensor_tof",
+)
+"""On the page. Not on it: copies of others, and those that repeat a defect on purpose."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How thorough a bench is.
+
+    Attributes:
+        tilts_deg: at `tilt_depth_m`, or the depth of the sensor nearest to it.
+        tilt_depth_m: where the plane is tilted.
+        phases: planes a condition.
+        repeats: frames for the noise over time.
+        half_px: half the region, in samples.
+        edge_frames: frames of the edge bench.
+    """
+
+    tilts_deg: tuple[float, ...] = (15, 30, 45, 60, 65, 70, 75, 80, 85)
+    tilt_depth_m: float = 2.0
+    phases: int = 16
+    repeats: int = 12
+    half_px: int = 24
+    edge_frames: int = 8
+
+    @staticmethod
+    def quick() -> Plan:
+        """Less of everything: seconds a sensor."""
+        return Plan(tilts_deg=(45, 75), phases=8, repeats=6, half_px=16, edge_frames=3)
+
+    def conditions(self, subject: Subject) -> list[planar.PlanarCondition | edges.EdgeCondition]:
+        """All of one sensor: the distances, the tilts both ways, the edge."""
+        depths = subject.depths_m()
+        common: dict[str, Any] = {"phases": self.phases, "half_px": self.half_px}
+        out: list[planar.PlanarCondition | edges.EdgeCondition] = [
+            planar.PlanarCondition(z, repeats=self.repeats, **common) for z in depths
+        ]
+        tilted = min(depths, key=lambda z: abs(z - self.tilt_depth_m))
+        for across in (True, False):
+            out += [
+                planar.PlanarCondition(tilted, float(t), across, **common) for t in self.tilts_deg
+            ]
+        out.append(edges.default_condition(subject, self.edge_frames))
+        return out
+
+
+@dataclass
+class SensorResult:
+    """All measurements of one sensor.
+
+    Attributes:
+        subject: the sensor.
+        config: its resolved settings.
+        planes: results of `planar.measure`, in the order of the plan.
+        edge: result of `edges.measure`.
+    """
+
+    subject: Subject
+    config: dict[str, Any]
+    planes: list[dict[str, Any]] = field(default_factory=list)
+    edge: dict[str, Any] = field(default_factory=dict)
+
+    def facing(self) -> list[dict[str, Any]]:
+        """Conditions without tilt, by depth."""
+        found = [m for m in self.planes if m["condition"]["tilt_deg"] == 0]
+        return sorted(found, key=lambda m: m["condition"]["depth_m"])
+
+    def tilted(self, across: bool) -> list[dict[str, Any]]:
+        """Conditions at one depth, by tilt, the untilted one first."""
+        found = [
+            m
+            for m in self.planes
+            if m["condition"]["tilt_deg"] > 0 and m["condition"]["across"] == across
+        ]
+        if not found:
+            return []
+        depth = found[0]["condition"]["depth_m"]
+        first = [m for m in self.facing() if m["condition"]["depth_m"] == depth]
+        return first + sorted(found, key=lambda m: m["condition"]["tilt_deg"])
+
+
+def load(name: str, overrides: Sequence[str] = ()) -> tuple[Subject, dict[str, Any]]:
+    """A sensor by the name of its file in conf/sensor, and its resolved settings.
+
+    Args:
+        name: e.g. "kinect_v1".
+        overrides: e.g. ["sensor.infrared.read_noise_e=20"].
+
+    Raises:
+        ConfigError: there is no such sensor, or it cannot be put on the bench.
+    """
+    known = sorted(path.stem for path in (CONF / "sensor").glob("*.yaml") if path.stem != "none")
+    if name not in known:
+        raise ConfigError(f"sensor={name} is unknown; there are {', '.join(known)}")
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            cfg = compose(overrides=[f"+sensor={name}", *overrides])
+    except ConfigCompositionException as error:
+        raise ConfigError(f"sensor={name}: {str(error).splitlines()[0]}") from error
+    settings = OmegaConf.to_container(cfg.sensor, resolve=True)
+    assert isinstance(settings, dict)
+    return Subject(name, build(cfg.sensor)), {str(k): v for k, v in settings.items()}
+
+
+def run(
+    subject: Subject,
+    config: dict[str, Any],
+    renderer: Renderer,
+    cache: Path,
+    plan: Plan,
+    advance: Callable[[], None] = lambda: None,
+) -> SensorResult:
+    """Measure all conditions of one sensor, or read what an earlier call measured.
+
+    Args:
+        subject, config: from `load`.
+        renderer: makes the images.
+        cache: folder for one JSON file a condition. Its name holds a hash of the settings, the
+            renderer and the code that measures, so a changed sensor is measured anew.
+        plan: which conditions.
+        advance: called after each.
+    """
+    result = SensorResult(subject, config)
+    for condition in plan.conditions(subject):
+        key = fingerprint(config, renderer.provenance(), asdict(condition))
+        path = cache / subject.name / f"{condition.name}-{key[:12]}.json"
+        found = _read(path)
+        if found is None:
+            module: Any = edges if isinstance(condition, edges.EdgeCondition) else planar
+            found = module.measure(subject, condition, renderer)
+            write_json(path, found)
+        if isinstance(condition, edges.EdgeCondition):
+            result.edge = found
+        else:
+            result.planes.append(found)
+        advance()
+    return result
+
+
+def fingerprint(*parts: Any) -> str:
+    """SHA-256 of settings and of the source code of sensors and measurements."""
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
+    digest.update(_code().encode())
+    return digest.hexdigest()
+
+
+def _code() -> str:
+    """Hash of what decides the numbers: the sensors, and how they are measured."""
+    sensors = Path(__file__).resolve().parents[1]
+    measuring = (
+        "metrics",
+        "targets",
+        "planar",
+        "edges",
+        "subject",
+        "still",
+        "own_laws",
+        "tabletop",
+    )
+    files = [path for path in sensors.rglob("*.py") if path.parent.name != "bench"]
+    files += [sensors / "bench" / f"{name}.py" for name in measuring]
+    digest = hashlib.sha256()
+    for path in sorted(files):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """A cached result; None if there is none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
