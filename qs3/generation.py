@@ -64,15 +64,16 @@ def generate(cfg: DictConfig) -> PointSet:
     domain: Domain = build(cfg.domain)
     folder = domain.folder
     items = mesh_items(cfg)
+    parts = Parts(folder)
     job = Job(
         recipe=build(cfg.recipe),
         make_renderer=partial(_make_renderer, OmegaConf.to_container(cfg.renderer, resolve=True)),
         seed=cfg.seed,
         keep=keep(cfg, items, folder),
+        save=parts.save,
     )
     check_recipe(job.recipe, cfg)
     check_folder(folder, cfg.paths.data_dir)
-    parts = Parts(folder)
     with (
         locked(
             folder,
@@ -134,12 +135,12 @@ def _scan_missing(
         log.info("continuing: %d of %d objects are done", len(items) - len(missing), len(items))
     with progress_bar(label, total=len(items), done=len(items) - len(missing)) as advance:
         for outcome in scan_all(job, missing, workers):
-            if outcome.lasting:
-                parts.save(outcome)
-            else:
+            if not outcome.lasting:
                 passing[outcome.item_id] = outcome
+            elif not outcome.saved:
+                parts.save(outcome)
             advance()
-            if outcome.cloud is None:
+            if outcome.reason:
                 log.warning("%s: %s", outcome.item_id, outcome.reason)
     return passing
 

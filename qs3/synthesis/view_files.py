@@ -10,8 +10,10 @@ same bytes.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
@@ -45,6 +47,25 @@ _REASON_COLOURS = {  # BGR
 
 class DiskError(Qs3Error):
     """A file of the dataset cannot be written; not the fault of the object."""
+
+
+@contextlib.contextmanager
+def disk_errors_travel() -> Iterator[None]:
+    """Turn what a full disk raises into a DiskError that reaches the parent process whole.
+
+    Raises:
+        DiskError: with the system's `errno`.
+    """
+    try:
+        yield
+    except (OSError, Qs3Error) as error:
+        if isinstance(error, DiskError):
+            raise
+        problem = DiskError(str(error))
+        # Kept as a plain value: on its way out of a worker an error loses its cause.
+        source = error if isinstance(error, OSError) else error.__cause__
+        problem.errno = getattr(source, "errno", None)  # type: ignore[attr-defined]
+        raise problem from error
 
 
 def view_folder(root: Path, object_id: str) -> Path:
@@ -96,14 +117,9 @@ def save_view(
     compressed = io.BytesIO()
     np.savez_compressed(compressed, **arrays)
     encoded = cv2.imencode(".png", view_picture(frame))[1]
-    try:
+    with disk_errors_travel():
         write_bytes(folder / f"view_{view}.png", encoded.tobytes())
         write_bytes(folder / f"view_{view}.npz", compressed.getvalue())
-    except Qs3Error as error:
-        problem = DiskError(str(error))
-        # Kept as a plain value: on its way out of a worker an error loses its cause.
-        problem.errno = getattr(error.__cause__, "errno", None)  # type: ignore[attr-defined]
-        raise problem from error
 
 
 def view_picture(frame: DepthFrame) -> np.ndarray:

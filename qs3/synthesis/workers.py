@@ -24,7 +24,7 @@ from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
 from qs3.synthesis.keeping import Keep
 from qs3.synthesis.recipes import Cloud, Recipe
-from qs3.synthesis.view_files import DiskError
+from qs3.synthesis.view_files import DiskError, disk_errors_travel
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +43,7 @@ class Outcome:
         reason: why it failed; empty if it did not.
         lasting: whether it would fail again: the object is to blame, and not the machine or a
             defect of ours. Other failures are tried again at the next start.
+        saved: the worker has saved it (`Job.save`); then `cloud` is None here.
     """
 
     item_id: str
@@ -50,6 +51,7 @@ class Outcome:
     cloud: Cloud | None
     reason: str
     lasting: bool = True
+    saved: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,12 +63,16 @@ class Job:
         make_renderer: picklable; called once in each worker if the recipe needs one.
         seed: of the dataset.
         keep: what is wanted besides the clouds.
+        save: picklable; a worker process saves lasting outcomes by it. Clouds must not come back
+            through the pool's pipe: a worker killed in the middle of a large message leaves half
+            of it there, and the pool waits for the rest for ever.
     """
 
     recipe: Recipe
     make_renderer: Callable[[], Renderer]
     seed: int
     keep: Keep = field(default_factory=Keep)
+    save: Callable[[Outcome], None] | None = None
 
 
 def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
@@ -229,4 +235,9 @@ def _provenance() -> tuple[dict[str, str], dict[str, str]]:
 
 def _scan(item: MeshItem) -> Outcome:
     assert _JOB is not None
-    return scan_one(_JOB, _renderer(), item)
+    outcome = scan_one(_JOB, _renderer(), item)
+    if _JOB.save is None or not outcome.lasting:
+        return outcome
+    with disk_errors_travel():
+        _JOB.save(outcome)
+    return replace(outcome, cloud=None, saved=True)
