@@ -40,9 +40,13 @@ def _wandb_id(*, _root_: DictConfig) -> str:
     return runs.run_name(_root_).replace("/", "-")
 
 
-def _choices(group: str) -> str:
-    """The choices of a config group, as `a | b`; `none` goes without saying."""
-    return " | ".join(path.stem for path in _files(group))
+def _choices(group: str, indent: int = 0) -> str:
+    """The choices of a config group, as `a | b`; `none` goes without saying.
+
+    With `indent`, in lines of 100 characters that all begin in that column.
+    """
+    text = " | ".join(path.stem for path in _files(group))
+    return ("\n" + " " * indent).join(textwrap.wrap(text, 100 - indent)) if indent else text
 
 
 def _described(group: str, also: str = "") -> str:
