@@ -1,0 +1,1 @@
+"""Point clouds in files. Imports nothing of qs3 but its errors."""

@@ -1,0 +1,222 @@
+"""Depth frames in files, and the camera that took them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.errors import ConfigError, DataError, MissingDataError
+
+_MAX_PIXELS = 1 << 26
+_RESOLUTIONS_M = (0.01, 0.001, 0.0001)
+_INVALID = 65535  # of 16 bits; 0 is the usual mark
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """The depth camera: focal lengths and principal point in pixels."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+
+    def __post_init__(self) -> None:
+        if not (self.fx_px > 0 and self.fy_px > 0):
+            raise ConfigError(
+                f"--intrinsics: fx and fy must be positive, got {self.fx_px} and {self.fy_px}"
+            )
+        if not np.isfinite([self.cx_px, self.cy_px]).all():
+            raise ConfigError("--intrinsics: cx and cy must be numbers")
+
+    def tangents(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """[w] and [h]: x / Z of each column and y / Z of each row."""
+        height, width = shape
+        return (
+            (np.arange(width) - self.cx_px) / self.fx_px,
+            (np.arange(height) - self.cy_px) / self.fy_px,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """One depth frame.
+
+    Attributes:
+        name: of its file, for messages.
+        depth_m: [h, w] float64 metres, NaN where nothing was measured.
+        resolution_m: all depths are whole multiples of it; 0 if there is no such step.
+        unit: what the file's numbers were taken for, in words.
+    """
+
+    name: str
+    depth_m: np.ndarray
+    resolution_m: float
+    unit: str
+
+
+def read_pinhole(text: str) -> Pinhole:
+    """`fx,fy,cx,cy`, or a JSON file with fx, fy, cx, cy (also as K or intrinsic_matrix).
+
+    Raises:
+        ConfigError: it is neither.
+        MissingDataError: there is no such file.
+    """
+    if text.lower().endswith(".json"):
+        path = Path(text)
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise MissingDataError(f"--intrinsics {path}: {error.strerror or error}") from error
+        except ValueError as error:
+            raise DataError(f"--intrinsics {path} is not JSON: {error}") from error
+        values = _four(found)
+        if values is None:
+            raise DataError(
+                f"--intrinsics {path} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
+            )
+        return Pinhole(*values)
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4:
+        raise ConfigError(f"--intrinsics {text!r}: write fx,fy,cx,cy in pixels, or a .json file")
+    return Pinhole(*values)
+
+
+def _four(found: object) -> list[float] | None:
+    if not isinstance(found, dict):
+        return None
+    try:
+        if all(key in found for key in ("fx", "fy", "cx", "cy")):
+            return [float(found[key]) for key in ("fx", "fy", "cx", "cy")]
+        for key in ("K", "intrinsic_matrix", "camera_matrix"):
+            if key in found:
+                k = np.asarray(found[key], dtype=np.float64).reshape(-1)
+                if len(k) != 9:
+                    return None
+                # Row by row has 0 0 1 at its end; column by column has cx there (Open3D).
+                if k[6] == 0 and k[7] == 0:
+                    return [k[0], k[4], k[2], k[5]]
+                return [k[0], k[4], k[6], k[7]]
+    except (TypeError, ValueError):
+        return None
+    return None
+
+
+def read_frame(path: str | Path, unit: str | None = None) -> DepthImage:
+    """One depth frame: 16 bit PNG, .npy, or an organised .pcd cloud.
+
+    Args:
+        path: of the file.
+        unit: "m", "mm", units a metre as a number, or None: as the numbers look.
+
+    Raises:
+        MissingDataError: there is no such file.
+        DataError: it is no depth image, or its unit cannot be told.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingDataError(f"{path}: there is no such file")
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        raw = _png(path)
+    elif suffix == ".npy":
+        raw = _npy(path)
+    elif suffix == ".pcd":
+        from qs3.clouds.pcd import read_pcd
+
+        cloud = read_pcd(path)
+        try:
+            raw = cloud.image("z")
+        except DataError as error:
+            raise DataError(f"{path}: {error}; an organised cloud is needed") from error
+    else:
+        raise DataError(f"{path}: depth frames are read from .png, .npy and .pcd")
+    if raw.ndim != 2 or raw.dtype.kind not in "iuf":
+        raise DataError(f"{path} is no depth image: {raw.dtype} of shape {list(raw.shape)}")
+    return as_frame(path.name, raw, unit)
+
+
+def as_frame(name: str, raw: np.ndarray, unit: str | None = None) -> DepthImage:
+    """An array as a depth frame; see `read_frame`."""
+    values = raw.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        valid = np.isfinite(values) & (values > 0)
+    if raw.dtype == np.uint16:
+        valid &= raw != _INVALID
+    if not valid.any():
+        raise DataError(f"{name} has no pixel with a depth")
+    whole = raw.dtype.kind in "iu"
+    scale, words = _scale(name, float(np.median(values[valid])), whole, unit)
+    depth = np.where(valid, values / scale, np.nan)
+    resolution = 1 / scale if whole else _resolution(depth[valid])
+    return DepthImage(name, depth, resolution, words)
+
+
+def _scale(name: str, middle: float, whole: bool, unit: str | None) -> tuple[float, str]:
+    """Units a metre, and how that was found."""
+    if unit == "m":
+        return 1.0, "metres, as given"
+    if unit == "mm":
+        return 1000.0, "millimetres, as given"
+    if unit is not None:
+        try:
+            scale = float(unit)
+        except ValueError:
+            scale = 0.0
+        if not (scale > 0 and np.isfinite(scale)):
+            raise ConfigError(f"--unit {unit!r}: write m, mm or a number of units a metre")
+        return scale, f"{scale:g} units a metre, as given"
+    if not whole and middle < 20:
+        return 1.0, f"metres, because the median is {middle:.3g}"
+    if 200 <= middle <= 12_000:
+        return 1000.0, f"millimetres, because the median is {middle:.4g}"
+    raise DataError(
+        f"{name}: a median depth of {middle:.4g} may be metres, millimetres or something else; "
+        "say it: --unit m, --unit mm, or --unit N for N units a metre (5000 in TUM's images)"
+    )
+
+
+def _resolution(depth_m: np.ndarray) -> float:
+    """The coarsest of some usual steps that all depths are multiples of; 0 if there is none."""
+    some = depth_m[:: max(1, len(depth_m) // 50_000)]
+    for step in _RESOLUTIONS_M:
+        phase = some / step
+        off = np.abs(phase - np.rint(phase))
+        if (off < 0.002 + 3e-7 * phase).mean() > 0.999 and len(np.unique(np.rint(phase))) > 1:
+            return step
+    return 0.0
+
+
+def _png(path: Path) -> np.ndarray:
+    import cv2
+
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise DataError(f"{path} cannot be read: {error}") from error
+    if image is None:
+        raise DataError(f"{path} is no PNG, or damaged")
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise DataError(
+            f"{path} is no depth image: {image.dtype}, shape {list(image.shape)}; 16 bit grey "
+            "is needed"
+        )
+    return np.asarray(image)
+
+
+def _npy(path: Path) -> np.ndarray:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"{path} is no .npy array, or damaged: {error}") from error
+    if not isinstance(array, np.ndarray):
+        raise DataError(f"{path} is no .npy array but an archive of several")
+    if array.size > _MAX_PIXELS:
+        raise DataError(f"{path} has {array.size} values; at most {_MAX_PIXELS} are read")
+    return np.array(array)

@@ -1,0 +1,167 @@
+"""A fitted preset as a file under conf/sensor, and the picture of data and model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from qs3.files import write_text
+from qs3.geometry.cameras import Intrinsics
+from qs3.sensors.fit.laws import Fill, Noise, Steps
+from qs3.sensors.fit.planes import Wall
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPreset:
+    """All that was found.
+
+    Attributes:
+        camera: of the frames.
+        noise, steps, fill: see qs3.sensors.fit.laws.
+        bias_m: coefficients, see FittedDepth.
+        baseline_m: as given; None if it was not.
+        walls: the data.
+    """
+
+    camera: Intrinsics
+    noise: Noise
+    steps: Steps
+    fill: Fill
+    bias_m: tuple[float, ...]
+    baseline_m: float | None
+    walls: Sequence[Wall]
+
+    def save(self, path: Path, command: str) -> None:
+        """Write the preset, with the command that made it."""
+        k, nearest, farthest = self.camera, *self._range()
+        baseline = "null" if self.baseline_m is None else f"{self.baseline_m:.6g}"
+        lines = [
+            "# Fitted to depth frames of a flat wall; noise is added to the true depth.",
+            f"# {command}",
+            "_target_: qs3.sensors.fitted.FittedDepth",
+            f"width_px: {k.width_px}",
+            f"height_px: {k.height_px}",
+            f"focal_px: {k.focal_px:.8g}",
+            f"cx_px: {k.cx_px:.8g}",
+            f"cy_px: {k.cy_px:.8g}",
+            "step_px: 1",
+            f"# The frames show walls from {nearest:.2f} to {farthest:.2f} m.",
+            "min_depth_m: 0.3",
+            "max_depth_m: 8.0",
+            f"noise_floor_m: {self.noise.floor_m:.6g}",
+            f"noise_factor: {self.noise.factor:.6g}",
+            f"noise_power: {self.noise.power:g}"
+            + ("" if self.noise.power_known else "   # assumed: all walls are equally far"),
+            f"correlation_px: {self.noise.correlation_px:.3g}",
+            f"inverse_step_per_m: {self.steps.inverse_per_m:.8g}",
+            f"depth_step_m: {self.steps.depth_m:.6g}",
+            f"bias_m: {_numbers(self.bias_m)}",
+            f"tilts_deg: {_numbers(self.fill.tilts_deg)}",
+            f"fill_rates: {_numbers(self.fill.rates)}",
+            f"hole_px: {self.fill.hole_px:.3g}",
+            f"baseline_m: {baseline}",
+        ]
+        write_text(path, "\n".join(lines) + "\n")
+
+    def summary(self) -> list[str]:
+        """What was found, a line each."""
+        noise, steps = self.noise, self.steps
+        floor = f"{1e3 * noise.floor_m:.2f} mm + " if noise.floor_m else ""
+        lines = [
+            f"noise     sigma(Z) = {floor}{1e3 * noise.factor:.3f} mm (Z / m)^{noise.power:g}"
+            + ("" if noise.power_known else "; the power is assumed, walls are equally far"),
+            f"          smooth over {noise.correlation_px:.2f} px",
+        ]
+        if steps.inverse_per_m:
+            lines.append(
+                f"steps     {steps.inverse_per_m:.6f} 1/m of 1/Z, so "
+                f"{1e3 * steps.inverse_per_m:.2f} mm at 1 m; eighths of a pixel if f b = "
+                f"{1 / (8 * steps.inverse_per_m):.2f} px m"
+            )
+        if steps.depth_m:
+            lines.append(f"          {1e3 * steps.depth_m:.3g} mm of depth")
+        if not steps.inverse_per_m and not steps.depth_m:
+            lines.append("steps     none seen")
+        rates = ", ".join(
+            f"{100 * rate:.1f} % at {tilt:.0f} deg"
+            for tilt, rate in zip(self.fill.tilts_deg, self.fill.rates, strict=True)
+        )
+        lines.append(f"fill      {rates}")
+        known = any(self.bias_m)
+        lines.append(
+            "bias      " + (f"{_numbers(self.bias_m)} m (constant first)" if known else
+            "unknown, taken as 0: give the true distances with --distances")
+        )  # fmt: skip
+        return lines
+
+    def plot(self, path: Path) -> None:
+        """Four panels: noise, steps, residuals of one frame, fill."""
+        figure, axes = plt.subplots(2, 2, figsize=(10, 7.5), constrained_layout=True)
+        self._plot_noise(axes[0, 0])
+        self._plot_steps(axes[0, 1])
+        self._plot_residual(figure, axes[1, 0])
+        self._plot_fill(axes[1, 1])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)
+        plt.close(figure)
+
+    def _range(self) -> tuple[float, float]:
+        z = np.concatenate([wall.depth_m[wall.on_wall] for wall in self.walls])
+        low, high = np.quantile(z, [0.01, 0.99])
+        return float(low), float(high)
+
+    def _plot_noise(self, ax: plt.Axes) -> None:
+        low, high = self._range()
+        z = np.linspace(0.9 * low, 1.1 * high, 200)
+        step2 = (self.steps.inverse_per_m * z**2) ** 2 / 12 + self.steps.depth_m**2 / 12
+        law = self.noise.law_m(z)
+        ax.plot(self.noise.depth_m, 1e3 * self.noise.sigma_m, "o", ms=4, label="data")
+        ax.plot(z, 1e3 * np.sqrt(law**2 + step2), label="model with quantiser")
+        ax.plot(z, 1e3 * law, "--", label="model before it")
+        nguyen = 0.0012 + 0.0019 * (z - 0.4) ** 2
+        ax.plot(z, 1e3 * nguyen, ":", color="grey", label="Kinect v1, Nguyen 2012")
+        ax.set(xlabel="distance (m)", ylabel="noise (mm)", title="Noise against distance")
+        ax.set_ylim(bottom=0)
+        ax.legend(fontsize=8)
+
+    def _plot_steps(self, ax: plt.Axes) -> None:
+        values = np.concatenate([wall.depth_m[wall.on_wall] for wall in self.walls])
+        levels = np.unique(np.round(values, 7))
+        ax.set(xlabel="distance (m)", ylabel="gap to the next level (mm)", title="Steps of depth")
+        if len(levels) > 0.3 * len(values):
+            ax.text(0.5, 0.5, "no steps seen", ha="center", transform=ax.transAxes)
+            return
+        gaps = np.diff(levels)
+        ax.plot(levels[1:], 1e3 * gaps, ".", ms=4, label="data")
+        z = np.linspace(levels[0], levels[-1], 200)
+        if self.steps.inverse_per_m:
+            ax.plot(z, 1e3 * self.steps.inverse_per_m * z**2, label="constant step of 1 / Z")
+        elif self.steps.depth_m:
+            ax.plot(z, np.full_like(z, 1e3 * self.steps.depth_m), label="constant step of Z")
+        ax.set_ylim(0, 1e3 * 4 * float(np.median(gaps)))
+        ax.legend(fontsize=8)
+
+    def _plot_residual(self, figure: plt.Figure, ax: plt.Axes) -> None:
+        wall = self.walls[0]
+        error = 1e3 * np.where(wall.on_wall, wall.depth_m - wall.plane_m, np.nan)
+        reach = float(np.nanquantile(np.abs(error), 0.98))
+        picture = ax.imshow(error, cmap="RdBu", vmin=-reach, vmax=reach)
+        ax.set(xlabel="column (px)", ylabel="row (px)", title=f"Measured minus plane: {wall.name}")
+        ax.set_facecolor("0.85")
+        figure.colorbar(picture, ax=ax, label="mm (grey: no depth, or not on the wall)")
+
+    def _plot_fill(self, ax: plt.Axes) -> None:
+        ax.plot(self.fill.tilts_deg, 100 * np.array(self.fill.rates), "o-")
+        ax.set(xlabel="angle of incidence (degrees)", ylabel="valid pixels (%)", title="Fill rate")
+        ax.set_ylim(min(90, 100 * min(self.fill.rates) - 5), 101)
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"
