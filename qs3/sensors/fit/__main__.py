@@ -9,16 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qs3.errors import ConfigError, Qs3Error
-from qs3.sensors.fit.frames import read_frame, read_intrinsics
-from qs3.sensors.fit.laws import find_bias, find_fill, find_noise, find_steps
+from qs3.geometry.cameras import Intrinsics
+from qs3.sensors.fit.frames import read_frame, read_pinhole
+from qs3.sensors.fit.laws import find_bias, find_fill, find_noise
 from qs3.sensors.fit.planes import find_wall
 from qs3.sensors.fit.preset import FittedPreset
+from qs3.sensors.fit.steps import find_steps
 
 HELP = """Measure a depth camera on a flat wall, and write a preset for generate.py.
 
-Take three or more depth frames of a flat, matt wall: straight on from distances that differ (say 1,
-1.5, 2 and 3 m), and some at a slant (20 to 70 degrees) for the fill rate. Other things may be in
-view; the plane that covers most is the wall.
+Take three or more depth frames of a flat, matt wall: from distances that differ (say 1, 1.5, 2 and
+3 m), turned by a few degrees so that several steps of depth are seen; and some at a slant (20 to
+70 degrees) for the fill rate. Other things may be in view; the plane that covers most is the wall.
 
     python -m qs3.sensors.fit frames/*.png --intrinsics 580,580,319.5,239.5 --baseline 0.075 \\
         --out conf/sensor/my_camera.yaml --plot my_camera.png
@@ -40,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("frames", nargs="+", type=Path, help=".png (16 bits), .npy [h, w] or .pcd")
     parser.add_argument("--intrinsics", help="fx,fy,cx,cy in px, or a JSON file with these keys")
     parser.add_argument("--focal", type=float, help="px; the principal point is the middle")
-    parser.add_argument("--unit", help="m, mm, or metres a count (default: judged by the values)")
+    parser.add_argument("--unit", help="m, mm, or units a metre (default: judged by the values)")
     parser.add_argument("--distances", help="true distances of the wall in the middle of each "
                         "frame in metres, e.g. 1.0,1.5,2.0: for the bias")  # fmt: skip
     parser.add_argument("--baseline", type=float, help="metres from camera to projector along x "
@@ -80,13 +82,12 @@ def fit(given: argparse.Namespace) -> FittedPreset:
     """
     frames = [read_frame(path, given.unit) for path in given.frames]
     for frame in frames:
-        if frame.assumed:
-            sys.stdout.write(f"{frame.name}: {frame.assumed}\n")
+        sys.stdout.write(f"{frame.name}: {frame.unit}\n")
     shapes = {frame.depth_m.shape for frame in frames}
     if len(shapes) > 1:
         raise ConfigError(f"frames of one camera have one size, these have {sorted(shapes)}")
     height, width = frames[0].depth_m.shape
-    camera = read_intrinsics(given.intrinsics, given.focal, (height, width))
+    camera = _camera(given, width, height)
     distances = None
     if given.distances is not None:
         try:
@@ -95,12 +96,27 @@ def fit(given: argparse.Namespace) -> FittedPreset:
             raise ConfigError(f"--distances: expected numbers, got {given.distances}") from None
         if len(distances) != len(frames):
             raise ConfigError(f"--distances has {len(distances)} values for {len(frames)} frames")
-    walls = [find_wall(frame.name, frame.depth_m, camera) for frame in frames]
-    steps = find_steps(walls, frames[0].unit_m)
+    steps = find_steps(frames)
+    step = steps.inverse_per_m
+    walls = [find_wall(frame.name, frame.depth_m, camera, step) for frame in frames]
     noise = find_noise(walls, steps, given.power)
     return FittedPreset(
         camera, noise, steps, find_fill(walls), find_bias(walls, distances), given.baseline, walls
     )
+
+
+def _camera(given: argparse.Namespace, width: int, height: int) -> Intrinsics:
+    if given.intrinsics is None:
+        if given.focal is None:
+            raise ConfigError("give the camera: --intrinsics fx,fy,cx,cy, or --focal PIXELS")
+        return Intrinsics.centred(width, height, given.focal)
+    found = read_pinhole(given.intrinsics)
+    if not 0.95 < found.fx_px / found.fy_px < 1.05:
+        raise ConfigError(
+            f"--intrinsics: fx {found.fx_px} and fy {found.fy_px} differ; pixels must be square"
+        )
+    focal = (found.fx_px + found.fy_px) / 2
+    return Intrinsics(width, height, focal, found.cx_px, found.cy_px)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import numpy as np
 
 from qs3.errors import DataError
 from qs3.sensors.fit.planes import Wall
+from qs3.sensors.fit.steps import Steps
 from qs3.sensors.fitted import neighbour_correlation
 
 TRIMMED_NORMAL = 0.9616
@@ -44,21 +45,6 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Steps:
-    """The quantiser; 0 where there is none.
-
-    Attributes:
-        inverse_per_m: step of 1 / Z.
-        depth_m: step of Z.
-        coherence: how well the levels lie on the grid, 0..1.
-    """
-
-    inverse_per_m: float
-    depth_m: float
-    coherence: float
-
-
-@dataclass(frozen=True)
 class Fill:
     """Share of valid pixels against the angle of incidence.
 
@@ -70,64 +56,6 @@ class Fill:
     tilts_deg: tuple[float, ...]
     rates: tuple[float, ...]
     hole_px: float
-
-
-def find_steps(walls: Sequence[Wall], unit_m: float) -> Steps:
-    """The step of the levels, constant in 1 / Z or in Z.
-
-    The levels of a grid with step q have phases x / q that agree: the coherence is the length of
-    their mean direction. Of the candidate steps that are coherent, the largest is the step:
-    its halves and thirds are coherent too.
-    """
-    values = np.concatenate([wall.depth_m[wall.on_wall] for wall in walls])
-    levels, counts = np.unique(np.round(values, 7), return_counts=True)
-    if len(levels) > 0.3 * len(values) or len(levels) < 8:
-        return Steps(0.0, 0.0, 0.0)
-    levels = levels[counts >= 3]
-    if len(levels) < 8:
-        return Steps(0.0, 0.0, 0.0)
-    if len(levels) > 600:
-        levels = levels[:: len(levels) // 600 + 1]
-    gap = float(np.median(np.diff(levels)))
-    # Rounding to whole counts of the file blurs a grid in 1 / Z; it is one in Z itself.
-    inverse, how_inverse = _grid(1 / levels[::-1], allowance=0.8)
-    stored = abs(gap - unit_m) < 0.01 * unit_m and unit_m < 1
-    if inverse and inverse * float(np.median(levels)) ** 2 > 1.5 * unit_m * (unit_m < 1):
-        return Steps(inverse, unit_m if unit_m < 1 else 0.0, how_inverse)
-    if stored:
-        return Steps(0.0, unit_m, 1.0)
-    depth, how_depth = _grid(levels, allowance=0.95)
-    return Steps(0.0, depth, how_depth)
-
-
-def _grid(levels: np.ndarray, allowance: float) -> tuple[float, float]:
-    """Largest coherent step of increasing levels, 0 if there is none; and its coherence."""
-    gaps = np.diff(levels)
-    span = float(levels[-1] - levels[0])
-    low, high = 0.3 * float(np.median(gaps)), 2.5 * float(np.quantile(gaps, 0.9))
-    steps, step = [], low
-    while step < high:
-        steps.append(step)
-        step += 0.12 * step * step / span
-        if len(steps) > 200_000:
-            return 0.0, 0.0
-    candidates = np.array(steps)
-    coherence = np.concatenate(
-        [
-            np.abs(np.exp(2j * np.pi * levels[:, None] / part).mean(axis=0))
-            for part in np.array_split(candidates, max(1, len(candidates) // 2000))
-        ]
-    )
-    top = float(coherence.max())
-    if top < allowance:
-        return 0.0, top
-    good = np.flatnonzero(coherence > max(allowance, 0.93 * top))
-    # The last run of good candidates is one peak: its best.
-    start = good[-1]
-    while start - 1 in good:
-        start -= 1
-    peak = start + int(coherence[start : good[-1] + 1].argmax())
-    return float(candidates[peak]), float(coherence[peak])
 
 
 def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) -> Noise:
@@ -162,6 +90,13 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
         raise DataError("too few pixels lie on the wall to measure noise: 400 at one distance")
     z, total, weight = np.array(depth), np.array(sigma), np.sqrt(np.array(white, dtype=float))
     quantiser = (steps.inverse_per_m * z**2) ** 2 / 12 + steps.depth_m**2 / 12
+    some = total > 0  # a quiet camera may see one level only
+    if not some.any():
+        raise DataError(
+            "every wall has one single level of depth: turn the camera by a few degrees, so that "
+            "several steps are seen"
+        )
+    z, total, weight, quantiser = (a[some] for a in (z, total, weight, quantiser))
     bare = np.sqrt(np.maximum(total**2 - quantiser, (0.05 * total) ** 2))
     known = power is not None or z.max() / z.min() > _LEAST_RANGE
     if not known:
@@ -169,7 +104,7 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
         floor, chosen = 0.0, 2.0
     else:
         laws = [_law(z, bare, weight, p) for p in ((1.0, 2.0) if power is None else (power,))]
-        misfit, floor, factor, chosen = min(laws)
+        _, floor, factor, chosen = min(laws)
     correlation = _correlation(walls, steps)
     return Noise(floor, factor, chosen, z, total, known, correlation)
 
@@ -186,21 +121,25 @@ def _law(
 
 
 def _correlation(walls: Sequence[Wall], steps: Steps) -> float:
-    """Size of the Gaussian that explains the correlation of horizontal neighbours."""
-    products, squares, rounding = [], [], []
+    """Size of the Gaussian that explains the correlation of horizontal neighbours.
+
+    In 1 / Z where the steps are, because noise and rounding have one size there. Rounding has a
+    variance of step^2 / 12 and, where noise exceeds a third of a step, hardly a correlation.
+    """
+    products, squares = [], []
     for wall in walls:
-        error = np.where(wall.on_wall, wall.depth_m - wall.plane_m, np.nan)
-        scale = np.nanstd(error)
-        error = np.clip(error, -3 * scale, 3 * scale) / scale
-        pair = error[:, 1:] * error[:, :-1]
-        products.append(float(np.nanmean(pair)))
-        squares.append(float(np.nanmean(error**2)))
-        z = np.where(wall.on_wall, wall.plane_m, np.nan)
-        step = np.nanmean((steps.inverse_per_m * z**2) ** 2) / 12 + steps.depth_m**2 / 12
-        rounding.append(float(step / scale**2))
-    bare = float(np.mean(squares)) - min(float(np.mean(rounding)), 0.9)
-    wanted = float(np.mean(products)) / max(bare, 1e-9)
-    if wanted < 0.05:
+        if steps.inverse_per_m:
+            error = 1 / wall.depth_m - 1 / wall.plane_m
+            rounding = steps.inverse_per_m**2 / 12
+        else:
+            error = (wall.depth_m - wall.plane_m) / wall.plane_m
+            rounding = steps.depth_m**2 / 12 / wall.centre_m**2
+        error = np.where(wall.on_wall, error, np.nan)
+        variance = float(np.nanvar(error))
+        products.append(float(np.nanmean(error[:, 1:] * error[:, :-1])) / variance)
+        squares.append(1 - min(rounding / variance, 0.9))
+    wanted = float(np.mean(products)) / float(np.mean(squares))
+    if wanted < 0.1:
         return 0.0
     sizes = np.linspace(0.2, 10, 197)
     found = np.array([neighbour_correlation(size) for size in sizes])
@@ -240,7 +179,10 @@ def find_bias(walls: Sequence[Wall], distances_m: Sequence[float] | None) -> tup
     """Polynomial of the error of the plane's distance in the middle; (0,) without references."""
     if distances_m is None:
         return (0.0,)
-    true = np.array(distances_m)
-    error = np.array([wall.centre_m for wall in walls]) - true
+    tilt = np.array([float(np.median(wall.tilt_deg[wall.region])) for wall in walls])
+    facing = tilt < _FACING_DEG / 2
+    use = facing if facing.any() else np.ones_like(facing)
+    true = np.array(distances_m)[use]
+    error = np.array([wall.centre_m for wall in walls])[use] - true
     degree = min(len(np.unique(true)) - 1, 2)
     return tuple(float(c) for c in np.polynomial.polynomial.polyfit(true, error, degree))

@@ -12,6 +12,7 @@ from qs3.geometry.cameras import Intrinsics
 
 _TRIES = 300
 _LEAST_PIXELS = 2000
+_LARGEST_ERROR = 0.08  # of 1 / Z, relative: no depth camera is as bad, and boxes of noise are
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +40,33 @@ class Wall:
 
     @property
     def centre_m(self) -> float:
-        """Depth of the plane in the middle of the image."""
+        """Measured distance in the middle of the image: the plane's and the mean error there.
+
+        A camera with a bias sees a slanted plane bent, so the plane alone would not do.
+        """
         height, width = self.plane_m.shape
-        return float(self.plane_m[height // 2, width // 2])
+        middle = (slice(2 * height // 5, 3 * height // 5 + 1),
+                  slice(2 * width // 5, 3 * width // 5 + 1))  # fmt: skip
+        error = (self.depth_m - self.plane_m)[middle][self.on_wall[middle]]
+        plane = float(self.plane_m[height // 2, width // 2])
+        return plane + (float(error.mean()) if error.size else 0.0)
 
 
-def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0) -> Wall:
+def find_wall(
+    name: str, depth_m: np.ndarray, camera: Intrinsics, step_per_m: float = 0.0, seed: int = 0
+) -> Wall:
     """Fit the plane that most pixels lie on.
 
     A plane is linear in 1 / Z over the pixels, so the fit is linear and its errors are those of
     a disparity. Random triples first (the one with the lowest 30 % quantile of errors), then
     least squares on what lies within 4.5 standard deviations, four times.
+
+    Args:
+        name: for messages.
+        depth_m: [h, w] with NaN.
+        camera: intrinsics.
+        step_per_m: the camera's step of 1 / Z, below which errors mean nothing.
+        seed: of the triples.
 
     Raises:
         DataError: there is no plane, or it covers too little.
@@ -77,7 +94,7 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
     scale = best / 0.385  # of a normal law, 30 % lie within 0.385 standard deviations
     near = np.zeros(len(x), dtype=bool)
     for _ in range(4):
-        near = np.abs(design @ normal - inverse) < 4.5 * max(scale, 1e-7)
+        near = np.abs(design @ normal - inverse) < 4.5 * max(scale, step_per_m / 2, 1e-7)
         if near.sum() < _LEAST_PIXELS:
             break
         normal = np.linalg.lstsq(design[near], inverse[near], rcond=None)[0]
@@ -85,6 +102,11 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
     if near.sum() < max(_LEAST_PIXELS, 0.05 * len(x)):
         raise DataError(
             f"{name}: only {int(near.sum())} pixels lie on one plane; show the camera a flat wall"
+        )
+    if scale > _LARGEST_ERROR * float(np.median(inverse)):
+        raise DataError(
+            f"{name}: no plane was found; the best one leaves an error of "
+            f"{100 * scale / float(np.median(inverse)):.0f} %. Show the camera a flat wall"
         )
 
     u, v = np.arange(width), np.arange(height)[:, None]

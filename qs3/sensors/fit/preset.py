@@ -14,8 +14,9 @@ import numpy as np
 
 from qs3.files import write_text
 from qs3.geometry.cameras import Intrinsics
-from qs3.sensors.fit.laws import Fill, Noise, Steps
+from qs3.sensors.fit.laws import Fill, Noise
 from qs3.sensors.fit.planes import Wall
+from qs3.sensors.fit.steps import Steps
 
 
 @dataclass(frozen=True, eq=False)

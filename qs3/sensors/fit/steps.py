@@ -38,7 +38,7 @@ class Steps:
         inverse = 1 / depth_m
         if self.inverse_per_m:
             index = np.rint((inverse - self.offset_per_m) / self.inverse_per_m)
-            return tuple(  # type: ignore[return-value]
+            return tuple(
                 (index + side) * self.inverse_per_m + self.offset_per_m for side in (-0.5, 0.5)
             )
         half = self.depth_m / 2

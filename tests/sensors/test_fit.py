@@ -1,0 +1,172 @@
+"""`python -m qs3.sensors.fit` must find what cameras hide."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from qs3.geometry.cameras import look_at
+from qs3.sensors.fit.__main__ import main
+from qs3.sensors.fitted import FittedDepth
+from qs3.sensors.reference_speckle import ReferenceSpeckle
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.test_known_planes import plane
+
+POSES = [(0.9, 8), (1.4, -6), (2.0, 10), (3.0, 7), (2.0, 30), (2.0, 55)]
+KINECT = Path(__file__).resolve().parents[3] / "shared" / "data" / "kinect_v1"
+
+HIDDEN = {
+    "steps of 1/Z, smooth holes": FittedDepth(
+        noise_factor=0.0013, inverse_step_per_m=1 / (8 * 43.5), bias_m=(0.004, -0.003),
+        tilts_deg=(0, 40, 70), fill_rates=(0.97, 0.95, 0.6), hole_px=2.0, correlation_px=1.5,
+    ),
+    "noise with a floor, growing with Z": FittedDepth(
+        width_px=320, height_px=240, focal_px=250.0, noise_floor_m=0.001, noise_factor=0.002,
+        noise_power=1.0, bias_m=(0.01,), fill_rates=(0.9,),
+    ),
+    "fine steps, wide noise": FittedDepth(
+        width_px=424, height_px=240, focal_px=212.0, noise_factor=0.004, correlation_px=3.0,
+        inverse_step_per_m=1 / (32 * 10.6), fill_rates=(0.99,), bias_m=(0.0, 0.01),
+    ),
+}  # fmt: skip
+
+
+def wall(sensor, depth_m, tilt_deg, seed):
+    """[h, w] float32 of a wall turned about the vertical axis, depth_m away in the middle."""
+    k, angle = sensor.intrinsics, np.deg2rad(tilt_deg)
+    x = ((np.arange(k.width_px) - k.cx_px) / k.focal_px)[None]
+    y = ((np.arange(k.height_px) - k.cy_px) / k.focal_px)[:, None]
+    along = np.sin(angle) * x + np.cos(angle) + 0 * y
+    with np.errstate(divide="ignore"):
+        clean = np.where(along > 0, depth_m * np.cos(angle) / along, np.inf)
+    cosine = np.abs(along) / np.sqrt(x**2 + y**2 + 1)
+    rng = np.random.default_rng(seed)
+    return sensor.measure(clean.astype(np.float32), cosine.astype(np.float32), rng)[0]
+
+
+def camera_of(sensor):
+    k = sensor.intrinsics
+    return f"{k.focal_px},{k.focal_px},{k.cx_px},{k.cy_px}"
+
+
+def fitted(folder, files, *arguments):
+    out = folder / "found.yaml"
+    assert main([*map(str, files), "--out", str(out), *arguments]) == 0
+    assert out.with_suffix(".png").stat().st_size > 20_000
+    text = out.read_text()
+    settings = yaml.safe_load(text)
+    assert settings.pop("_target_") == "qs3.sensors.fitted.FittedDepth"
+    return FittedDepth(
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+    ), text
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_hidden_parameters_are_recovered(name, tmp_path):
+    hidden, files = HIDDEN[name], []
+    for i, (depth, tilt) in enumerate(POSES):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    distances = ",".join(str(depth) for depth, _ in POSES)
+    found, text = fitted(
+        tmp_path, files, "--intrinsics", camera_of(hidden), "--distances", distances
+    )
+    assert found.noise_power == hidden.noise_power
+    for depth in (0.9, 1.5, 2.5, 3.0):
+        assert found.noise_law_m(depth) == pytest.approx(hidden.noise_law_m(depth), rel=0.1)
+        bias = np.polynomial.polynomial.polyval
+        allowed = 0.001 + 0.3 * hidden.inverse_step_per_m * depth**2
+        assert bias(depth, found.bias_m) == pytest.approx(bias(depth, hidden.bias_m), abs=allowed)
+    assert found.inverse_step_per_m == pytest.approx(hidden.inverse_step_per_m, rel=0.02)
+    assert found.depth_step_m == 0
+    for tilt in (5, 20, 40, 60):
+        rates = [np.interp(tilt, s.tilts_deg, s.fill_rates) for s in (found, hidden)]
+        assert rates[0] == pytest.approx(rates[1], abs=0.02)
+    assert abs(found.correlation_px - hidden.correlation_px) < 0.9
+    assert "python -m qs3.sensors.fit" in text
+
+
+def test_other_things_before_the_wall_and_millimetre_pictures(tmp_path):
+    hidden = FittedDepth(noise_factor=0.002)
+    files = []
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        image = wall(hidden, depth, tilt, seed=i)
+        image[200:400, 100:300] = 0.6  # a box, a fifth of the view
+        image[:90] = np.nan
+        files.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(files[-1]), np.nan_to_num(image * 1000).astype(np.uint16))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    assert found.noise_law_m(2.0) == pytest.approx(0.008, rel=0.1)
+    assert found.depth_step_m == pytest.approx(0.001)
+    assert found.inverse_step_per_m == 0
+    assert found.bias_m == (0.0,)
+
+
+def test_one_distance_cannot_tell_the_law(tmp_path):
+    hidden = FittedDepth(noise_factor=0.003)
+    np.save(tmp_path / "a.npy", wall(hidden, 1.5, 4, seed=0))
+    found, text = fitted(tmp_path, [tmp_path / "a.npy"], "--intrinsics", camera_of(hidden))
+    assert found.noise_power == 2
+    assert found.noise_factor == pytest.approx(0.003, rel=0.05)
+    assert "assumed: all walls are equally far" in text
+
+
+def test_the_steps_of_a_simulated_kinect_are_found(tmp_path):
+    """Frames of matched images, not of this model: 1/8 px steps of f b = 43.5 px m."""
+    sensor, renderer = ReferenceSpeckle(), MitsubaRenderer(samples=4)
+    pose = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    files = []
+    for i, (depth, tilt) in enumerate([(1.2, 12), (1.9, -15), (2.6, 20)]):
+        bodies, box = plane(depth, half_m=0.45, tilt_deg=tilt)
+        frame = sensor.scan(bodies, box, pose, renderer, np.random.default_rng(i))
+        whole = np.full((sensor.height_px, sensor.width_px), np.nan, np.float32)
+        height, width = frame.depth_m.shape
+        place = (slice(frame.top, frame.top + height), slice(frame.left, frame.left + width))
+        whole[place] = np.where(frame.label == 1, frame.depth_m, np.nan)
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], whole)
+    found, _ = fitted(tmp_path, files, "--focal", "580")
+    assert 1 / (8 * found.inverse_step_per_m) == pytest.approx(43.5, rel=0.02)
+    assert found.noise_power == 2
+
+
+@pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds beside the checkout")
+def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
+    files = sorted(KINECT.glob("*.pcd"))[:4]
+    found, _ = fitted(tmp_path, files, "--focal", "575")
+    # Published geometry: 580 px, 75 mm. Files hold whole millimetres.
+    assert 1 / (8 * found.inverse_step_per_m) == pytest.approx(43.5, rel=0.03)
+    assert found.depth_step_m == pytest.approx(0.001)
+    assert 0.0005 < found.noise_law_m(0.8) < 0.004
+    assert max(found.fill_rates) > 0.98
+
+
+@pytest.mark.parametrize(
+    ("image", "arguments", "message"),
+    [
+        (np.full((60, 80), np.nan, np.float32), [], "no pixel"),
+        (np.random.default_rng(0).uniform(1, 4, (200, 300)), [], "no plane was found"),
+        (np.full((200, 300), 60.0), [], "--unit"),
+        (np.full((200, 300), 2.0), ["--distances", "1,2"], "--distances has 2"),
+        (np.full((200, 300), 2.0), ["--intrinsics", "1,2,3"], "fx,fy,cx,cy"),
+        (np.zeros((5, 5, 3)), [], "no depth image"),
+    ],
+)
+def test_errors_say_what_to_do(image, arguments, message, tmp_path, capsys):
+    np.save(tmp_path / "a.npy", image)
+    camera = [] if "--intrinsics" in arguments else ["--focal", "300"]
+    out = ["--out", str(tmp_path / "x.yaml")]
+    assert main([str(tmp_path / "a.npy"), *camera, *out, *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "x.yaml").exists()
+
+
+def test_a_file_that_is_missing_and_frames_of_two_sizes(tmp_path, capsys):
+    assert main([str(tmp_path / "no.npy"), "--focal", "300", "--out", "x.yaml"]) == 2
+    np.save(tmp_path / "a.npy", np.full((100, 100), 2.0))
+    np.save(tmp_path / "b.npy", np.full((90, 100), 2.0))
+    files = [str(tmp_path / name) for name in ("a.npy", "b.npy")]
+    assert main([*files, "--focal", "300", "--out", str(tmp_path / "x.yaml")]) == 2
+    assert "one size" in capsys.readouterr().err
