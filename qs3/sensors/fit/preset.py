@@ -134,7 +134,7 @@ class FittedPreset:
 
     def _plot_steps(self, ax: plt.Axes) -> None:
         values = np.concatenate([wall.depth_m[wall.on_wall] for wall in self.walls])
-        levels = np.unique(np.round(values, 7))
+        levels = np.unique(np.round(values, 5))
         ax.set(xlabel="distance (m)", ylabel="gap to the next level (mm)", title="Steps of depth")
         if len(levels) > 0.3 * len(values):
             ax.text(0.5, 0.5, "no steps seen", ha="center", transform=ax.transAxes)

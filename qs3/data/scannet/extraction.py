@@ -1,0 +1,250 @@
+"""All scenes of ScanNet to the dataset: find, extract in parallel, resume, write.
+
+The dataset depends on the scenes, the label map, the lists and the settings alone: neither the
+number of workers, nor their order, nor an interruption changes a byte of it.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import io
+import logging
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import qs3
+from qs3.classes import CLASSES
+from qs3.data.manifest import ManifestRow
+from qs3.data.scannet.files import Found, SceneFiles, find_scenes
+from qs3.data.scannet.labels import read_label_map, read_scene_list
+from qs3.data.scannet.objects import ObjectCloud
+from qs3.data.scannet.pool import Job, all_scenes
+from qs3.data.scannet.scene import SceneResult
+from qs3.data.scannet.scene_parts import RECIPE, SceneParts
+from qs3.data.scannet.settings import Extraction
+from qs3.data.store import PointSet, is_finished, open_pointset, read_meta, write_pointset
+from qs3.errors import DataError
+from qs3.files import locked, make_folder, sha256_file, write_text
+from qs3.settings import whole
+from qs3.synthesis.parts import forget
+from qs3.synthesis.progress import progress_bar
+
+log = logging.getLogger(__name__)
+
+SCENES = "scenes.csv"
+_FAILURES_SHOWN = 5
+_COLUMNS = (
+    "scene", "split", "status", "objects", "clouds",
+    "frames", "frames_used", "frames_lost", "frames_unmasked", "sha256", "notes",
+)  # fmt: skip
+
+
+def extract(
+    *,
+    scans: Path,
+    labels: Path,
+    train: Path,
+    val: Path,
+    out: Path,
+    settings: Extraction | None = None,
+    workers: int = 1,
+    force: bool = False,
+) -> PointSet:
+    """Make the dataset at `out`, continue it, add scenes that came since, or find it finished.
+
+    A second call with the same `out` waits for the first, and then finds its work.
+
+    Args:
+        scans: ScanNet's folder of scenes.
+        labels: scannetv2-labels.combined.tsv.
+        train, val: scannetv2_train.txt and scannetv2_val.txt; the latter is our split "test".
+        out: folder of the dataset.
+        settings: None is the defaults.
+        workers: processes; 0 works in this one.
+        force: delete what is at `out` first.
+
+    Returns:
+        The dataset. Scenes that failed are in scenes.csv with the reason, and are tried again
+        by the next call.
+
+    Raises:
+        ConfigError: `out` was made with other settings.
+        MissingDataError: a file or the folder of scenes is not there.
+        DataError: no object gave a cloud.
+    """
+    settings = settings or Extraction()
+    whole("workers", workers, 0)
+    scans, out = scans.absolute(), out.absolute()
+    label_map = read_label_map(labels, settings.column)
+    found = find_scenes(scans, read_scene_list(train), read_scene_list(val))
+    recipe = {
+        "settings": dataclasses.asdict(settings),
+        "labels": {"sha256": sha256_file(labels)},
+        "versions": _versions(),
+    }
+    make_folder(out)
+    with locked(out / ".lock"):
+        if force and (is_finished(out) or (out / RECIPE).is_file()):
+            (out / SCENES).unlink(missing_ok=True)
+            forget(out)
+        parts = SceneParts(out)
+        parts.check(recipe)
+        if is_finished(out) and not parts.are_there:
+            log.info("%s is finished, and its parts were deleted: nothing to do", out)
+            return open_pointset(out)
+        parts.begin(recipe)
+        _say_found(found)
+        results = _results(Job(label_map, settings, parts), found, workers)
+        pointset = _write(out, scans, results, recipe)
+        _report(pointset, results, found, out)
+    return pointset
+
+
+def _results(job: Job, found: Found, workers: int) -> list[SceneResult]:
+    """One a scene, by name: from the parts, which are made where they are not there yet."""
+    todo = [files for files in found.scenes if not job.parts.has(files)]
+    total = len(found.scenes)
+    failed = {}
+    with progress_bar("scenes", total=total, done=total - len(todo)) as advance:
+        for done in all_scenes(job, todo, workers):
+            if done.reason:
+                log.warning("%s: %s", done.scene, done.reason)
+                failed[done.scene] = done.reason
+            advance()
+    job.parts.tidy()
+    results = []
+    for files in found.scenes:
+        if reason := failed.get(files.scene):
+            results.append(SceneResult(files, reason=reason))
+        else:
+            results.append(job.parts.load(files))
+    return results
+
+
+def _write(
+    out: Path, scans: Path, results: Sequence[SceneResult], recipe: dict[str, Any]
+) -> PointSet:
+    """The dataset, unless it is there already with exactly these scenes."""
+    table = _scenes_csv(results, scans)
+    digest = hashlib.sha256(table.encode()).hexdigest()
+    if is_finished(out) and read_meta(out).get("scenes_sha256") == digest:
+        log.info("nothing has changed since %s was written", out)
+        return open_pointset(out)
+    objects = [(result.files, one) for result in results for one in result.objects]
+    # Class by class, train before test, as the other datasets.
+    objects.sort(key=lambda pair: (CLASSES.index(pair[1].labelled.cls), pair[0].split == "test"))
+    clouds = [one.cloud for _, one in objects if one.cloud is not None]
+    if not clouds:
+        first = next((r for r in results if r.reason), None)
+        why = f"; the first that failed: {first.files.scene}: {first.reason}" if first else ""
+        raise DataError(f"no object of {len(results)} scenes gave a cloud{why}")
+    write_text(out / SCENES, table)
+    return write_pointset(
+        out,
+        name=out.name,
+        classes=CLASSES,
+        arrays={"points": clouds},
+        rows=[_row(files, one) for files, one in objects],
+        meta={
+            "simulated": False,
+            "source": "ScanNet: .sens depth cropped by 2D instance masks, fused, sampled",
+            "scenes": len(results),
+            "scenes_failed": sum(bool(result.reason) for result in results),
+            "scenes_sha256": digest,
+            **{"extraction" if key == "settings" else key: value for key, value in recipe.items()},
+        },
+    )
+
+
+def _row(files: SceneFiles, one: ObjectCloud) -> ManifestRow:
+    """The manifest's row; `origin` says scene, object, label and frames."""
+    labelled = one.labelled
+    frames = " ".join(map(str, one.frames)) or "none"
+    return ManifestRow(
+        id=f"{labelled.cls}/{files.split}/{files.scene}_{labelled.object_id}",
+        cls=labelled.cls,
+        split=files.split,
+        origin=f"scene {files.scene}, object {labelled.object_id}, label {labelled.label!r}, "
+        f"frames {frames}, of {one.candidates}",
+        views=len(one.frames),
+        valid_points=one.fused_points,
+        status="ok" if one.cloud is not None else "skipped",
+        reason=one.reason,
+    )
+
+
+def _scenes_csv(results: Sequence[SceneResult], scans: Path) -> str:
+    """One line a scene; paths in it are relative to `scans`, so it is the same anywhere."""
+    file = io.StringIO(newline="")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for result in results:
+        clouds = [one.cloud for one in result.objects if one.cloud is not None]
+        digest = hashlib.sha256()
+        for one in result.objects:
+            digest.update(repr((one.labelled, one.frames, one.reason)).encode())
+            digest.update(b"" if one.cloud is None else one.cloud.tobytes())
+        notes = "; ".join([result.reason, *result.notes] if result.reason else result.notes)
+        values = [
+            result.files.scene, result.files.split, "failed" if result.reason else "ok",
+            len(result.objects), len(clouds), result.frames, result.frames_used,
+            result.frames_lost, result.frames_unmasked, digest.hexdigest()[:16],
+            " ".join(notes.replace(f"{scans}/", "").splitlines()),
+        ]  # fmt: skip
+        writer.writerow(values)
+    return file.getvalue()
+
+
+def _versions() -> dict[str, str]:
+    """What may change a number in a cloud."""
+    return {
+        "qs3": qs3.__version__,
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "fpsample": version("fpsample"),
+    }
+
+
+def _say_found(found: Found) -> None:
+    splits = [files.split for files in found.scenes]
+    log.info("%d scenes of train and %d of test are there", *map(splits.count, ("train", "test")))
+    if found.absent:
+        log.info("%d scenes of the lists are not, first %s", len(found.absent), found.absent[0])
+    if found.unlisted:
+        log.info(
+            "%d scenes are in neither list and are left out, first %s",
+            len(found.unlisted),
+            found.unlisted[0],
+        )
+
+
+def _report(pointset: PointSet, results: Sequence[SceneResult], found: Found, out: Path) -> None:
+    """Counts a class, what was left out, and the content hash."""
+    counts = pointset.counts()
+    missed = [o.labelled.cls for result in results for o in result.objects if o.cloud is None]
+    log.info("%-10s %s %7s", "clouds", " ".join(f"{split:>7}" for split in counts), "skipped")
+    for name in pointset.classes:
+        row = [counts[split][name] for split in counts]
+        log.info("%-10s %s %7d", name, " ".join(f"{n:>7d}" for n in row), missed.count(name))
+    total = [sum(counts[split].values()) for split in counts]
+    log.info("%-10s %s %7d", "all", " ".join(f"{n:>7d}" for n in total), len(missed))
+    lost = sum(result.frames_lost for result in results)
+    log.info("%d frames were left out for their pose", lost)
+    failed = [result for result in results if result.reason]
+    for result in failed[:_FAILURES_SHOWN]:
+        log.warning("failed: %s: %s", result.files.scene, result.reason)
+    if failed:
+        log.warning(
+            "%d of %d scenes failed (%s); mend or download them and run the same command again",
+            len(failed),
+            len(results),
+            SCENES,
+        )
+    log.info("in %s, content hash %s", out, pointset.sha256[:16])

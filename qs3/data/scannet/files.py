@@ -1,0 +1,130 @@
+"""Which files a scene has, which scenes there are, and of which split each one is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.data.scannet.labels import is_scene
+from qs3.data.scannet.sens import is_rigid
+from qs3.errors import DataError, MissingDataError
+
+_MAX_INFO_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """A scene's files; those that are not there are None.
+
+    Attributes:
+        scene: its name, e.g. "scene0000_00".
+        split: "train" or "test".
+        sens, instances: the recording and the zip of instance masks; both are needed.
+        labels, aggregation: zip of label masks and list of objects; one of them is needed.
+        info: <scene>.txt, needed to align.
+    """
+
+    scene: str
+    split: str
+    sens: Path | None
+    instances: Path | None
+    labels: Path | None
+    aggregation: Path | None
+    info: Path | None
+
+    @staticmethod
+    def find(folder: Path, split: str) -> SceneFiles:
+        """Those in a scene's folder, under ScanNet's names."""
+
+        def there(suffix: str) -> Path | None:
+            path = folder / f"{folder.name}{suffix}"
+            return path if path.is_file() else None
+
+        return SceneFiles(
+            scene=folder.name,
+            split=split,
+            sens=there(".sens"),
+            instances=there("_2d-instance-filt.zip"),
+            labels=there("_2d-label-filt.zip"),
+            aggregation=there(".aggregation.json"),
+            info=there(".txt"),
+        )
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each file, by its role: another size means another file."""
+        roles = ("sens", "instances", "labels", "aggregation", "info")
+        paths = {role: getattr(self, role) for role in roles}
+        return {role: path.stat().st_size for role, path in paths.items() if path is not None}
+
+
+@dataclass(frozen=True)
+class Found:
+    """The scenes in a folder.
+
+    Attributes:
+        scenes: those of the lists that are there, by name.
+        unlisted: folders of scenes that are in neither list.
+        absent: scenes of the lists that are not there.
+    """
+
+    scenes: tuple[SceneFiles, ...]
+    unlisted: tuple[str, ...]
+    absent: tuple[str, ...]
+
+
+def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> Found:
+    """The scenes in a folder, one folder each, with the split that the lists give them.
+
+    Args:
+        scans: holds scene0000_00/ and so on.
+        train, test: names of scenes.
+
+    Raises:
+        MissingDataError: there is no such folder, or no scene of the lists in it.
+        DataError: a scene is in both lists.
+    """
+    if both := sorted(set(train) & set(test)):
+        raise DataError(f"{both[0]} is in the list of train and in that of test ({len(both)} are)")
+    if not scans.is_dir():
+        raise MissingDataError(f"there is no folder {scans}")
+    split_of = {**dict.fromkeys(train, "train"), **dict.fromkeys(test, "test")}
+    there = sorted(path.name for path in scans.iterdir() if path.is_dir() and is_scene(path.name))
+    scenes = [SceneFiles.find(scans / name, split_of[name]) for name in there if name in split_of]
+    if not scenes:
+        raise MissingDataError(
+            f"{scans} holds none of the {len(split_of)} scenes of the lists, only {len(there)} "
+            "others; it should hold folders like scene0000_00 (ScanNet's folder `scans`)"
+        )
+    return Found(
+        scenes=tuple(scenes),
+        unlisted=tuple(name for name in there if name not in split_of),
+        absent=tuple(sorted(set(split_of) - set(there))),
+    )
+
+
+def read_alignment(path: Path | None, scene: str) -> np.ndarray:
+    """[4, 4] `axisAlignment` of <scene>.txt, which turns about z and shifts.
+
+    Raises:
+        DataError: it is not there, or tilts the scene.
+    """
+    if path is None:
+        raise DataError(f"{scene}.txt is not there, so the scene cannot be aligned (align=false)")
+    if path.stat().st_size > _MAX_INFO_BYTES:
+        raise DataError(f"{path} is too large for a scene's information")
+    text = path.read_bytes().decode("utf-8", "replace")
+    match = re.search(r"^\s*axisAlignment\s*=(.*)$", text, re.MULTILINE)
+    try:
+        matrix = np.array([float(word) for word in match[1].split()] if match else [])
+    except ValueError as error:
+        raise DataError(f"{path}: axisAlignment holds {error}") from error
+    if matrix.size != 16:
+        raise DataError(f"{path} has no axisAlignment of 16 numbers (align=false does without)")
+    matrix = matrix.reshape(4, 4)
+    if not is_rigid(matrix) or not np.allclose(matrix[2, :3], (0, 0, 1), rtol=0, atol=1e-3):
+        raise DataError(f"{path}: axisAlignment does not turn about z: {matrix.tolist()}")
+    return matrix

@@ -1,0 +1,163 @@
+"""The zips of masks: what is read, and what is refused."""
+
+import io
+import struct
+import tracemalloc
+import zipfile
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.data.scannet.masks import INSTANCES, LABELS, MaskArchive, read_png
+from qs3.errors import DataError
+from tests.data.scannet.writing import png, write_zip
+
+
+def images(dtype=np.uint8, count=3):
+    rng = np.random.default_rng(1)
+    top = np.iinfo(dtype).max
+    return {i: rng.integers(0, top, (9, 12), endpoint=True, dtype=dtype) for i in range(count)}
+
+
+@pytest.mark.parametrize(("dtype", "folder"), [(np.uint8, INSTANCES), (np.uint16, LABELS)])
+def test_what_was_written_is_read(tmp_path, dtype, folder):
+    made = images(dtype)
+    write_zip(tmp_path / "a.zip", folder, made)
+    with MaskArchive(tmp_path / "a.zip", folder) as masks:
+        assert masks.frames == {0, 1, 2}
+        for frame in (2, 0, 1):
+            found = masks.read(frame)
+            assert found.dtype == dtype
+            np.testing.assert_array_equal(found, made[frame])
+        with pytest.raises(DataError, match="frame 7: there is no mask"):
+            masks.read(7)
+
+
+def test_a_folder_about_the_folder_and_other_files_do_no_harm(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr(f"scene0000_00/{INSTANCES}/12.png", png(images()[0]))
+        file.writestr("readme.txt", "hello")
+        file.writestr(f"{INSTANCES}/notes.txt", "hello")
+    with MaskArchive(tmp_path / "a.zip", INSTANCES) as masks:
+        assert masks.frames == {12}
+
+
+@pytest.mark.parametrize(
+    "name", ["../instance-filt/0.png", "/instance-filt/0.png", "a/../../b.png", "c:/x", "..\\x"]
+)
+def test_names_that_lead_elsewhere_are_refused(tmp_path, name):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr(f"{INSTANCES}/0.png", png(images()[0]))
+        file.writestr(name, b"x")
+    with pytest.raises(DataError, match="leads elsewhere; refused"):
+        MaskArchive(tmp_path / "a.zip", INSTANCES)
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_two_masks_of_a_frame_or_none_at_all_are_told(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        for _ in range(2):
+            file.writestr(f"{INSTANCES}/3.png", png(images()[0]))
+    with pytest.raises(DataError, match="two masks of frame 3"):
+        MaskArchive(tmp_path / "a.zip", INSTANCES)
+    with pytest.raises(DataError, match="holds no label-filt/<frame>"):
+        MaskArchive(tmp_path / "a.zip", LABELS)
+
+
+def chunk(kind, data):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def bomb(width, height):
+    """A small PNG that says that it is large; its rows are all zero."""
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    rows = zlib.compress(bytes(1000))
+    parts = chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (0, 5), (2**31 - 1, 1), (4097, 2)])
+def test_a_picture_too_large_is_refused_by_its_header(size):
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"here: a PNG of \d+ x \d+ px; refused"):
+            read_png(bomb(*size), "here")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "are no PNG"),
+        (b"GIF89a" + bytes(100), "no PNG"),
+        (png(np.zeros((4, 4, 3), np.uint8)), "grey with 8 or 16 bits"),
+        (png(images()[0])[:-5], "broken off"),
+        (bytes(2**26 + 1), "more than 67108864 bytes"),
+    ],
+)
+def test_what_is_no_grey_png_is_refused(data, message):
+    with pytest.raises(DataError, match=f"here: .*{message}"):
+        read_png(data, "here")
+
+
+def test_a_zip_cannot_unpack_without_end(tmp_path):
+    """A member of 200 MB in a small file: no more than the limit is ever unpacked."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(f"{INSTANCES}/0.png", bytes(200_000_000))
+    assert (tmp_path / "a.zip").stat().st_size < 300_000
+    with (
+        MaskArchive(tmp_path / "a.zip", INSTANCES) as masks,
+        pytest.raises(DataError, match="frame 0: the PNG has more than"),
+    ):
+        masks.read(0)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), min_size=1, max_size=8),
+    cut=st.integers(0, 3000),
+)
+def test_a_garbled_zip_is_read_or_refused_and_nothing_else(tmp_path_factory, changes, cut):
+    path = tmp_path_factory.mktemp("garbled") / "a.zip"
+    write_zip(path, INSTANCES, images())
+    data = bytearray(path.read_bytes())
+    for at, value in changes:
+        data[at % len(data)] = value
+    path.write_bytes(data[:-cut] if cut % 3 == 0 and cut else data)
+    told = None
+    try:
+        with MaskArchive(path, INSTANCES) as masks:
+            dtypes = {masks.read(frame).dtype for frame in masks.frames}
+            assert dtypes <= {np.dtype(np.uint8), np.dtype(np.uint16)}
+    except DataError as error:
+        told = str(error)
+    assert told is None or "a.zip" in told
+
+
+def test_an_encrypted_mask_is_told(tmp_path):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as made:
+        made.writestr(f"{INSTANCES}/0.png", png(images()[0]))
+    data = bytearray(file.getvalue())
+    at = data.index(b"PK\x01\x02")
+    data[at + 8] |= 1
+    (tmp_path / "a.zip").write_bytes(data)
+    with pytest.raises(DataError, match="is encrypted"):
+        MaskArchive(tmp_path / "a.zip", INSTANCES)
+
+
+def test_our_pngs_are_real_pngs():
+    """The reader of the tests' files and of ours is the same library; this one is not."""
+    image = images(np.uint16)[0]
+    data = png(image)
+    start = data.index(b"IDAT") + 4
+    length = struct.unpack(">I", data[start - 8 : start - 4])[0]
+    rows = zlib.decompress(data[start : start + length])
+    assert len(rows) == 9 * (1 + 12 * 2)
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).dtype == np.uint16
