@@ -61,7 +61,7 @@ class FringeProjection:
     max_depth_m: float = 6.0
     tan_half_width: float = 0.6
     projector_strength: float = 1.0
-    ambient: float = 0.02
+    ambient: float = 0.01
     code: FringeCode = field(default_factory=FringeCode)
     infrared: InfraredCamera = field(default_factory=InfraredCamera)
     min_modulation: float = 10.0

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from qs3.geometry.cameras import look_at
+from qs3.sensors.bench.laws import nguyen_axial_m
 from qs3.sensors.fit.__main__ import main
 from qs3.sensors.fitted import FittedDepth
 from qs3.sensors.reference_speckle import ReferenceSpeckle
@@ -132,6 +133,60 @@ def test_the_steps_of_a_simulated_kinect_are_found(tmp_path):
     assert found.noise_power == 2
 
 
+@pytest.mark.parametrize("share", [0.1, 0.25])
+def test_noise_far_below_a_step_is_found(share, tmp_path):
+    """Taking step^2 / 12 off the variance would leave nothing but its own error."""
+    step, files = 1 / (8 * 43.5), []
+    hidden = FittedDepth(noise_factor=share * step, inverse_step_per_m=step)
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    assert found.noise_law_m(2.0) == pytest.approx(hidden.noise_law_m(2.0), rel=0.05)
+    assert found.correlation_px == 0
+
+
+def test_walls_that_show_too_few_levels_are_refused(tmp_path, capsys):
+    step = 1 / (8 * 43.5)
+    hidden = FittedDepth(noise_factor=0.3 * step, inverse_step_per_m=step)
+    np.save(tmp_path / "a.npy", wall(hidden, 1.5, 0.5, seed=0))
+    out = ["--out", str(tmp_path / "x.yaml")]
+    assert main([str(tmp_path / "a.npy"), "--focal", "580", *out]) == 2
+    assert "turn the camera by a few degrees" in capsys.readouterr().err
+
+
+def test_a_lens_that_bends_the_wall_adds_no_noise(tmp_path):
+    hidden, files = FittedDepth(noise_factor=0.001), []
+    bend = 0.01 * np.linspace(-1, 1, 640, dtype=np.float32) ** 3
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i) + bend)
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    for depth in (1.0, 2.0, 3.0):
+        assert found.noise_law_m(depth) == pytest.approx(hidden.noise_law_m(depth), rel=0.1)
+
+
+@pytest.mark.parametrize(("rate", "hole"), [(0.9, 1.0), (0.6, 3.0), (0.5, 8.0)])
+def test_holes_of_any_size_count(rate, hole, tmp_path):
+    hidden, files = FittedDepth(fill_rates=(rate,), hole_px=hole), []
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    # Four frames hold some 300 holes a frame of the largest size: a few per cent of chance.
+    assert np.mean(found.fill_rates) == pytest.approx(rate, abs=0.01 + 0.004 * hole)
+    assert found.hole_px == pytest.approx(hole, rel=0.15)
+
+
+def test_the_shadow_of_a_thing_is_no_hole_of_the_wall(tmp_path):
+    image = wall(FittedDepth(noise_factor=0.001), 2.0, 5, seed=0)
+    image[200:300, 300:400] = 1.2
+    image[200:300, 280:300] = np.nan
+    np.save(tmp_path / "a.npy", image)
+    found, _ = fitted(tmp_path, [tmp_path / "a.npy"], "--focal", "580")
+    assert min(found.fill_rates) == 1
+
+
 @pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds beside the checkout")
 def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
     files = sorted(KINECT.glob("*.pcd"))[:4]
@@ -139,7 +194,9 @@ def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
     # Published geometry: 580 px, 75 mm. Files hold whole millimetres.
     assert 1 / (8 * found.inverse_step_per_m) == pytest.approx(43.5, rel=0.03)
     assert found.depth_step_m == pytest.approx(0.001)
-    assert 0.0005 < found.noise_law_m(0.8) < 0.004
+    step = found.inverse_step_per_m * 0.8**2
+    total = np.hypot(found.noise_law_m(0.8), step / np.sqrt(12))
+    assert total == pytest.approx(float(nguyen_axial_m(0.8)), rel=0.3)
     assert max(found.fill_rates) > 0.98
 
 

@@ -71,6 +71,8 @@ def test_planes_of_a_sensor_with_a_stored_pattern_come_back(renderer, name):
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "sensor/matcher").iterdir()))
 def test_every_matcher_is_a_choice_and_its_file_shows_all_it_has(name):
     sensor = "speckle_stereo_small" if name.endswith("_small") else "speckle_stereo"
+    if (CONF / f"sensor/{name}.yaml").is_file():  # a device's own
+        sensor = name
     with initialize_config_dir(str(CONF), version_base=None):
         choices = ["domain=specklenet10", f"sensor={sensor}", f"sensor/matcher={name}"]
         cfg = compose("generate", choices)

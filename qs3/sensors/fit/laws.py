@@ -6,17 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri
 
 from qs3.errors import DataError
 from qs3.sensors.fit.planes import Wall
+from qs3.sensors.fit.rounded import TRIMMED_NORMAL, smooth_wall, spread_between
 from qs3.sensors.fit.steps import Steps
 from qs3.sensors.fitted import neighbour_correlation
 
-TRIMMED_NORMAL = 0.9616
-"""Standard deviation of a normal law without its lowest and highest 0.5 %."""
 _BIN = 1.08  # ratio of the ends of a bin of distances
 _LEAST_IN_BIN = 400
 _FACING_DEG = 50.0  # noise against distance is taken from smaller tilts
+_TURN = (
+    "every wall shows one level of depth, or a few of them, which says neither how large a step is "
+    "nor what the noise is: turn the camera by a few degrees, so that many steps are seen"
+)
+_LEAST_NOISE = 0.4  # share of the variance that is not rounding
 _LEAST_RANGE = 1.3  # of distances, to tell one law from another
 
 
@@ -61,8 +66,10 @@ class Fill:
 def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) -> Noise:
     """Noise against distance.
 
-    Pixels are binned by the plane's depth, frame by frame; sigma is the standard deviation of
-    the inner 99 %. The quantiser's share, step^2 / 12, is taken off before the law is fitted.
+    Pixels are binned by the plane's depth, frame by frame. Errors are those from a smooth surface
+    (`smooth_wall`), so that neither distortion nor bias counts as noise. sigma as measured is the
+    standard deviation of the inner 99 %; that before the quantiser, to which the law is fitted,
+    is the one of highest likelihood (`spread_between`).
 
     Args:
         power: 1 or 2 to fix the law; None lets the data choose, if distances differ by 30 %.
@@ -70,34 +77,39 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     Raises:
         DataError: too few pixels.
     """
-    depth, sigma, white = [], [], []
+    if not steps.inverse_per_m and all(_few_levels(wall, steps) for wall in walls):
+        raise DataError(_TURN)
+    depth, sigma, before, white, smooth = [], [], [], [], []
     for wall in walls:
+        surface = smooth_wall(wall, steps)
+        smooth.append(surface)
         usable = wall.on_wall & (wall.tilt_deg < _FACING_DEG)
         if not usable.any():
             usable = wall.on_wall
-        z, error = wall.plane_m[usable], (wall.depth_m - wall.plane_m)[usable]
+        z, mean, measured = wall.plane_m[usable], surface[usable], wall.depth_m[usable]
+        low, high = steps.interval(measured)
         bins = np.floor(np.log(z) / np.log(_BIN)).astype(int)
         for number in np.unique(bins):
             inside = bins == number
             if inside.sum() < _LEAST_IN_BIN:
                 continue
-            part = error[inside]
-            low, high = np.quantile(part, [0.005, 0.995])
+            part = measured[inside] - 1 / mean[inside]
+            near, far = np.quantile(part, [0.005, 0.995])
+            sigma.append(float(part[(part >= near) & (part <= far)].std()) / TRIMMED_NORMAL)
+            # One level or none besides says nothing of what lies below a step.
+            levels = len(np.unique(measured[inside].astype(np.float32)))
+            found = spread_between(low[inside], high[inside], mean[inside]) if levels > 1 else 0.0
             depth.append(float(z[inside].mean()))
-            sigma.append(float(part[(part >= low) & (part <= high)].std()) / TRIMMED_NORMAL)
+            before.append(found * depth[-1] ** 2)
             white.append(inside.sum())
     if not depth:
         raise DataError("too few pixels lie on the wall to measure noise: 400 at one distance")
     z, total, weight = np.array(depth), np.array(sigma), np.sqrt(np.array(white, dtype=float))
-    quantiser = (steps.inverse_per_m * z**2) ** 2 / 12 + steps.depth_m**2 / 12
-    some = total > 0  # a quiet camera may see one level only
+    bare = np.array(before)
+    some = bare > 0  # a quiet camera may see one level only
     if not some.any():
-        raise DataError(
-            "every wall has one single level of depth: turn the camera by a few degrees, so that "
-            "several steps are seen"
-        )
-    z, total, weight, quantiser = (a[some] for a in (z, total, weight, quantiser))
-    bare = np.sqrt(np.maximum(total**2 - quantiser, (0.05 * total) ** 2))
+        raise DataError(_TURN)
+    z, total, weight, bare = (a[some] for a in (z, total, weight, bare))
     known = power is not None or z.max() / z.min() > _LEAST_RANGE
     if not known:
         factor = float((weight * bare / z**2).sum() / weight.sum())
@@ -105,8 +117,16 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     else:
         laws = [_law(z, bare, weight, p) for p in ((1.0, 2.0) if power is None else (power,))]
         _, floor, factor, chosen = min(laws)
-    correlation = _correlation(walls, steps)
+    correlation = _correlation(walls, smooth, steps)
     return Noise(floor, factor, chosen, z, total, known, correlation)
+
+
+def _few_levels(wall: Wall, steps: Steps) -> bool:
+    """Whether depths come in a few levels, further apart than the steps that were found."""
+    levels = np.unique(wall.depth_m[wall.on_wall].astype(np.float32))
+    if len(levels) >= 8:
+        return False
+    return len(levels) < 2 or float(np.median(np.diff(levels))) > 1.5 * steps.depth_m
 
 
 def _law(
@@ -120,25 +140,27 @@ def _law(
     return float(misfit), float(floor), float(factor), power
 
 
-def _correlation(walls: Sequence[Wall], steps: Steps) -> float:
+def _correlation(walls: Sequence[Wall], smooth: Sequence[np.ndarray], steps: Steps) -> float:
     """Size of the Gaussian that explains the correlation of horizontal neighbours.
 
     In 1 / Z where the steps are, because noise and rounding have one size there. Rounding has a
-    variance of step^2 / 12 and, where noise exceeds a third of a step, hardly a correlation.
+    variance of step^2 / 12 and, where noise exceeds a third of a step, hardly a correlation;
+    walls with less noise are left out.
     """
     products, squares = [], []
-    for wall in walls:
+    for wall, surface in zip(walls, smooth, strict=True):
         if steps.inverse_per_m:
-            error = 1 / wall.depth_m - 1 / wall.plane_m
+            error = 1 / wall.depth_m - surface
             rounding = steps.inverse_per_m**2 / 12
         else:
-            error = (wall.depth_m - wall.plane_m) / wall.plane_m
+            error = wall.depth_m * surface - 1
             rounding = steps.depth_m**2 / 12 / wall.centre_m**2
         error = np.where(wall.on_wall, error, np.nan)
         variance = float(np.nanvar(error))
-        products.append(float(np.nanmean(error[:, 1:] * error[:, :-1])) / variance)
-        squares.append(1 - min(rounding / variance, 0.9))
-    wanted = float(np.mean(products)) / float(np.mean(squares))
+        if variance * _LEAST_NOISE <= variance - rounding:
+            products.append(float(np.nanmean(error[:, 1:] * error[:, :-1])) / variance)
+            squares.append(1 - rounding / variance)
+    wanted = float(np.mean(products)) / float(np.mean(squares)) if products else 0.0
     if wanted < 0.1:
         return 0.0
     sizes = np.linspace(0.2, 10, 197)
@@ -163,16 +185,32 @@ def find_fill(walls: Sequence[Wall]) -> Fill:
 
 
 def _hole_size(walls: Sequence[Wall]) -> float:
-    """From the mean length of holes along rows: single pixels give 0."""
-    lengths = []
+    """The Gaussian that explains how often horizontal neighbours are both without a depth.
+
+    Holes are where a smooth normal field exceeds what the fill rate allows.
+    """
+    # Correlations of neighbours from 0 to nearly 1, and the probability that both exceed.
+    grid = np.concatenate([np.linspace(0, 0.95, 96), 1 - np.geomspace(0.045, 1e-4, 60)])
+    wanted, expected = [], []
     for wall in walls:
         hole = wall.region & ~np.isfinite(wall.depth_m)
-        edges = np.diff(np.pad(hole, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-        starts, ends = (np.argwhere(edges == sign) for sign in (1, -1))
-        lengths.append(ends[:, 1] - starts[:, 1])
-    runs = np.concatenate(lengths)
-    mean = float(runs.mean()) if len(runs) else 1.0
-    return 0.0 if mean < 1.3 else min(mean / 2, 10.0)
+        pair = wall.region[:, 1:] & wall.region[:, :-1]
+        share = float(hole.sum() / max(wall.region.sum(), 1))
+        if hole.sum() < _LEAST_IN_BIN or share > 0.95:
+            continue
+        wanted.append(float((hole[:, 1:] & hole[:, :-1])[pair].mean()))
+        density = np.exp(-(ndtri(share) ** 2) / (1 + grid)) / np.sqrt(1 - grid**2) / (2 * np.pi)
+        steps = np.diff(grid) * (density[1:] + density[:-1]) / 2
+        expected.append(share**2 + np.concatenate([[0], np.cumsum(steps)]))
+    if not wanted:
+        return 0.0
+    misfit = np.abs(np.mean(expected, axis=0) - np.mean(wanted))
+    correlation = float(grid[int(np.argmin(misfit))])
+    if correlation < 0.1:
+        return 0.0
+    sizes = np.linspace(0.2, 20, 397)
+    found = np.array([neighbour_correlation(size) for size in sizes])
+    return float(np.interp(min(correlation, found[-1]), found, sizes))
 
 
 def find_bias(walls: Sequence[Wall], distances_m: Sequence[float] | None) -> tuple[float, ...]:

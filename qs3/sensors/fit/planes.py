@@ -12,6 +12,9 @@ from qs3.geometry.cameras import Intrinsics
 
 _TRIES = 300
 _LEAST_PIXELS = 2000
+_LEAST_THING = 50  # pixels that lie together off the wall and are not its noise
+_RIM = 40  # the rim left out is this part of the image's width
+_SHADOW = 12  # a shadow is narrower than this part of the image
 _LARGEST_ERROR = 0.08  # of 1 / Z, relative: no depth camera is as bad, and boxes of noise are
 
 
@@ -118,11 +121,7 @@ def find_wall(
 
     mask = np.zeros((height, width), dtype=np.uint8)
     mask[rows[near], cols[near]] = 1
-    # The region with its holes: closed over 15 px; what is measured off the wall is not in it.
-    kernel = np.ones((15, 15), dtype=np.uint8)
-    region = cv2.morphologyEx(cv2.copyMakeBorder(mask, 8, 8, 8, 8, cv2.BORDER_REPLICATE),
-                              cv2.MORPH_CLOSE, kernel)[8:-8, 8:-8].astype(bool)  # fmt: skip
-    region &= (mask > 0) | ~np.isfinite(depth_m)
+    region = _region(mask > 0, np.isfinite(depth_m))
     return Wall(
         name,
         np.where(mask > 0, depth_m, np.nan),
@@ -130,3 +129,33 @@ def find_wall(
         np.degrees(np.arccos(np.clip(cosine, 0, 1))),
         region,
     )
+
+
+def _region(on_wall: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """[h, w] bool: the wall with its holes, of whatever size these are.
+
+    What lies between pixels of the wall, in its row and in its column, but for a rim, where
+    holes would be open to one side and left out. Holes beside another thing are its shadow.
+    """
+    inside = np.ones_like(on_wall)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(on_wall, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(on_wall, axis), axis=axis), axis)
+        inside &= before & after
+    side = 2 * (on_wall.shape[1] // _RIM) + 1
+    kernel = np.ones((side, side), np.uint8)
+    inside = cv2.erode(
+        inside.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0.0,)
+    ).astype(bool)
+    holes = inside & ~measured
+    _, number, stats, _ = cv2.connectedComponentsWithStats(
+        (measured & ~on_wall).astype(np.uint8), connectivity=8
+    )
+    things = np.isin(number, 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= _LEAST_THING))
+    if things.any():
+        side = 2 * (on_wall.shape[1] // _SHADOW) + 1
+        near = cv2.dilate(things.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+        _, number = cv2.connectedComponents((holes & near).astype(np.uint8), connectivity=8)
+        touching = cv2.dilate(things.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        holes &= ~np.isin(number, np.setdiff1d(number[touching & holes], 0))
+    return (on_wall & inside) | holes

@@ -1,0 +1,98 @@
+"""Noise of depths that were rounded: what lay between two steps is known to lie there, no more."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+from scipy.special import ndtr
+
+from qs3.sensors.fit.planes import Wall
+from qs3.sensors.fit.steps import Steps
+
+_MAX_PIXELS = 12_000
+_OUTLIERS = 1e-4  # share of pixels that lie anywhere, so that a single one decides nothing
+_COARSE = 0.5  # steps a standard deviation from which rounding is no small extra error
+
+
+def smooth_wall(wall: Wall, steps: Steps) -> np.ndarray:
+    """[h, w] 1 / Z of the wall as the camera sees it without noise: a cubic in the pixels.
+
+    Lenses bend a plane over the whole image, which is no noise. Where steps are coarse the
+    surface is that of highest likelihood (every pixel gives an interval, the error is normal),
+    because a mean over few steps is drawn to them.
+    """
+    height, width = wall.depth_m.shape
+    rows, cols = np.nonzero(wall.on_wall)
+    basis = _basis(rows / height - 0.5, cols / width - 0.5)
+    y = 1 / wall.depth_m[rows, cols]
+    found = np.linalg.lstsq(basis, y, rcond=None)[0]
+    v, u = np.mgrid[:height, :width]
+    everywhere = _basis(v.ravel() / height - 0.5, u.ravel() / width - 0.5)
+    low, high = steps.interval(wall.depth_m[rows, cols])
+    step, spread = float(np.median(high - low)), float(np.std(basis @ found - y))
+    if step > _COARSE * spread:
+        some = np.linspace(0, len(y) - 1, min(len(y), _MAX_PIXELS)).astype(int)
+        found = _most_likely(basis[some], low[some], high[some], found, step, spread)
+    return np.asarray(everywhere @ found).reshape(height, width)
+
+
+def spread_between(low: np.ndarray, high: np.ndarray, mean: np.ndarray) -> float:
+    """Standard deviation of normal errors about `mean` of values known to lie in [low, high].
+
+    Args:
+        low, high, mean: [N], of one unit.
+    """
+    step = float(np.median(high - low))
+    off = (low + high) / 2 - mean
+    near, far = np.quantile(off, [0.005, 0.995])
+    inner = off[(off >= near) & (off <= far)]
+    total = float(inner.std()) / TRIMMED_NORMAL
+    if step < _COARSE * total:
+        return float(np.sqrt(max(total**2 - step**2 / 12, 0.0)))
+
+    def cost(log_sigma: float) -> float:
+        sigma = np.exp(log_sigma)
+        share = ndtr((high - mean) / sigma) - ndtr((low - mean) / sigma)
+        return -float(np.log((1 - _OUTLIERS) * share + _OUTLIERS).mean())
+
+    ends = (np.log(0.02 * step), np.log(3 * max(step, total)))
+    return float(np.exp(minimize_scalar(cost, bounds=ends, method="bounded").x))
+
+
+TRIMMED_NORMAL = 0.9616
+"""Standard deviation of a normal law without its lowest and highest 0.5 %."""
+
+
+def _basis(v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """[N, 10] monomials up to the third degree."""
+    return np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
+
+
+def _most_likely(
+    basis: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    start: np.ndarray,
+    step: float,
+    spread: float,
+) -> np.ndarray:
+    """Coefficients of the surface from which normal errors lead into the intervals."""
+    q, r = np.linalg.qr(basis)
+    q, r = q * np.sqrt(len(q)), r / np.sqrt(len(q))
+    below, above = low / step, high / step
+    first = np.append(
+        r @ start / step, np.log(max(np.sqrt(max((spread / step) ** 2 - 1 / 12, 0)), 0.1))
+    )
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        sigma, mean = np.exp(x[-1]), q @ x[:-1]
+        a, b = (below - mean) / sigma, (above - mean) / sigma
+        share = (1 - _OUTLIERS) * (ndtr(b) - ndtr(a)) + _OUTLIERS
+        pa, pb = (np.exp(-(t**2) / 2) / np.sqrt(2 * np.pi) for t in (a, b))
+        by_mean = (pb - pa) / sigma / share
+        by_sigma = (b * pb - a * pa) / share
+        return -float(np.log(share).mean()), np.append(q.T @ by_mean, by_sigma.sum()) / len(q)
+
+    bounds = [(None, None)] * len(start) + [(np.log(0.02), np.log(10.0))]
+    found = minimize(cost, first, jac=True, method="L-BFGS-B", bounds=bounds).x[:-1]
+    return np.asarray(np.linalg.solve(r, found) * step)
