@@ -97,8 +97,7 @@ def fit(given: argparse.Namespace) -> FittedPreset:
         if len(distances) != len(frames):
             raise ConfigError(f"--distances has {len(distances)} values for {len(frames)} frames")
     steps = find_steps(frames)
-    step = steps.inverse_per_m
-    walls = [find_wall(frame.name, frame.depth_m, camera, step) for frame in frames]
+    walls = [find_wall(frame.name, frame.depth_m, camera) for frame in frames]
     noise = find_noise(walls, steps, given.power)
     return FittedPreset(
         camera, noise, steps, find_fill(walls), find_bias(walls, distances), given.baseline, walls

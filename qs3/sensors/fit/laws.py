@@ -12,7 +12,8 @@ from qs3.errors import DataError
 from qs3.sensors.fit.planes import Wall
 from qs3.sensors.fit.rounded import TRIMMED_NORMAL, smooth_wall, spread_between
 from qs3.sensors.fit.steps import Steps
-from qs3.sensors.fitted import neighbour_correlation
+from qs3.sensors.fit.texture import noise_size_px
+from qs3.sensors.fitted import FittedDepth, neighbour_correlation
 
 _BIN = 1.08  # ratio of the ends of a bin of distances
 _LEAST_IN_BIN = 400
@@ -21,7 +22,6 @@ _TURN = (
     "every wall shows one level of depth, or a few of them, which says neither how large a step is "
     "nor what the noise is: turn the camera by a few degrees, so that many steps are seen"
 )
-_LEAST_NOISE = 0.4  # share of the variance that is not rounding
 _LEAST_RANGE = 1.3  # of distances, to tell one law from another
 
 
@@ -79,14 +79,17 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     """
     if not steps.inverse_per_m and all(_few_levels(wall, steps) for wall in walls):
         raise DataError(_TURN)
-    depth, sigma, before, white, smooth = [], [], [], [], []
+    depth, sigma, before, white = [], [], [], []
+    hidden = False
     for wall in walls:
         surface = smooth_wall(wall, steps)
-        smooth.append(surface)
         usable = wall.on_wall & (wall.tilt_deg < _FACING_DEG)
         if not usable.any():
             usable = wall.on_wall
         z, mean, measured = wall.plane_m[usable], surface[usable], wall.depth_m[usable]
+        if _within_a_step(1 / z, 1 / measured - mean, wall.gap_per_m):
+            hidden = True
+            continue
         low, high = steps.interval(measured)
         bins = np.floor(np.log(z) / np.log(_BIN)).astype(int)
         for number in np.unique(bins):
@@ -102,6 +105,8 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
             depth.append(float(z[inside].mean()))
             before.append(found * depth[-1] ** 2)
             white.append(inside.sum())
+    if not depth and hidden:
+        raise DataError(_TURN)
     if not depth:
         raise DataError("too few pixels lie on the wall to measure noise: 400 at one distance")
     z, total, weight = np.array(depth), np.array(sigma), np.sqrt(np.array(white, dtype=float))
@@ -117,8 +122,34 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     else:
         laws = [_law(z, bare, weight, p) for p in ((1.0, 2.0) if power is None else (power,))]
         _, floor, factor, chosen = min(laws)
-    correlation = _correlation(walls, smooth, steps)
-    return Noise(floor, factor, chosen, z, total, known, correlation)
+
+    def simulated(size_px: float) -> FittedDepth:
+        return FittedDepth(
+            min_depth_m=1e-3,
+            max_depth_m=1e3,
+            noise_floor_m=floor,
+            noise_factor=factor,
+            noise_power=chosen,
+            correlation_px=size_px,
+            inverse_step_per_m=steps.inverse_per_m,
+            depth_step_m=steps.depth_m,
+        )
+
+    return Noise(floor, factor, chosen, z, total, known, noise_size_px(walls, simulated))
+
+
+def _within_a_step(inverse: np.ndarray, error: np.ndarray, gap: float) -> bool:
+    """Whether a wall meets so few steps that rounding is not spread evenly, and noise is small.
+
+    Over many steps rounding adds step^2 / 12 to the variance, whatever the noise; over few only
+    if the noise is half a step or more.
+
+    Args:
+        inverse, error: [N] 1 / Z of the plane, and errors of 1 / Z.
+        gap: between levels of 1 / Z.
+    """
+    low, high = np.quantile(inverse, [0.05, 0.95])
+    return gap > 0 and high - low < 2 * gap and float(error.std()) < 0.55 * gap
 
 
 def _few_levels(wall: Wall, steps: Steps) -> bool:
@@ -138,34 +169,6 @@ def _law(
     design = np.stack([np.ones_like(z), z**power], axis=1) * (weight / sigma)[:, None]
     (floor, factor), misfit = nnls(design, weight)
     return float(misfit), float(floor), float(factor), power
-
-
-def _correlation(walls: Sequence[Wall], smooth: Sequence[np.ndarray], steps: Steps) -> float:
-    """Size of the Gaussian that explains the correlation of horizontal neighbours.
-
-    In 1 / Z where the steps are, because noise and rounding have one size there. Rounding has a
-    variance of step^2 / 12 and, where noise exceeds a third of a step, hardly a correlation;
-    walls with less noise are left out.
-    """
-    products, squares = [], []
-    for wall, surface in zip(walls, smooth, strict=True):
-        if steps.inverse_per_m:
-            error = 1 / wall.depth_m - surface
-            rounding = steps.inverse_per_m**2 / 12
-        else:
-            error = wall.depth_m * surface - 1
-            rounding = steps.depth_m**2 / 12 / wall.centre_m**2
-        error = np.where(wall.on_wall, error, np.nan)
-        variance = float(np.nanvar(error))
-        if variance * _LEAST_NOISE <= variance - rounding:
-            products.append(float(np.nanmean(error[:, 1:] * error[:, :-1])) / variance)
-            squares.append(1 - rounding / variance)
-    wanted = float(np.mean(products)) / float(np.mean(squares)) if products else 0.0
-    if wanted < 0.1:
-        return 0.0
-    sizes = np.linspace(0.2, 10, 197)
-    found = np.array([neighbour_correlation(size) for size in sizes])
-    return float(np.interp(min(wanted, found[-1]), found, sizes))
 
 
 def find_fill(walls: Sequence[Wall]) -> Fill:
@@ -214,13 +217,27 @@ def _hole_size(walls: Sequence[Wall]) -> float:
 
 
 def find_bias(walls: Sequence[Wall], distances_m: Sequence[float] | None) -> tuple[float, ...]:
-    """Polynomial of the error of the plane's distance in the middle; (0,) without references."""
+    """Polynomial of the error of the wall's distance at the principal point.
+
+    A constant, a line or a parabola: a higher power must lower the corrected RMS error by a
+    fifth, and there must be more distances than coefficients. A slanted wall counts less: an
+    error of its tilt is one of its distance.
+
+    Returns:
+        Coefficients, the constant first; (0,) without references.
+    """
     if distances_m is None:
         return (0.0,)
-    tilt = np.array([float(np.median(wall.tilt_deg[wall.region])) for wall in walls])
-    facing = tilt < _FACING_DEG / 2
-    use = facing if facing.any() else np.ones_like(facing)
-    true = np.array(distances_m)[use]
-    error = np.array([wall.centre_m for wall in walls])[use] - true
-    degree = min(len(np.unique(true)) - 1, 2)
-    return tuple(float(c) for c in np.polynomial.polynomial.polyfit(true, error, degree))
+    true = np.array(distances_m)
+    error = np.array([wall.centre_m for wall in walls]) - true
+    tilt = np.deg2rad([float(np.median(wall.tilt_deg[wall.region])) for wall in walls])
+    weight = np.cos(tilt) ** 2 / true  # errors grow with the distance and more
+    best, least = np.zeros(1), np.inf
+    for degree in range(min(len(np.unique(true)) - 1, 2) + 1):
+        found = np.polynomial.polynomial.polyfit(true, error, degree, w=weight)
+        off = weight * (error - np.polynomial.polynomial.polyval(true, found))
+        free = len(true) - degree - 1
+        rms = float(np.sqrt((off**2).sum() / free)) if free else np.inf
+        if degree == 0 or rms < 0.8 * least:
+            best, least = found, rms
+    return tuple(float(c) for c in best)

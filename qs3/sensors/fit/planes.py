@@ -11,10 +11,12 @@ from qs3.errors import DataError
 from qs3.geometry.cameras import Intrinsics
 
 _TRIES = 300
+_LEAST_PURE = 0.6  # share of the depths within the outline of the wall that lie on it
 _LEAST_PIXELS = 2000
 _LEAST_THING = 50  # pixels that lie together off the wall and are not its noise
 _RIM = 40  # the rim left out is this part of the image's width
 _SHADOW = 12  # a shadow is narrower than this part of the image
+_WIDE = 0.02  # of 1 / Z, relative: what the first fit takes for the wall
 _LARGEST_ERROR = 0.08  # of 1 / Z, relative: no depth camera is as bad, and boxes of noise are
 
 
@@ -28,6 +30,8 @@ class Wall:
         plane_m: [h, w] depth of the fitted plane.
         tilt_deg: [h, w] angle of incidence on it.
         region: [h, w] bool: where the wall is seen, holes included.
+        centre_m: its measured distance at the principal point.
+        gap_per_m: usual gap between the levels of 1 / Z that are seen on it; 0 without levels.
     """
 
     name: str
@@ -35,40 +39,26 @@ class Wall:
     plane_m: np.ndarray
     tilt_deg: np.ndarray
     region: np.ndarray
+    centre_m: float
+    gap_per_m: float
 
     @property
     def on_wall(self) -> np.ndarray:
         """[h, w] bool: measured, and on the wall."""
         return self.region & np.isfinite(self.depth_m)
 
-    @property
-    def centre_m(self) -> float:
-        """Measured distance in the middle of the image: the plane's and the mean error there.
 
-        A camera with a bias sees a slanted plane bent, so the plane alone would not do.
-        """
-        height, width = self.plane_m.shape
-        middle = (slice(2 * height // 5, 3 * height // 5 + 1),
-                  slice(2 * width // 5, 3 * width // 5 + 1))  # fmt: skip
-        error = (self.depth_m - self.plane_m)[middle][self.on_wall[middle]]
-        plane = float(self.plane_m[height // 2, width // 2])
-        return plane + (float(error.mean()) if error.size else 0.0)
-
-
-def find_wall(
-    name: str, depth_m: np.ndarray, camera: Intrinsics, step_per_m: float = 0.0, seed: int = 0
-) -> Wall:
+def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0) -> Wall:
     """Fit the plane that most pixels lie on.
 
     A plane is linear in 1 / Z over the pixels, so the fit is linear and its errors are those of
     a disparity. Random triples first (the one with the lowest 30 % quantile of errors), then
-    least squares on what lies within 4.5 standard deviations, four times.
+    least squares on what lies within 4.5 standard deviations, eight times.
 
     Args:
         name: for messages.
         depth_m: [h, w] with NaN.
         camera: intrinsics.
-        step_per_m: the camera's step of 1 / Z, below which errors mean nothing.
         seed: of the triples.
 
     Raises:
@@ -94,14 +84,17 @@ def find_wall(
             best, normal = quantile, trial
     if normal is None:
         raise DataError(f"{name}: no plane was found")
-    scale = best / 0.385  # of a normal law, 30 % lie within 0.385 standard deviations
-    near = np.zeros(len(x), dtype=bool)
-    for _ in range(4):
-        near = np.abs(design @ normal - inverse) < 4.5 * max(scale, step_per_m / 2, 1e-7)
+    near = np.abs(design @ normal - inverse) < _WIDE * inverse
+    gap = 0.0
+    for _ in range(8):
         if near.sum() < _LEAST_PIXELS:
             break
         normal = np.linalg.lstsq(design[near], inverse[near], rcond=None)[0]
-        scale = float(np.std((design @ normal - inverse)[near])) / 0.99
+        error = np.abs(design @ normal - inverse)
+        gap = level_gap(inverse[near])
+        # Within one level errors say nothing, so the next levels count as well.
+        scale = max(float(np.quantile(error[near], 0.68)), 0.6 * gap, 1e-7)
+        near = error < np.minimum(4.5 * scale, 5 * _WIDE * inverse)
     if near.sum() < max(_LEAST_PIXELS, 0.05 * len(x)):
         raise DataError(
             f"{name}: only {int(near.sum())} pixels lie on one plane; show the camera a flat wall"
@@ -122,13 +115,47 @@ def find_wall(
     mask = np.zeros((height, width), dtype=np.uint8)
     mask[rows[near], cols[near]] = 1
     region = _region(mask > 0, np.isfinite(depth_m))
+    about = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)) > 0
+    pure = mask.sum() / max((about & np.isfinite(depth_m)).sum(), 1)
+    if pure < _LEAST_PURE:
+        raise DataError(
+            f"{name}: no plane was found; of the pixels about the best one only {100 * pure:.0f} % "
+            "lie on it. Show the camera a flat wall"
+        )
+    measured = np.where(mask > 0, depth_m, np.nan)
     return Wall(
         name,
-        np.where(mask > 0, depth_m, np.nan),
+        measured,
         plane,
         np.degrees(np.arccos(np.clip(cosine, 0, 1))),
         region,
+        1 / float(normal[0]) + _error_around(measured - plane, camera),
+        gap,
     )
+
+
+def level_gap(inverse: np.ndarray) -> float:
+    """Median gap between the distinct values of [N]; 0 where nearly every value is another."""
+    levels, counts = np.unique(inverse.astype(np.float32), return_counts=True)
+    if len(levels) > 0.05 * len(inverse):
+        return 0.0
+    levels = levels[counts >= max(3, 1e-4 * len(inverse))].astype(np.float64)
+    return float(np.median(np.diff(levels))) if len(levels) > 1 else 0.0
+
+
+def _error_around(error_m: np.ndarray, camera: Intrinsics) -> float:
+    """Mean of [h, w] errors around the principal point; 0 without any.
+
+    A camera with a bias, or a lens that bends, sees a plane bent: the plane alone is not what it
+    measured in the middle. Symmetric about that point, or a slant would count as an error.
+    """
+    height, width = error_m.shape
+    reach_v, reach_u = height // 10, width // 10
+    rows = np.abs(np.arange(height) - camera.cy_px) <= reach_v
+    cols = np.abs(np.arange(width) - camera.cx_px) <= reach_u
+    part = error_m[np.ix_(rows, cols)]
+    part = part[np.isfinite(part)]
+    return float(part.mean()) if part.size else 0.0
 
 
 def _region(on_wall: np.ndarray, measured: np.ndarray) -> np.ndarray:

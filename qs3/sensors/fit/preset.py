@@ -140,7 +140,8 @@ class FittedPreset:
             ax.text(0.5, 0.5, "no steps seen", ha="center", transform=ax.transAxes)
             return
         gaps = np.diff(levels)
-        ax.plot(levels[1:], 1e3 * gaps, ".", ms=4, label="data")
+        between = np.sqrt(levels[1:] * levels[:-1])  # where a step s of 1 / Z is s Z^2
+        ax.plot(between, 1e3 * gaps, ".", ms=4, label="data")
         z = np.linspace(levels[0], levels[-1], 200)
         if self.steps.inverse_per_m:
             ax.plot(z, 1e3 * self.steps.inverse_per_m * z**2, label="constant step of 1 / Z")

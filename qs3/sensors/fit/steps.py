@@ -62,7 +62,7 @@ def find_steps(frames: Sequence[DepthImage]) -> Steps:
     levels, counts = levels[strong], counts[strong]
     if len(levels) < 4:
         return Steps(0.0, 0.0, resolution, levels, 0.29)
-    weight = np.sqrt(counts)
+    weight = np.sqrt(np.minimum(counts, 100))  # each level is one witness
     # A level is known to half a unit of the file: dx = r / Z^2 / 2 to either side.
     found = _lattice((1 / levels)[::-1], weight[::-1], resolution / levels[::-1] ** 2)
     if found is not None:
@@ -106,8 +106,12 @@ def _lattice(
         x, weight, blur = x[keep], weight[keep], blur[keep]
     gaps = np.diff(x)
     wide = gaps > 1.5 * blur[1:]
-    if wide.sum() < 3:
+    wide &= gaps < 8 * np.median(gaps)  # not those between walls
+    if wide.sum() < max(3, 0.1 * len(gaps)):
         return None
+    few = _few(x, weight, blur)
+    if few is not None:
+        return few
     # The finest step that could be told from rounding, and one that is surely too coarse.
     finest = max(0.4 * float(np.quantile(gaps[wide], 0.1)), 1.5 * float(blur.min()))
     coarsest = 2.2 * float(np.quantile(gaps[wide], 0.75))
@@ -145,6 +149,27 @@ def _lattice(
     off -= np.rint(off)
     misfit = float(np.sqrt((use * off**2).sum() / use.sum()))
     return float(step), float(offset % step), misfit
+
+
+def _few(x: np.ndarray, weight: np.ndarray, blur: np.ndarray) -> tuple[float, float, float] | None:
+    """Step, offset and misfit where some walls show two or three levels each, else None.
+
+    So few levels lie on many lattices; but gaps that are alike at different depths are enough.
+    """
+    gaps, known = np.diff(x), (blur[1:] + blur[:-1]) / 2
+    near = gaps < 8 * gaps.min()
+    if len(x) > 40 or near.sum() < 3 or (known[near] > 0.2 * gaps[near]).any():
+        return None
+    where = x[1:][near]
+    if where.max() < 1.3 * where.min():  # a step of Z would look the same
+        return None
+    times = np.rint(gaps[near] / gaps[near].min())
+    step = float((gaps[near] * times).sum() / (times**2).sum())
+    if (np.abs(gaps[near] - times * step) > 0.02 * step * times + known[near]).any():
+        return None
+    # The step is known to a part of a gap only: too little to count steps from wall to wall.
+    angle = np.angle((weight * np.exp(2j * np.pi * x / step)).sum())
+    return step, float(angle / (2 * np.pi) * step % step), float("nan")
 
 
 def _resultant(
