@@ -45,6 +45,7 @@ class ClassHead(nn.Sequential):
         dropout: after every hidden layer.
         negative_slope: of LeakyReLU; 0 is ReLU.
         first_bias: False where the first layer is published without one.
+        hidden_bias: False where no hidden layer has one.
     """
 
     def __init__(
@@ -56,12 +57,13 @@ class ClassHead(nn.Sequential):
         dropout: float = 0.5,
         negative_slope: float = 0.2,
         first_bias: bool = True,
+        hidden_bias: bool = True,
     ) -> None:
         widths = (feature_dim, *hidden)
         layers: list[nn.Module] = []
         for i, (wide, narrow) in enumerate(zip(widths, hidden, strict=False)):
             layers += [
-                nn.Linear(wide, narrow, bias=first_bias or i > 0),
+                nn.Linear(wide, narrow, bias=hidden_bias and (first_bias or i > 0)),
                 nn.BatchNorm1d(narrow),
                 nn.LeakyReLU(negative_slope),
                 nn.Dropout(dropout),

@@ -1,0 +1,211 @@
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from qs3.errors import ConfigError
+from qs3.geometry.ball_query import ball_query
+from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.models import pointnet2 as pointnet2_module
+from qs3.models.grouped import GroupedMLP
+from qs3.models.pointnet2 import pointnet2
+from tests.models.reference_pointnet2 import StraightMLP, StraightPointNet2
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+
+
+@pytest.mark.parametrize(
+    ("variant", "classes", "count"),
+    [
+        ("ssg", 10, 1_464_650),
+        ("ssg", 40, 1_472_360),
+        ("msg", 10, 1_735_146),
+        ("msg", 40, 1_742_856),
+    ],
+)
+def test_parameters(variant: str, classes: int, count: int) -> None:
+    assert sum(p.numel() for p in pointnet2(classes, variant).parameters()) == count
+
+
+def _scramble(net: nn.Module) -> None:
+    """Norms as after training: scales of both signs, own statistics."""
+    for module in net.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            nn.init.normal_(module.weight, 0.3)
+            nn.init.normal_(module.bias)
+            if module.running_mean is not None:
+                module.running_mean.normal_()
+                module.running_var.uniform_(0.5, 2)
+
+
+def _grads(module: nn.Module) -> list[torch.Tensor]:
+    """In the order conv and norm of each layer, whatever they are called."""
+    return [p.grad for p in module.parameters() if p.grad is not None]
+
+
+@pytest.mark.parametrize("norm", ["batch", "instance"])
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize(
+    ("channels", "widths", "members"), [(0, (8, 6, 11), 9), (5, (8, 7), 4), (3, (4, 5, 6, 30), 1)]
+)
+def test_layer_equals_the_straight_one(
+    norm: str, training: bool, channels: int, widths: tuple[int, ...], members: int
+) -> None:
+    torch.manual_seed(0)
+    ours = GroupedMLP(channels, widths, norm=norm).double()
+    _scramble(ours)
+    assert (ours.norms[-1].weight < 0).any()
+    straight = StraightMLP(ours)
+    ours.train(training)
+    straight.train(training)
+    xyz = torch.randn(3, 40, 3, dtype=torch.float64) + 1
+    features = torch.randn(3, 40, channels, dtype=torch.float64) if channels else None
+    centres = gather(xyz, farthest_point_sampling(xyz, 12))
+    index = ball_query(xyz, centres, 0.8, members)
+    upstream = torch.randn(3, 12, widths[-1], dtype=torch.float64)
+    results = []
+    for module in (ours, straight):
+        inputs = [x.clone().requires_grad_() for x in (xyz, centres, features) if x is not None]
+        out = module(inputs[0], inputs[2] if channels else None, inputs[1], index)
+        (out * upstream).sum().backward()
+        results.append([out.detach(), *(x.grad for x in inputs)])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b, **TIGHT)
+    for linear, convolution in zip(ours.linears, straight.convolutions, strict=True):
+        torch.testing.assert_close(linear.weight.grad, convolution.weight.grad[:, :, 0, 0], **TIGHT)
+    for a, b in zip(ours.norms, straight.norms, strict=True):
+        torch.testing.assert_close(a.weight.grad, b.weight.grad, **TIGHT)
+        torch.testing.assert_close(a.bias.grad, b.bias.grad, **TIGHT)
+        if norm == "batch":
+            torch.testing.assert_close(a.running_mean, b.running_mean, **TIGHT)
+            torch.testing.assert_close(a.running_var, b.running_var, **TIGHT)
+            assert a.num_batches_tracked == b.num_batches_tracked
+
+
+def _clouds(
+    b: int = 2, n: int = 300, dtype: torch.dtype = torch.float64, seed: int = 1
+) -> torch.Tensor:
+    """On a sphere and a plane, in the unit ball."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn(b, n, 3, generator=generator, dtype=torch.float64)
+    x = x / x.norm(dim=2, keepdim=True)
+    x[:, ::3, 2] = -0.5
+    return x.to(dtype)
+
+
+def _step(net: nn.Module, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    points = points.clone().requires_grad_()
+    torch.manual_seed(3)  # dropout
+    logits = net(points)
+    nn.functional.cross_entropy(logits, torch.arange(len(points)) % 10).backward()
+    assert points.grad is not None
+    return logits.detach(), points.grad
+
+
+@pytest.fixture
+def few_centres(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same layers about an eighth of the centres: written straight they are slow."""
+    for name in ("SSG", "MSG"):
+        levels = tuple((m // 8, scales) for m, scales in getattr(pointnet2_module, name))
+        monkeypatch.setattr(pointnet2_module, name, levels)
+
+
+@pytest.mark.usefixtures("few_centres")
+@pytest.mark.parametrize("variant", ["ssg", "msg"])
+@pytest.mark.parametrize("training", [True, False])
+def test_whole_net_equals_the_straight_one(variant: str, training: bool) -> None:
+    torch.manual_seed(0)
+    ours = pointnet2(10, variant).double().train(training)
+    _scramble(ours)
+    straight = StraightPointNet2(copy.deepcopy(ours)).train(training)
+    points = _clouds(6, 200)
+    (a, da), (b, db) = _step(ours, points), _step(straight, points)
+    torch.testing.assert_close(a, b, **TIGHT)
+    torch.testing.assert_close(da, db, rtol=0.0, atol=1e-10 * max(1.0, float(db.abs().max())))
+
+
+@pytest.mark.usefixtures("few_centres")
+@pytest.mark.parametrize("variant", ["ssg", "msg"])
+def test_float32_errs_no_more_than_twice_the_straight_one(variant: str) -> None:
+    torch.manual_seed(0)
+    exact = pointnet2(10, variant, dropout=0.0).double()
+    points = _clouds(6, 200, torch.float32)
+    truth = exact(points.double())
+    straight = StraightPointNet2(copy.deepcopy(exact).float())
+    ours = copy.deepcopy(exact).float()
+    assert _error(ours(points), truth) <= 2 * _error(straight(points), truth)
+
+
+def test_float32_gradients_err_no_more_than_twice_the_straight_ones() -> None:
+    """Of one layer: in a whole net a maximum that goes to another point outweighs all rounding."""
+    torch.manual_seed(0)
+    exact = GroupedMLP(5, (32, 48, 64)).double()
+    _scramble(exact)
+    modules = [exact, copy.deepcopy(exact).float(), StraightMLP(copy.deepcopy(exact).float())]
+    xyz = _clouds(3, 150, torch.float32)
+    features = torch.randn(3, 150, 5)
+    centres = gather(xyz, farthest_point_sampling(xyz, 30))
+    index = ball_query(xyz, centres, 0.6, 24)
+    upstream = torch.randn(3, 30, 64)
+    found = []
+    for module in modules:
+        kind = torch.float64 if module is exact else torch.float32
+        inputs = [x.to(kind).requires_grad_() for x in (xyz, features, centres)]
+        (module(*inputs, index) * upstream).sum().backward()
+        grads = [x.grad for x in inputs] + [p.grad.squeeze() for p in module.parameters()]
+        by_shape = sorted(grads, key=lambda g: (tuple(g.shape), float(g.double().norm())))
+        found.append(torch.cat([g.flatten().double() for g in by_shape]))
+    truth, ours, straight = found
+    assert _error(ours, truth) <= 2 * _error(straight, truth)
+
+
+def _error(value: torch.Tensor, truth: torch.Tensor) -> float:
+    return float(((value - truth).norm() / truth.norm()).detach())
+
+
+def test_groups_of_centres_move_with_the_cloud_but_for_the_last_level() -> None:
+    """The levels see relative coordinates, so their features do not change under a shift."""
+    net = pointnet2(10).double().eval()
+    level, points = net.backbone.levels[0], _clouds()
+    _, here = level(points, None)
+    _, there = level(points + torch.tensor([0.25, -0.5, 1.0], dtype=torch.float64), None)
+    torch.testing.assert_close(here, there, rtol=1e-9, atol=1e-9)
+
+
+def test_the_order_of_points_matters_only_through_starts_and_full_balls() -> None:
+    """With the first point in its place and no ball overfull, a shuffle changes nothing."""
+    net = pointnet2(10, "ssg").double().eval()
+    points = _clouds(1, 24)
+    shuffle = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(23)])
+    torch.testing.assert_close(net(points), net(points[:, shuffle]), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 5, 100, 1500])
+def test_any_number_of_points_and_one_cloud(n: int) -> None:
+    net = pointnet2(10, "ssg").eval()
+    assert net(_clouds(1, n, torch.float32)).isfinite().all()
+
+
+def test_a_cloud_of_one_point_repeated() -> None:
+    net = pointnet2(10, "msg")
+    points = torch.full((2, 64, 3), 0.3)
+    assert net(points).isfinite().all()
+    net(points).sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
+
+
+def test_autocast_keeps_neighbours_and_groups_in_float32() -> None:
+    torch.manual_seed(0)
+    net = pointnet2(10, "ssg").eval()
+    points = _clouds(2, 256, torch.float32)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = net.features(points).global_
+    torch.testing.assert_close(half.float(), net.features(points).global_)
+
+
+def test_unknown_settings() -> None:
+    with pytest.raises(ConfigError, match="'ssg' or 'msg'"):
+        pointnet2(10, "msgg")
+    with pytest.raises(ConfigError, match="'batch' or 'instance'"):
+        pointnet2(10, norm="layer")
