@@ -1,0 +1,157 @@
+"""ModelNet's CAD meshes, `<class>/{train,test}/*.off`, sampled here: P points on each surface.
+
+The folder is that of the unpacked archive, or the root of torch_geometric.datasets.ModelNet, which
+keeps the same tree in `raw/`. Points are uniform on the area, as PyG's SamplePoints and PointDA-10
+draw them; every object has its own seed, made from the dataset's seed and the object's id, so the
+order of reading changes nothing. The files stand on z, in the units of their makers.
+
+The files are read by `qs3.meshes`, not by `torch_geometric.io.read_off`. Both give the same
+vertices and triangles for files that are as they should be, joined first lines ("OFF490 518 0")
+included, ours about eight times as fast. But PyG's reader (2.8.1) passes over polygons of more than
+four corners, drops the last face if the file does not end with a line break, and takes truncated
+files, vertices that are not finite and faces with vertices that do not exist, all without a word;
+damage that it does notice is an IndexError or ValueError that names no file. A test holds all this.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.classes import ALIASES
+from qs3.data.importers.base import Importer, Item, inside, split_of
+from qs3.data.manifest import SPLITS, ManifestRow
+from qs3.errors import ConfigError, DataError, MeshError
+from qs3.randomness import derive
+
+log = logging.getLogger(__name__)
+
+_WHERE = ("", "raw", "ModelNet40", "ModelNet10")  # below the folder, the tree may lie here
+
+
+@dataclass(frozen=True)
+class ModelNetMeshes(Importer):
+    """See the module. Folders of other classes than the wanted ones are left alone.
+
+    Attributes:
+        seed: of the dataset; another one gives other points on the same surfaces.
+    """
+
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seed < 0:
+            raise ConfigError(f"seed of {type(self).__name__} is {self.seed}, must be >= 0")
+
+    def looks_for(self) -> list[str]:
+        """See `Importer`."""
+        return [
+            f"{self.root}/<class>/{{train,test}}/*.off",
+            f"{self.root}/raw/<class>/{{train,test}}/*.off   (root of PyG's ModelNet)",
+        ]
+
+    def is_there(self) -> bool:
+        """See `Importer`: whether there is a folder with a folder `train`."""
+        return self._tree() is not None
+
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """See `Importer`. By split, in it by class, in it by name.
+
+        Raises:
+            DataError: two folders of one class, two files of one name, an unknown split, or a
+                link that leads out of the folder.
+        """
+        tree = self._tree()
+        if tree is None:
+            raise DataError(f"{self.root} holds no folders <class>/{{train,test}}")
+        found: dict[str, Item] = {}
+        folders: dict[str, Path] = {}
+        other = []
+        for folder in _folders(tree, tree):
+            cls = wanted_class(folder.name, classes)
+            if cls is None:
+                other.append(folder.name)
+                continue
+            if cls in folders:
+                raise DataError(f"{folder} and {folders[cls]} are the same class")
+            folders[cls] = folder
+            for split_folder in _folders(folder, tree):
+                split = split_of(split_folder.name, str(folder))
+                for path in _off_files(split_folder, tree):
+                    item = self._item(path, tree, cls, split)
+                    if item.row.id in found:
+                        raise DataError(f"{path} and {found[item.row.id].where} have one name")
+                    found[item.row.id] = item
+        if other:
+            log.info("%s: %d folders of other classes are left alone", tree, len(other))
+        return sorted(
+            found.values(),
+            key=lambda f: (SPLITS.index(f.row.split), classes.index(f.row.cls), f.row.id),
+        )
+
+    def _item(self, path: Path, tree: Path, cls: str, split: str) -> Item:
+        name = f"{cls}/{split}/{path.stem}"
+        seed = derive(self.seed, "modelnet surface", name)
+        row = ManifestRow(name, cls, split, seed=seed, origin=str(path.relative_to(tree)))
+        return Item(row, str(path), functools.partial(sample_file, path, self.points, seed))
+
+    def _tree(self) -> Path | None:
+        for below in _WHERE:
+            tree = self.root / below
+            if tree.is_dir() and any((f / "train").is_dir() for f in _folders(tree, self.root)):
+                return tree
+        return None
+
+
+def sample_file(path: Path, points: int, seed: int) -> np.ndarray:
+    """[points, 3] float32, uniform on the surface in one mesh file, in the file's axes and units.
+
+    Raises:
+        MeshError: the file is damaged or has no surface; names the file.
+    """
+    from qs3.geometry.sampling import surface_sample
+    from qs3.meshes.files import load_mesh
+
+    mesh = load_mesh(path)
+    try:
+        cloud = surface_sample(mesh.vertices, mesh.faces, points, np.random.default_rng(seed))
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+    return cloud.astype(np.float32)
+
+
+def wanted_class(folder: str, classes: Sequence[str]) -> str | None:
+    """Which of `classes` a folder of ModelNet holds; None if it is none of them.
+
+    A name that is wanted as it is comes before its meaning among the ten: `night_stand` is
+    itself in ModelNet40 and `cabinet` in PointDA-10.
+    """
+    name = folder.casefold()
+    return next((c for c in (name, ALIASES.get(name)) if c in classes), None)
+
+
+def _folders(folder: Path, root: Path) -> Iterator[Path]:
+    return (path for path in _visible(folder, root) if path.is_dir())
+
+
+def _off_files(folder: Path, root: Path) -> Iterator[Path]:
+    return (path for path in _visible(folder, root) if path.suffix.lower() == ".off")
+
+
+def _visible(folder: Path, root: Path) -> list[Path]:
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError as error:
+        raise DataError(f"{folder} cannot be read ({error.strerror})") from error
+    shown = [name for name in names if not name.startswith(".") and name != "__MACOSX"]
+    for name in shown:
+        if not name.isprintable():
+            raise DataError(f"{folder / name!r}: a name with control or broken characters")
+    return [inside(folder / name, root) for name in shown]
