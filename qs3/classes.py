@@ -1,8 +1,10 @@
-"""The ten classes of the Sim2Real benchmark and their published order.
+"""The ten classes of the Sim2Real benchmark in their published order, and ModelNet40's.
 
 PointDA-10 (Qin et al., NeurIPS 2019) fixed the order; DefRec, GAST and QS3 kept it.
 `cabinet` holds ModelNet's `night_stand` and ScanNet's cabinets.
 """
+
+from collections.abc import Sequence
 
 CLASSES: tuple[str, ...] = (
     "bathtub",
@@ -24,3 +26,32 @@ ALIASES: dict[str, str] = {
     "couch": "sofa",
 }
 """Names of the same classes in published datasets, mapped to ours."""
+
+
+MODELNET40: tuple[str, ...] = (
+    *("airplane", "bathtub", "bed", "bench", "bookshelf", "bottle", "bowl", "car", "chair", "cone"),
+    *("cup", "curtain", "desk", "door", "dresser", "flower_pot", "glass_box", "guitar"),
+    *("keyboard", "lamp", "laptop", "mantel", "monitor", "night_stand", "person", "piano", "plant"),
+    *("radio", "range_hood", "sink", "sofa", "stairs", "stool", "table", "tent", "toilet"),
+    *("tv_stand", "vase", "wardrobe", "xbox"),
+)
+"""ModelNet40's classes (Wu et al., CVPR 2015) in alphabetical order, the usual one."""
+
+
+def class_list(classes: str | Sequence[str] | None) -> tuple[str, ...]:
+    """What a config says: names, "modelnet40", or nothing (the ten)."""
+    if classes is None:
+        return CLASSES
+    if isinstance(classes, str):
+        return MODELNET40 if classes == "modelnet40" else (classes,)
+    return tuple(str(name) for name in classes)
+
+
+def known_as(name: str, classes: Sequence[str]) -> str | None:
+    """Which of `classes` a folder or file calls `name`, whatever its case; None if none.
+
+    A name of the list itself comes first: `night_stand` is a class of ModelNet40, and an alias of
+    `cabinet` among the ten.
+    """
+    plain = name.casefold().replace("-", "_").replace(" ", "_")
+    return next((c for c in (plain, ALIASES.get(plain)) if c in classes), None)

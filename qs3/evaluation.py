@@ -5,7 +5,8 @@ Nothing here is read by training: no model is chosen and no threshold set by the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.data.datamodule import Labelled
+from qs3.data.augment import rotate_z
+from qs3.data.datamodule import Unlabelled
 from qs3.selftraining.table import read_pseudo_labels
+
+CALIBRATION_BINS = 15
 
 
 @torch.no_grad()
@@ -35,6 +39,21 @@ def predict(
     return torch.cat(parts).numpy()
 
 
+def predict_turned(
+    net: nn.Module,
+    points: Float[Tensor, "n p 3"],
+    rotations: int,
+    batch_size: int,
+    device: Any = "cpu",
+) -> Float[np.ndarray, "n c"]:
+    """Mean of the probabilities over `rotations` turns about gravity: by 0, 2π/n, 4π/n, ..."""
+    total: Any = 0.0
+    for i in range(rotations):
+        angle = torch.full((len(points),), 2 * math.pi * i / rotations, dtype=points.dtype)
+        total = total + predict(net, rotate_z(points, angle), batch_size, device)
+    return total / rotations
+
+
 def figures(
     predicted: Int[np.ndarray, " n"], labels: Int[np.ndarray, " n"], classes: Sequence[str]
 ) -> dict[str, Any]:
@@ -42,7 +61,7 @@ def figures(
 
     `confusion[i][j]` counts clouds of class i predicted as j. A class without clouds has recall
     None and is left out of the balanced accuracy. `majority_rate` is what always naming the
-    commonest class would reach.
+    commonest class would reach. `predicted` counts the predictions of each class.
     """
     k = len(classes)
     confusion = np.bincount(labels * k + predicted, minlength=k * k).reshape(k, k)
@@ -55,7 +74,39 @@ def figures(
         "confusion": confusion.tolist(),
         "majority_rate": float(support.max() / support.sum()),
         "n": int(support.sum()),
+        "predicted": dict(zip(classes, confusion.sum(axis=0).tolist(), strict=True)),
     }
+
+
+def figures_without_labels(
+    predicted: Int[np.ndarray, " n"], classes: Sequence[str]
+) -> dict[str, Any]:
+    """The same keys for clouds whose labels nobody knows: the counts, and None for the rest."""
+    counts = np.bincount(predicted, minlength=len(classes)).tolist()
+    unknown = ("accuracy", "balanced_accuracy", "per_class_recall", "confusion", "majority_rate")
+    return {
+        **dict.fromkeys(unknown),
+        "n": len(predicted),
+        "predicted": dict(zip(classes, counts, strict=True)),
+        "calibration_error": None,
+    }
+
+
+def calibration_error(
+    probabilities: Float[np.ndarray, "n c"],
+    labels: Int[np.ndarray, " n"],
+    bins: int = CALIBRATION_BINS,
+) -> float:
+    """Expected calibration error in [0, 1]: how far confidence is from accuracy on average.
+
+    ECE = Σ_b n_b / n |accuracy_b - confidence_b| over bins of equal width, ((b-1)/B, b/B], of the
+    largest probability (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, eq. 3).
+    """
+    confidence = probabilities.max(axis=1)
+    right = probabilities.argmax(axis=1) == labels
+    bin_ = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    gap = np.bincount(bin_, weights=right - confidence, minlength=bins)  # n_b (accuracy - conf.)
+    return float(np.abs(gap).sum() / len(labels))
 
 
 class Evaluation:
@@ -63,29 +114,56 @@ class Evaluation:
 
     Args:
         test: the target's test clouds.
-        train: its training clouds; their labels only judge pseudo-labels.
+        labels: theirs [n]; None if nobody knows them.
+        train_labels: of its training clouds by id, which only judge pseudo-labels; None likewise.
         classes: names in label order.
         batch_size: of the predictions.
+        rotations: over how many turns `turned` averages; 0 leaves it out.
     """
 
     def __init__(
-        self, test: Labelled, train: Labelled, classes: Sequence[str], batch_size: int
+        self,
+        test: Unlabelled,
+        labels: Int[Tensor, " n"] | None,
+        train_labels: Mapping[str, int] | None,
+        classes: Sequence[str],
+        batch_size: int,
+        rotations: int = 0,
     ) -> None:
         self.points, self.classes, self.batch_size = test.points, tuple(classes), batch_size
-        self.y_target_eval = test.labels.numpy()
-        self._train = dict(zip(train.ids, train.labels.tolist(), strict=True))
+        self.y_target_eval = None if labels is None else labels.numpy()
+        self.rotations = rotations
+        self._train = train_labels
 
     def figures(self, net: nn.Module, device: Any = "cpu") -> dict[str, Any]:
-        """What `net` is worth on the target's test clouds."""
-        probabilities = predict(net, self.points, self.batch_size, device)
-        return figures(probabilities.argmax(axis=1), self.y_target_eval, self.classes)
+        """What `net` is worth on the target's test clouds: each as it is, in one fixed sample."""
+        return self._figures(predict(net, self.points, self.batch_size, device))
 
-    def pseudo_labels(self, path: Path) -> dict[str, float]:
+    def turned(self, net: nn.Module, device: Any = "cpu") -> dict[str, Any] | None:
+        """The same for probabilities averaged over turns; None if that was not asked for."""
+        if not self.rotations:
+            return None
+        return self._figures(
+            predict_turned(net, self.points, self.rotations, self.batch_size, device)
+        )
+
+    def _figures(self, probabilities: np.ndarray) -> dict[str, Any]:
+        predicted, labels = probabilities.argmax(axis=1), self.y_target_eval
+        if labels is None:
+            return figures_without_labels(predicted, self.classes)
+        return {
+            **figures(predicted, labels, self.classes),
+            "calibration_error": calibration_error(probabilities, labels),
+        }
+
+    def pseudo_labels(self, path: Path) -> dict[str, float] | None:
         """How right a round's pseudo-labels were: a diagnostic, computed when training is over.
 
         `precision`: right among the selected; `recall`: selected and right among all; `accuracy`:
-        right among all.
+        right among all. None without labels.
         """
+        if self._train is None:
+            return None
         rows = read_pseudo_labels(path)
         right = np.array([self.classes[self._train[row.id]] == row.label for row in rows])
         kept = np.array([row.selected for row in rows])

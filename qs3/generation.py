@@ -14,7 +14,6 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from qs3.classes import CLASSES
 from qs3.data.domain import Domain
 from qs3.data.store import ManifestRow, PointSet, is_finished, open_pointset, write_pointset
 from qs3.errors import DataError
@@ -206,7 +205,7 @@ def _write(
     return write_pointset(
         domain.folder,
         name=domain.folder.name,
-        classes=CLASSES,
+        classes=domain.names,
         arrays={name: [cloud.arrays[name] for cloud in good] for name in good[0].arrays},
         rows=rows,
         meta={

@@ -16,7 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import qs3
-from qs3.classes import CLASSES
+from qs3.classes import CLASSES, class_list
 from qs3.errors import ConfigError
 from qs3.files import sha256_file
 from qs3.hydra_glue import build
@@ -47,8 +47,9 @@ def check(cfg: DictConfig) -> None:
     if cfg.classes is not None:
         if not isinstance(cfg.classes, ListConfig):
             raise ConfigError(f"classes is a list: classes=[{cfg.classes}]")
-        if unknown := sorted(set(cfg.classes) - set(CLASSES)):
-            raise ConfigError(f"classes: {unknown} are not among the known {', '.join(CLASSES)}")
+        known = known_classes(cfg)
+        if unknown := sorted(set(cfg.classes) - set(known)):
+            raise ConfigError(f"classes: {unknown} are not among the known {', '.join(known)}")
     for key in _SWITCHES:
         if not isinstance(cfg[key], bool):
             raise ConfigError(f"{key} must be true or false, got {cfg[key]!r}")
@@ -62,6 +63,11 @@ def check(cfg: DictConfig) -> None:
                 f"{key}= is for domain=specklenet10, and where it fits for blensor10, as the "
                 f"authors made them; leave it out for domain={cfg.domain.name}"
             )
+
+
+def known_classes(cfg: DictConfig) -> tuple[str, ...]:
+    """The classes of the domain, in label order."""
+    return class_list(cfg.domain.get("classes"))
 
 
 def check_recipe(recipe: Any, cfg: DictConfig) -> None:
@@ -89,6 +95,11 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
     """The objects to scan, from the user's folder or the embedded catalogue."""
     classes = tuple(cfg.classes) if cfg.classes else None
     if cfg.meshes is None:
+        if missing := sorted(set(classes or known_classes(cfg)) - set(CLASSES)):
+            raise ConfigError(
+                f"the embedded catalogue has no {', '.join(missing)}: give a folder of meshes with "
+                "meshes=PATH, or only classes that it has, classes=[chair,table]"
+            )
         items = build(cfg.catalogue, classes=classes or CLASSES).items()
     else:
         items = MeshFolder(
@@ -96,6 +107,7 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
             classes=classes,
             test_fraction=cfg.test_fraction,
             half=cfg.half,
+            known=known_classes(cfg),
         ).items()
     kept = _first_of_each(items, cfg.limit, cfg.fraction)
     return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]

@@ -63,12 +63,14 @@ def train(cfg: DictConfig) -> dict[str, Any]:
 
 def headline(metrics: dict[str, Any]) -> str:
     """The result in one line; says when the target is simulated."""
-    final = metrics["final"]
+    final, run = metrics["final"], f"{metrics['experiment']}, seed {metrics['seed']}"
+    target = f"{metrics['target']}{' (simulated)' if metrics['simulated'] else ''}"
+    if final["accuracy"] is None:
+        counts = ", ".join(f"{name} {count}" for name, count in final["predicted"].items() if count)
+        return f"{run}: no labels to judge {target} by; predicted {counts}"
     return (
-        f"{metrics['experiment']}, seed {metrics['seed']}: accuracy {final['accuracy']:.1%}, "
-        f"balanced {final['balanced_accuracy']:.1%} on {metrics['target']}"
-        f"{' (simulated)' if metrics['simulated'] else ''}, "
-        f"majority rate {final['majority_rate']:.1%}"
+        f"{run}: accuracy {final['accuracy']:.1%}, balanced {final['balanced_accuracy']:.1%} "
+        f"on {target}, majority rate {final['majority_rate']:.1%}"
     )
 
 
@@ -83,7 +85,9 @@ def _check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
     one_of("selection.teacher", cfg.selection.teacher, TEACHERS)
     whole("data.points", cfg.data.points, 1)
+    whole("data.fps_starts", cfg.data.fps_starts, 1)
     whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
+    whole("evaluation.rotations", cfg.evaluation.rotations, 0)
     whole("protocol.batch_size", cfg.protocol.batch_size, 2)  # batch norm needs two clouds
     if "lr" in cfg.protocol.optimizer:
         number("protocol.optimizer.lr", cfg.protocol.optimizer.lr)

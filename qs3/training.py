@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import qs3
 from qs3 import runs
 from qs3.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
 from qs3.classifier import Classifier
-from qs3.data.datamodule import UdaData, load_clouds, without_labels
+from qs3.data.datamodule import UdaData, labels_of, load_clouds, with_labels
 from qs3.data.prepare import remove_old_leftovers
 from qs3.data.store import PointSet
 from qs3.errors import ConfigError, DataError
@@ -59,11 +60,17 @@ def fit(run: Run) -> dict[str, Any]:
     # 1. Data. Target labels go to the method that asks for them by name, and to the evaluation.
     method: Method = build(cfg.method)
     cache = Path(cfg.data.cache_dir) if cfg.data.cache_dir else None
-    target_train = load_clouds(target_set, "train", cfg.data.points, cache)
+    load_split = partial(load_clouds, points=cfg.data.points, cache_dir=cache)
+    target = load_split(target_set, "train", starts=cfg.data.fps_starts)
     supervised = method.labels == "target_train"
+    if supervised:
+        labelled = with_labels(target, target_set, "train", "method=supervised")
+    else:
+        clouds = load_split(source_set, "train", starts=cfg.data.fps_starts)
+        labelled = with_labels(clouds, source_set, "train", "data.source")
     data = UdaData(
-        target_train if supervised else load_clouds(source_set, "train", cfg.data.points, cache),
-        without_labels(target_train),
+        labelled,
+        target,
         phases=run.phases,
         scheme=run.scheme,
         augment=build(cfg.protocol.augment),
@@ -71,18 +78,28 @@ def fit(run: Run) -> dict[str, Any]:
         seed=run.seed,
         owner=method.labels,
         val=cfg.data.val,
+        sampler=cfg.data.sampler,
         eval_batch_size=cfg.data.eval_batch_size,
         uses_target=method.uses_target,
     )
-    test = load_clouds(target_set, "test", cfg.data.points, cache)
-    evaluation = Evaluation(test, target_train, target_set.classes, cfg.data.eval_batch_size)
+    split = _evaluated_split(target_set)
+    evaluation = Evaluation(
+        load_split(target_set, split),
+        labels_of(target_set, split) if split == "test" else None,
+        _labels_by_id(target_set, "train"),
+        target_set.classes,
+        cfg.data.eval_batch_size,
+        cfg.evaluation.rotations,
+    )
 
     # 2. Classifier and callbacks.
     classifier = Classifier(
         build_net=lambda: build(cfg.model),
         build_optimizer=build(cfg.protocol.optimizer),
         method=method,
-        student=Student(pcm=run.scheme.pcm),
+        student=Student(
+            run.scheme.pcm, run.scheme.weight_step, run.scheme.mrkld, run.phases.warmup
+        ),
         phases=run.phases,
         seed=run.seed,
     )
@@ -112,11 +129,14 @@ def fit(run: Run) -> dict[str, Any]:
     if trainer.is_global_zero:
         save(copy_weights(classifier.net), run.folder / STUDENT)
     trainer.strategy.barrier("student saved")
-    scores = {}
+    final = "student" if run.scheme.rounds else "selected"
+    scores, turned = {}, {}
     for name, file in (("selected", WARMUP_SELECTED), ("last", WARMUP_LAST), ("student", STUDENT)):
         net = classifier.fresh_net(phase=0).to(classifier.device)
         net.load_state_dict(load(run.folder / file, classifier.device))
         scores[name] = evaluation.figures(net, classifier.device)
+        if name in (final, "selected"):
+            turned[name] = evaluation.turned(net, classifier.device)
     validated_on = f"{method.labels}_val"
     teacher = (
         f"{validated_on if warmup.rule == 'source_val' else warmup.rule}, epoch {warmup.epoch}"
@@ -131,8 +151,24 @@ def fit(run: Run) -> dict[str, Any]:
         "target": run.target.name,
         "simulated": bool(run.target.simulated),
         **_names(run),
-        "selection": {"teacher": teacher, "student": "last" if run.scheme.rounds else teacher},
-        "final": scores["student" if run.scheme.rounds else "selected"],
+        "selection": {
+            "teacher": teacher,
+            "student": "last" if run.scheme.rounds else teacher,
+            "validation": cfg.data.val,
+        },
+        "loading": {
+            "points": cfg.data.points,
+            "fps_starts": labelled.clouds.starts,
+            "sampler": cfg.data.sampler,
+        },
+        "final": scores[final],
+        "evaluation": {
+            "split": split,
+            "labels": evaluation.y_target_eval is not None,
+            "rotations": evaluation.rotations,
+            "final_over_rotations": turned[final],
+            "warmup_over_rotations": turned["selected"],
+        },
         "warmup": {
             "selected": {**scores["selected"], "epoch": warmup.epoch},
             "last": {**scores["last"], "epoch": run.phases.warmup - 1},
@@ -163,6 +199,26 @@ def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None
             f"num_classes is {num_classes}, but {source.name} has {len(source.classes)} classes; "
             f"set num_classes={len(source.classes)}"
         )
+
+
+def _evaluated_split(target: PointSet) -> str:
+    """The test split; the training split if there is no other, e.g. of somebody's own scans."""
+    if "test" in target.counts():
+        if labels_of(target, "test") is None:
+            log.warning("%s has no labels: no accuracy, only counts of predictions", target.name)
+        return "test"
+    log.warning(
+        "%s has no test split: no accuracy, only counts of predictions for its training clouds",
+        target.name,
+    )
+    return "train"
+
+
+def _labels_by_id(dataset: PointSet, split: str) -> dict[str, int] | None:
+    labels = labels_of(dataset, split)
+    if labels is None:
+        return None
+    return dict(zip(dataset.split(split).ids, labels.tolist(), strict=True))
 
 
 def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""Batches drawn from tables in memory, in an order that is a function of (seed, epoch).
+"""Batches drawn from tables, in an order that is a function of (seed, epoch).
 
-There are no worker processes: clouds lie in memory, a batch is one indexing, and augmentation
-happens on the device. So there is nothing that the number of workers could change.
+There are no worker processes: a batch is one indexing into mapped files, and augmentation happens
+on the device. So there is nothing that the number of workers could change.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
+from qs3.data.clouds import Clouds
 from qs3.randomness import derive
 
 
@@ -21,23 +23,52 @@ class Table:
     """Clouds of one domain, with labels under the name of their owner, or without any.
 
     Attributes:
-        points: [n, p, 3] float32.
+        clouds: n clouds.
         labels: by owner ("y_source", "y_pseudo", "y_target_train"): [n] int64; often none at all.
+        balance: the owner whose classes are drawn equally often; None draws each cloud once.
     """
 
-    points: Tensor
+    clouds: Clouds
     labels: Mapping[str, Tensor]
+    balance: str | None = None
 
     def __len__(self) -> int:
-        return len(self.points)
+        return len(self.clouds)
 
-    def rows(self, index: Tensor) -> dict[str, Tensor]:
-        """The clouds (key "points") and labels at `index`."""
-        return {"points": self.points[index], **{k: y[index] for k, y in self.labels.items()}}
+    def rows(self, index: Tensor, start: Tensor | None = None) -> dict[str, Tensor]:
+        """The clouds (key "points") and labels at `index`, each cloud in its sample `start`."""
+        labels = {key: y[index] for key, y in self.labels.items()}
+        return {"points": self.clouds.take(index, start), **labels}
+
+    def order(self, generator: torch.Generator) -> Int[Tensor, " n"]:
+        """As many positions as clouds: all of them, shuffled; or `balanced`."""
+        if self.balance is None:
+            return torch.randperm(len(self), generator=generator)
+        return balanced(self.labels[self.balance], generator)
+
+
+def balanced(classes: Int[Tensor, " n"], generator: torch.Generator) -> Int[Tensor, " n"]:
+    """As many positions, each of a class drawn at random: all that occur are equally likely.
+
+    A class's clouds come in a shuffled order, again and again: none comes twice before all have
+    come once. So a rare class repeats its clouds, and some of a common one do not come at all.
+    """
+    present, of = classes.unique(return_inverse=True)
+    drawn = torch.randint(len(present), (len(classes),), generator=generator)
+    order = torch.empty_like(drawn)
+    for k in range(len(present)):
+        places, members = (drawn == k).nonzero()[:, 0], (of == k).nonzero()[:, 0]
+        while len(places):
+            members = members[torch.randperm(len(members), generator=generator)]
+            order[places[: len(members)]] = members[: len(places)]
+            places = places[len(members) :]
+    return order
 
 
 class Batches:
     """One epoch: `{"source": {"points", "y_source"}, ..., "index": i, "epoch": e}` per step.
+
+    Each cloud is seen in one of its samples, drawn anew each epoch.
 
     Args:
         tables: by domain; the first decides the number of batches, the others are drawn from
@@ -46,7 +77,7 @@ class Batches:
             normalisation cannot use it) joins the one before.
         seed: of the run.
         epoch: counted from 0.
-        shuffle: False keeps the tables' order (evaluation).
+        shuffle: False keeps the tables' order, and each cloud's sample 0 (evaluation).
         rank: of this process; each takes every `world`-th cloud, and as many as the others.
         world: number of processes.
     """
@@ -72,27 +103,40 @@ class Batches:
         return len(self.sizes)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        orders = {name: self._order(name, len(table)) for name, table in self.tables.items()}
-        for i, size in enumerate(self.sizes):
+        parts = {name: self._parts(name, table) for name, table in self.tables.items()}
+        for i in range(len(self)):
             batch: dict[str, Any] = {"index": i, "epoch": self.epoch}
             for name, table in self.tables.items():
-                batch[name] = table.rows(torch.tensor([next(orders[name]) for _ in range(size)]))
+                batch[name] = table.rows(*(part[i] for part in parts[name]))
             yield batch
 
-    def _order(self, name: str, n: int) -> Iterator[int]:
-        """Endless positions in 0..n-1, this process's share of one permutation after another."""
-        passed = 0
-        while True:
+    def _parts(self, name: str, table: Table) -> list[tuple[Tensor, ...]]:
+        """Of each batch the positions [size], and while training the samples [size]."""
+        index = self._order(name, table)
+        parts = [index.split(self.sizes)]
+        if self.shuffle and table.clouds.starts > 1:
+            generator = self._generator("sample", name, self.epoch)
+            start = torch.randint(table.clouds.starts, (len(table),), generator=generator)
+            parts.append(start[index].split(self.sizes))
+        return parts
+
+    def _order(self, name: str, table: Table) -> Tensor:
+        """This process's positions of the epoch: its share of one order after another."""
+        n, needed = len(table), sum(self.sizes)
+        each = -(-n // self.world)  # all processes take equally many: some clouds come twice
+        shares = []
+        for passed in range(-(-needed // each)):
             if self.shuffle:
-                generator = torch.Generator().manual_seed(
-                    derive(self.seed, "shuffle", name, self.epoch, passed)
-                )
-                order = torch.randperm(n, generator=generator).tolist()
+                order = table.order(self._generator("shuffle", name, self.epoch, passed))
             else:
-                order = list(range(n))
-            padded = order + order[: -n % self.world]  # all processes take equally many
-            yield from padded[self.rank :: self.world]
-            passed += 1
+                order = torch.arange(n)
+            shares.append(
+                order.repeat(1 + self.world)[: each * self.world][self.rank :: self.world]
+            )
+        return torch.cat(shares)[:needed]
+
+    def _generator(self, *names: int | str) -> torch.Generator:
+        return torch.Generator().manual_seed(derive(self.seed, *names))
 
 
 def generator_of(

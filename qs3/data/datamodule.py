@@ -6,85 +6,92 @@ The target's test clouds do not come here at all: only `qs3.evaluation` holds th
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from qs3.data.augment import Augment
 from qs3.data.batches import Batches, Table, generator_of
+from qs3.data.clouds import Clouds
 from qs3.data.prepare import prepare
 from qs3.data.store import PointSet
-from qs3.errors import DataError
+from qs3.data.validation import RULES
+from qs3.errors import ConfigError
 from qs3.selftraining.scheme import Phases, Scheme
 from qs3.settings import one_of
 
-
-@dataclass(frozen=True, eq=False)
-class Labelled:
-    """Clouds [n, p, 3] with their ids and labels [n] int64."""
-
-    points: Tensor
-    ids: tuple[str, ...]
-    labels: Tensor
-
-    def at(self, index: np.ndarray) -> Labelled:
-        """A part."""
-        rows = torch.from_numpy(index)
-        return Labelled(self.points[rows], tuple(self.ids[i] for i in index), self.labels[rows])
+SAMPLERS = ("shuffled", "balanced")
 
 
 @dataclass(frozen=True, eq=False)
 class Unlabelled:
-    """Clouds [n, p, 3] with their ids."""
+    """n clouds with their ids."""
 
-    points: Tensor
+    clouds: Clouds
     ids: tuple[str, ...]
 
+    @property
+    def points(self) -> Float[Tensor, "n m 3"]:
+        """The clouds in memory as evaluation sees them; made anew each time."""
+        return self.clouds.all()
 
-def load_clouds(dataset: PointSet, split: str, points: int, cache_dir: Path | None) -> Labelled:
-    """A split's clouds, prepared (see `prepare`)."""
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """n clouds with their ids and labels [n] int64."""
+
+    clouds: Clouds
+    ids: tuple[str, ...]
+    labels: Int[Tensor, " n"]
+
+    def at(self, index: np.ndarray) -> Labelled:
+        """A part."""
+        ids = tuple(self.ids[i] for i in index)
+        return Labelled(self.clouds.at(index), ids, self.labels[torch.from_numpy(index)])
+
+
+def load_clouds(
+    dataset: PointSet, split: str, points: int, starts: int = 1, cache_dir: Path | None = None
+) -> Unlabelled:
+    """A split's clouds, prepared (see `prepare`), without their labels."""
     part = dataset.split(split)
     key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
-    clouds = prepare(part.points, points, cache_dir, key)
-    return Labelled(torch.from_numpy(clouds), part.ids, torch.from_numpy(np.array(part.labels)))
+    clouds = prepare(part.points, points, starts=starts, cache_dir=cache_dir, key=key)
+    return Unlabelled(clouds, part.ids)
 
 
-def without_labels(clouds: Labelled) -> Unlabelled:
-    """The clouds alone."""
-    return Unlabelled(clouds.points, clouds.ids)
+def labels_of(dataset: PointSet, split: str) -> Int[Tensor, " n"] | None:
+    """A split's labels, for those who may have them; None if the dataset has none."""
+    if not dataset.labelled:
+        return None
+    return torch.from_numpy(np.array(dataset.labels[dataset.indices(split)]))
 
 
-def split_lineage(clouds: Labelled) -> tuple[Labelled, Labelled]:
-    """(train, validation): of the objects sorted by id, positions with i % 10 >= 8 validate.
+def with_labels(clouds: Unlabelled, dataset: PointSet, split: str, what: str) -> Labelled:
+    """The clouds of `load_clouds` with their labels.
 
-    The rule of DefRec, GAST and QS3. Ids begin with the class, so each class is split 4 : 1.
-    Further scans of an object (`generate.py scans=N` calls them id~1, id~2, ...) go where it
-    goes: else training would see the validation shapes.
+    Args:
+        clouds: of this split.
+        dataset: theirs.
+        split: theirs.
+        what: who asks for labels, for the message.
 
     Raises:
-        DataError: fewer than nine objects, so that there is nothing to validate on.
+        ConfigError: the dataset has no labels.
     """
-    order = np.argsort(np.array(clouds.ids), kind="stable")
-    objects, place = np.unique(
-        [_FURTHER_SCAN.sub("", name) for name in clouds.ids], return_inverse=True
-    )
-    validation = place[order] % 10 >= 8
-    if not validation.any():
-        raise DataError(
-            f"only {len(objects)} labelled training objects; at least 9 are needed, so that every "
-            "ninth and tenth can validate"
+    labels = labels_of(dataset, split)
+    if labels is None:
+        raise ConfigError(
+            f"{what} needs labels, but the clouds of {dataset.name} have none; label them, or "
+            "choose another dataset or method"
         )
-    return clouds.at(order[~validation]), clouds.at(order[validation])
-
-
-_FURTHER_SCAN = re.compile(r"~\d+$")
-_SPLITS = {"lineage": split_lineage}
+    return Labelled(clouds.clouds, clouds.ids, labels)
 
 
 class UdaData(LightningDataModule):
@@ -100,7 +107,10 @@ class UdaData(LightningDataModule):
         augment: applied to every training batch, on its device.
         batch_size: of the warm-up, at least 2 (batch norm).
         seed: of the run.
-        val: rule that takes a validation set from `labelled`.
+        val: rule that takes a validation set from `labelled` (see `qs3.data.validation`).
+        sampler: "shuffled" trains on each labelled cloud once an epoch; "balanced" on as many
+            clouds of each class (see `qs3.data.batches.balanced`). For the source alone: how
+            often the target's classes occur is not known.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
     """
 
@@ -116,13 +126,22 @@ class UdaData(LightningDataModule):
         seed: int,
         owner: str = "source",
         val: str = "lineage",
+        sampler: str = "shuffled",
         eval_batch_size: int = 64,
         uses_target: bool = False,
     ) -> None:
         super().__init__()
-        split = _SPLITS[one_of("data.val", val, sorted(_SPLITS))]
-        self.labelled, self.validation = split(labelled)
+        rule = RULES[one_of("data.val", val, sorted(RULES))]
+        train, validation = rule(labelled.ids, labelled.labels.numpy())
+        self.labelled, self.validation = labelled.at(train), labelled.at(validation)
         self.target = target
+        self.sampler = one_of("data.sampler", sampler, SAMPLERS)
+        if sampler == "balanced" and owner != "source":
+            raise ConfigError(
+                "data.sampler=balanced draws source clouds only. Balancing the target's classes "
+                "takes its true labels, which one released code does and which makes its figures "
+                "incomparable; set data.sampler=shuffled"
+            )
         self.owner, self.uses_target = owner, uses_target
         self.phases, self.scheme, self.augment = phases, scheme, augment
         self.batch_size, self.eval_batch_size, self.seed = batch_size, eval_batch_size, seed
@@ -140,7 +159,7 @@ class UdaData(LightningDataModule):
         if not warmup:
             tables = {"target": self._pseudo_labelled(), **tables}
         elif self.uses_target:
-            tables["target"] = Table(self.target.points, {})
+            tables["target"] = Table(self.target.clouds, {})
         return Batches(
             tables,
             self.batch_size if warmup else self.scheme.batch_size,
@@ -152,7 +171,7 @@ class UdaData(LightningDataModule):
 
     def val_dataloader(self) -> Batches:
         """Validation clouds of the labelled domain, all of them in every process."""
-        table = Table(self.validation.points, {f"y_{self.owner}": self.validation.labels})
+        table = Table(self.validation.clouds, {f"y_{self.owner}": self.validation.labels})
         return Batches(
             {"source": table}, self.eval_batch_size, seed=self.seed, epoch=0, shuffle=False
         )
@@ -178,9 +197,11 @@ class UdaData(LightningDataModule):
         self.pseudo = (state_dict["index"], state_dict["labels"]) if state_dict else None
 
     def _labelled(self) -> Table:
-        return Table(self.labelled.points, {f"y_{self.owner}": self.labelled.labels})
+        y = f"y_{self.owner}"
+        balance = y if self.sampler == "balanced" else None
+        return Table(self.labelled.clouds, {y: self.labelled.labels}, balance)
 
     def _pseudo_labelled(self) -> Table:
         assert self.pseudo is not None, "a round has begun without pseudo-labels"
         index, labels = self.pseudo
-        return Table(self.target.points[index], {"y_pseudo": labels})
+        return Table(self.target.clouds.at(index.numpy()), {"y_pseudo": labels})

@@ -6,12 +6,12 @@ Light on purpose: `train.py` asks `Domain.check` before it imports anything heav
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qs3.classes import CLASSES
+from qs3.classes import class_list
 from qs3.data.importers import Importer, import_into
 from qs3.data.store import PointSet, is_begun, is_finished, open_pointset, read_meta
 from qs3.errors import ConfigError, DataError, MissingDataError
@@ -34,7 +34,10 @@ class Domain:
         published: how to read the published files, if there are any: an `Importer`, or its
             config (instantiated when it is needed).
         simulated: the target's reality is simulated; every output about it says so.
-        gravity: the axis that points up in the store; "z" for all datasets.
+        gravity: the axis that points up in the store: "z"; or "none" for clouds in the frame of
+            their camera, which training should not turn about z (protocol.augment.rotate_z=false).
+        classes: names in label order; "modelnet40"; None: the ten of the benchmark.
+        expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
         make: the command that makes the dataset; None if only published files can give it.
         stand_in: a command that makes something to try instead.
@@ -53,18 +56,34 @@ class Domain:
     make: str | None = None
     stand_in: str | None = None
     synthesis: Any = None
+    classes: str | Sequence[str] | None = None
+    expected_counts: Mapping[str, Sequence[int]] | None = None
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
             raise ConfigError(
                 f"domain {self.name}: variant is {self.variant!r}, expected one of {VARIANTS}"
             )
-        if self.gravity != "z":
+        if self.gravity not in ("z", "none"):
             raise ConfigError(
                 f"domain {self.name}: gravity is {self.gravity!r}, but the clouds of a store stand "
                 "on z; let the importer turn them (its key `up`)"
             )
         object.__setattr__(self, "path", Path(self.path))
+        classes = class_list(self.classes)
+        if not classes or len(set(classes)) < len(classes):
+            raise ConfigError(f"domain {self.name}: classes are {list(classes)}: empty or twice")
+        for split, counts in (self.expected_counts or {}).items():
+            if len(counts) != len(classes):
+                raise ConfigError(
+                    f"domain {self.name}: expected_counts.{split} has {len(counts)} numbers for "
+                    f"{len(classes)} classes"
+                )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The classes in label order."""
+        return class_list(self.classes)
 
     @property
     def folder(self) -> Path:
@@ -128,10 +147,35 @@ class Domain:
         if not is_finished(self.folder):
             assert importer is not None  # `check` passed
             log.info("importing %s from %s", self.label, importer.looks_for()[0])
-            import_into(self.folder, importer, name=self.folder.name, classes=CLASSES)
+            import_into(self.folder, importer, name=self.folder.name, classes=self.names)
         elif importer is not None:
             self._refuse_stale(importer)
-        return open_pointset(self.folder, self.variant, verify=verify)
+        dataset = open_pointset(self.folder, self.variant, verify=verify)
+        if self.classes is not None and dataset.classes != self.names:
+            raise DataError(
+                f"{self.folder} was made with the classes {', '.join(dataset.classes)}; the config "
+                f"of domain {self.name} says {', '.join(self.names)}"
+            )
+        if "imported" in dataset.meta:
+            self._compare_counts(dataset)
+        return dataset
+
+    def _compare_counts(self, dataset: PointSet) -> None:
+        """Warn once, by name, if there are not as many clouds as were published."""
+        found, problems = dataset.counts(), []
+        for split, counts in (self.expected_counts or {}).items():
+            have = found.get(split, {})
+            problems += [
+                f"{split} {cls} {have.get(cls, 0)} instead of {count}"
+                for cls, count in zip(dataset.classes, counts, strict=True)
+                if have.get(cls, 0) != count
+            ]
+        if problems:
+            log.warning(
+                "%s does not have the published numbers of clouds: %s",
+                self.label,
+                ", ".join(problems),
+            )
 
     def _refuse_stale(self, importer: Importer) -> None:
         """Raise DataError if the store was imported with other settings than today's."""

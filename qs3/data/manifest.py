@@ -28,7 +28,7 @@ class ManifestRow:
 
     Attributes:
         id: unique in the dataset, e.g. "chair/train/chair_0007".
-        cls: class name (column `class`).
+        cls: class name (column `class`); empty in all rows of a dataset without labels.
         split: one of `SPLITS`.
         seed: the object's own seed; None for published clouds.
         mesh_sha256: hash of the mesh it was made from; empty for published clouds.
@@ -112,6 +112,7 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
     """Raise DataError at the first row that contradicts the others or the classes."""
     seen: dict[str, int] = {}
     index = 0
+    labelled = any(row.cls for row in rows)
     for line, row in enumerate(rows, start=2):  # line 1 of the file is the header
         at = f"{where}, line {line} (id {row.id!r})"
         if not row.id:
@@ -119,7 +120,7 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
         if row.id in seen:
             raise DataError(f"{at}: the same id is already in line {seen[row.id]}")
         seen[row.id] = line
-        if row.cls not in classes:
+        if labelled and row.cls not in classes:
             raise DataError(f"{at}: unknown class {row.cls!r}; known are {', '.join(classes)}")
         if row.split not in SPLITS:
             raise DataError(f"{at}: unknown split {row.split!r}; known are {', '.join(SPLITS)}")

@@ -1,37 +1,55 @@
-"""From a stored cloud to what a net sees: unit ball, then farthest points; done once, cached."""
+"""Which points of each stored cloud a net sees: farthest point sampling, done once, cached.
+
+The lineage samples in every access, from a random point. Here each cloud is sampled from a few
+points once, and an epoch draws one of these samples for each cloud: it costs an index.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
+import os
 import time
+from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from qs3.data.clouds import Clouds
+from qs3.data.samples import sample_all
 from qs3.errors import ConfigError, Qs3Error
-from qs3.files import write_npy
+from qs3.files import atomic_path, locked
 
 log = logging.getLogger(__name__)
 
 _DAY = 24 * 3600  # seconds
-_VERSION = 1  # part of the cache's name: raise it when the numbers below would change
+_VERSION = 2  # of the cache: raise it when the samples would be others
+_DIGEST = hashlib.sha256().digest_size
 
 
 def prepare(
-    points: Float[np.ndarray, "n p 3"], count: int, cache_dir: Path | None = None, key: str = ""
-) -> Float[np.ndarray, "n count 3"]:
-    """Normalise each cloud to the unit ball, then keep `count` farthest points, from point 0 on.
+    points: Float[np.ndarray, "n p 3"],
+    count: int,
+    *,
+    starts: int = 1,
+    cache_dir: Path | None = None,
+    key: str = "",
+) -> Clouds:
+    """Each cloud in the unit ball, and in it `starts` samples of `count` farthest points.
 
-    The cloud is not normalised again afterwards, and nothing is random, so evaluation is
-    deterministic. Training shuffles, turns and jitters these points later.
+    Sample 0 begins at point 0, the others at points that are a function of the cloud's bytes
+    (`start_points`). A cloud is not normalised again after sampling. Nothing is random, so
+    evaluation, which takes sample 0, is deterministic.
 
     Args:
-        points: clouds as stored, e.g. a memmap.
-        count: points to keep, at most p.
-        cache_dir: where to keep the result for the next seed; None keeps nothing.
-        key: names the clouds: hash of the dataset, and the split.
+        points: clouds as stored, e.g. a memmap; kept, not copied.
+        count: points to keep, at most p. If it is p there is nothing to choose.
+        starts: samples of each cloud, at most p.
+        cache_dir: where to keep the indices for the next run; None keeps nothing.
+        key: names the clouds: the dataset with its hash, and the split.
 
     Raises:
         ConfigError: the clouds have fewer points than asked for.
@@ -39,23 +57,26 @@ def prepare(
     n, stored, _ = points.shape
     if not 1 <= count <= stored:
         raise ConfigError(f"data.points is {count}, but the clouds of {key} have {stored} points")
-    cache = cache_dir / f"{key}-{count}-v{_VERSION}.npy" if cache_dir else None
-    if cache is not None and (found := _read(cache, (n, count, 3))) is not None:
-        return found
+    if count == stored:
+        return Clouds.of(points)
+    starts = min(starts, stored)
 
-    from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
+    def work() -> np.ndarray:
+        log.info("sampling %d of %d points of %d clouds, %dx (%s)", count, stored, n, starts, key)
+        return sample_all(points, count, starts)
 
-    log.info("sampling %d of %d points in %d clouds (%s)", count, stored, n, key)
-    result = np.empty((n, count, 3), dtype=np.float32)
-    for i in range(n):
-        cloud = np.asarray(unit_ball(np.asarray(points[i])), dtype=np.float32)
-        result[i] = cloud[farthest_point_sampling_np(cloud, count, 0)] if count < stored else cloud
-    if cache is not None:
-        try:
-            write_npy(cache, result)
-        except Qs3Error as error:  # the data may lie where only others may write
-            log.warning("%s (paths.cache_dir, or data.cache_dir=null to keep none)", error)
-    return result
+    if cache_dir is None:
+        return Clouds.of(points, work())
+    cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
+    name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
+    shape = (n, starts, count)
+    order = _read(cache, shape, name)
+    if order is None:
+        with _alone(cache_dir):  # seeds that start at the same time wait for the first
+            order = _read(cache, shape, name)
+            if order is None:
+                order = _kept(cache, work(), name)
+    return Clouds.of(points, order)
 
 
 def remove_old_leftovers(cache_dir: Path) -> None:
@@ -66,10 +87,50 @@ def remove_old_leftovers(cache_dir: Path) -> None:
                 path.unlink()
 
 
-def _read(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
-    """The cached array, or None if it is not there or not what it should be (then it is redone)."""
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError):
+# The cache's file is an .npy with 32 bytes after it: SHA-256 of what it is and of what it holds.
+
+
+def _read(path: Path, shape: tuple[int, ...], name: str) -> np.ndarray | None:
+    """The cached indices as a memmap; None if they are not there or not what they should be."""
+    if not path.is_file():
         return None
-    return array if array.shape == shape and array.dtype == np.float32 else None
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        with open(path, "rb") as file:
+            file.seek(-_DIGEST, os.SEEK_END)
+            digest = file.read()
+    except (OSError, ValueError, EOFError) as error:
+        log.warning("%s cannot be read (%s); sampling again", path, error)
+        return None
+    if array.shape != shape or digest != _digest(array, name):
+        log.warning("%s is damaged or of another version; sampling again", path)
+        return None
+    return array
+
+
+def _kept(path: Path, order: np.ndarray, name: str) -> np.ndarray:
+    """The indices from the cache, after writing them there; from memory if that is not possible."""
+    try:
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            np.save(file, order, allow_pickle=False)
+            file.write(_digest(order, name))
+    except Qs3Error as error:  # others' folder, a full disk
+        log.warning("%s (paths.cache_dir, or data.cache_dir=null to keep none)", error)
+        return order
+    kept = _read(path, order.shape, name)
+    return order if kept is None else kept
+
+
+def _digest(order: np.ndarray, name: str) -> bytes:
+    digest = hashlib.sha256(f"{name} {order.shape} {order.dtype.str}".encode())
+    digest.update(np.ascontiguousarray(order).data)
+    return digest.digest()
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold the cache's lock if there can be one; without it, at worst the work is done twice."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(Qs3Error, OSError):
+            stack.enter_context(locked(folder / ".lock"))
+        yield

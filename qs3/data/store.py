@@ -67,7 +67,7 @@ class PointSet:
         name: of the dataset.
         classes: names; a label is a position in this tuple.
         points: [N, P, 3] float32, read only (a memmap, or a copy after `split`).
-        labels: [N] int64.
+        labels: [N] int64; all -1 if the dataset has no labels.
         splits: [N] str.
         ids: N unique strings.
         sha256: hash of these clouds with their ids, labels and splits (of the whole dataset,
@@ -87,6 +87,11 @@ class PointSet:
     def __len__(self) -> int:
         """N."""
         return len(self.labels)
+
+    @property
+    def labelled(self) -> bool:
+        """Whether the classes of the clouds are known."""
+        return bool((self.labels >= 0).all())
 
     def indices(self, split: str) -> np.ndarray:
         """[n] int64 positions of a split's clouds, in the dataset's order."""
@@ -246,7 +251,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         name=meta["name"],
         classes=classes,
         points=points,
-        labels=np.array([position[row.cls] for row in kept], dtype=np.int64),
+        labels=np.array([position.get(row.cls, -1) for row in kept], dtype=np.int64),
         splits=np.array([row.split for row in kept], dtype=np.str_),
         ids=tuple(row.id for row in kept),
         sha256=_content_hash(hashes[variant], classes, kept),

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from qs3.classes import ALIASES, CLASSES
+from qs3.classes import ALIASES, CLASSES, known_as
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.meshes.files import SUFFIXES, load_mesh
 from qs3.meshes.source import MeshItem
@@ -45,12 +45,13 @@ class MeshFolder:
 
     Attributes:
         path: the root; its sub-folders are classes.
-        classes: the wanted ones; folders of other names are then left alone. None: all ten,
+        classes: the wanted ones; folders of other names are then left alone. None: all known,
             and a folder of another name is an error, since it may be a misspelt class.
         test_fraction: of the meshes of a class whose folder has no splits, the part for test.
         half: "all", or "first" or "second": two disjoint halves of every class and split, so
             that a source and a target domain made from one folder share no shape.
         skip: stems of files to leave out, as if they were not there.
+        known: the classes of the dataset, in label order.
     """
 
     path: Path
@@ -58,6 +59,7 @@ class MeshFolder:
     test_fraction: float = 0.2
     half: str = "all"
     skip: tuple[str, ...] = ()
+    known: tuple[str, ...] = CLASSES
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
@@ -66,9 +68,9 @@ class MeshFolder:
         object.__setattr__(self, "skip", tuple(self.skip))
         if self.classes is not None:
             object.__setattr__(self, "classes", tuple(self.classes))
-            unknown = [name for name in self.classes if name not in CLASSES]
+            unknown = [name for name in self.classes if name not in self.known]
             if unknown or not self.classes:
-                raise ConfigError(f"classes must be among {', '.join(CLASSES)}; got {unknown}")
+                raise ConfigError(f"classes must be among {', '.join(self.known)}; got {unknown}")
         if not 0 < self.test_fraction < 1:
             raise ConfigError(f"test_fraction must be in (0, 1), got {self.test_fraction}")
         if self.half not in HALVES:
@@ -82,10 +84,10 @@ class MeshFolder:
             ConfigError: a folder or file cannot be assigned to a class and split.
             DataError: a link leads out of the root.
         """
-        wanted = self.classes or CLASSES
+        wanted = self.classes or self.known
         folders = self._class_folders()
         found: list[MeshItem] = []
-        for cls in (name for name in CLASSES if name in wanted):
+        for cls in (name for name in self.known if name in wanted):
             groups = self._groups(cls, folders.get(cls, []))
             chosen = [
                 self._item(cls, split, stem, file)
@@ -108,7 +110,7 @@ class MeshFolder:
         for entry in _visible(self.path):
             if not entry.is_dir():
                 continue
-            cls = _class_of(entry.name)
+            cls = known_as(entry.name, self.known)
             if cls is None:
                 unknown.append(entry.name)
             elif self.classes is None or cls in self.classes:
@@ -117,7 +119,7 @@ class MeshFolder:
         if unknown and self.classes is None:
             raise ConfigError(
                 f"{self.path}: {', '.join(repr(name) for name in unknown)} is not the name of a "
-                f"class. Known: {', '.join((*CLASSES, *ALIASES))}. Rename the folder or move it "
+                f"class. Known: {', '.join((*self.known, *ALIASES))}. Rename the folder or move it "
                 "away, or name the classes that are wanted with classes=[...]: then all other "
                 "folders are left alone"
             )
@@ -221,12 +223,6 @@ class MeshFolder:
                 f"{entry} is a link that leads out of {self.path}, to {target}: links outside "
                 "are not followed; put the file itself there"
             )
-
-
-def _class_of(folder: str) -> str | None:
-    name = folder.lower().replace("-", "_").replace(" ", "_")
-    name = ALIASES.get(name, name)
-    return name if name in CLASSES else None
 
 
 def _visible(folder: Path) -> list[Path]:

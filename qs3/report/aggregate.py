@@ -106,6 +106,12 @@ class Group:
         """Of the finished runs."""
         return [run.seed for run in self.finished if run.seed is not None]
 
+    @property
+    def unlabelled(self) -> bool:
+        """Whether it was finished on a target without labels, so that there is no accuracy."""
+        final = self.first.get("final")
+        return isinstance(final, Mapping) and final.get("accuracy", 0.0) is None
+
     def stat(self, *path: str) -> Stat | None:
         """Mean of `metrics[path[0]][path[1]]...`; None if there is nothing that may be averaged."""
         if not self.finished or not self.comparable:
@@ -225,6 +231,8 @@ def summarise(folders: list[Path]) -> str:
                 f"{100 * majority.mean:.1f}" if majority else "-",  # of the data: no SEM
             )
         )
+        if g.unlabelled:
+            notes.append(f"{g.experiment} {g.hash}: no target labels, so no accuracy")
         notes += [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
     if any("(!)" in line[6] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")

@@ -64,6 +64,8 @@ class Cell:
             return stat.percent() + few
         if self.missing:
             return "not available yet"
+        if self.group and self.group.unlabelled:
+            return "no target labels"
         return "not averaged" if self.group and self.group.finished else "not run"
 
 
@@ -252,6 +254,13 @@ def remarks(table: Table) -> list[str]:
         }
         if rules:
             lines.append(f"{role} selected by: {', '.join(sorted(rules))}")
+    splits = {
+        str(run.metrics.get("selection", {}).get("validation", "lineage"))
+        for g in found
+        for run in g.finished
+    }
+    if splits - {"lineage"}:
+        lines.append(f"validation split: {', '.join(sorted(splits))}")
     if found:
         counts = sorted({len(g.finished) for g in found})
         seeds = f"{' or '.join(map(str, counts))} seed{'s' * (counts[-1] > 1)}"
@@ -267,7 +276,13 @@ def remarks(table: Table) -> list[str]:
 
 def to_run(table: Table) -> list[str]:
     """Commands that fill the cells without a number, each once."""
-    empty = [c for c in table.cells if not c.missing and c.ours(table.metrics[0]) is None]
+    empty = [
+        cell
+        for cell in table.cells
+        if not cell.missing
+        and cell.ours(table.metrics[0]) is None
+        and not (cell.group and cell.group.unlabelled)
+    ]
     return list(dict.fromkeys(cell.command for cell in empty))
 
 

@@ -23,6 +23,11 @@ NAMES = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
 SPLITS = {"train": 2, "test": 1}
 
 
+GRASPNET = ("graspnetpc10", "graspnetpc10_kinect", "graspnetpc10_realsense")
+FORTY = ("specklenet40", "modelnet40_meshes")
+WITHOUT_STAND_IN = (*GRASPNET, "modelnet40_meshes")  # classes that cannot be generated
+
+
 def domain(name, data_dir, *overrides):
     """As train.py would mount it, in a config of our own."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -50,8 +55,11 @@ def test_missing_data_is_explained(tmp_path, name):
     message = str(caught.value)
     assert str(found.folder / "meta.yaml") in message
     assert "Where to get it: " in message
-    assert "python generate.py domain=" in message
-    assert f"paths.data_dir={tmp_path}" in message
+    if found.make or found.stand_in:
+        assert "python generate.py domain=" in message
+        assert f"paths.data_dir={tmp_path}" in message
+    else:
+        assert name in WITHOUT_STAND_IN
     assert ("simulated" in found.label) == (name == "kinectsim10")
     with pytest.raises(MissingDataError):
         found.open()
@@ -64,13 +72,17 @@ def test_every_domain_opens_on_its_fixture(tmp_path, name):
     found = domain(name, tmp_path)
     found.check()
     data = found.open()
-    assert data.classes == CLASSES
-    assert set(data.counts()["train"].values()) == {2}
-    assert set(data.counts()["test"].values()) == {1}
-    assert data.points.shape[1:] == (
-        1024 if name in ("shapenet10", "modelnet10_arrays") else 2048,
-        3,
-    )
+    counts, small = data.counts(), ("shapenet10", "modelnet10_arrays", *GRASPNET)
+    both = 2 if name == "graspnetpc10" else 1  # sensors
+    absent = {"bathtub", "lamp", "plant"} if name == "scanobjectnn" else set()
+    assert data.classes == found.names
+    assert (data.classes == CLASSES) == (name not in (*GRASPNET, *FORTY))
+    for split, each in (("train", 2 * both), ("test", 1)):
+        if (name, split) == ("graspnetpc10", "test"):
+            assert split not in counts
+            continue
+        assert counts[split] == {c: 0 if c in absent else each for c in data.classes}
+    assert data.points.shape[1:] == (1024 if name in small else 2048, 3)
     assert domain(name, tmp_path).open().sha256 == data.sha256
 
 
@@ -89,6 +101,45 @@ def test_every_command_that_a_message_names_composes(tmp_path, name):
         assert cfg.paths.data_dir == str(tmp_path)
         instantiate(cfg.domain)
         instantiate(cfg.recipe)
+
+
+def test_published_counts_are_compared(tmp_path, caplog):
+    fixtures.write_domain("scannet10", tmp_path, SPLITS)
+    for _ in range(2):  # after the import, and whenever it is opened
+        caplog.clear()
+        domain("scannet10", tmp_path).open()
+        (record,) = (r for r in caplog.records if "published numbers" in r.message)
+        assert record.levelname == "WARNING"
+        assert "ScanNet10 (S*)" in record.message
+        assert "train bathtub 2 instead of 98" in record.message
+        assert "test table 1 instead of 301" in record.message
+    exact = [f"expected_counts.{s}={[n] * 10}" for s, n in SPLITS.items()]
+    caplog.clear()
+    domain("scannet10", tmp_path, *exact).open()
+    assert "published numbers" not in caplog.text
+    with pytest.raises(ConfigError, match=r"expected_counts\.train has 2 numbers for 10 classes"):
+        Domain("a", "A", "A", tmp_path, expected_counts={"train": [1, 2]})
+
+
+def test_a_generated_store_has_no_published_counts(tmp_path, caplog):
+    fixtures.write_store(tmp_path / "scannet10", SPLITS)
+    domain("scannet10", tmp_path).open()
+    assert "published numbers" not in caplog.text
+
+
+def test_a_store_of_other_classes_is_refused(tmp_path):
+    fixtures.write_domain("own", tmp_path, SPLITS)
+    domain("own", tmp_path).open()
+    with pytest.raises(DataError, match=r"made with the classes bathtub, .*says cup, box"):
+        domain("own", tmp_path, "classes=[cup,box]").open()
+
+
+def test_gravity_and_classes_are_checked(tmp_path):
+    assert domain("graspnetpc10", tmp_path).gravity == "none"
+    with pytest.raises(ConfigError, match="gravity is 'y'"):
+        Domain("a", "A", "A", tmp_path, gravity="y")
+    with pytest.raises(ConfigError, match="empty or twice"):
+        Domain("a", "A", "A", tmp_path, classes=["cup", "cup"])
 
 
 def test_clean_twin_is_the_same_objects(tmp_path):

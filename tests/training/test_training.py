@@ -209,49 +209,55 @@ def test_other_target_labels_change_the_figures_and_nothing_else(toy, toy_data, 
         assert torch.equal(student[name], value)
 
 
-def reachable(thing: object, truth: list[torch.Tensor], name: str, seen: set, depth: int = 0):
-    """Names of all tensors and arrays hanging on `thing` that equal one of `truth`."""
-    if id(thing) in seen or depth > 8:
-        return
-    seen.add(id(thing))
-    if isinstance(thing, np.ndarray | torch.Tensor):
-        if any(tuple(thing.shape) == tuple(y.shape) for y in truth):
-            values = np.asarray(thing)
-            if any(values.shape == tuple(y.shape) and (values == y.numpy()).all() for y in truth):
-                yield name
-    elif isinstance(thing, dict):
-        for key, value in list(thing.items()):
-            yield from reachable(value, truth, f"{name}[{key!r}]", seen, depth + 1)
-    elif isinstance(thing, list | tuple):
-        for i, value in enumerate(list(thing)[:50]):
-            yield from reachable(value, truth, f"{name}[{i}]", seen, depth + 1)
-    elif hasattr(thing, "__dict__") and not isinstance(thing, type(np)):
-        for key, value in list(vars(thing).items()):
-            yield from reachable(value, truth, f"{name}.{key}", seen, depth + 1)
+# --- loading and evaluation ------------------------------------------------------------------
 
 
-def test_no_target_label_within_reach_of_training(toy, toy_data, monkeypatch):
-    """Search all that hangs on the trainer for the target's labels; see what the batches hold."""
-    target = open_pointset(toy_data / "kinectsim10")
-    truth = [torch.tensor(target.split(name).labels) for name in ("train", "test")]
-    found: list[str] = []
-    controls: list[str] = []
-    owners: set[str] = set()
+def test_metrics_say_how_clouds_were_loaded_and_judged(finished):
+    metrics = runs.read_metrics(finished)
+    assert metrics["loading"] == {"points": 32, "fps_starts": 4, "sampler": "shuffled"}
+    assert metrics["selection"]["validation"] == "lineage"
+    assert metrics["evaluation"] == {
+        "split": "test",
+        "labels": True,
+        "rotations": 0,
+        "final_over_rotations": None,
+        "warmup_over_rotations": None,
+    }
+    assert 0 <= metrics["final"]["calibration_error"] <= 1
 
-    def spy(self, batch, batch_idx, real=Classifier.training_step):
-        owners.update(key for part in batch.values() if isinstance(part, dict) for key in part)
-        if batch_idx == 0:
-            found.extend(reachable(self.trainer, truth, "trainer", set()))
-            self.trainer.datamodule.target.__dict__["planted"] = truth[0].numpy()
-            controls.extend(reachable(self.trainer, truth, "trainer", set()))
-            del self.trainer.datamodule.target.__dict__["planted"]
-        return real(self, batch, batch_idx)
 
-    monkeypatch.setattr(Classifier, "training_step", spy)
-    train(toy("selftraining.rounds=1"))
-    assert found == []
-    assert len(controls) == 7  # the search does find what is planted, in each epoch
-    assert owners == {"points", "y_source", "y_pseudo"}
+def test_turned_figures_stand_beside_the_plain_ones(toy, finished):
+    metrics = train(toy("evaluation.rotations=12"))
+    assert metrics["final"] == runs.read_metrics(finished)["final"]
+    evaluation = metrics["evaluation"]
+    assert evaluation["rotations"] == 12
+    for name in ("final_over_rotations", "warmup_over_rotations"):
+        assert evaluation[name].keys() == metrics["final"].keys()
+        assert evaluation[name]["calibration_error"] != metrics["final"]["calibration_error"]
+
+
+@pytest.mark.parametrize(
+    ("more", "where", "value"),
+    [
+        ("data.val=stratified", ("selection", "validation"), "stratified"),
+        ("data.sampler=balanced", ("loading", "sampler"), "balanced"),
+        ("data.fps_starts=1", ("loading", "fps_starts"), 1),
+        ("data.points=64", ("loading", "fps_starts"), 1),  # all points: nothing to choose
+    ],
+)
+def test_other_loading_is_another_result_and_named(toy, finished, more, where, value):
+    cfg = toy(more, "selftraining=none")
+    metrics = train(cfg)
+    assert metrics[where[0]][where[1]] == value
+    rows = table(runs.run_folder(cfg) / "history.csv")
+    assert rows != table(finished / "history.csv")[: len(rows)]
+
+
+def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
+    cache = tmp_path / "cache"
+    train(toy("selftraining=none", "protocol.epochs=1", f"paths.cache_dir={cache}"))
+    names = sorted(path.name[-12:] for path in cache.glob("*.npy"))
+    assert names == ["-32x1-v2.npy", "-32x4-v2.npy", "-32x4-v2.npy"]
 
 
 # --- errors ----------------------------------------------------------------------------------
@@ -271,6 +277,9 @@ def test_misspelt_key():
         ("protocol.batch_size=1", r"protocol\.batch_size"),
         ("data.points=65", r"data\.points is 65"),
         ("data.val=other", r"data\.val"),
+        ("data.sampler=other", r"data\.sampler"),
+        ("data.fps_starts=0", r"data\.fps_starts .* >= 1, got 0"),
+        ("evaluation.rotations=-1", r"evaluation\.rotations .* >= 0, got -1"),
         ("num_classes=10", r"num_classes is 10.*set num_classes=3"),
         ("selection.teacher=best", r"selection\.teacher"),
         ("protocol.epochs=abc", r"protocol\.epochs .* got 'abc'"),
@@ -287,6 +296,11 @@ def test_misspelt_key():
 def test_wrong_setting_names_the_key(toy, override, message):
     with pytest.raises(ConfigError, match=message):
         train(toy(override))
+
+
+def test_target_classes_are_not_balanced(toy):
+    with pytest.raises(ConfigError, match=r"data\.sampler=balanced draws source clouds only"):
+        train(toy("data.sampler=balanced", "method=supervised", "selftraining=none"))
 
 
 def test_empty_selection(toy):

@@ -91,7 +91,7 @@ SOURCES: tuple[Source, ...] = (
         "ModelNet40, the CAD meshes as published (12,311 .off files, 40 classes)",
         "ModelNet40.zip",
         _MODELNET,
-        (Part("modelnet40/raw", _tree("off"), ("modelnet10_meshes",)),),
+        (Part("modelnet40/raw", _tree("off"), ("modelnet10_meshes", "modelnet40_meshes")),),
         pyg="40",
         size_says="about 2 GB; unpacked several times as much",
     ),

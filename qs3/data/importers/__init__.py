@@ -7,7 +7,20 @@ only the axes are turned so that z is up.
 
 from qs3.data.importers.arrays import NamedArrays
 from qs3.data.importers.base import Importer, import_into
+from qs3.data.importers.folders import CloudFolder
+from qs3.data.importers.graspnet import GraspNetPC
 from qs3.data.importers.pointda_h5 import PointDAH5
+from qs3.data.importers.scanobjectnn import ScanObjectNN
 from qs3.data.importers.trees import NpyTree, XyzTree
 
-__all__ = ["Importer", "NamedArrays", "NpyTree", "PointDAH5", "XyzTree", "import_into"]
+__all__ = [
+    "CloudFolder",
+    "GraspNetPC",
+    "Importer",
+    "NamedArrays",
+    "NpyTree",
+    "PointDAH5",
+    "ScanObjectNN",
+    "XyzTree",
+    "import_into",
+]

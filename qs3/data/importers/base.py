@@ -10,11 +10,11 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from qs3.classes import ALIASES
+from qs3.classes import ALIASES, known_as
 from qs3.data.manifest import ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
 from qs3.errors import ConfigError, DataError
@@ -55,6 +55,9 @@ class Importer(abc.ABC):
     points: int = 2048
     on_error: str = "stop"
 
+    complete: ClassVar[bool] = True
+    """Whether a class without clouds in a split means that something is wrong."""
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
         if self.points < 1:
@@ -87,6 +90,10 @@ class Importer(abc.ABC):
         """[P, 3] as published to [P, 3] with z up."""
         return cloud
 
+    def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
+        """[n, 3] as read to at most P points, for formats that allow more."""
+        return cloud
+
     def read(self, classes: Sequence[str]) -> tuple[list[np.ndarray], list[ManifestRow]]:
         """Read everything.
 
@@ -103,7 +110,7 @@ class Importer(abc.ABC):
         for row, where, load in _progress(self.items(classes), f"importing {self.root.name}"):
             try:
                 raw = load()
-                cloud = check_cloud(raw, self.points, where)
+                cloud = check_cloud(self.thin(raw, where), self.points, where)
             except DataError as error:
                 if self.on_error == "stop":
                     raise
@@ -111,7 +118,7 @@ class Importer(abc.ABC):
                 continue
             clouds.append(self.turn(cloud, row.cls))
             rows.append(dataclasses.replace(row, valid_points=len(raw)))
-        _check_complete(rows, classes, self.root)
+        _check_complete(rows, classes, self.root, strict=self.complete)
         _report(rows, self.points, self.root)
         return clouds, rows
 
@@ -163,9 +170,8 @@ def class_of(name: str, classes: Sequence[str], where: str) -> str:
     Raises:
         DataError: none of the classes.
     """
-    lower = name.casefold()
-    found = ALIASES.get(lower, lower)
-    if found not in classes:
+    found = known_as(name, classes)
+    if found is None:
         raise DataError(
             f"{where}: unknown class {name!r}; known are {', '.join(classes)} "
             f"and the other names {', '.join(sorted(ALIASES))}"
@@ -218,14 +224,21 @@ def y_up_to_z_up(cloud: np.ndarray) -> np.ndarray:
     return np.stack([cloud[..., 0], -cloud[..., 2], cloud[..., 1]], axis=-1)
 
 
-def _check_complete(rows: Iterable[ManifestRow], classes: Sequence[str], where: Path) -> None:
-    """Raise DataError if a class has no cloud in a split that other classes have."""
+def _check_complete(
+    rows: Iterable[ManifestRow], classes: Sequence[str], where: Path, *, strict: bool
+) -> None:
+    """Raise DataError (or warn) if a class has no cloud in a split that other classes have."""
     have = {(row.split, row.cls) for row in rows if row.status == "ok"}
     if not have:
         raise DataError(f"{where} holds no clouds")
+    if not any(cls for _, cls in have):
+        return  # no labels at all
     for split in sorted({split for split, _ in have}):
         if empty := [name for name in classes if (split, name) not in have]:
-            raise DataError(f"{where}: split {split!r} has no clouds of {', '.join(empty)}")
+            problem = f"{where}: split {split!r} has no clouds of {', '.join(empty)}"
+            if strict:
+                raise DataError(problem)
+            log.warning("%s", problem)
 
 
 def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:

@@ -7,6 +7,7 @@ which is what Blender writes.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,27 +42,44 @@ class _Element:
 
 def read(data: bytes) -> Triangles:
     """Read the elements "vertex" and "face"; all else is stepped over."""
-    elements, body = _parse_header(data)
-    counts = {element.name: element.count for element in elements}
-    check_counts(max(counts.values(), default=0), counts.get("face", 0))
     vertices = faces = None
-    offset = 0
-    for element in elements:
-        columns, offset = _read_element(element, body, offset)
-        if element.name == "vertex":
-            missing = [axis for axis in "xyz" if axis not in columns]
-            if missing:
-                raise MeshError(f"has vertices without {', '.join(missing)}")
-            vertices = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        elif element.name == "face":
-            name = next((n for n in ("vertex_indices", "vertex_index") if n in columns), None)
-            if name is None:
+    for name, columns in _elements(data):
+        if name == "vertex":
+            vertices = _vertices(columns)
+        elif name == "face":
+            key = next((n for n in ("vertex_indices", "vertex_index") if n in columns), None)
+            if key is None:
                 raise MeshError("has faces without vertex_indices")
-            sizes, corners = columns[name]
+            sizes, corners = columns[key]
             faces = fan(sizes, whole(corners.astype(np.float64), "a vertex index"))
         if vertices is not None and faces is not None:
             return vertices, faces
     raise MeshError("has no faces: it is a point cloud, or not made of triangles")
+
+
+def read_vertices(data: bytes) -> np.ndarray:
+    """[V, 3] float64: the vertices alone, of a point cloud or of a mesh."""
+    for name, columns in _elements(data):
+        if name == "vertex":
+            return _vertices(columns)
+    raise MeshError("has no vertices")
+
+
+def _elements(data: bytes) -> Iterator[tuple[str, dict]]:
+    """Name and columns of each element."""
+    elements, body = _parse_header(data)
+    counts = {element.name: element.count for element in elements}
+    check_counts(max(counts.values(), default=0), counts.get("face", 0))
+    offset = 0
+    for element in elements:
+        columns, offset = _read_element(element, body, offset)
+        yield element.name, columns
+
+
+def _vertices(columns: dict) -> np.ndarray:
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise MeshError(f"has vertices without {', '.join(missing)}")
+    return np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
 
 
 def _parse_header(data: bytes) -> tuple[list[_Element], bytes]:

@@ -1,0 +1,265 @@
+"""Point clouds of any number of points from files in the usual formats; files are not trusted.
+
+    .xyz .txt   text, a row a point: x y z and perhaps more columns, by blanks, commas or
+                semicolons; # and // begin a comment
+    .npy        [n, >= 3], or [m, n, >= 3]: m clouds
+    .npz        the array `points` (or the only one) as in .npy; perhaps `label` or `cls`
+    .ply        the vertices, text or binary; faces are passed over
+    .pcd        x y z; pixels without a measurement (NaN) are left out, as the format means them
+    .h5 .hdf5   the dataset `data` or `points` as in .npy; perhaps `label`
+
+Only x y z are read. Pickled arrays are refused unopened, sizes are checked before memory is taken.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.clouds.pcd import read_pcd
+from qs3.errors import DataError, MeshError
+
+MAX_BYTES = 4 << 30  # of a file, and of what it unpacks to
+
+
+@dataclass(frozen=True, eq=False)
+class CloudFile:
+    """What a file holds.
+
+    Attributes:
+        clouds: [n, 3] each, in the numbers of the file, as float64 or float32.
+        labels: of each cloud as the file has them, a number or a word; None if it has none.
+        dropped: pixels without a measurement that were left out.
+        many: whether the file is made for several clouds (then each has a number in its name).
+    """
+
+    clouds: tuple[np.ndarray, ...]
+    labels: tuple[Any, ...] | None = None
+    dropped: int = 0
+    many: bool = False
+
+
+def read_cloud(path: str | Path) -> np.ndarray:
+    """[n, 3] coordinates of the one cloud in a file, n >= 1, finite.
+
+    Raises:
+        DataError: names the file and what is wrong with it, or it holds several clouds.
+    """
+    found = read_clouds(path)
+    if len(found.clouds) != 1:
+        raise DataError(f"{path} holds {len(found.clouds)} clouds, expected one")
+    return found.clouds[0]
+
+
+def read_clouds(path: str | Path) -> CloudFile:
+    """All clouds of a file.
+
+    Raises:
+        DataError: names the file, and the line or cloud.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DataError(f"{path}: unknown format; known are {', '.join(SUFFIXES)}")
+    try:
+        size = path.stat().st_size
+        if not 0 < size <= MAX_BYTES:
+            raise DataError(f"{path}: {size} bytes, expected 1 to {MAX_BYTES}")
+        found = reader(path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
+    for number, cloud in enumerate(found.clouds):
+        where = f"{path}, cloud {number}" if found.many else str(path)
+        if len(cloud) == 0:
+            raise DataError(f"{where}: there are no points")
+        if not (finite := np.isfinite(cloud).all(axis=1)).all():
+            row = int(np.flatnonzero(~finite)[0])
+            raise DataError(f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite")
+    if not found.clouds:
+        raise DataError(f"{path}: there are no clouds")
+    return found
+
+
+def _text(path: Path) -> CloudFile:
+    data = path.read_bytes()
+    rows = data.replace(b"//", b"#")
+    if b"," in rows or b";" in rows:
+        rows = rows.translate(bytes.maketrans(b",;", b"  "))
+    lines = rows.splitlines()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # no rows: told below
+            table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments="#", encoding="latin-1")
+    except ValueError:
+        table = None
+    if table is None or (table.size and table.shape[1] < 3):
+        raise DataError(_bad_line(path, lines))
+    if table.size == 0:
+        raise DataError(f"{path}: there are no points")
+    return CloudFile((table[:, :3],))
+
+
+def _bad_line(path: Path, lines: list[bytes]) -> str:
+    """Where and why a text file is not rows of numbers."""
+    width = None
+    for number, line in enumerate(lines, start=1):
+        words = line.split(b"#")[0].split()
+        if not words:
+            continue
+        shown = line[:60].decode(errors="replace").strip()
+        try:
+            [float(word) for word in words]
+        except ValueError:
+            return f"{path}, line {number}: {shown!r} is not a row of numbers"
+        if len(words) < 3 or (width is not None and len(words) != width):
+            return f"{path}, line {number}: {shown!r} has {len(words)} numbers, not {width or 3}"
+        width = len(words)
+    return f"{path}: not a text file of rows with numbers"
+
+
+def _npy(path: Path) -> CloudFile:
+    try:
+        with open(path, "rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a header written by Python 2
+            version = np.lib.format.read_magic(file)
+            read: Callable[..., Any] | None = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }.get(version)
+            if read is None:
+                raise ValueError(f"version {version} of the .npy format")
+            shape, _, dtype = read(file)
+            if dtype.hasobject:
+                raise DataError(f"{path}: a pickled array, refused; save it as plain numbers")
+            size = path.stat().st_size
+            expected = file.tell() + dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+            if size != expected:
+                raise DataError(f"{path}: {size} bytes, expected {expected} for shape {shape}")
+            file.seek(0)
+            array = np.load(file, allow_pickle=False)
+    except DataError:
+        raise
+    except Exception as error:  # numpy's parser of headers raises a dozen kinds
+        raise DataError(f"{path}: not a readable .npy file ({error})") from error
+    return _of_array(path, array)
+
+
+def _npz(path: Path) -> CloudFile:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+        if size > MAX_BYTES:
+            raise DataError(f"{path} unpacks to {size} bytes, more than {MAX_BYTES}")
+        with np.load(path, allow_pickle=False) as file:
+            names = file.files
+            key = "points" if "points" in names else names[0] if len(names) == 1 else None
+            if key is None:
+                raise DataError(f"{path} has no array 'points'; it has {', '.join(names)}")
+            array = file[key]
+            labels = next(
+                (file[name] for name in ("cls", "label", "labels") if name in names), None
+            )
+    except DataError:
+        raise
+    except Exception as error:  # zlib.error, BadZipFile, pickled content, unknown compression ...
+        raise DataError(f"{path}: not a readable .npz of plain arrays ({error})") from error
+    return _of_array(path, array, labels)
+
+
+def _ply(path: Path) -> CloudFile:
+    from qs3.meshes.formats.ply import read_vertices
+
+    try:
+        return CloudFile((read_vertices(path.read_bytes()),))
+    except MeshError as error:
+        raise DataError(f"{path} {error}") from error
+
+
+def _pcd(path: Path) -> CloudFile:
+    try:
+        points = read_pcd(path).xyz()
+    except DataError as error:
+        raise error if str(path) in str(error) else DataError(f"{path}: {error}") from error
+    measured = np.isfinite(points).all(axis=1)
+    if not measured.any():
+        raise DataError(f"{path}: no pixel has a measurement")
+    return CloudFile((points[measured],), dropped=int((~measured).sum()))
+
+
+def _hdf5(path: Path) -> CloudFile:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            data = _own_dataset(file, ("data", "points"), path)
+            if data is None:
+                raise DataError(f"{path} has no dataset 'data' or 'points'")
+            if data.size * data.dtype.itemsize > MAX_BYTES:
+                raise DataError(f"{path}: data {data.shape} is larger than {MAX_BYTES} bytes")
+            label = _own_dataset(file, ("label", "labels"), path)
+            array = np.asarray(data[...])
+            labels = None if label is None else np.asarray(label[...]).reshape(-1)
+    except (OSError, RuntimeError, ValueError, KeyError, MemoryError) as error:
+        raise DataError(f"{path}: not a readable HDF5 file ({error})") from error
+    return _of_array(path, array, labels)
+
+
+def _own_dataset(file: Any, names: tuple[str, ...], path: Path) -> Any:
+    """The first of the named datasets whose numbers are in this very file; None if there is none.
+
+    Raises:
+        DataError: it takes them from other files, as HDF5 can.
+    """
+    import h5py
+
+    name = next((name for name in names if name in file), None)
+    if name is None:
+        return None
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise DataError(f"{path}: {name!r} is a link; refused")
+    found = file[name]
+    if not isinstance(found, h5py.Dataset):
+        raise DataError(f"{path}: {name!r} is no dataset")
+    if found.external or found.is_virtual:
+        raise DataError(f"{path}: {name!r} takes its numbers from other files; refused")
+    return found
+
+
+def _of_array(path: Path, array: np.ndarray, labels: np.ndarray | None = None) -> CloudFile:
+    if array.dtype.kind not in "fiu":
+        raise DataError(f"{path}: the array holds {array.dtype}, not numbers")
+    if array.ndim not in (2, 3) or array.shape[-1] < 3:
+        raise DataError(f"{path}: the array has shape {array.shape}, expected [n, 3] or [m, n, 3]")
+    many = array.ndim == 3
+    clouds = array[..., :3] if many else array[None, :, :3]
+    if clouds.dtype.kind != "f":
+        clouds = clouds.astype(np.float64)
+    if labels is not None and labels.shape != (len(clouds),):
+        raise DataError(
+            f"{path}: {len(clouds)} clouds, but the labels have the shape {labels.shape}"
+        )
+    words = None if labels is None else tuple(labels.tolist())
+    return CloudFile(tuple(clouds), words, many=many)
+
+
+_READERS: dict[str, Callable[[Path], CloudFile]] = {
+    **{".xyz": _text, ".txt": _text, ".npy": _npy, ".npz": _npz, ".ply": _ply, ".pcd": _pcd},
+    **{".h5": _hdf5, ".hdf5": _hdf5},
+}
+SUFFIXES: tuple[str, ...] = tuple(_READERS)
+"""Of the formats that are read, in lower case."""
+
+_SPLIT_PREFIX = re.compile(r"(train|test|val|validation)(?![a-z])", re.IGNORECASE)
+
+
+def split_prefix(stem: str) -> str | None:
+    """The split that the name of a file with many clouds begins with (`train_0`), if any."""
+    match = _SPLIT_PREFIX.match(stem)
+    return match[1].lower() if match else None

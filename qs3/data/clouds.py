@@ -1,0 +1,82 @@
+"""Clouds as a net sees them, taken from where they lie on disk: unit ball, then farthest points.
+
+Nothing is copied until a batch asks for it: the stored clouds stay a memmap, and of the samples
+only the indices are kept. Processes that train on the same dataset share both in the page cache.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Clouds:
+    """n clouds of m points in the unit ball, each in `starts` different samples.
+
+    Attributes:
+        stored: [N, P, 3] float32, as published; e.g. a memmap.
+        order: [N, starts, m] indices into a stored cloud, each in the order of farthest point
+            sampling; None if m = P, where there is nothing to choose.
+        centre: [N, 3] float32, a cloud's centroid about its first point.
+        radius: [N] float32, largest distance from the centroid; 1 where it is 0.
+        rows: [n] which of the N clouds these are.
+    """
+
+    stored: Float[np.ndarray, "N P 3"]
+    order: Int[np.ndarray, "N s m"] | None
+    centre: Float[np.ndarray, "N 3"]
+    radius: Float[np.ndarray, " N"]
+    rows: Int[np.ndarray, " n"]
+
+    @staticmethod
+    def of(stored: Float[np.ndarray, "n p 3"], order: np.ndarray | None = None) -> Clouds:
+        """All of `stored`; its clouds are read once, for their balls (see `geometry.unit_ball`)."""
+        centre = np.empty((len(stored), 3), dtype=np.float32)
+        radius = np.empty(len(stored), dtype=np.float32)
+        for i, cloud in enumerate(np.asarray(stored)):
+            moved = cloud - cloud[:1]
+            centre[i] = moved.mean(axis=0)
+            radius[i] = np.linalg.norm(moved - centre[i], axis=1).max() or 1.0
+        return Clouds(stored, order, centre, radius, np.arange(len(stored)))
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.rows)
+
+    @property
+    def starts(self) -> int:
+        """Samples to choose from, numbered from 0; number 0 begins at point 0."""
+        return 1 if self.order is None else self.order.shape[1]
+
+    def at(self, index: Shaped[np.ndarray, " k"]) -> Clouds:
+        """A part of these clouds, by positions or by a mask; nothing is copied."""
+        return dataclasses.replace(self, rows=self.rows[index])
+
+    def take(
+        self, index: Int[Tensor, " b"], start: Int[Tensor, " b"] | None = None
+    ) -> Float[Tensor, "b m 3"]:
+        """A batch: the clouds at `index`, each in its sample `start` (None: all in number 0)."""
+        rows = self.rows[index.numpy()]  # [B]
+        first, centre = self.stored[rows, 0], self.centre[rows]  # [B, 3]
+        if self.order is None:
+            points = self.stored[rows]  # [B, P, 3], a copy
+        else:
+            chosen = self.order[rows, 0 if start is None else start.numpy()]  # [B, m]
+            points_each = self.stored.shape[1]
+            flat = self.stored.reshape(-1, 3)  # a view: one row of 12 bytes a point
+            points = flat.take(chosen + rows[:, None] * points_each, axis=0)  # [B, m, 3]
+        # In this order, which is `geometry.unit_ball`'s: the same bits as of the whole cloud.
+        points -= first[:, None]
+        points -= centre[:, None]
+        points /= self.radius[rows, None, None]
+        return torch.from_numpy(np.asarray(points))
+
+    def all(self) -> Float[Tensor, "n m 3"]:
+        """All clouds in memory, each in its sample number 0: what evaluation sees."""
+        return self.take(torch.arange(len(self)))

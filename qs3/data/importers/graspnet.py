@@ -1,0 +1,92 @@
+"""GraspNetPC-10 (Shen et al., CVPR 2022): ten objects of GraspNet-1Billion seen by two sensors.
+
+    {train,test}/{Real,Synthetic}/{kinect,realsense}/<0-9>/scene_XXXX_FFFF.xyz
+
+1024 rows of x y z, in the frame of the camera, already in the unit ball; there is no gravity axis.
+The classes are the objects 0, 2, 5, 8, 9, 15, 46, 48, 60, 66 of GraspNet, called 0 to 9. The test
+split is one scene an object, so its frames are highly correlated.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from qs3.data.importers.base import Importer, Item
+from qs3.data.importers.trees import _visible, read_xyz
+from qs3.data.manifest import ManifestRow
+from qs3.errors import ConfigError, DataError
+
+_REALITIES = ("Real", "Synthetic")
+_SENSORS = ("kinect", "realsense")
+
+
+@dataclass(frozen=True)
+class GraspNetPC(Importer):
+    """See the module.
+
+    Attributes:
+        reality: "Real" or "Synthetic".
+        sensors: whose clouds; the benchmark's synthetic domain takes both.
+    """
+
+    points: int = 1024
+    reality: str = "Real"
+    sensors: Sequence[str] = _SENSORS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "sensors", list(self.sensors))
+        if self.reality not in _REALITIES:
+            raise ConfigError(f"reality is {self.reality!r}, expected one of {_REALITIES}")
+        if not self.sensors or set(self.sensors) - set(_SENSORS):
+            raise ConfigError(f"sensors are {self.sensors}, expected some of {_SENSORS}")
+
+    def looks_for(self) -> list[str]:
+        """See `Importer`."""
+        sensors = ",".join(self.sensors)
+        return [f"{self.root}/{{train,test}}/{self.reality}/{{{sensors}}}/<0-9>/*.xyz"]
+
+    def is_there(self) -> bool:
+        """See `Importer`: whether the training part of a sensor is there."""
+        return any(self._folder("train", sensor).is_dir() for sensor in self.sensors)
+
+    def items(self, classes: Sequence[str]) -> list[Item]:
+        """See `Importer`. By split, class, sensor and name.
+
+        Raises:
+            DataError: a folder that is no class, or a link that leads out of the folder.
+        """
+        found = []
+        for split in ("train", "test"):
+            of_split = []
+            for sensor in self.sensors:
+                folder = self._folder(split, sensor)
+                if not folder.is_dir():
+                    continue  # the synthetic domain has no test split
+                for class_folder in (e for e in _visible(folder, self.root) if e.is_dir()):
+                    if class_folder.name not in classes:
+                        raise DataError(
+                            f"{class_folder}: unknown class; known are {', '.join(classes)}"
+                        )
+                    of_split += [
+                        self._item(path, class_folder.name, split, sensor)
+                        for path in _visible(class_folder, self.root)
+                        if path.suffix.lower() == ".xyz" and path.is_file()
+                    ]
+            found += sorted(of_split, key=lambda item: (classes.index(item.row.cls), item.row.id))
+        return found
+
+    def _folder(self, split: str, sensor: str) -> Path:
+        return self.root / split / self.reality / sensor
+
+    def _item(self, path: Path, cls: str, split: str, sensor: str) -> Item:
+        row = ManifestRow(
+            f"{cls}/{split}/{sensor}_{path.stem}",
+            cls,
+            split,
+            origin=path.relative_to(self.root).as_posix(),
+        )
+        return Item(row, str(path), functools.partial(read_xyz, path))

@@ -1,0 +1,209 @@
+"""Training cannot reach the target's labels: everything that hangs on it is searched for them."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.classifier import Classifier
+from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
+from qs3.data.validation import RULES
+from qs3.evaluation import Evaluation
+from qs3.run import train
+from tests.training.search import Truth, search
+from tests.training.toy import _SHAPES, CLASSES, write_domain
+
+TRAIN, TEST = 90, 45
+
+
+def write_shuffled_target(folder: Path, class_in_id: bool) -> None:
+    """Classes in a random order: nothing else in memory has it."""
+    rng = np.random.default_rng(7)
+    clouds, rows = [], []
+    for split, count in (("train", TRAIN), ("test", TEST)):
+        for i, label in enumerate(rng.integers(3, size=count)):
+            cls = CLASSES[label]
+            clouds.append(rng.normal(size=(64, 3)) * _SHAPES[cls] + 0.5 * rng.normal(size=(64, 3)))
+            name = f"{cls}/{split}/{i:03d}" if class_in_id else f"scan/{split}/{i:03d}"
+            rows.append(ManifestRow(id=name, cls=cls, split=split))
+    write_pointset(
+        folder / "kinectsim10",
+        name="kinectsim10",
+        classes=CLASSES,
+        arrays={"points": np.array(clouds, dtype=np.float32)},
+        rows=rows,
+        meta={},
+    )
+
+
+def truth_of(folder: Path) -> Truth:
+    """The target's labels of both splits, as stored, by id, and as validation divides them."""
+    target = open_pointset(folder / "kinectsim10")
+    wanted = {}
+    for split in ("train", "test"):
+        part = target.split(split)
+        by_id = np.argsort(np.array(part.ids), kind="stable")
+        wanted |= {f"{split} labels": part.labels, f"{split} labels by id": part.labels[by_id]}
+        for rule in RULES:
+            for side, rows in zip(("t", "v"), RULES[rule](part.ids, part.labels), strict=True):
+                wanted[f"{split} labels, {rule} {side}"] = part.labels[rows]
+    return Truth(wanted, kinds=(PointSet, Evaluation))
+
+
+class Watch:
+    """Searches from within `training_step`, once an epoch; and for what is planted there."""
+
+    def __init__(self) -> None:
+        self.found: set[str] = set()
+        self.planted: list[bool] = []
+        self.keys: set[str] = set()
+        self.truth: Truth | None = None
+        self.plant: Callable[[Any], None] | None = None
+
+    def look(self, classifier: Classifier, batch: dict[str, Any], batch_idx: int) -> None:
+        self.keys.update(key for part in batch.values() if isinstance(part, dict) for key in part)
+        if batch_idx:
+            return
+        assert self.truth is not None
+        trainer = classifier.trainer
+        roots = {
+            "trainer": trainer,
+            "classifier": classifier,
+            "datamodule": trainer.datamodule,
+            "callbacks": trainer.callbacks,
+            "loader": trainer.train_dataloader,
+            "batch": batch,
+            "modules": {name: vars(m) for name, m in sys.modules.items() if name.startswith("qs3")},
+        }
+        self.found.update(search(roots, self.truth))
+        if classifier.current_epoch == 0:
+            trainer.datamodule.target.__dict__["planted"] = self.truth.wanted["test labels"].copy()
+            self.planted.append(bool(search({"trainer": trainer}, self.truth)))
+            del trainer.datamodule.target.__dict__["planted"]
+
+
+@pytest.fixture
+def watch(monkeypatch):
+    """Searches while `train` runs."""
+    watching = Watch()
+    real = Classifier.training_step
+
+    def step(self, batch, batch_idx):
+        _LOOK[0](self, batch, batch_idx)
+        return real(self, batch, batch_idx)
+
+    _LOOK[0] = watching.look
+    monkeypatch.setattr(Classifier, "training_step", step)
+    yield watching
+    _LOOK[0] = None
+
+
+_LOOK: list[Any] = [None]  # a global, so that the search does not find what it searches for
+
+
+@pytest.mark.parametrize(
+    ("method", "selftraining"),
+    [("source_only", "none"), ("pcm", "none"), ("pcm", "qbst")],
+)
+@pytest.mark.parametrize("class_in_id", [False, True])
+def test_no_target_label_within_reach(toy, tmp_path, watch, method, selftraining, class_in_id):
+    write_domain(tmp_path / "data", "specklenet10", noise=0.05)
+    write_shuffled_target(tmp_path / "data", class_in_id)
+    watch.truth = truth_of(tmp_path / "data")
+    more = ["selftraining.use_source=true"] if selftraining == "qbst" else []
+    metrics = train(
+        toy(
+            f"paths.data_dir={tmp_path / 'data'}",
+            f"method={method}",
+            f"selftraining={selftraining}",
+            *more,
+        )
+    )
+    assert metrics["final"]["accuracy"] < 1  # else pseudo-labels would be the labels
+    assert watch.planted == [True]
+    # What a cloud is called may tell its class. No batch and no loss holds a name.
+    names = {path for path in watch.found if path.endswith("ids: train labels")}
+    assert watch.found == names
+    assert bool(names) == class_in_id
+    assert watch.keys == {"points", "y_source"} | ({"y_pseudo"} if more else set())
+
+
+def test_the_upper_bound_does_hold_them(toy, tmp_path, watch):
+    """The same search finds what `method=supervised` asks for: the training labels alone."""
+    write_domain(tmp_path / "data", "specklenet10", noise=0.05)
+    write_shuffled_target(tmp_path / "data", class_in_id=False)
+    watch.truth = truth_of(tmp_path / "data")
+    train(toy(f"paths.data_dir={tmp_path / 'data'}", "method=supervised", "selftraining=none"))
+    which = {path.split(": ")[-1] for path in watch.found}
+    assert which == {"train labels, lineage t", "train labels, lineage v"}
+    assert watch.keys == {"points", "y_target_train"}
+
+
+# --- the search finds labels in whatever they are hidden ---------------------------------------
+
+LABELS = np.random.default_rng(0).integers(3, size=50)
+
+
+def closure() -> Callable[[], np.ndarray]:
+    hidden = LABELS.copy()
+    return lambda: hidden
+
+
+def generator() -> Any:
+    hidden = LABELS.tolist()
+    yield 0
+    yield hidden
+
+
+def started() -> Any:
+    iterator = generator()
+    next(iterator)
+    return iterator
+
+
+class Slotted:
+    __slots__ = ("hidden",)
+
+    def __init__(self) -> None:
+        self.hidden = tuple(LABELS.tolist())
+
+
+HIDDEN = {
+    "array": lambda: LABELS.copy(),
+    "float tensor": lambda: torch.tensor(LABELS).float(),
+    "one-hot": lambda: torch.nn.functional.one_hot(torch.tensor(LABELS)),
+    "other names": lambda: [("c", "a", "b")[y] for y in LABELS],
+    "by id": lambda: {f"id{i}": int(y) for i, y in enumerate(LABELS)},
+    "as folders": lambda: tuple(f"{'abc'[y]}/train/{i}" for i, y in enumerate(LABELS)),
+    "view": lambda: torch.tensor(LABELS)[:4],
+    "array's view": lambda: LABELS.copy()[3:5],
+    "part of more": lambda: np.concatenate([np.zeros(9, int), LABELS, np.ones(3, int)]),
+    "closure": closure,
+    "partial": lambda: functools.partial(print, LABELS.copy()),
+    "generator": started,
+    "slot": Slotted,
+    "buffer": lambda: torch.utils.data.TensorDataset(torch.tensor(LABELS)),
+    "iterator": lambda: iter([LABELS.copy()]),
+    "method": lambda: SimpleNamespace(hidden=LABELS.copy()).__repr__,
+}
+
+
+@pytest.mark.parametrize("how", HIDDEN)
+def test_the_search_finds(how):
+    thing = SimpleNamespace(deep=[{"a": HIDDEN[how]()}])
+    assert search({"thing": thing}, Truth({"labels": LABELS}))
+
+
+def test_the_search_finds_nothing_where_there_is_nothing():
+    rng = np.random.default_rng(1)
+    others = [rng.integers(3, size=50), rng.random((50, 3)), list(range(50)), "a" * 50, None]
+    thing = SimpleNamespace(deep=[others, torch.zeros(50), lambda: others])
+    assert search({"thing": thing}, Truth({"labels": LABELS})) == []

@@ -1,0 +1,155 @@
+"""Targets that cannot judge: somebody's own scans without labels, or without a test split."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3 import runs
+from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
+from qs3.errors import ConfigError
+from qs3.report.aggregate import summarise
+from qs3.run import headline, train
+from tests.training.toy import CLASSES
+
+
+def without_labels(dataset: PointSet) -> PointSet:
+    return dataclasses.replace(dataset, labels=np.full(len(dataset), -1, dtype=np.int64))
+
+
+@pytest.fixture
+def unlabelled(monkeypatch):
+    """The toy target is opened without its labels."""
+    import qs3.data.domain
+
+    def opened(folder, *args, **kwargs):
+        dataset = open_pointset(folder, *args, **kwargs)
+        return without_labels(dataset) if Path(folder).name == "kinectsim10" else dataset
+
+    monkeypatch.setattr(qs3.data.domain, "open_pointset", opened)
+
+
+def only(toy_data: Path, folder: Path, keep) -> Path:
+    """The toy data with those target clouds of which `keep(row)` is true."""
+    folder.mkdir()
+    (folder / "specklenet10").symlink_to(toy_data / "specklenet10")
+    old = open_pointset(toy_data / "kinectsim10")
+    rows = [
+        ManifestRow(id=i, cls=CLASSES[y], split=s)
+        for i, y, s in zip(old.ids, old.labels, old.splits, strict=True)
+    ]
+    kept = [i for i, row in enumerate(rows) if keep(row)]
+    write_pointset(
+        folder / "kinectsim10",
+        name="kinectsim10",
+        classes=CLASSES,
+        arrays={"points": old.points[kept]},
+        rows=[rows[i] for i in kept],
+        meta={},
+    )
+    return folder
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("method=source_only", "selftraining=none"),
+        ("method=pcm", "selftraining=none"),
+        ("method=pcm", "evaluation.rotations=2"),
+    ],
+)
+def test_own_scans_without_labels(toy, unlabelled, finished, more):
+    cfg = toy(*more)
+    metrics = train(cfg)
+    final = metrics["final"]
+    assert final["accuracy"] is final["balanced_accuracy"] is final["majority_rate"] is None
+    assert final["per_class_recall"] is final["confusion"] is final["calibration_error"] is None
+    assert final["n"] == sum(final["predicted"].values()) == 24
+    assert set(final["predicted"]) == set(CLASSES)
+    assert metrics["evaluation"]["labels"] is False
+    assert metrics["evaluation"]["split"] == "test"
+    assert all(record["with_target_labels"] is None for record in metrics["rounds"])
+    if "selftraining=none" not in more:  # labels or not, training does the same
+        theirs = runs.read_metrics(finished)
+        assert final["predicted"] == theirs["final"]["predicted"]
+        assert metrics["evaluation"]["final_over_rotations"]["accuracy"] is None
+    assert "no labels to judge kinectsim10 (simulated) by; predicted " in headline(metrics)
+    assert train(cfg) == json.loads((runs.run_folder(cfg) / "metrics.json").read_text())
+
+
+def test_reports_of_such_runs(toy, unlabelled):
+    cfg = toy("selftraining=none")
+    train(cfg)
+    text = summarise([runs.run_folder(cfg)])
+    assert "no target labels, so no accuracy" in text
+    assert "simulated" in text
+
+
+def test_table_of_such_runs(tmp_path):
+    from tests.report.test_tables import build_table, markdown, run_cell
+
+    table = build_table("quickstart", tmp_path)
+    for cell in table.cells:
+        if cell is table.cells[0] or cell.overrides != table.cells[0].overrides:
+            nothing = {"accuracy": None, "balanced_accuracy": None, "majority_rate": None}
+            run_cell(
+                tmp_path, cell, final={**nothing, "n": 3},
+                selection={"teacher": "last", "student": "last", "validation": "stratified"},
+            )  # fmt: skip
+            break
+    text = markdown(build_table("quickstart", tmp_path))
+    assert "no target labels" in text
+    assert "validation split: stratified" in text
+
+
+def test_the_command_of_the_report(toy, unlabelled, tmp_path):
+    train(toy("selftraining=none"))
+    command = [sys.executable, "-m", "qs3.report", f"log_dir={tmp_path / 'logs'}"]
+    result = subprocess.run(
+        [*command, "table=quickstart", f"out={tmp_path / 'out'}"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+
+
+def test_the_upper_bound_needs_labels(toy, unlabelled):
+    with pytest.raises(ConfigError, match=r"method=supervised needs labels.*kinectsim10 have none"):
+        train(toy("method=supervised", "selftraining=none"))
+
+
+def test_the_source_needs_labels(toy, unlabelled):
+    with pytest.raises(ConfigError, match=r"data\.source needs labels.*kinectsim10 have none"):
+        train(toy("domain@data.source=kinectsim10", "selftraining=none"))
+
+
+@pytest.mark.parametrize("labelled", [True, False])
+def test_without_a_test_split_predictions_of_the_training_clouds_are_counted(
+    toy, toy_data, tmp_path, request, caplog, labelled
+):
+    data = only(toy_data, tmp_path / "cut", lambda row: row.split == "train")
+    if not labelled:
+        request.getfixturevalue("unlabelled")
+    metrics = train(toy(f"paths.data_dir={data}", "selftraining.rounds=1"))
+    assert metrics["evaluation"]["split"] == "train"
+    assert metrics["final"]["accuracy"] is None
+    assert metrics["final"]["n"] == 72
+    assert "no test split" in caplog.text
+    known = metrics["rounds"][0]["with_target_labels"]  # they judge pseudo-labels only
+    assert (known is not None) == labelled
+
+
+def test_labels_of_some_classes_only(toy, toy_data, tmp_path):
+    """As ScanObjectNN has seven of the ten: the others are left out of the balanced accuracy."""
+    data = only(toy_data, tmp_path / "cut", lambda row: row.cls != "rod")
+    metrics = train(toy(f"paths.data_dir={data}", "selftraining=none"))
+    final = metrics["final"]
+    recall = final["per_class_recall"]
+    assert recall["rod"] is None
+    assert final["balanced_accuracy"] == pytest.approx((recall["ball"] + recall["slab"]) / 2)
+    assert final["n"] == 16
