@@ -21,7 +21,7 @@ four for each layer. Here, with the same sums:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.models.edgeconv import max_over_rows
+from qs3.models.products import outer, times
 
 _AT_ONCE = 1 << 18  # values of a layer worked on at once: 1 MB in float32
 
@@ -82,7 +83,11 @@ class _Members:
 
     def __call__(self, part: slice) -> Tensor:
         """[g, k, c]."""
-        index, relative, weight = self.index[part], self.relative(part), self.weight.T
+        return self.first(part, self.relative(part))
+
+    def first(self, part: slice, relative: Tensor) -> Tensor:
+        """The same from x_j - c_i."""
+        index, weight = self.index[part], self.weight.T
         if self.p is not None:
             z = self.p.index_select(0, index.flatten()).addmm_(relative, weight)
         elif self.offset is not None:
@@ -162,38 +167,36 @@ class _GroupedMaximum(torch.autograd.Function):
         given = running or []
         training = running is None
         layers: list[_Layer] = []
-        kept: list[Tensor] = []  # z of the layers between
+        parts = _parts(groups, members * max(len(weight) for weight in weights))
+        z: list[Tensor] = []  # of the layers between, part by part
 
-        def norm(moments: _Moments | tuple[Tensor, Tensor]) -> None:
+        def norm(moments: _Moments) -> None:
             i = len(layers)
-            mean, var = moments.result() if isinstance(moments, _Moments) else moments
+            mean, var = moments.result() if training else given[i]
             layers.append(_Layer(gammas[i], betas[i], mean, var, eps))
 
-        if training:
-            moments = _Moments()
-            for part in _parts(groups, members * len(weights[0])):
-                moments.add(source(part))
-        norm(moments if training else given[0])
+        moments = _Moments()
+        for part in parts if training else []:
+            moments.add(source(part))
+        norm(moments)
         for weight in weights[1:-1]:
-            z = xyz.new_empty(groups, members, len(weight))
-            moments, make = _Moments(), _maker(source, layers, kept)
-            for part in _parts(groups, members * len(weight)):
-                out = z[part]
-                torch.matmul(make(part), weight.T, out=out)
+            moments, make = _Moments(), _maker(source, layers, z, parts)
+            after = []
+            for i in range(len(parts)):
+                after.append(times(make(i), weight))
                 if training:
-                    moments.add(out)
-            kept.append(z)
-            norm(moments if training else given[len(layers)])
+                    moments.add(after[i])
+            z += after
+            norm(moments)
 
-        weight, gamma = weights[-1], gammas[-1]
-        sign = torch.where(gamma < 0, -1.0, 1.0).to(xyz.dtype)
-        signed = (weight * sign[:, None]).T.contiguous()
+        weight, sign = weights[-1], torch.where(gammas[-1] < 0, -1.0, 1.0).to(xyz.dtype)
+        signed = weight * sign[:, None]
         best = xyz.new_empty(groups, len(weight))
         where = torch.empty(groups, len(weight), dtype=torch.int64, device=xyz.device)
-        covariance, make = _Covariance(), _maker(source, layers, kept)
-        for part in _parts(groups, members * max(weight.shape)):
-            y = make(part)
-            best[part], where[part] = max_over_rows(y @ signed)
+        covariance, make = _Covariance(), _maker(source, layers, z, parts)
+        for i, part in enumerate(parts):
+            y = make(i)
+            best[part], where[part] = max_over_rows(times(y, signed))
             if training:
                 covariance.add(y)
         best *= sign
@@ -201,13 +204,14 @@ class _GroupedMaximum(torch.autograd.Function):
             mean, cov = covariance.result()
             wide = weight.double()
             z_var = ((wide @ cov) * wide).sum(1).clamp_min(0).to(xyz.dtype)
-            norm(((wide @ mean).to(xyz.dtype), z_var))
+            z_mean = (wide @ mean).to(xyz.dtype)
             ctx.mean, ctx.cov = mean, cov
         else:
-            norm(given[-1])
+            z_mean, z_var = given[-1]
+        layers.append(_Layer(gammas[-1], betas[-1], z_mean, z_var, eps))
         out = F.relu(best * layers[-1].h + layers[-1].s)
-        ctx.save_for_backward(xyz, centres, p, index, best, where, *weights, *kept)
-        ctx.layers, ctx.training = layers, training
+        ctx.save_for_backward(xyz, centres, p, index, best, where, *weights, *z)
+        ctx.layers, ctx.training, ctx.parts = layers, training, parts
         statistics = [value for layer in layers for value in (layer.mean, layer.var)]
         ctx.mark_non_differentiable(*statistics)
         return (out, *statistics)
@@ -217,11 +221,11 @@ class _GroupedMaximum(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor, *without: Tensor) -> tuple[Tensor | None, ...]:
         layers: list[_Layer] = ctx.layers
         xyz, centres, p, index, best, where, *rest = ctx.saved_tensors
-        weights, kept = rest[: len(layers)], rest[len(layers) :]
-        source = _Members(xyz, centres, p, index, weights[0])
+        weights, z = rest[: len(layers)], rest[len(layers) :]
+        source, parts = _Members(xyz, centres, p, index, weights[0]), ctx.parts
         groups, members = index.shape
         rows = groups * members
-        grads: list[Tensor] = []  # of gamma, beta, weight, from the last layer to the first
+        grads: list[Tensor] = []  # of beta, gamma, weight, from the last layer to the first
 
         # the last layer: nothing has its width but one row a group
         last, weight = layers[-1], weights[-1]
@@ -232,53 +236,48 @@ class _GroupedMaximum(torch.autograd.Function):
         if ctx.training:
             a = -scale * dbeta / rows
             mean = ctx.mean.to(weight.dtype)
-            product = (weight * b[:, None]).T @ weight  # W' diag(b) W
+            product = weight.T @ (weight * b[:, None])  # W' diag(b) W, symmetric
             bias = a @ weight - mean @ product
             # the mean of z - mean(z) is zero, so that only the covariance is left of Y'Y
             dweight += b[:, None] * (weight @ (ctx.cov * rows).to(weight.dtype))
             dweight += torch.outer(a, mean * rows)
-        make = _maker(source, layers[:-1], kept)
-        dy = xyz.new_empty(groups, members, weight.shape[1])
-        first, second = xyz.new_zeros(2, weight.shape[1]).unbind()
-        for part in _parts(groups, members * weight.shape[1]):
-            y, out = make(part), dy[part]
-            if ctx.training:
-                torch.addmm(bias, y.flatten(0, 1), product, out=out.flatten(0, 1))
-            else:
-                out.zero_()
+        make, sums = _maker(source, layers[:-1], z, parts), _Sums()
+        dy: list[Tensor] = []
+        for i, part in enumerate(parts):
+            y = make(i)
+            out = times(y, product, bias) if ctx.training else torch.zeros_like(y)
             _at_maxima(out, dweight, y, weight, at_max[part], where[part])
-            _through_relu(out, y)
-            first += out.sum((0, 1))
-            second += _dot(out, kept[-1][part] if kept else source(part))
+            out.mul_(y > 0)
+            sums.add(out, z[len(z) - len(parts) + i] if z else source(part))
+            dy.append(out)
         grads += [dbeta, dgamma, dweight]
 
-        for i in reversed(range(len(kept))):  # the layers between
-            dgamma, dbeta, *parts = layers[i + 1].gradient(first, second, rows)
-            weight, z = weights[i + 1], kept[i]
-            make = _maker(source, layers[: i + 1], kept[:i])
-            before = xyz.new_empty(groups, members, weight.shape[1])
+        while z:  # the layers between
+            here, z = z[-len(parts) :], z[: -len(parts)]
+            level = len(z) // len(parts) + 1
+            dgamma, dbeta, *affine = layers[level].gradient(*sums.result(), rows)
+            weight, transposed = weights[level], weights[level].T.contiguous()
+            make, sums = _maker(source, layers[:level], z, parts), _Sums()
             dweight = torch.zeros_like(weight)
-            first, second = xyz.new_zeros(2, weight.shape[1]).unbind()
-            for part in _parts(groups, members * max(weight.shape)):
-                dz = _dz(dy[part], z[part], parts, ctx.training).flatten(0, 1)
-                y, out = make(part), before[part]
-                dweight.addmm_(dz.T, y.flatten(0, 1))
-                torch.mm(dz, weight, out=out.flatten(0, 1))
-                _through_relu(out, y)
-                first += out.sum((0, 1))
-                second += _dot(out, kept[i - 1][part] if i else source(part))
+            for i, part in enumerate(parts):
+                dz = _dz(dy[i], here[i], affine, ctx.training)
+                y = make(i)
+                dweight += outer(dz.flatten(0, 1), y.flatten(0, 1))
+                out = times(dz, transposed).mul_(y > 0)
+                sums.add(out, z[len(z) - len(parts) + i] if z else source(part))
+                dy[i] = out
             grads += [dbeta, dgamma, dweight]
-            dy = before
 
-        dgamma, dbeta, *parts = layers[0].gradient(first, second, rows)
+        dgamma, dbeta, *affine = layers[0].gradient(*sums.result(), rows)
         needs_xyz, needs_centres, needs_p = ctx.needs_input_grad[:3]
         dxyz = torch.zeros_like(xyz) if needs_xyz else None
         dcentres = torch.zeros_like(centres) if needs_centres else None
         dp = torch.zeros_like(p) if p is not None and needs_p else None
         dweight = torch.zeros_like(weights[0])
-        for part in _parts(groups, members * len(dweight)):
-            dz = _dz(dy[part], source(part), parts, ctx.training).flatten(0, 1)
-            dweight.addmm_(dz.T, source.relative(part))
+        for i, part in enumerate(parts):
+            relative = source.relative(part)
+            dz = _dz(dy[i], source.first(part, relative), affine, ctx.training).flatten(0, 1)
+            dweight += outer(dz, relative)
             if dxyz is not None or dcentres is not None:
                 drelative = dz @ weights[0]  # [g * k, 3]
                 if dxyz is not None:
@@ -289,6 +288,25 @@ class _GroupedMaximum(torch.autograd.Function):
                 dp.index_add_(0, index[part].flatten(), dz)
         grads += [dbeta, dgamma, dweight]
         return dxyz, dcentres, dp, None, None, None, *grads[::-1]
+
+
+class _Sums:
+    """Sums of dy and of dy z over all rows, by channel."""
+
+    def __init__(self) -> None:
+        self.first: Tensor | float = 0.0
+        self.second: Tensor | float = 0.0
+
+    def add(self, dy: Tensor, z: Tensor) -> None:
+        """Some more rows: [..., C]."""
+        self.first = self.first + dy.sum((0, 1))
+        self.second = self.second + (dy * z).sum((0, 1))
+
+    def result(self) -> tuple[Tensor, Tensor]:
+        """[C] each."""
+        assert isinstance(self.first, Tensor)
+        assert isinstance(self.second, Tensor)
+        return self.first, self.second
 
 
 class _Covariance:
@@ -318,36 +336,27 @@ class _Covariance:
         return mean + self.shift, self.second / self.rows - torch.outer(mean, mean)
 
 
-def _parts(groups: int, values: int) -> Iterator[slice]:
+def _parts(groups: int, values: int) -> list[slice]:
     """Groups in parts of about `_AT_ONCE` values, `values` a group."""
     step = max(1, _AT_ONCE // values)
-    return (slice(i, min(i + step, groups)) for i in range(0, groups, step))
+    return [slice(i, min(i + step, groups)) for i in range(0, groups, step)]
 
 
 def _maker(
-    source: _Members, layers: Sequence[_Layer], kept: Sequence[Tensor]
-) -> Callable[[slice], Tensor]:
-    """A function from a slice of groups to y of the last of `layers`: [g, k, c]."""
+    source: _Members, layers: Sequence[_Layer], z: Sequence[Tensor], parts: Sequence[slice]
+) -> Callable[[int], Tensor]:
+    """A function from the number of a part to y of the last of `layers` there: [g, k, c]."""
     layer = layers[-1]
-    if kept:
-        z = kept[-1]
-        return lambda part: torch.addcmul(layer.s, z[part], layer.h).relu_()
+    if z:
+        last = z[-len(parts) :]
+        return lambda i: torch.addcmul(layer.s, last[i], layer.h).relu_()
     scaled = source.scaled(layer)
-    return lambda part: scaled(part).relu_()
+    return lambda i: scaled(parts[i]).relu_()
 
 
-def _through_relu(dy: Tensor, y: Tensor) -> None:
-    dy.mul_(y > 0)
-
-
-def _dot(x: Tensor, z: Tensor) -> Tensor:
-    """The sum of x z over all rows, by channel."""
-    return (x * z).sum((0, 1))
-
-
-def _dz(dy: Tensor, z: Tensor, parts: Sequence[Tensor], training: bool) -> Tensor:
+def _dz(dy: Tensor, z: Tensor, affine: Sequence[Tensor], training: bool) -> Tensor:
     """The gradient of z, in the place of dy."""
-    scale, slope, bias = parts
+    scale, slope, bias = affine
     dy.mul_(scale)
     return dy.addcmul_(z, slope).add_(bias) if training else dy
 

@@ -1,0 +1,114 @@
+"""The two commands: measure, say, save."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.data.inspection.facts import COMPARE_STEPS, Bounds, compare, inspect
+from qs3.data.inspection.opening import Opened, open_named, parse
+from qs3.data.inspection.words import of_domain, of_pair
+from qs3.errors import ConfigError
+from qs3.files import make_folder, write_json, write_text
+
+OUT = Path("out/inspection")
+_OWN = {"domain": str, "out": str, "sample": int, "seed": int, "meshes": str}
+_SHOWN = 6  # clouds a class
+
+
+def inspect_command(argv: Sequence[str]) -> str:
+    """Inspect one domain and save what was found.
+
+    Returns:
+        The text for the terminal.
+
+    Raises:
+        ConfigError: no domain, several, or a value that does not do.
+    """
+    names, values, (overrides,) = parse(argv, _OWN)
+    names = [*names, *([str(values["domain"])] if "domain" in values else [])]
+    if len(names) != 1:
+        raise ConfigError(f"which domain? domain=NAME or domain=FOLDER, one of them; got {names}")
+    opened = open_named(names[0], overrides)
+    bounds = _bounds(values)
+    steps = min(bounds.sample, len(opened.data))
+    with _bar(f"inspecting {opened.name}", steps) as advance:
+        facts = inspect(opened, bounds, advance)
+    out = make_folder(str(values.get("out", OUT / _file_name(opened))))
+    write_json(out / "inspection.json", facts)
+    text = of_domain(facts)
+    write_text(out / "inspection.txt", text + "\n")
+    _sheet(opened, out / "clouds.png", bounds.seed)
+    return f"{text}\n\nsaved inspection.json, inspection.txt and clouds.png in {out}"
+
+
+def compare_command(argv: Sequence[str]) -> str:
+    """Compare two domains and save what was found; text for the terminal."""
+    names, values, overrides = parse(argv, _OWN, sides=("a", "b"))
+    if len(names) != 2 or "domain" in values:
+        raise ConfigError(f"compare takes two domains, names or folders: compare A B; got {names}")
+    a, b = (open_named(name, of) for name, of in zip(names, overrides, strict=True))
+    bounds = _bounds(values)
+    with _bar(f"comparing {a.name} and {b.name}", COMPARE_STEPS) as advance:
+        facts = compare(a, b, bounds, advance)
+    default = OUT / f"{_file_name(a)}-{_file_name(b)}"
+    out = make_folder(str(values.get("out", default)))
+    write_json(out / "comparison.json", facts)
+    write_text(out / "comparison.md", of_pair(facts))
+    _side_by_side(a, b, out / "clouds.png", bounds.seed)
+    text = of_pair(facts, markdown=False)
+    return f"{text}\nsaved comparison.json, comparison.md and clouds.png in {out}"
+
+
+def _bounds(values: dict[str, Any]) -> Bounds:
+    meshes = values.get("meshes")
+    return Bounds(
+        sample=values.get("sample", Bounds.sample),
+        seed=values.get("seed", Bounds.seed),
+        meshes=Path(meshes).expanduser() if meshes else None,
+    )
+
+
+def _file_name(opened: Opened) -> str:
+    return opened.name if opened.variant == "points" else f"{opened.name}_{opened.variant}"
+
+
+@contextmanager
+def _bar(label: str, total: int) -> Any:
+    from qs3.synthesis.progress import progress_bar
+
+    with progress_bar(label, total=total) as advance:
+        yield advance
+
+
+def _drawn(opened: Opened, cls: str, count: int, seed: int) -> list[np.ndarray]:
+    data = opened.data
+    if cls not in data.classes and cls != "unlabelled":
+        return []
+    label = data.classes.index(cls) if cls in data.classes else -1
+    members = (
+        np.flatnonzero(data.labels == label) if label >= 0 else np.flatnonzero(data.labels < 0)
+    )
+    chosen = np.random.default_rng([seed, 3, label + 1]).permutation(members)[:count]
+    return [np.asarray(data.points[i]) for i in np.sort(chosen)]
+
+
+def _sheet(opened: Opened, path: Path, seed: int) -> None:
+    from qs3.data.inspection.sheets import sheet
+
+    names = [*opened.data.classes, *(["unlabelled"] if (opened.data.labels < 0).any() else [])]
+    rows = {cls: [_drawn(opened, cls, _SHOWN, seed)] for cls in names}
+    sheet(path, {cls: of for cls, of in rows.items() if of[0]}, [""], opened.label)
+
+
+def _side_by_side(a: Opened, b: Opened, path: Path, seed: int) -> None:
+    from qs3.data.inspection.sheets import sheet
+
+    names = dict.fromkeys([*a.data.classes, *b.data.classes])
+    rows = {cls: [_drawn(o, cls, _SHOWN // 2, seed) for o in (a, b)] for cls in names}
+    kept = {cls: of for cls, of in rows.items() if any(of)}
+    sheet(path, kept, [a.label, b.label], "one view, each cloud scaled to its panel")

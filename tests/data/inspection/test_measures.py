@@ -1,0 +1,275 @@
+"""Measures against known answers and brute force."""
+
+import json
+
+import numpy as np
+import pytest
+
+from qs3.data import inspect as command
+from qs3.data.inspection import gap, measures
+from qs3.data.inspection.facts import WITHIN, Bounds, compare
+from qs3.data.inspection.opening import open_named
+from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
+from qs3.data.store import ManifestRow, open_pointset, write_pointset
+from qs3.errors import ConfigError
+from qs3.meshes.catalogue import Catalogue
+from qs3.meshes.mesh import Mesh
+from qs3.synthesis.placing import UnitCube
+from qs3.synthesis.randomness import object_rng
+from qs3.synthesis.recipes import SurfaceSamples
+from tests.fixtures import published as fixtures
+
+
+def grid(side=8):
+    """A flat square of side x side points, 1 apart."""
+    x, y = np.meshgrid(np.arange(side), np.arange(side))
+    return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1).astype(np.float32)
+
+
+def test_an_even_grid_has_one_spacing():
+    of = measures.one_cloud(grid())
+    radius = np.hypot(3.5, 3.5)
+    assert of["nn_median"] == pytest.approx(1 / radius)
+    assert of["nn_low"] == pytest.approx(of["nn_high"])
+    assert of["nn_variation"] == pytest.approx(0, abs=1e-5)
+    assert of["copies"] == of["lonely"] == 0
+    assert of["radius"] == pytest.approx(radius)
+
+
+def test_copies_and_lonely_points():
+    cloud = np.concatenate([grid(), grid()[:16], [[100, 0, 0]]])
+    of = measures.one_cloud(cloud.astype(np.float32))
+    assert of["copies"] == pytest.approx(16 / 81)
+    assert of["lonely"] == pytest.approx(1 / 65)
+    few = measures.one_cloud(np.zeros((10, 3), dtype=np.float32))
+    assert few["copies"] == pytest.approx(0.9)
+
+
+def test_directions_of_a_sphere_and_of_its_upper_half():
+    x = np.random.default_rng(0).normal(size=(20000, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    whole = measures._directions(x)
+    assert whole["directions"] == whole["below"] == 1
+    upper = measures._directions(x[x[:, 2] > 0])
+    assert upper["directions"] == pytest.approx(0.5)
+    assert upper["below"] == 0
+    assert measures._directions(x[x[:, 1] > 0])["azimuth_gap_deg"] == pytest.approx(180, abs=1)
+
+
+def store(folder, clouds, ids, splits, classes=("a", "b"), **meta):
+    rows = [ManifestRow(i, i.split("/")[0], s) for i, s in zip(ids, splits, strict=True)]
+    return write_pointset(
+        folder, name="s", classes=classes, arrays={"points": clouds}, rows=rows, meta=meta
+    )
+
+
+def test_a_cloud_in_train_and_test_is_a_leak(tmp_path):
+    rng = np.random.default_rng(0)
+    clouds = rng.normal(size=(5, 32, 3)).astype(np.float32)
+    clouds[3] = clouds[0][rng.permutation(32)]  # in another order
+    clouds[2] = clouds[1]  # both in train, of two classes
+    ids = ["a/0", "a/1", "b/2", "a/3", "b/4"]
+    data = store(tmp_path / "s", clouds, ids, ["train"] * 3 + ["test"] * 2)
+    rows = [
+        ManifestRow("x", "a", "train", mesh_sha256="1"),
+        ManifestRow("y", "a", "test", mesh_sha256="1"),
+        ManifestRow("z", "a", "test", mesh_sha256="2"),
+    ]
+    found = measures.copies(data, rows)
+    assert (found["clouds"], found["leaks"], found["contradicting_labels"]) == (2, 1, 1)
+    assert (found["meshes"], found["leaking_meshes"]) == (2, 1)
+
+
+def test_distance_to_a_mesh_is_that_of_brute_force():
+    mesh = Catalogue(train=1, test=0, classes=("chair",)).items()[0].load()
+    rng = np.random.default_rng(0)
+    points = rng.uniform(mesh.bounds[0] - 0.2, mesh.bounds[1] + 0.2, (60, 3))
+    found = distance_to_mesh(points, mesh, rng)
+    exact = np.array([brute_force(p, mesh) for p in points])
+    # the grid of the twin is as fine as 1e-5 of a triangle, and never below the truth
+    np.testing.assert_allclose(found, exact, atol=1e-4)
+    assert (found <= exact + 1e-9).all()
+
+
+def brute_force(point, mesh):
+    """Least distance to a fine barycentric grid on every triangle, each then polished."""
+    corners = mesh.vertices[mesh.faces]
+    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    s, t = np.meshgrid(np.linspace(0, 1, 41), np.linspace(0, 1, 41))
+    keep = s + t <= 1 + 1e-9
+    low, at = np.inf, (0, 0.0, 0.0)
+    for i in range(len(corners)):
+        q = a[i] + s[keep][:, None] * u[i] + t[keep][:, None] * v[i]
+        d = np.linalg.norm(q - point, axis=1)
+        if d.min() < low:
+            k = int(d.argmin())
+            low, at = d.min(), (i, s[keep][k], t[keep][k])
+    i, s0, t0 = at
+    for _ in range(6):  # finer and finer about the best
+        step = 1 / 40 / 4**_
+        ds, dt = np.meshgrid(np.linspace(-step, step, 17), np.linspace(-step, step, 17))
+        p, r = np.clip(s0 + ds.ravel(), 0, 1), np.clip(t0 + dt.ravel(), 0, 1)
+        inside = p + r <= 1 + 1e-12
+        q = a[i] + p[inside, None] * u[i] + r[inside, None] * v[i]
+        d = np.linalg.norm(q - point, axis=1)
+        k = int(d.argmin())
+        low, s0, t0 = min(low, d[k]), p[inside][k], r[inside][k]
+    return low
+
+
+def test_distance_to_one_triangle():
+    mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
+    points = np.array([[0.2, 0.2, 0.5], [2, 0, 0], [-3, -4, 0], [1, 1, 0]])
+    found = distance_to_mesh(points, mesh, np.random.default_rng(0))
+    assert found == pytest.approx([0.5, 1, 5, np.sqrt(0.5)])
+
+
+CATALOGUE = {"_target_": "qs3.meshes.catalogue.Catalogue", "seed": 3, "train": 2, "test": 0}
+
+
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory):
+    """Surface samples of the catalogue with noise of known size, and what describes them."""
+    items = Catalogue(seed=3, train=2, test=0).items()
+    meshes = [item.load() for item in items]
+    recipe = SurfaceSamples(points=256)
+    clouds = [
+        recipe.make(mesh, item.id, 5, None).arrays["points"]
+        for mesh, item in zip(meshes, items, strict=True)
+    ]
+    folder = tmp_path_factory.mktemp("generated")
+    placing = {"_target_": "qs3.synthesis.placing.UnitCube"}
+    write_pointset(
+        folder,
+        name="generated",
+        classes=fixtures.CLASSES,
+        arrays={"points": clouds},
+        rows=[
+            ManifestRow(item.id, item.cls, item.split, mesh_sha256=mesh.sha256)
+            for item, mesh in zip(items, meshes, strict=True)
+        ],
+        meta={"settings": {"seed": 5, "recipe": {"placing": placing}, "meshes": CATALOGUE}},
+    )
+    return folder
+
+
+def test_samples_of_a_surface_lie_on_it(generated):
+    opened = open_named(str(generated), {})
+    surfaces, reason = surfaces_of(dict(opened.data.meta))
+    assert surfaces is not None
+    assert not reason
+    for row, cloud in zip(opened.kept[::4], opened.data.points[::4], strict=True):
+        mesh = surfaces.mesh(row)
+        assert mesh is not None
+        assert distance_to_mesh(cloud, mesh, np.random.default_rng(0)).max() < 1e-4
+        wrong = UnitCube().place(mesh, object_rng(6, row.id, 0))  # another yaw
+        assert distance_to_mesh(cloud, wrong, np.random.default_rng(0)).mean() > 1e-3
+
+
+def test_only_known_targets_are_made_from_a_store():
+    evil = {"seed": 0, "recipe": {"placing": {"_target_": "os.system", "command": "false"}}}
+    assert surfaces_of({"settings": {**evil, "meshes": CATALOGUE}})[0] is None
+    assert surfaces_of({})[0] is None
+
+
+def test_the_best_yaw_undoes_a_turn():
+    cloud = gap.sampled(fixtures.cloud("chair", "x", 1024), 512)
+    for yaw in (0, 90, 210):
+        turned = gap.turned(cloud, np.deg2rad(yaw))
+        assert np.rad2deg(gap.best_yaw_rad(cloud, turned)) == pytest.approx(yaw)
+        there, back = gap.chamfer(gap.turned(cloud, np.deg2rad(yaw)), turned)
+        assert there.max() < 1e-6
+        assert back.max() < 1e-6
+
+
+def test_chamfer_is_that_of_all_distances():
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(40, 3)), rng.normal(size=(50, 3))
+    all_of_them = np.linalg.norm(a[:, None] - b, axis=2)
+    there, back = gap.chamfer(a, b)
+    np.testing.assert_allclose(there, all_of_them.min(1))
+    np.testing.assert_allclose(back, all_of_them.min(0))
+
+
+def test_two_samples_of_one_distribution_and_of_two():
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(size=(2, 200, 6))
+    same, other = gap.two_samples(a, b, 0), gap.two_samples(a, b + 2, 0)
+    assert 0.35 < same["nearest_neighbour"] < 0.65
+    assert same["mmd"] < 2 * same["mmd_chance"]
+    assert other["nearest_neighbour"] > 0.95
+    assert other["mmd"] > 10 * other["mmd_chance"]
+
+
+def test_priors_of_sets_with_other_classes(tmp_path):
+    clouds = np.random.default_rng(0).normal(size=(4, 8, 3))
+    ids = ["a/0", "a/1", "b/2", "b/3"]
+    a = store(tmp_path / "a", clouds, ids, ["train"] * 4)
+    b = store(tmp_path / "b", clouds, [i.replace("b", "c") for i in ids], ["train"] * 4, ("a", "c"))
+    found = gap.priors(a, b)
+    assert found["by_class"] == {"a": [0.5, 0.5], "b": [0.5, 0], "c": [0, 0.5]}
+    assert found["total_variation"] == pytest.approx(0.5)
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    for name in ("modelnet10_arrays", "kinectsim10"):
+        fixtures.write_domain(name, folder)
+    return folder
+
+
+def test_inspect_says_and_saves(data_dir, tmp_path, capsys):
+    words = ["domain=modelnet10_arrays", f"paths.data_dir={data_dir}", f"out={tmp_path}"]
+    assert command.main(words) == 0
+    said = capsys.readouterr().out
+    assert "60 clouds of 1024 points" in said
+    facts = json.loads((tmp_path / "inspection.json").read_text())
+    assert facts["counts"]["splits"]["train"]["by_class"]["chair"] == 4
+    assert set(facts["gravity"]["by_class"]) == set(fixtures.CLASSES)
+    assert (tmp_path / "clouds.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_compare_says_and_saves(data_dir, tmp_path, capsys):
+    words = ["compare", "modelnet10_arrays", f"{data_dir}/kinectsim10"]
+    words += [f"a.paths.data_dir={data_dir}", "b.variant=points_clean", f"out={tmp_path}"]
+    assert command.main(words) == 0
+    assert "Chamfer" in capsys.readouterr().out
+    facts = json.loads((tmp_path / "comparison.json").read_text())
+    assert facts["prior"]["total_variation"] == 0
+    assert facts["chamfer"]["chair"]["within_a"] > 0
+    assert (tmp_path / "comparison.md").read_text().startswith("# A = ModelNet10")
+
+
+def test_one_domain_against_itself_has_no_gap(data_dir):
+    opened = open_named(f"{data_dir}/kinectsim10", {})
+    facts = compare(opened, opened, Bounds())
+    assert facts["surface_a"]["truth"] == "clean twin"
+    assert facts["prior"]["total_variation"] == 0
+    assert facts["distributions"]["all"]["mmd"] <= facts["distributions"]["all"]["mmd_chance"]
+    assert facts["chamfer"]["table"]["b_found_in_a"] == 1  # each cloud finds itself
+    assert facts["cloud_a"] == facts["cloud_b"]
+    assert facts["within"] == WITHIN
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["domain=nothing10"], "unknown; there are"),
+        (["domain=modelnet10", "variantt=points"], "variantt"),
+        (["domain=modelnet10", "paths.data_dir=/nowhere"], "is not there"),
+        (["domain=modelnet10", "sample=many"], "whole number"),
+        (["out=x"], "which domain"),
+        (["compare", "modelnet10"], "two domains"),
+        (["domain=/nowhere/at/all"], "no dataset folder"),
+    ],
+)
+def test_mistakes_are_told(words, message, capsys):
+    assert command.main(words) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_unknown_keys_of_a_folder(data_dir):
+    with pytest.raises(ConfigError, match="takes variant= only"):
+        open_named(f"{data_dir}/kinectsim10", {"path": "x"})
+    assert open_pointset(data_dir / "kinectsim10").name == "kinectsim10"
