@@ -1,19 +1,19 @@
 """Look at a dataset before training on it, or at two and the gap between them.
 
-python -m qs3.data.inspect domain=NAME [key=value ...] [out=out/inspection/NAME]
-python -m qs3.data.inspect compare A B [key=value ...] [out=out/inspection/A-B]
+    python -m qs3.data.inspect domain=NAME [key=value ...] [out=out/inspection/NAME]
+    python -m qs3.data.inspect compare A B [key=value ...] [out=out/inspection/A-B]
 
-domain=   a domain (conf/domain), or the folder of a dataset. Counts by class and split, sizes,
-which way is up by the shape, spacing, density, coverage, copies, leaks from train to
-test, odd objects; a contact sheet. Published files are imported first
-compare   class frequencies, spacing, density, coverage, distance to the true surface and how
-much of it was measured (of generated datasets), Chamfer distances by class, distance
-of the distributions; both contact sheets beside each other
-key=value  of the domain's config: variant=points_clean, path=..., published.folder=...; and
-paths.data_dir=data. In a comparison for both, or for one: a.variant=points_clean
-sample=3000  clouds that are measured one by one; larger sets are drawn from
-seed=0    of all draws
-meshes=   folder of the meshes that a dataset was generated from, if not from the catalogue
+  domain=      a domain (conf/domain), or the folder of a dataset. Counts by class and split, sizes,
+               which way is up by the shape, spacing, density, coverage, copies, leaks from train to
+               test, odd objects; a contact sheet. Published files are imported first
+  compare      class frequencies, spacing, density, coverage, distance to the true surface and how
+               much of it was measured (of generated datasets), Chamfer distances by class, distance
+               of the distributions; both contact sheets beside each other
+  key=value    of the domain's config: variant=points_clean, path=..., published.folder=...; and
+               paths.data_dir=data. In a comparison for both, or for one: a.variant=points_clean
+  sample=3000  clouds that are measured one by one; larger sets are drawn from
+  seed=0       of all draws
+  meshes=      folder of the meshes that a dataset was generated from, if not from the catalogue
 """
 
 from __future__ import annotations
