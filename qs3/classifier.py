@@ -53,6 +53,9 @@ class Classifier(LightningModule):
         self.phases, self.seed = phases, seed
         self.net = self.fresh_net(phase=0)
         self.method, self.student = method, student
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive(seed, "heads"))
+            method.prepare(self.net)
         self._hits: list[Tensor] = []
 
     def fresh_net(self, phase: int) -> nn.Module:
@@ -68,11 +71,23 @@ class Classifier(LightningModule):
     def configure_optimizers(self) -> Any:
         """One optimiser, one schedule: a cosine in each phase."""
         try:
-            optimizer = self.build_optimizer(self.parameters())
+            optimizer = self._optimizer()
         except (TypeError, ValueError) as error:  # e.g. a negative learning rate
             raise ConfigError(f"protocol.optimizer: {error}") from error
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, self.phases.cosine)
         return {"optimizer": optimizer, "lr_scheduler": schedule}
+
+    def _optimizer(self) -> torch.optim.Optimizer:
+        own = self.method.learning_rates(self.net)
+        if not own:
+            return self.build_optimizer(self.parameters())
+        groups = [list(module.parameters()) for module, _ in own]
+        taken = {id(p) for group in groups for p in group}
+        rest = [p for p in self.parameters() if id(p) not in taken]
+        optimizer = self.build_optimizer([{"params": group} for group in (rest, *groups)])
+        for group, (_, factor) in zip(optimizer.param_groups[1:], own, strict=True):
+            group["lr"] *= factor
+        return optimizer
 
     def start_phase(self, weights: Mapping[str, Tensor] | None) -> None:
         """Forget the optimiser's moments; go on with `weights`, or with the net's if None."""
@@ -88,13 +103,21 @@ class Classifier(LightningModule):
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """The loss of the current phase."""
-        method = self.method if self.phases.phase(self.current_epoch) == 0 else self.student
+        warmup = self.phases.phase(self.current_epoch) == 0
+        method = self.method if warmup else self.student
         generator = generator_of(batch, "method", self.seed, self.global_rank, self.device)
-        terms = method.loss(self.net, batch, generator)
+        terms = method.loss(self.net, {**batch, "progress": self._progress(batch_idx)}, generator)
         total = torch.stack(list(terms.values())).sum()
+        if not warmup and self.trainer.world_size > 1:  # DDP waits for the gradient of all
+            total = total + sum(0.0 * p.sum() for p in self.method.parameters())
         size = max(len(part["points"]) for part in batch.values() if isinstance(part, dict))
         self.log("train/loss", total, batch_size=size, **_PER_EPOCH)
         return total
+
+    def _progress(self, batch_idx: int) -> float:
+        """Part of the warm-up that is done after this step, in (0, 1]; 1 in the rounds."""
+        done = self.current_epoch + (batch_idx + 1) / int(self.trainer.num_training_batches)
+        return min(done / self.phases.warmup, 1.0)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Count the hits on held-out labelled clouds."""

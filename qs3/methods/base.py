@@ -1,17 +1,22 @@
 """What a method is: a loss on a batch, and perhaps heads of its own.
 
-A batch is `{"source": {"points": [B, N, 3], "y_source": [B]}, "target": {"points": ...}}`, with
-only the domains that the method asks for. Labels carry their owner's name, so reading a label
-that one must not see is a KeyError.
+A batch is `{"source": {"points": [B, N, 3], "y_source": [B]}, "target": {"points": ...},
+"progress": p}`, with only the domains that the method asks for. Labels carry their owner's name,
+so reading a label that one must not see is a KeyError. `p` in (0, 1] is the part of the warm-up
+that is done after this step: 1 in its last one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from qs3.errors import ConfigError
+from qs3.settings import number
 
 
 class Method(nn.Module):
@@ -25,6 +30,19 @@ class Method(nn.Module):
     labels: ClassVar[str] = "source"
     uses_target: ClassVar[bool] = False
 
+    def prepare(self, net: nn.Module) -> None:
+        """Make the heads that this method puts on `net`. Called once, before `loss`.
+
+        Their weights come from torch's global generator, which the caller has seeded.
+
+        Raises:
+            ConfigError: the model does not offer what the method needs.
+        """
+
+    def learning_rates(self, net: nn.Module) -> Sequence[tuple[nn.Module, float]]:
+        """Modules that learn at another rate than `protocol.optimizer.lr`, and its factors."""
+        return ()
+
     def loss(
         self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
     ) -> dict[str, Float[Tensor, ""]]:
@@ -36,3 +54,37 @@ class Method(nn.Module):
             generator: all randomness of this step comes from it; on the same device.
         """
         raise NotImplementedError
+
+
+def weight(key: str, value: float) -> float:
+    """A loss's weight from `method.<key>`: any finite number >= 0; 0 switches the loss off."""
+    if number(f"method.{key}", value) < 0:
+        raise ConfigError(f"method.{key} must be >= 0, got {value}; 0 switches its loss off")
+    return float(value)
+
+
+@torch.no_grad()
+def feature_dims(net: Any) -> tuple[int, int | None]:
+    """Widths of a net's features: of a cloud, and of a point (None: it has none per point).
+
+    Asked of the net itself, with two clouds in eval mode: nothing in it changes.
+
+    Raises:
+        ConfigError: the model is no backbone with a head.
+    """
+    if not hasattr(net, "features"):
+        raise ConfigError(
+            f"this method puts heads on a model's features, but {type(net).__name__} has none; "
+            "choose e.g. model=dgcnn or model=pointnet"
+        )
+    parameter = next(net.parameters())
+    points = torch.linspace(-1, 1, 2 * 64 * 3, device=parameter.device, dtype=parameter.dtype)
+    points = torch.sin(7919 * points).view(2, 64, 3)  # spread out, without drawing at random
+    training = net.training
+    net.eval()
+    try:
+        features = net.features(points)
+    finally:
+        net.train(training)
+    per_point = features.per_point
+    return features.global_.shape[1], None if per_point is None else per_point.shape[2]

@@ -6,17 +6,21 @@ Achituve, Maron, Chechik, "Self-Supervised Learning for Domain Adaptation on Poi
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 
+Labels = Int[Tensor, " b"] | Float[Tensor, "b c"]  # classes, or their probabilities
+
 
 def mix(
-    points: Float[Tensor, "b n 3"], labels: Int[Tensor, " b"], generator: torch.Generator
-) -> tuple[Float[Tensor, "b n 3"], Int[Tensor, " b"], Int[Tensor, " b"], float]:
+    points: Float[Tensor, "b n 3"], labels: Labels, generator: torch.Generator
+) -> tuple[Float[Tensor, "b n 3"], Labels, Labels, Float[Tensor, ""]]:
     """Each cloud with its partner, another cloud of the batch (or itself, by chance).
 
     λ ~ Beta(1, 1), one a batch; round(λN) farthest points of the cloud and N - round(λN) of its
@@ -27,23 +31,44 @@ def mix(
         Mixed clouds, labels of the clouds, labels of their partners, λ.
     """
     b, n, _ = points.shape
-    lam = float(torch.rand((), generator=generator, device=generator.device))
+    lam = torch.rand((), generator=generator, device=generator.device).to(points.device)
     partner = torch.randperm(b, generator=generator, device=generator.device).to(points.device)
     start = torch.randint(n, (b,), generator=generator, device=generator.device).to(points.device)
     shuffle = torch.randperm(n, generator=generator, device=generator.device).to(points.device)
-    own = round(lam * n)
-    order = farthest_point_sampling(points, max(own, n - own), start)  # [b, m]
-    first = gather(points, order[:, :own])
-    second = gather(points, order[:, : n - own])[partner]
-    mixed = torch.cat([first, second], dim=1)[:, shuffle]
+    ordered = gather(points, farthest_point_sampling(points, n, start))
+    mixed = join(ordered, ordered[partner], lam)[:, shuffle]
     return mixed, labels, labels[partner], lam
+
+
+def join(
+    first: Float[Tensor, "b n 3"], second: Float[Tensor, "b n 3"], lam: Float[Tensor, ""]
+) -> Float[Tensor, "b n 3"]:
+    """The first round(λN) points of one, then the first N - round(λN) of the other.
+
+    How many they are is never asked, so a device need not be waited for.
+    """
+    n = first.shape[1]
+    own = (lam.double() * n).round().long()
+    place = torch.arange(n, device=first.device)
+    of_second = second[:, (place - own).clamp_min(0)]
+    return torch.where((place < own)[:, None], first, of_second)
 
 
 def pcm_loss(
     logits: Float[Tensor, "b c"],
-    labels_a: Int[Tensor, " b"],
-    labels_b: Int[Tensor, " b"],
-    lam: float,
+    labels_a: Labels,
+    labels_b: Labels,
+    lam: float | Float[Tensor, ""],
 ) -> Float[Tensor, ""]:
     """λ CE(logits, a) + (1 - λ) CE(logits, b)."""
     return lam * F.cross_entropy(logits, labels_a) + (1 - lam) * F.cross_entropy(logits, labels_b)
+
+
+def source_loss(
+    net: nn.Module, source: dict[str, Any], generator: torch.Generator, *, pcm: bool
+) -> tuple[str, Float[Tensor, ""]]:
+    """What methods add their own losses to: "ce", or "pcm" in its place; and its value, >= 0."""
+    if not pcm:
+        return "ce", F.cross_entropy(net(source["points"]), source["y_source"])
+    mixed, labels_a, labels_b, lam = mix(source["points"], source["y_source"], generator)
+    return "pcm", pcm_loss(net(mixed), labels_a, labels_b, lam)

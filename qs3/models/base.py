@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import DataError
+from qs3.models.norms import head_norm, make_norm
 
 
 class Features(NamedTuple):
@@ -46,6 +47,7 @@ class ClassHead(nn.Sequential):
         negative_slope: of LeakyReLU; 0 is ReLU.
         first_bias: False where the first layer is published without one.
         hidden_bias: False where no hidden layer has one.
+        norm: of the backbone; see `qs3.models.norms.head_norm` for what it is here.
     """
 
     def __init__(
@@ -58,13 +60,14 @@ class ClassHead(nn.Sequential):
         negative_slope: float = 0.2,
         first_bias: bool = True,
         hidden_bias: bool = True,
+        norm: str = "batch",
     ) -> None:
         widths = (feature_dim, *hidden)
         layers: list[nn.Module] = []
         for i, (wide, narrow) in enumerate(zip(widths, hidden, strict=False)):
             layers += [
                 nn.Linear(wide, narrow, bias=hidden_bias and (first_bias or i > 0)),
-                nn.BatchNorm1d(narrow),
+                make_norm(head_norm(norm), narrow),
                 nn.LeakyReLU(negative_slope),
                 nn.Dropout(dropout),
             ]

@@ -1,10 +1,12 @@
 """DGCNN (Wang et al., "Dynamic Graph CNN for Learning on Point Clouds", TOG 2019).
 
-Two variants, chosen by `variant`:
-- "uda": what QS3, after DefRec and GAST, trains: no T-Net, conv5 without norm and activation,
-  biases in the whole head. 1,800,330 parameters for 10 classes.
+Three variants, chosen by `variant`; parameters are with the class head for 10 classes:
+- "uda": what QS3 trains: no T-Net, conv5 without norm and activation, maximum and mean, biases in
+  the whole head. 1,800,330 parameters.
 - "simpleview": the authors' classification net, as in SimpleView's comparison: conv5 with batch
-  norm and LeakyReLU, no bias in the head's first layer. 1,801,866 parameters for 10 classes.
+  norm and LeakyReLU, no bias in the head's first layer. 1,801,866 parameters.
+- "defrec": of DefRec (Achituve et al., WACV 2021): a T-Net on the edges of the input, conv5 as in
+  "simpleview", the maximum alone, biases in the whole head. 2,079,635 parameters.
 """
 
 from __future__ import annotations
@@ -18,9 +20,43 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
-from qs3.geometry.neighbours import knn
+from qs3.geometry.neighbours import gather, knn
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.models.edgeconv import EdgeConv, max_over_rows
+from qs3.models.norms import head_norm, make_norm
+
+VARIANTS = ("uda", "simpleview", "defrec")
+
+
+class EdgeTNet(nn.Module):
+    """DefRec's T-Net: from the edges of a cloud the identity plus what they ask for, [B, 3, 3].
+
+    Two layers act on each edge, so unlike EdgeConv's they cannot be computed without edges.
+    """
+
+    def __init__(self, norm: str = "batch") -> None:
+        super().__init__()
+        kind = head_norm(norm)  # rows of all clouds together
+
+        def layer(wide: int, narrow: int, bias: bool = False) -> list[nn.Module]:
+            linear = nn.Linear(wide, narrow, bias=bias)
+            return [linear, make_norm(kind, narrow), nn.LeakyReLU(0.2)]
+
+        self.edges = nn.Sequential(*layer(6, 64), *layer(64, 128))
+        self.points = nn.Sequential(*layer(128, 1024))
+        self.cloud = nn.Sequential(
+            *layer(1024, 512), *layer(512, 256, bias=True), nn.Linear(256, 9)
+        )
+
+    def forward(self, points: Float[Tensor, "b n 3"], k: int) -> Float[Tensor, "b 3 3"]:
+        """The matrix that multiplies column vectors from the left."""
+        b, n, _ = points.shape
+        neighbour = gather(points, knn(points, k))  # [b, n, k, 3]
+        centre = points[:, :, None].expand_as(neighbour)
+        edges = torch.cat([neighbour - centre, centre], dim=3)
+        x = self.edges(edges.flatten(0, 2)).view(b * n, k, -1).amax(1)
+        x = self.points(x).view(b, n, -1).amax(1)
+        return self.cloud(x).view(b, 3, 3) + torch.eye(3, dtype=x.dtype, device=x.device)
 
 
 class DGCNN(Backbone):
@@ -28,10 +64,11 @@ class DGCNN(Backbone):
 
     Args:
         k: neighbours of a point, itself included; clouds smaller than k use all points.
-        variant: "uda" or "simpleview", see the module.
-        norm: "batch" or "instance", of the EdgeConvs and of "simpleview"'s conv5.
+        variant: "uda", "simpleview" or "defrec", see the module.
+        norm: of the EdgeConvs and of conv5, see `qs3.models.norms`; "defrec"'s T-Net has batch norm
+            where this is "instance".
         widths: channels of the EdgeConvs.
-        embedding: channels of conv5; `feature_dim` is twice that (maximum and mean).
+        embedding: channels of conv5; `feature_dim` is twice that where maximum and mean are taken.
     """
 
     def __init__(
@@ -44,29 +81,27 @@ class DGCNN(Backbone):
         embedding: int = 1024,
     ) -> None:
         super().__init__()
-        if variant not in ("uda", "simpleview"):
-            raise ConfigError(f"variant must be 'uda' or 'simpleview', got {variant!r}")
-        if norm not in ("batch", "instance"):
-            raise ConfigError(f"norm must be 'batch' or 'instance', got {norm!r}")
+        if variant not in VARIANTS:
+            names = ", ".join(f"'{v}'" for v in VARIANTS)
+            raise ConfigError(f"variant must be one of {names}, got {variant!r}")
         if k < 1:
             raise ConfigError(f"k must be at least 1, got {k}")
         self.k = k
         self.variant = variant
-        self.feature_dim = 2 * embedding
+        self.feature_dim = embedding if variant == "defrec" else 2 * embedding
+        self.transform = EdgeTNet(norm) if variant == "defrec" else None
         self.edge_convs = nn.ModuleList(
             EdgeConv(c, d, norm=norm) for c, d in zip((3, *widths), widths, strict=False)
         )
         self.conv5 = nn.Linear(sum(widths), embedding, bias=False)
-        norms = {
-            "batch": nn.BatchNorm1d(embedding),
-            "instance": nn.InstanceNorm1d(embedding, affine=True),
-        }
-        self.norm5 = norms[norm] if variant == "simpleview" else None
+        self.norm5 = None if variant == "uda" else make_norm(norm, embedding)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
-        """[B, N, 3] to maximum and mean of conv5, and the EdgeConvs' outputs per point."""
+        """[B, N, 3] to the pooled conv5, and the EdgeConvs' outputs per point."""
         k = min(self.k, points.shape[1])
         x, levels = points, []
+        if self.transform is not None:
+            x = points @ self.transform(points, k).transpose(1, 2)
         for edge_conv in self.edge_convs:
             x = edge_conv(x, knn(x, k))
             levels.append(x)
@@ -75,6 +110,8 @@ class DGCNN(Backbone):
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
         y = self.norm5(self.conv5(per_point).transpose(1, 2))  # [B, 1024, N]
         y = F.leaky_relu(y, 0.2)
+        if self.variant == "defrec":
+            return Features(y.amax(2), per_point)
         return Features(torch.cat([y.amax(2), y.mean(2)], dim=1), per_point)
 
 
@@ -126,6 +163,10 @@ def dgcnn(
     """DGCNN with its class head (512, 256; batch norm, LeakyReLU 0.2)."""
     backbone = DGCNN(k=k, variant=variant, norm=norm)
     head = ClassHead(
-        backbone.feature_dim, num_classes, dropout=dropout, first_bias=variant == "uda"
+        backbone.feature_dim,
+        num_classes,
+        dropout=dropout,
+        first_bias=variant != "simpleview",
+        norm=norm,
     )
     return PointClassifier(backbone, head)

@@ -29,6 +29,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from qs3.models.norms import active, make_norm, track, uses_batch
+
 _GATHERED = 1 << 20  # values gathered at once: 4 MB in float32
 
 
@@ -112,14 +114,10 @@ class EdgeConv(nn.Module):
 
     Args:
         in_channels, out_channels: Cin, Cout.
-        norm: "batch": over all edges of the batch, with running statistics; "instance": over the
-            edges of each cloud, in eval too, and without running statistics.
+        norm: see `qs3.models.norms`; "batch" is over all edges of the batch, "instance" over the
+            edges of each cloud, in eval too.
         negative_slope: of LeakyReLU.
-        eps, momentum: as in `nn.BatchNorm2d`.
     """
-
-    running_mean: Tensor | None
-    running_var: Tensor | None
 
     def __init__(
         self,
@@ -128,17 +126,11 @@ class EdgeConv(nn.Module):
         *,
         norm: str = "batch",
         negative_slope: float = 0.2,
-        eps: float = 1e-5,
-        momentum: float = 0.1,
     ) -> None:
         super().__init__()
-        self.norm, self.negative_slope = norm, negative_slope
-        self.eps, self.momentum = eps, momentum
+        self.negative_slope = negative_slope
         self.linear = nn.Linear(2 * in_channels, out_channels, bias=False)  # [W1 | W2]
-        self.gamma = nn.Parameter(torch.ones(out_channels))
-        self.beta = nn.Parameter(torch.zeros(out_channels))
-        self.register_buffer("running_mean", torch.zeros(out_channels) if norm == "batch" else None)
-        self.register_buffer("running_var", torch.ones(out_channels) if norm == "batch" else None)
+        self.norm = make_norm(norm, out_channels)  # never called: holds parameters and statistics
 
     def forward(
         self, x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]
@@ -154,18 +146,20 @@ class EdgeConv(nn.Module):
         flat = (index + first).view(b * n, k)  # rows of all clouds put together
         w1, w2 = self.linear.weight.split(c, dim=1)  # [d, c] each
         e = w2 - w1
-        rows = x.reshape(b if self.norm == "instance" else 1, -1, c)  # [g, r, c]
-        if self.running_mean is None or self.training:
+        norm = active(self.norm)
+        rows = x.reshape(b if isinstance(norm, nn.InstanceNorm1d) else 1, -1, c)  # [g, r, c]
+        if uses_batch(norm):
             # about the mean, lest E[z^2] - E[z]^2 cancel; z only changes by W2 centre
             centre = rows.detach().mean(1, keepdim=True)
             rows = rows - centre
             mean, var = self._statistics(rows, flat, w1, e)  # [g, d]
-            self._track(mean + centre[:, 0] @ w2.T, var, b * n * k)
+            track(norm, mean[0] + centre[0, 0] @ w2.T, var[0], b * n * k)
         else:
-            assert self.running_var is not None
-            mean, var = self.running_mean[None], self.running_var[None]
-        h = self.gamma * torch.rsqrt(var + self.eps)
-        shift = self.beta - h * mean
+            assert norm.running_mean is not None
+            assert norm.running_var is not None
+            mean, var = norm.running_mean[None], norm.running_var[None]
+        h = norm.weight * torch.rsqrt(var + norm.eps)
+        shift = norm.bias - h * mean
         p = rows @ (h[:, :, None] * w1).transpose(1, 2)  # [g, r, d]
         q = torch.baddbmm(shift[:, None], rows, (h[:, :, None] * e).transpose(1, 2))
         best = neighbour_max(p.flatten(0, 1), flat).view_as(q)
@@ -181,13 +175,6 @@ class EdgeConv(nn.Module):
         square = ((w1 @ xdx + 2 * (e @ xax)) * w1).sum(2) + k * ((e @ xx) * e).sum(2)
         return mean, (square / edges - mean.square()).clamp_min(0)
 
-    def _track(self, mean: Tensor, var: Tensor, count: int) -> None:
-        if self.running_mean is None or self.running_var is None:
-            return
-        with torch.no_grad():
-            self.running_mean.lerp_(mean[0], self.momentum)
-            self.running_var.lerp_(var[0] * (count / max(count - 1, 1)), self.momentum)
-
     def extra_repr(self) -> str:
         """Shown by print(model)."""
-        return f"norm={self.norm}, negative_slope={self.negative_slope}"
+        return f"negative_slope={self.negative_slope}"

@@ -1,7 +1,12 @@
-"""PointNet (Qi et al., CVPR 2017) with both T-Nets, as SimpleView compares with.
+"""PointNet (Qi et al., CVPR 2017).
 
-3,463,763 parameters for 10 classes. As there, the head has one dropout, before the norm of its
-second layer, and a loss adds 0.001 times `Features.regulariser`.
+Three variants, chosen by `variant`; parameters are with the class head for 10 classes:
+- "simpleview": with both T-Nets, as SimpleView compares with. The last layer before the maximum has
+  no ReLU, the head one dropout, before the norm of its second layer. SimpleView adds 0.001 times
+  `Features.regulariser` to the loss. 3,463,763 parameters.
+- "uda": that of the lineage from DefRec to QS3: one more layer of 64 on both sides of the second
+  T-Net, ReLU everywhere, two dropouts in the head; no regulariser in the loss. 3,471,827.
+- "basic": of DGCNN's repository, without T-Nets and with a head of one hidden layer. 680,778.
 """
 
 from __future__ import annotations
@@ -12,34 +17,54 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.models.base import Backbone, Features, PointClassifier
+from qs3.errors import ConfigError
+from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.norms import head_norm, make_norm
+
+VARIANTS = ("simpleview", "uda", "basic")
 
 
 class PointMLP(nn.Module):
-    """Linear - BN - ReLU on each point of [B, N, C]; `last_relu=False` leaves out the last ReLU."""
+    """Linear - norm - ReLU on each point of [B, N, C].
 
-    def __init__(self, *widths: int, last_relu: bool = True) -> None:
+    Args:
+        widths: C, and channels of each layer.
+        last_relu: False leaves out the last ReLU.
+        bias: of the linear maps.
+        norm: see `qs3.models.norms`; "batch" is over all points of the batch.
+    """
+
+    def __init__(
+        self, *widths: int, last_relu: bool = True, bias: bool = True, norm: str = "batch"
+    ) -> None:
         super().__init__()
         layers: list[nn.Module] = []
         for wide, narrow in pairwise(widths):
-            layers += [nn.Linear(wide, narrow), nn.BatchNorm1d(narrow), nn.ReLU()]
+            layers += [nn.Linear(wide, narrow, bias=bias), make_norm(norm, narrow), nn.ReLU()]
         self.layers = nn.Sequential(*layers[: None if last_relu else -1])
+        self.by_cloud = norm == "instance"
 
     def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
-        """The same map at every point, statistics over all points of the batch."""
-        return self.layers(x.flatten(0, 1)).unflatten(0, x.shape[:2])
+        """The same map at every point."""
+        if not self.by_cloud:
+            return self.layers(x.flatten(0, 1)).unflatten(0, x.shape[:2])
+        for layer in self.layers:
+            normed = isinstance(layer, nn.InstanceNorm1d)  # takes [b, c, n]
+            x = layer(x.transpose(1, 2)).transpose(1, 2) if normed else layer(x)
+        return x
 
 
 class TNet(nn.Module):
     """A matrix for each cloud, the identity plus what the cloud asks for: [B, C, C]."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, norm: str = "batch") -> None:
         super().__init__()
         self.channels = channels
-        self.points = PointMLP(channels, 64, 128, 1024)
+        self.points = PointMLP(channels, 64, 128, 1024, norm=norm)
+        kind = head_norm(norm)
         self.cloud = nn.Sequential(
-            *(nn.Linear(1024, 512), nn.BatchNorm1d(512), nn.ReLU()),
-            *(nn.Linear(512, 256), nn.BatchNorm1d(256), nn.ReLU()),
+            *(nn.Linear(1024, 512), make_norm(kind, 512), nn.ReLU()),
+            *(nn.Linear(512, 256), make_norm(kind, 256), nn.ReLU()),
             nn.Linear(256, channels**2),
         )
 
@@ -51,23 +76,60 @@ class TNet(nn.Module):
 
 
 class PointNet(Backbone):
-    """Input T-Net, 64, feature T-Net, 128, 1024, maximum."""
+    """Shared maps of each point, and the maximum over the points.
+
+    Args:
+        variant: "simpleview", "uda" or "basic", see the module.
+        norm: see `qs3.models.norms`.
+    """
 
     feature_dim = 1024
 
-    def __init__(self) -> None:
+    def __init__(self, *, variant: str = "simpleview", norm: str = "batch") -> None:
         super().__init__()
-        self.input_transform = TNet(3)
-        self.first = PointMLP(3, 64)
-        self.feature_transform = TNet(64)
-        self.last = PointMLP(64, 128, 1024, last_relu=False)
+        if variant not in VARIANTS:
+            names = ", ".join(f"'{v}'" for v in VARIANTS)
+            raise ConfigError(f"variant must be one of {names}, got {variant!r}")
+        self.input_transform = self.feature_transform = None
+        if variant != "basic":
+            self.input_transform, self.feature_transform = TNet(3, norm), TNet(64, norm)
+        relu, bias = variant != "simpleview", variant != "basic"
+        first, last = {
+            "simpleview": ([(3, 64)], [(64, 128)]),
+            "uda": ([(3, 64), (64, 64)], [(64, 64), (64, 128)]),
+            "basic": ([(3, 64), (64, 64)], [(64, 64), (64, 128)]),
+        }[variant]
+
+        def layers(widths: list[tuple[int, int]]) -> nn.ModuleList:
+            return nn.ModuleList(PointMLP(*w, bias=bias, norm=norm) for w in widths)
+
+        self.first, self.middle = layers(first), layers(last)
+        self.last = PointMLP(128, 1024, last_relu=relu, bias=bias, norm=norm)
+        self.every_level = variant != "simpleview"
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
-        """Maximum over the points; per point the 64 transformed features."""
-        x = self.first(points @ self.input_transform(points))
-        transform = self.feature_transform(x)  # [b, 64, 64]
-        x = x @ transform
-        return Features(self.last(x).amax(1), x, transform_regulariser(transform))
+        """Maximum over the points; per point the first layers, as these variants publish it.
+
+        Those are the 64 transformed features of "simpleview", and of the others the outputs of all
+        layers but the last, [B, N, 320].
+        """
+        x, levels, regulariser = points, [], None
+        if self.input_transform is not None:
+            x = x @ self.input_transform(x)
+        for layer in self.first:
+            x = layer(x)
+            levels.append(x)
+        if self.feature_transform is not None:
+            transform = self.feature_transform(x)  # [b, 64, 64]
+            regulariser = transform_regulariser(transform)
+            x = x @ transform
+        per_point = x
+        for layer in self.middle:
+            x = layer(x)
+            levels.append(x)
+        if self.every_level:
+            per_point = torch.cat(levels, dim=2)
+        return Features(self.last(x).amax(1), per_point, regulariser)
 
 
 def transform_regulariser(transform: Float[Tensor, "b c c"]) -> Float[Tensor, ""]:
@@ -76,11 +138,28 @@ def transform_regulariser(transform: Float[Tensor, "b c c"]) -> Float[Tensor, ""
     return (identity - transform @ transform.transpose(1, 2)).flatten(1).norm(dim=1).mean()
 
 
-def pointnet(num_classes: int, dropout: float = 0.3) -> PointClassifier:
-    """PointNet with its class head (512, 256)."""
-    head = nn.Sequential(
-        *(nn.Linear(1024, 512), nn.BatchNorm1d(512), nn.ReLU()),
-        *(nn.Linear(512, 256), nn.Dropout(dropout), nn.BatchNorm1d(256), nn.ReLU()),
-        nn.Linear(256, num_classes),
+def pointnet(
+    num_classes: int, dropout: float = 0.3, variant: str = "simpleview", norm: str = "batch"
+) -> PointClassifier:
+    """PointNet with its class head: hidden layers of 512 and 256, of 512 in "basic"."""
+    backbone = PointNet(variant=variant, norm=norm)
+    if variant == "simpleview":
+        kind = head_norm(norm)
+        head = nn.Sequential(
+            *(nn.Linear(1024, 512), make_norm(kind, 512), nn.ReLU()),
+            *(nn.Linear(512, 256), nn.Dropout(dropout), make_norm(kind, 256), nn.ReLU()),
+            nn.Linear(256, num_classes),
+        )
+        return PointClassifier(backbone, head)
+    return PointClassifier(
+        backbone,
+        ClassHead(
+            backbone.feature_dim,
+            num_classes,
+            hidden=(512,) if variant == "basic" else (512, 256),
+            dropout=dropout,
+            negative_slope=0.0,
+            first_bias=False,
+            norm=norm,
+        ),
     )
-    return PointClassifier(PointNet(), head)

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -29,7 +30,7 @@ from qs3.classifier import Classifier
 from qs3.data.datamodule import UdaData
 from qs3.evaluation import predict
 from qs3.selftraining.scheme import Phases, Scheme
-from qs3.selftraining.selectors import check_selection
+from qs3.selftraining.selectors import check_selection, keep_all
 from qs3.selftraining.table import path_of, write_pseudo_labels
 
 log = logging.getLogger(__name__)
@@ -138,8 +139,19 @@ class SelfTraining(Callback):
         )
         confidence, predicted = probabilities.max(axis=1), probabilities.argmax(axis=1)
         selection = self.scheme.selector.select(
-            confidence, predicted, data.target.ids, len(self.classes), self.scheme.theta_of(round_)
+            confidence,
+            predicted,
+            data.target.ids,
+            len(self.classes),
+            self.scheme.theta_of(round_),
+            probabilities=probabilities,
+            round_=round_,
         )
+        if selection.labels is not None:  # a selector may name another class than the likeliest
+            predicted = selection.labels
+            confidence = np.take_along_axis(probabilities, predicted[:, None], axis=1)[:, 0]
+        if self.scheme.rehearsal:
+            selection = keep_all(selection, predicted)
         if trainer.is_global_zero:
             write_pseudo_labels(
                 path_of(self.folder, round_),
@@ -153,14 +165,19 @@ class SelfTraining(Callback):
 
         labels = torch.from_numpy(predicted)
         index = torch.from_numpy(selection.selected.nonzero()[0])
-        data.set_pseudo_labels(index, labels[index])
+        if selection.soft is None:
+            data.set_pseudo_labels(index, labels[index])
+        else:
+            data.set_pseudo_labels(index, torch.from_numpy(selection.soft).float()[index])
         by_class = {
             name: {key: value.item() for key, value in zip(self.classes, values, strict=True)}
             for name, values in (
                 ("mu", selection.mu),
                 ("confident", selection.confident),
                 ("selected", selection.kept),
+                ("thresholds", selection.thresholds),
             )
+            if values is not None
         }
         same = None if self._previous is None else float((labels == self._previous).double().mean())
         self._previous = labels

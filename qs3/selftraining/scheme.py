@@ -69,13 +69,18 @@ class Scheme:
         rounds: number of rounds; 0 is no self-training.
         epochs: of each round.
         batch_size: of each round.
-        theta: confidence that a pseudo-label must exceed, in round 0.
+        theta: confidence that a pseudo-label must exceed, in round 0; 0 is for selectors that have
+            thresholds of their own (CBST), and for them alone.
         epsilon: added to theta in each further round.
         init: "scratch" draws new weights each round; "continue" begins round 0 with the weights of
             the teacher that labelled it, and each further round with the student before.
         use_source: whether labelled source clouds are trained on in the rounds, too.
         pcm: whether the student's clouds are mixed (see `qs3.methods.pcm`).
+        weight_step: by how much the weight of both losses falls each epoch of the rounds, from 1
+            (GAST's code: 0.005; both fall alike, so it matters beside the weight decay alone).
+        mrkld: weight of CRST's regulariser (see `qs3.methods.student`); 0 is none.
         missing_class: what to do if a class has no pseudo-label: "warn" or "error".
+        rehearsal: train on all target samples, whatever the selector keeps (`debug=fast`).
     """
 
     selector: Any = None
@@ -87,7 +92,10 @@ class Scheme:
     init: str = "scratch"
     use_source: bool = False
     pcm: bool = False
+    weight_step: float = 0.0
+    mrkld: float = 0.0
     missing_class: str = "warn"
+    rehearsal: bool = False
 
     def __post_init__(self) -> None:
         whole("selftraining.rounds", self.rounds, 0)
@@ -101,10 +109,19 @@ class Scheme:
         one_of("selftraining.missing_class", self.missing_class, ("warn", "error"))
         number("selftraining.theta", self.theta)
         number("selftraining.epsilon", self.epsilon)
-        if not 0.0 < self.theta < 1.0:
+        free = bool(getattr(self.selector, "own_thresholds", False)) and self.theta == 0
+        if not (0.0 < self.theta < 1.0 or free):
             raise ConfigError(f"selftraining.theta must lie in (0, 1), got {self.theta}")
+        if number("selftraining.mrkld", self.mrkld) < 0:
+            raise ConfigError(f"selftraining.mrkld must be >= 0, got {self.mrkld}")
+        epochs = self.rounds * self.epochs
+        if not 0.0 <= number("selftraining.weight_step", self.weight_step) * (epochs - 1) < 1.0:
+            raise ConfigError(
+                f"selftraining.weight_step must be >= 0, and below 1 after {epochs - 1} epochs, "
+                f"got {self.weight_step}"
+            )
         last = self.theta_of(self.rounds - 1)
-        if not 0.0 < last < 1.0:
+        if not (0.0 < last < 1.0 or (free and last == 0)):
             raise ConfigError(
                 f"selftraining.theta + epsilon * (rounds - 1) must lie in (0, 1), got {last} "
                 f"(theta={self.theta}, epsilon={self.epsilon}, rounds={self.rounds})"

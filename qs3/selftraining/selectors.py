@@ -1,14 +1,15 @@
 """Which pseudo-labels to trust: pure functions on a table of predictions (numpy only).
 
-A selector sees one row a target sample: its predicted class, that class's probability and its
-id. It never sees a label. The result does not depend on the order of the rows: ties are broken
-by id.
+A selector sees one row a target sample: its predicted class, that class's probability, its id, and
+the probabilities of all classes. It never sees a label. The result does not depend on the order of
+the rows: ties are broken by id. Here: QBST and SPST; CBST and CRST in `cbst`, controls in
+`controls`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,7 +28,10 @@ class Selection:
         theta: the threshold used.
         mu: [K] fraction of the confident samples of each class to keep.
         confident: [K] samples above the threshold, by predicted class.
-        kept: [K] samples kept, by predicted class.
+        kept: [K] samples kept, by pseudo-label.
+        labels: [n] pseudo-labels; None where they are the predicted classes.
+        soft: [n, K] pseudo-labels as probabilities; None trains on `labels`.
+        thresholds: [K] of each class, of selectors that have such.
     """
 
     selected: Bool[np.ndarray, " n"]
@@ -35,6 +39,9 @@ class Selection:
     mu: Float[np.ndarray, " k"]
     confident: Int[np.ndarray, " k"]
     kept: Int[np.ndarray, " k"]
+    labels: Int[np.ndarray, " n"] | None = None
+    soft: Float[np.ndarray, "n k"] | None = None
+    thresholds: Float[np.ndarray, " k"] | None = None
 
 
 class Selector(Protocol):
@@ -47,8 +54,21 @@ class Selector(Protocol):
         ids: Sequence[str],
         classes: int,
         theta: float,
+        *,
+        probabilities: Float[np.ndarray, "n k"] | None = None,
+        round_: int = 0,
     ) -> Selection:
-        """Choose the samples to train on."""
+        """Choose the samples to train on; may choose none (the caller decides what that means).
+
+        Args:
+            confidence: probability of the predicted class.
+            predicted: that class.
+            ids: of the samples, all different.
+            classes: K.
+            theta: the probability of every chosen pseudo-label exceeds it.
+            probabilities: of all classes; only some selectors look at them.
+            round_: counted from 0.
+        """
         ...
 
 
@@ -84,8 +104,11 @@ class Qbst:
         ids: Sequence[str],
         classes: int,
         theta: float,
+        *,
+        probabilities: Float[np.ndarray, "n k"] | None = None,
+        round_: int = 0,
     ) -> Selection:
-        """Choose the samples to train on; may choose none (the caller decides what that means)."""
+        """As `Selector.select`; looks at the predicted classes alone."""
         confidence = np.asarray(confidence, dtype=np.float64)
         above = confidence > theta
         n_k = np.bincount(predicted[above], minlength=classes)
@@ -108,6 +131,37 @@ class Qbst:
             confident=n_k,
             kept=np.bincount(predicted[selected], minlength=classes),
         )
+
+
+@dataclass(frozen=True)
+class Spst:
+    """Self-paced self-training: every sample with p_i > theta (GAST, section 3.3; no other rule).
+
+    The pace is theta's, which grows by `selftraining.epsilon` a round. Chooses what
+    `Qbst(mu="one")` chooses.
+    """
+
+    def select(
+        self,
+        confidence: Float[np.ndarray, " n"],
+        predicted: Int[np.ndarray, " n"],
+        ids: Sequence[str],
+        classes: int,
+        theta: float,
+        *,
+        probabilities: Float[np.ndarray, "n k"] | None = None,
+        round_: int = 0,
+    ) -> Selection:
+        """As `Selector.select`; looks at the predicted classes alone."""
+        selected = np.asarray(confidence, dtype=np.float64) > theta
+        kept = np.bincount(predicted[selected], minlength=classes)
+        return Selection(selected, theta, mu=np.ones(classes), confident=kept, kept=kept)
+
+
+def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
+    """The same with every sample selected."""
+    kept = np.bincount(labels, minlength=len(selection.kept))
+    return replace(selection, selected=np.ones(len(labels), dtype=bool), kept=kept)
 
 
 def check_selection(

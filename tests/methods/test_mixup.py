@@ -20,7 +20,8 @@ def _batch(b: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:
 @given(st.integers(1, 5), st.integers(1, 40), st.integers(0, 10_000))
 def test_proportions_and_labels(b: int, n: int, seed: int) -> None:
     points, labels = _batch(b, n)
-    mixed, own, other, lam = mix(points, labels, torch.Generator().manual_seed(seed))
+    mixed, own, other, drawn = mix(points, labels, torch.Generator().manual_seed(seed))
+    lam = float(drawn)
     assert mixed.shape == points.shape
     assert torch.equal(own, labels)
     assert sorted(other.tolist()) == labels.tolist()  # a permutation
@@ -40,7 +41,8 @@ def test_proportions_and_labels(b: int, n: int, seed: int) -> None:
 def test_parts_are_farthest_point_samples() -> None:
     points, labels = _batch(3, 50)
     for seed in range(5):
-        mixed, _, other, lam = mix(points, labels, torch.Generator().manual_seed(seed))
+        mixed, _, other, drawn = mix(points, labels, torch.Generator().manual_seed(seed))
+        lam = float(drawn)
         for i in range(3):
             if other[i] == i:
                 continue

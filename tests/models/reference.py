@@ -39,15 +39,15 @@ class NaiveEdgeConv(nn.Module):
         d, _ = twin.linear.weight.shape
         self.weight = nn.Parameter(twin.linear.weight.detach().clone())
         self.bn: nn.Module
-        if twin.norm == "batch":
+        if isinstance(twin.norm, nn.BatchNorm1d):
             self.bn = nn.BatchNorm2d(d, dtype=self.weight.dtype)
-            self.bn.running_mean.copy_(twin.running_mean)
-            self.bn.running_var.copy_(twin.running_var)
+            self.bn.running_mean.copy_(twin.norm.running_mean)
+            self.bn.running_var.copy_(twin.norm.running_var)
         else:
             self.bn = nn.InstanceNorm2d(d, affine=True, dtype=self.weight.dtype)
         with torch.no_grad():
-            self.bn.weight.copy_(twin.gamma)
-            self.bn.bias.copy_(twin.beta)
+            self.bn.weight.copy_(twin.norm.weight)
+            self.bn.bias.copy_(twin.norm.bias)
 
     def forward(self, x: Tensor, index: Tensor) -> Tensor:
         return edge_conv_reference(x, index, self.weight, self.bn)

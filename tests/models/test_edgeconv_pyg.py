@@ -18,8 +18,8 @@ def pyg_twin(ours, in_channels):
     with torch.no_grad():  # after PyG has drawn weights of its own
         w_difference, w_centre = ours.linear.weight.split(in_channels, dim=1)
         linear.weight.copy_(torch.cat([w_centre, w_difference], dim=1))
-        norm.weight.copy_(ours.gamma)
-        norm.bias.copy_(ours.beta)
+        norm.weight.copy_(ours.norm.weight)
+        norm.bias.copy_(ours.norm.bias)
     return theirs
 
 
@@ -36,8 +36,8 @@ def test_outputs_statistics_and_gradients_equal_pyg(training):
     torch.manual_seed(0)
     ours = EdgeConv(5, 7).double()
     with torch.no_grad():
-        ours.gamma.normal_()  # negative ones too
-        ours.beta.normal_()
+        ours.norm.weight.normal_()  # negative ones too
+        ours.norm.bias.normal_()
     theirs = pyg_twin(ours, 5)
     ours.train(training)
     theirs.train(training)
@@ -52,5 +52,5 @@ def test_outputs_statistics_and_gradients_equal_pyg(training):
     (out_b * weights).sum().backward()
     torch.testing.assert_close(a.grad.reshape(-1, 5), b.grad, rtol=0, atol=1e-10)
     norm = theirs.nn[1]
-    torch.testing.assert_close(ours.gamma.grad, norm.weight.grad, rtol=0, atol=1e-10)
-    torch.testing.assert_close(ours.running_var, norm.running_var, rtol=0, atol=1e-10)
+    torch.testing.assert_close(ours.norm.weight.grad, norm.weight.grad, rtol=0, atol=1e-10)
+    torch.testing.assert_close(ours.norm.running_var, norm.running_var, rtol=0, atol=1e-10)
