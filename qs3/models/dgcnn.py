@@ -108,11 +108,18 @@ class DGCNN(Backbone):
         per_point = torch.cat(levels, dim=2)  # [B, N, 512]
         if self.norm5 is None:
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
-        y = self.norm5(self.conv5(per_point).transpose(1, 2))  # [B, 1024, N]
-        y = F.leaky_relu(y, 0.2)
+        y = F.leaky_relu(self._normed(self.conv5(per_point)), 0.2)  # [B, N, 1024]
+        most, _ = max_over_rows(y)
         if self.variant == "defrec":
-            return Features(y.amax(2), per_point)
-        return Features(torch.cat([y.amax(2), y.mean(2)], dim=1), per_point)
+            return Features(most, per_point)
+        return Features(torch.cat([most, y.mean(1)], dim=1), per_point)
+
+    def _normed(self, y: Tensor) -> Tensor:
+        """norm5 of [B, N, D], as rows where it can be: twice as fast as in [B, D, N]."""
+        assert self.norm5 is not None
+        if isinstance(self.norm5, nn.InstanceNorm1d):
+            return self.norm5(y.transpose(1, 2)).transpose(1, 2)
+        return self.norm5(y.flatten(0, 1)).view_as(y)
 
 
 class _PooledLinear(torch.autograd.Function):

@@ -90,11 +90,9 @@ class PointNet(Backbone):
         if variant not in VARIANTS:
             names = ", ".join(f"'{v}'" for v in VARIANTS)
             raise ConfigError(f"variant must be one of {names}, got {variant!r}")
-        self.input_transform = self.feature_transform = None
-        if variant != "basic":
-            self.input_transform, self.feature_transform = TNet(3, norm), TNet(64, norm)
+        turned = variant != "basic"
         relu, bias = variant != "simpleview", variant != "basic"
-        first, last = {
+        first, middle = {
             "simpleview": ([(3, 64)], [(64, 128)]),
             "uda": ([(3, 64), (64, 64)], [(64, 64), (64, 128)]),
             "basic": ([(3, 64), (64, 64)], [(64, 64), (64, 128)]),
@@ -103,7 +101,11 @@ class PointNet(Backbone):
         def layers(widths: list[tuple[int, int]]) -> nn.ModuleList:
             return nn.ModuleList(PointMLP(*w, bias=bias, norm=norm) for w in widths)
 
-        self.first, self.middle = layers(first), layers(last)
+        # in the order in which data passes them, which AdaBN goes by
+        self.input_transform = TNet(3, norm) if turned else None
+        self.first = layers(first)
+        self.feature_transform = TNet(64, norm) if turned else None
+        self.middle = layers(middle)
         self.last = PointMLP(128, 1024, last_relu=relu, bias=bias, norm=norm)
         self.every_level = variant != "simpleview"
 

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError, DataError
+from qs3.geometry.neighbours import knn
 from qs3.models.base import ClassHead, Features, PointClassifier, check_points
 from qs3.models.dgcnn import DGCNN, dgcnn, pooled_linear
 from tests.models.reference import NaiveDGCNN
@@ -25,9 +26,15 @@ def _small(k: int = 5, variant: str = "uda", norm: str = "batch") -> PointClassi
 
 @pytest.mark.parametrize(
     ("classes", "variant", "expected"),
-    [(10, "uda", 1_800_330), (10, "simpleview", 1_801_866), (40, "simpleview", 1_809_576)],
+    [
+        (10, "uda", 1_800_330),
+        (40, "uda", 1_808_040),
+        (10, "simpleview", 1_801_866),
+        (40, "simpleview", 1_809_576),
+        (10, "defrec", 2_079_635),
+    ],
 )
-@pytest.mark.parametrize("norm", ["batch", "instance"])
+@pytest.mark.parametrize("norm", ["batch", "instance", "domain_statistics"])
 def test_parameter_count(classes: int, variant: str, expected: int, norm: str) -> None:
     model = dgcnn(classes, variant=variant, norm=norm)
     assert sum(p.numel() for p in model.parameters()) == expected
@@ -87,13 +94,64 @@ def test_clouds_of_a_batch_do_not_meet_in_eval() -> None:
     torch.testing.assert_close(together, alone, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("variant", ["uda", "simpleview"])
+@pytest.mark.parametrize("variant", ["uda", "simpleview", "defrec"])
 @pytest.mark.parametrize("n", [1, 3, 50])
 def test_batch_of_one_and_fewer_points_than_k(variant: str, n: int) -> None:
     model = _small(k=20, variant=variant).eval()
     out = model(torch.randn(1, n, 3))
     assert out.shape == (1, 4)
     assert torch.isfinite(out).all()
+
+
+def _error(value: list[torch.Tensor], truth: list[torch.Tensor]) -> float:
+    pairs = zip(value, truth, strict=True)
+    errors = torch.stack([(a.double() - b).norm() / b.norm() for a, b in pairs])
+    return float(errors.square().mean().sqrt())
+
+
+def test_float32_errs_no_more_than_twice_the_straight_one() -> None:
+    """Logits and the gradients of the EdgeConvs' weights, against float64, as a mean of seeds.
+
+    With k = n neighbours never change, so no choice of a neighbour outweighs all rounding.
+    """
+    totals = torch.zeros(2, 2)
+    for seed in range(4):
+        torch.manual_seed(seed)
+        exact = dgcnn(4, k=24, dropout=0.0).double()
+        straight = NaiveDGCNN(copy.deepcopy(exact).float())
+        nets = [exact, copy.deepcopy(exact).float(), straight]
+        points = torch.randn(6, 24, 3) / 2
+        found = []
+        for net in nets:
+            logits = net(points.double() if net is exact else points)
+            F.cross_entropy(logits, torch.tensor([0, 1, 2, 3, 0, 1])).backward()
+            convs = net.edge_convs if net is straight else net.backbone.edge_convs
+            weights = [e.weight if net is straight else e.linear.weight for e in convs]
+            found.append(([logits.detach()], [w.grad for w in weights]))
+        for i in (0, 1):  # ours, straight
+            totals[i, 0] += _error(found[i + 1][0], found[0][0])
+            totals[i, 1] += _error(found[i + 1][1], found[0][1])
+    assert (totals[0] <= 2 * totals[1]).all(), totals
+
+
+def test_autocast_keeps_neighbours_in_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    net = _small(k=8).eval()  # a norm over two clouds in the head would magnify the rounding
+    points = torch.randn(2, 64, 3)
+    found: list[torch.Tensor] = []
+
+    def spy(x: torch.Tensor, k: int) -> torch.Tensor:
+        found.append(knn(x, k))
+        return found[-1]
+
+    monkeypatch.setattr("qs3.models.dgcnn.knn", spy)
+    levels, plain = net.features(points).per_point, net(points)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(net.features(points).per_point, levels)
+        half = net(points)
+    assert all(torch.equal(a, b) for a, b in zip(found[:8], found[8:], strict=True))
+    assert half.dtype == torch.bfloat16
+    torch.testing.assert_close(half.float(), plain, rtol=0.02, atol=0.02)
 
 
 def test_one_repeated_point_trains() -> None:

@@ -6,16 +6,43 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch.nn import functional as F
 
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.models.base import PointClassifier
 from qs3.models.pointnet import PointNet, TNet, pointnet, transform_regulariser
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
 
 
-@pytest.mark.parametrize(("classes", "expected"), [(10, 3_463_763), (40, 3_471_473)])
-def test_parameter_count(classes: int, expected: int) -> None:
-    assert sum(p.numel() for p in pointnet(classes).parameters()) == expected
+@pytest.mark.parametrize(
+    ("classes", "variant", "expected"),
+    [
+        (10, "simpleview", 3_463_763),
+        (40, "simpleview", 3_471_473),
+        (10, "basic", 680_778),
+        (40, "basic", 696_168),
+        (10, "uda", 3_471_827),
+    ],
+)
+@pytest.mark.parametrize("norm", ["batch", "instance", "domain_statistics"])
+def test_parameter_count(classes: int, variant: str, expected: int, norm: str) -> None:
+    net = pointnet(classes, variant=variant, norm=norm)
+    assert sum(p.numel() for p in net.parameters()) == expected
+
+
+def test_instance_norm_is_of_each_cloud_alone() -> None:
+    torch.manual_seed(0)
+    model = pointnet(4, norm="instance").double().eval()
+    points = torch.randn(3, 20, 3, dtype=torch.float64)
+    backbone = model.backbone.train()  # its norms are the same in both modes
+    backbone.input_transform.cloud.eval()
+    backbone.feature_transform.cloud.eval()
+    together = backbone(points).global_
+    torch.testing.assert_close(together[1:2], backbone(points[1:2]).global_)
+
+
+def test_unknown_variant() -> None:
+    with pytest.raises(ConfigError, match="'simpleview', 'uda', 'basic'"):
+        pointnet(4, variant="big")
 
 
 def test_order_and_copies_of_points_do_not_matter() -> None:

@@ -1,0 +1,132 @@
+"""GAST without its self-training: two questions about geometry, put to clouds of both domains.
+
+Zou et al., "Geometry-Aware Self-Training for Unsupervised Domain Adaptation on Object Point
+Clouds", ICCV 2021. The self-training that completes it is `selftraining=spst`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.methods.base import Method, feature_dims, weight
+from qs3.methods.deform import VOXELS, deform
+from qs3.methods.mixup import join, source_loss
+from qs3.models.norms import use_domain
+from qs3.settings import whole
+
+_QUARTERS = 4
+# By quarter turns: what multiplies row vectors from the right, exact.
+_ABOUT_X = [[[1, 0, 0], [0, c, -s], [0, s, c]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+_ABOUT_Y = [[[c, 0, s], [0, 1, 0], [-s, 0, c]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+
+
+class Gast(Method):
+    r"""L = w_c L_s + w_d [DefCls(x_s) + DefCls(x_t)] + w_r [RotCls(x_s) + RotCls(x_t)].
+
+    DefCls: one of 27 voxels of a cloud is deformed (`qs3.methods.deform`): which? Cross-entropy
+    of a linear map of the cloud's vector. RotCls: a cloud is mixed with itself, one part turned
+    about x, the other about y, each by a multiple of 90 degrees (`turn_parts`): by which?
+    λ CE(h_1, a) + (1 - λ) CE(h_2, b), h_1 and h_2 linear.
+
+    Args:
+        class_weight: w_c; the released code's default is 0.5, its logs have 0.5 to 1.
+        def_weight: w_d; 0.5, in the logs 0.2 to 1; 0 leaves it out.
+        rot_weight: w_r; 0.2, in the logs 0.1 to 0.5; 0 leaves it out, as the released code does
+            unless asked (RotCls_on_src, RotCls_on_trgt), although the paper has it.
+        min_points: of a voxel that may be deformed: 20, of clouds of 1024 points.
+        pcm: mix source clouds for L_s (a switch of the released code).
+
+    Not taken over from the released code: one tensor for both rotation labels, so that both heads
+    learn the turn about y; and label 0 for a cloud without a voxel to deform (here it does not
+    count).
+    """
+
+    uses_target: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        class_weight: float = 0.5,
+        def_weight: float = 0.5,
+        rot_weight: float = 0.2,
+        min_points: int = 20,
+        pcm: bool = False,
+    ) -> None:
+        super().__init__()
+        self.class_weight = weight("class_weight", class_weight)
+        self.def_weight = weight("def_weight", def_weight)
+        self.rot_weight = weight("rot_weight", rot_weight)
+        self.min_points, self.pcm = whole("method.min_points", min_points, 1), pcm
+        self.def_head: nn.Module | None = None
+        self.rot_heads: nn.ModuleList | None = None
+
+    def prepare(self, net: nn.Module) -> None:
+        """Linear heads: 27 voxels; four turns, twice. Only those of losses in use."""
+        width, _ = feature_dims(net)
+        if self.def_weight:
+            self.def_head = nn.Linear(width, VOXELS)
+        if self.rot_weight:
+            self.rot_heads = nn.ModuleList(nn.Linear(width, _QUARTERS) for _ in range(2))
+
+    def loss(
+        self, net: Any, batch: dict[str, Any], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Terms "ce" or "pcm", "def_source", "def_target", "rot_source", "rot_target"; >= 0.
+
+        Where a head knows nothing, a "def" is w_d ln 27 and a "rot" w_r ln 4.
+        """
+        name, supervised = source_loss(net, batch["source"], generator, pcm=self.pcm)
+        terms = {name: self.class_weight * supervised}
+        for domain in ("source", "target"):
+            points = batch[domain]["points"]
+            with use_domain(net, domain):
+                if self.def_head is not None:
+                    terms[f"def_{domain}"] = self.def_weight * self._where(net, points, generator)
+                if self.rot_heads is not None:
+                    terms[f"rot_{domain}"] = self.rot_weight * self._turns(net, points, generator)
+        return terms
+
+    def _where(self, net: Any, points: Tensor, generator: torch.Generator) -> Tensor:
+        assert self.def_head is not None
+        deformed = deform(points, generator, self.min_points)
+        logits = self.def_head(net.features(deformed.points).global_)  # [B, 27]
+        each = F.cross_entropy(logits, deformed.voxel, reduction="none")  # [B]
+        counts = deformed.mask.any(1)
+        return torch.where(counts, each, 0.0).sum() / counts.sum().clamp_min(1)
+
+    def _turns(self, net: Any, points: Tensor, generator: torch.Generator) -> Tensor:
+        assert self.rot_heads is not None
+        mixed, about_x, about_y, lam = turn_parts(points, generator)
+        features = net.features(mixed).global_  # [B, D]
+        first, second = (head(features) for head in self.rot_heads)  # [B, 4] each
+        return lam * F.cross_entropy(first, about_x) + (1 - lam) * F.cross_entropy(second, about_y)
+
+
+def turn_parts(
+    points: Float[Tensor, "b n 3"], generator: torch.Generator
+) -> tuple[Float[Tensor, "b n 3"], Int[Tensor, " b"], Int[Tensor, " b"], Float[Tensor, ""]]:
+    """Each cloud mixed with itself: a part turned about x, a part turned about y.
+
+    λ ~ Beta(1, 1), one a batch. The parts are round(λN) and N - round(λN) farthest points, each
+    sampled from a random point of its own (so points may be in both); two independent turns by
+    0, 90, 180 or 270 degrees for each cloud; all in random order.
+
+    Returns:
+        Mixed clouds, quarter turns about x [B], quarter turns about y [B], λ.
+    """
+    b, n, _ = points.shape
+    own, device = generator.device, points.device
+    lam = torch.rand((), generator=generator, device=own).to(device)
+    start = torch.randint(n, (2 * b,), generator=generator, device=own).to(device)
+    turns = torch.randint(_QUARTERS, (2, b), generator=generator, device=own).to(device)
+    shuffle = torch.randperm(n, generator=generator, device=own).to(device)
+    twice = torch.cat([points, points])  # both samplings at once
+    first, second = gather(twice, farthest_point_sampling(twice, n, start)).chunk(2)
+    tables = torch.tensor([_ABOUT_X, _ABOUT_Y], dtype=points.dtype, device=device)
+    mixed = join(first @ tables[0, turns[0]], second @ tables[1, turns[1]], lam)[:, shuffle]
+    return mixed, turns[0], turns[1], lam

@@ -1,0 +1,251 @@
+"""Norms by name, and what adaptation does with them: one a domain, or estimated anew.
+
+- "batch": batch norm; its running statistics serve in eval.
+- "instance": over each cloud alone, in eval too (Ulyanov et al., 2016). In class heads, where a
+  cloud is one vector and has no statistics, it is batch norm.
+- "domain": a whole batch norm for each domain, statistics and affine, as in DSBN (Chang et al.,
+  "Domain-Specific Batch Normalization for Unsupervised Domain Adaptation", CVPR 2019, eq. 3).
+- "domain_statistics": statistics for each domain, one affine for both.
+
+Which domain a pass is on is said around it: `with use_domain(net, "target"): net(points)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor, nn
+
+from qs3.errors import ConfigError, DataError
+
+KINDS = ("batch", "instance", "domain", "domain_statistics")
+DOMAINS = ("source", "target")
+_LAST_COUNT: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()  # of `track`, for AdaBN
+
+
+class DomainNorm(nn.Module):
+    """A batch norm for each of `DOMAINS`; the current one is used, "source" at first.
+
+    Args:
+        channels: C, of [R, C] or [B, C, N].
+        shared_affine: the domains share scale and shift (and both names hold the same parameter).
+    """
+
+    def __init__(self, channels: int, *, shared_affine: bool = False) -> None:
+        super().__init__()
+        self.source, self.target = nn.BatchNorm1d(channels), nn.BatchNorm1d(channels)
+        if shared_affine:
+            self.target.weight, self.target.bias = self.source.weight, self.source.bias
+        self.domain = "source"
+
+    @property
+    def current(self) -> nn.BatchNorm1d:
+        """The norm of the current domain."""
+        return self.target if self.domain == "target" else self.source
+
+    def forward(self, x: Tensor) -> Tensor:
+        """As `nn.BatchNorm1d`."""
+        return self.current(x)
+
+    def extra_repr(self) -> str:
+        """Shown by print(model)."""
+        return f"domain={self.domain}"
+
+
+def make_norm(kind: str, channels: int) -> nn.Module:
+    """The norm of that name for [R, C] (not "instance") or [B, C, N].
+
+    Layers that compute the statistics themselves take parameters and running statistics from
+    `active(norm)` and hand in what they found with `track`.
+    """
+    if kind == "batch":
+        return nn.BatchNorm1d(channels)
+    if kind == "instance":
+        return nn.InstanceNorm1d(channels, affine=True)
+    if kind in KINDS:
+        return DomainNorm(channels, shared_affine=kind == "domain_statistics")
+    names = ", ".join(f"'{k}'" for k in KINDS)
+    raise ConfigError(f"norm must be one of {names}, got {kind!r}")
+
+
+def head_norm(kind: str) -> str:
+    """The kind to use where each cloud is one vector: instance norm has nothing to do there."""
+    return "batch" if kind == "instance" else kind
+
+
+def active(norm: nn.Module) -> nn.BatchNorm1d | nn.InstanceNorm1d:
+    """The plain norm that a pass uses now: of the current domain, if `norm` has several."""
+    found = norm.current if isinstance(norm, DomainNorm) else norm
+    assert isinstance(found, nn.BatchNorm1d | nn.InstanceNorm1d)
+    return found
+
+
+def uses_batch(norm: nn.Module) -> bool:
+    """Whether a pass takes statistics of its input, rather than the running ones."""
+    norm = active(norm)
+    return norm.training or norm.running_mean is None
+
+
+@torch.no_grad()
+def track(norm: nn.Module, mean: Tensor, var: Tensor, count: int) -> None:
+    """Update running statistics as `nn.BatchNorm1d` does; nothing if the norm keeps none.
+
+    Args:
+        norm: as from `make_norm`.
+        mean, var: [C] of this batch, `var` biased.
+        count: values behind them.
+    """
+    norm = active(norm)
+    if not norm.training or norm.running_mean is None or norm.running_var is None:
+        return
+    assert norm.num_batches_tracked is not None
+    norm.num_batches_tracked += 1
+    _LAST_COUNT[norm] = count
+    momentum = norm.momentum
+    if momentum is None:  # torch's cumulative average
+        momentum = 1.0 / float(norm.num_batches_tracked)
+    unbiased = var * (count / max(count - 1, 1))
+    norm.running_mean.lerp_(mean.to(norm.running_mean), momentum)
+    norm.running_var.lerp_(unbiased.to(norm.running_var), momentum)
+
+
+@contextmanager
+def use_domain(net: nn.Module, domain: str) -> Iterator[None]:
+    """Passes of `net` inside use the norms of `domain`; afterwards those of before.
+
+    Nothing happens in a net without domain-specific norms, so callers need not ask.
+
+    Raises:
+        ConfigError: no such domain.
+    """
+    if domain not in DOMAINS:
+        raise ConfigError(f"domain must be 'source' or 'target', got {domain!r}")
+    norms = [m for m in net.modules() if isinstance(m, DomainNorm)]
+    before = [norm.domain for norm in norms]
+    for norm in norms:
+        norm.domain = domain
+    try:
+        yield
+    finally:
+        for norm, old in zip(norms, before, strict=True):
+            norm.domain = old
+
+
+class _Pooled:
+    """Mean and biased variance of a norm's input over all batches (Chan et al., 1979), float64."""
+
+    def __init__(self, norm: nn.BatchNorm1d) -> None:
+        assert norm.running_mean is not None
+        self.norm, self.seen = norm, 0
+        self.total = 0
+        self.mean = torch.zeros_like(norm.running_mean, dtype=torch.float64)
+        self.squares = torch.zeros_like(self.mean)  # sum of squares about the mean
+
+    def add(self, count: int) -> None:
+        """What the norm holds after a pass with momentum 1: this batch's mean and variance."""
+        norm = self.norm
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        step = norm.running_mean.double() - self.mean
+        total = self.total + count
+        self.squares += norm.running_var.double() * (count - 1)
+        self.squares += step.square() * (self.total * count / total)
+        self.mean += step * (count / total)
+        self.total = total
+
+    def store(self) -> None:
+        norm = self.norm
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        norm.running_mean.copy_(self.mean)
+        norm.running_var.copy_(self.squares / max(self.total - 1, 1))
+
+
+@torch.no_grad()
+def adapt_batchnorm(
+    net: nn.Module, batches: Iterable[Tensor], *, exact: bool = False
+) -> list[nn.Module]:
+    """AdaBN: give every batch norm the statistics of these clouds (Li et al., 2016, alg. 1).
+
+    No weight changes. Means and variances are pooled over all batches: neither the order of the
+    batches nor a smaller last one matters, and nothing is left of the former statistics.
+
+    Args:
+        net: takes a batch of clouds. Of domain-specific norms those of the current domain are
+            re-estimated: call it inside `use_domain(net, "target")`.
+        batches: of clouds [B, N, 3], of at least two each; gone through several times if `exact`.
+        exact: one norm after the other, in the order in which the net holds them, each after all
+            before it are adapted: then each holds mean and unbiased variance of what it is given in
+            eval over all clouds, for as many passes as there are norms. Otherwise one pass, in
+            which a layer's input was normalised with the statistics of its own batch.
+
+    Returns:
+        The adapted norms.
+
+    Raises:
+        ConfigError: `exact`, and the net has norms that cannot be asked one by one.
+        DataError: there are no batches.
+    """
+    norms = _running(net)
+    modes = {module: module.training for module in net.modules()}
+    momenta = [norm.momentum for norm in norms]
+    try:
+        for group in [[norm] for norm in norms] if exact else [norms]:
+            net.eval()
+            if not exact:
+                for module in net.modules():
+                    module.training = not isinstance(module, nn.modules.dropout._DropoutNd)
+            for norm in group:
+                norm.training, norm.momentum = True, 1.0
+            _estimate(net, group, batches)
+    finally:
+        for norm, momentum in zip(norms, momenta, strict=True):
+            norm.momentum = momentum
+        for module, mode in modes.items():
+            module.training = mode
+    return list(norms)
+
+
+def _running(net: nn.Module) -> list[nn.BatchNorm1d]:
+    """Norms with running statistics that a pass would use now."""
+    asleep = {
+        norm.source if norm.domain == "target" else norm.target
+        for norm in net.modules()
+        if isinstance(norm, DomainNorm)
+    }
+    kind = nn.modules.batchnorm._BatchNorm
+    found = [m for m in net.modules() if isinstance(m, kind) and m.running_mean is not None]
+    return [norm for norm in found if norm not in asleep]  # type: ignore[misc]
+
+
+def _estimate(net: nn.Module, norms: list[nn.BatchNorm1d], batches: Iterable[Tensor]) -> None:
+    pooled = [_Pooled(norm) for norm in norms]
+
+    def count(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        _LAST_COUNT[norm] = inputs[0].numel() // inputs[0].shape[1]
+
+    hooks = [norm.register_forward_pre_hook(count) for norm in norms]
+    seen = 0
+    try:
+        for points in batches:
+            before = [int(norm.num_batches_tracked) for norm in norms]  # type: ignore[arg-type]
+            net(points)
+            seen += 1
+            for norm, pool, number in zip(norms, pooled, before, strict=True):
+                if norm.num_batches_tracked == number:
+                    raise ConfigError(
+                        "a layer of this net takes statistics of all its norms together; "
+                        "use adapt_batchnorm(exact=False)"
+                    )
+                # a layer that neither calls its norm nor `track` has so many that n - 1 is n
+                pool.add(_LAST_COUNT.get(norm, len(points) * 1_000_000))
+    finally:
+        for hook in hooks:
+            hook.remove()
+    if not seen:
+        raise DataError("no batches to take statistics of")
+    for pool in pooled:
+        pool.store()

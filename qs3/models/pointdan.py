@@ -1,0 +1,157 @@
+"""PointDAN's generator and its two classifiers.
+
+Qin et al., "PointDAN: A Multi-Scale 3D Domain Adaption Network for Point Cloud Representation",
+NeurIPS 2019: PointNet with a module of self-adaptive nodes between its layers.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.geometry.ball_query import ball_query
+from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.models.base import Backbone, Features, PointClassifier
+from qs3.models.pointnet import PointMLP
+
+
+class Nodes(NamedTuple):
+    """What the module of nodes makes of a cloud.
+
+    Attributes:
+        points: [B, N, 2 C] each point's features and what it gets from its nearest nodes.
+        features: [B, M, C] of the nodes.
+        places: [B, M, 3] where they moved to.
+    """
+
+    points: Float[Tensor, "b n 2*c"]
+    features: Float[Tensor, "b m c"]
+    places: Float[Tensor, "b m 3"]
+
+
+class NodeModule(nn.Module):
+    r"""Self-adaptive nodes (section 3.2 of the paper).
+
+    M nodes by farthest point sampling. Each moves by the mean over its ball's points k of
+    tanh(W (f_k - f_node)) * (x_k - x_node), gathers its K nearest points anew, and takes the
+    maximum of their mapped features. Each point gets a mean of its three nearest nodes, weighted
+    by the inverse of the squared distance.
+
+    Args:
+        channels: C of the points' features and of the nodes'.
+        nodes: M.
+        neighbours: K; also the size of a ball.
+        radius: of the balls, in the unit of the points.
+    """
+
+    def __init__(
+        self, channels: int = 64, nodes: int = 64, neighbours: int = 64, radius: float = 0.3
+    ) -> None:
+        super().__init__()
+        self.nodes, self.neighbours, self.radius = nodes, neighbours, radius
+        self.offset = nn.Linear(channels, 3, bias=False)
+        self.residual = PointMLP(channels, channels)
+
+    def forward(self, x: Float[Tensor, "b n 3"], f: Float[Tensor, "b n c"]) -> Nodes:
+        """Points [B, N, 3] and their features [B, N, C] to `Nodes`."""
+        b, n, _ = x.shape
+        k = min(self.neighbours, n)
+        # Another start each time in training (torch's generator, as for dropout), none in eval.
+        start = torch.randint(n, (b,), device=x.device) if self.training else 0
+        index = farthest_point_sampling(x, self.nodes, start)  # [b, m]
+        place, feature = gather(x, index), gather(f, index)
+        ball = ball_query(x, place, self.radius, k)  # [b, m, k]
+        towards = gather(x, ball) - place[:, :, None]  # [b, m, k, 3]
+        how_far = torch.tanh(self.offset(gather(f, ball) - feature[:, :, None]))
+        place = place + (how_far * towards).mean(2)  # [b, m, 3]
+        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+            squares = _squared_distances(place.detach().float(), x.float())  # [b, m, n]
+            nearest = squares.topk(k, dim=2, largest=False)[1]
+            three = squares.topk(min(3, self.nodes), dim=1, largest=False)[1]  # [b, 3, n]
+        nodes = gather(self.residual(f), nearest).amax(2)  # [b, m, c]
+        three = three.transpose(1, 2)  # [b, n, 3]
+        weight = 1 / (x[:, :, None] - gather(place, three)).square().sum(3).clamp_min(1e-10)
+        weight = weight / weight.sum(2, keepdim=True)
+        back = (weight[..., None] * gather(nodes, three)).sum(2)  # [b, n, c]
+        return Nodes(torch.cat([f, back.to(f.dtype)], dim=2), nodes, place)
+
+
+class _Turn(nn.Module):
+    """T-Net as PointDAN has it: LeakyReLU 0.01 in its second half, ReLU in the first."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.channels = channels
+        self.points = PointMLP(channels, 64, 128, 1024)
+        self.cloud = nn.Sequential(
+            *(nn.Linear(1024, 512), nn.BatchNorm1d(512), nn.LeakyReLU()),
+            *(nn.Linear(512, 256), nn.BatchNorm1d(256), nn.LeakyReLU()),
+            nn.Linear(256, channels**2),
+        )
+
+    def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b c c"]:
+        """The matrix that multiplies row vectors from the right."""
+        flat = self.cloud(self.points(x).amax(1))  # [b, c * c]
+        identity = torch.eye(self.channels, dtype=x.dtype, device=x.device)
+        return flat.view(-1, self.channels, self.channels) + identity
+
+
+class PointDanBackbone(Backbone):
+    """T-Net 3, 64, 64, T-Net 64, nodes (64 to 128), 128, 1024, maximum, batch norm.
+
+    Args:
+        nodes, neighbours, radius: of `NodeModule`.
+    """
+
+    feature_dim = 1024
+
+    def __init__(self, *, nodes: int = 64, neighbours: int = 64, radius: float = 0.3) -> None:
+        super().__init__()
+        self.input_transform = _Turn(3)
+        self.first = PointMLP(3, 64, 64)
+        self.feature_transform = _Turn(64)
+        self.node_module = NodeModule(64, nodes, neighbours, radius)
+        self.last = PointMLP(128, 128, 1024)
+        self.norm = nn.BatchNorm1d(1024)
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
+        """One vector a cloud; per point 128 features."""
+        return self.with_nodes(points)[0]
+
+    def with_nodes(self, points: Float[Tensor, "b n 3"]) -> tuple[Features, Nodes]:
+        """The same, and the nodes, for alignment."""
+        x = self.first(points @ self.input_transform(points))
+        x = x @ self.feature_transform(x)  # [b, n, 64]
+        nodes = self.node_module(points, x)
+        return Features(self.norm(self.last(nodes.points).amax(1)), nodes.points), nodes
+
+
+class TwoHeads(nn.Module):
+    """Two linear classifiers; logits are their mean."""
+
+    def __init__(self, feature_dim: int, num_classes: int) -> None:
+        super().__init__()
+        self.first = nn.Linear(feature_dim, num_classes)
+        self.second = nn.Linear(feature_dim, num_classes)
+
+    def forward(self, features: Float[Tensor, "b d"]) -> Float[Tensor, "b c"]:
+        """Mean of both."""
+        return (self.first(features) + self.second(features)) / 2
+
+
+def pointdan(
+    num_classes: int, nodes: int = 64, neighbours: int = 64, radius: float = 0.3
+) -> PointClassifier:
+    """PointDAN's net; any method can train it, `method=pointdan` needs it."""
+    backbone = PointDanBackbone(nodes=nodes, neighbours=neighbours, radius=radius)
+    return PointClassifier(backbone, TwoHeads(backbone.feature_dim, num_classes))
+
+
+def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
+    """[b, m, 3] and [b, n, 3] to [b, m, n], without gradient."""
+    return (
+        a.square().sum(2)[:, :, None] + b.square().sum(2)[:, None] - 2 * a @ b.transpose(1, 2)
+    ).clamp_min_(0)

@@ -1,0 +1,132 @@
+"""CBST and CRST: a threshold of its own for each class.
+
+Zou et al., "Unsupervised Domain Adaptation for Semantic Segmentation via Class-Balanced
+Self-Training", ECCV 2018; Zou et al., "Confidence Regularized Self-Training", ICCV 2019. Both are
+about pixels; what is done here with clouds is said in the docstrings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.errors import ConfigError
+from qs3.selftraining.selectors import Selection
+from qs3.settings import number, one_of
+
+_KEY = "selftraining.selector"
+
+
+def class_thresholds(
+    confidence: Float[np.ndarray, " n"],
+    predicted: Int[np.ndarray, " n"],
+    classes: int,
+    portion: float,
+) -> Float[np.ndarray, " k"]:
+    """theta_k: the floor(portion n_k)-th largest confidence among the n_k predicted as k.
+
+    1 if that rank is 0: an empty class, or one so rare that its portion is less than one sample.
+    """
+    thresholds = np.ones(classes)
+    for k in range(classes):
+        of_class = np.sort(confidence[predicted == k])[::-1]
+        rank = math.floor(Decimal(repr(float(portion))) * len(of_class))  # 0.3 * 10 is 3 exactly
+        if rank:
+            thresholds[k] = of_class[rank - 1]
+    return thresholds
+
+
+@dataclass(frozen=True)
+class Cbst:
+    r"""Class-balanced self-training: about the same portion of each predicted class.
+
+    With thresholds theta_k as in `class_thresholds`, a sample's pseudo-label is
+    argmax_k p_k / theta_k (the lowest k on ties), not argmax_k p_k: a class of which the teacher is
+    never sure is not ruled out. It is kept if that quotient is >= 1 and its p_k > theta of the
+    round (0 in the papers). Samples that tie with theta_k are kept as well, whatever their order.
+
+    `labels="lrent"` is CRST's LRENT: pseudo-labels are soft, y_k proportional to
+    (p_k / theta_k)^(1 / alpha), and a sample is kept if
+    -sum y log p + alpha sum y log y < -sum y log theta, which is
+    sum_k (p_k / theta_k)^(1 / alpha) > 1.
+    CRST's MRKLD keeps what CBST keeps; it is a loss of the student (`selftraining.mrkld`).
+
+    Attributes:
+        portion: of each class in round 0, in (0, 1]; 0.2 in the released codes.
+        step: added each round; 0.05.
+        most: of the portion; 0.5.
+        labels: "hard" or "lrent".
+        alpha: weight of LRENT's entropy; 0.25 in the released code.
+    """
+
+    own_thresholds: ClassVar[bool] = True
+
+    portion: float = 0.2
+    step: float = 0.05
+    most: float = 0.5
+    labels: str = "hard"
+    alpha: float = 0.25
+
+    def __post_init__(self) -> None:
+        one_of(f"{_KEY}.labels", self.labels, ("hard", "lrent"))
+        for key in ("portion", "step", "most", "alpha"):
+            number(f"{_KEY}.{key}", getattr(self, key))
+        if not 0 < self.portion <= self.most <= 1:
+            raise ConfigError(
+                f"{_KEY}: 0 < portion <= most <= 1, got portion={self.portion}, most={self.most}"
+            )
+        if self.step < 0 or self.alpha <= 0:
+            raise ConfigError(
+                f"{_KEY}: step >= 0 and alpha > 0, got step={self.step}, alpha={self.alpha}"
+            )
+
+    def portion_of(self, round_: int) -> float:
+        """min(portion + round step, most), in decimal arithmetic."""
+        grown = Decimal(repr(self.portion)) + round_ * Decimal(repr(self.step))
+        return float(min(grown, Decimal(repr(self.most))))
+
+    def select(
+        self,
+        confidence: Float[np.ndarray, " n"],
+        predicted: Int[np.ndarray, " n"],
+        ids: Sequence[str],
+        classes: int,
+        theta: float,
+        *,
+        probabilities: Float[np.ndarray, "n k"] | None = None,
+        round_: int = 0,
+    ) -> Selection:
+        """As `Selector.select`; the figure "confident" counts predictions above theta."""
+        if probabilities is None:
+            raise ConfigError("CBST needs the probabilities of all classes")
+        portion = self.portion_of(round_)
+        thresholds = class_thresholds(confidence, predicted, classes, portion)
+        quotient = probabilities / thresholds  # [n, K]; thresholds > 0, as a largest p is
+        labels = quotient.argmax(axis=1)
+        soft = None
+        keep = quotient.max(axis=1) >= 1
+        if self.labels == "lrent":
+            logs = np.log(np.maximum(quotient, np.finfo(float).tiny)) / self.alpha
+            top = logs.max(axis=1, keepdims=True)
+            powers = np.exp(logs - top)
+            total = powers.sum(axis=1, keepdims=True)
+            soft = powers / total
+            keep = (top + np.log(total))[:, 0] > 0
+        chosen = np.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
+        selected = keep & (chosen > theta)
+        return Selection(
+            selected=selected,
+            theta=theta,
+            mu=np.full(classes, portion),
+            confident=np.bincount(predicted[np.asarray(confidence) > theta], minlength=classes),
+            kept=np.bincount(labels[selected], minlength=classes),
+            labels=labels,
+            soft=soft,
+            thresholds=thresholds,
+        )

@@ -1,0 +1,72 @@
+"""Controls: what a selection is worth beside one of the same size that does not choose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.errors import ConfigError
+from qs3.randomness import derive
+from qs3.selftraining.selectors import Selection, Selector
+from qs3.settings import one_of, whole
+
+
+@dataclass(frozen=True)
+class Random:
+    """As many samples of each class as another selector keeps, drawn at random.
+
+    A sample's chance is a number made from (seed, round, id): the same whatever the order and
+    whatever else is in the table.
+
+    Attributes:
+        of: the other selector; its pseudo-labels are kept, its choice is not.
+        seed: of the run.
+        pool: drawn from the "confident" samples, above theta, or from "all" of the class.
+    """
+
+    of: Selector
+    seed: int = 0
+    pool: str = "confident"
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.of, "select"):
+            raise ConfigError("selftraining.selector.of must be a selector")
+        whole("selftraining.selector.seed", self.seed, 0)
+        one_of("selftraining.selector.pool", self.pool, ("confident", "all"))
+
+    @property
+    def own_thresholds(self) -> bool:
+        """Whether the other selector has thresholds of its own."""
+        return bool(getattr(self.of, "own_thresholds", False))
+
+    def select(
+        self,
+        confidence: Float[np.ndarray, " n"],
+        predicted: Int[np.ndarray, " n"],
+        ids: Sequence[str],
+        classes: int,
+        theta: float,
+        *,
+        probabilities: Float[np.ndarray, "n k"] | None = None,
+        round_: int = 0,
+    ) -> Selection:
+        """As `Selector.select`; figures are those of the other selector."""
+        given = self.of.select(
+            confidence, predicted, ids, classes, theta, probabilities=probabilities, round_=round_
+        )
+        labels, chosen = predicted, np.asarray(confidence)
+        if given.labels is not None:
+            assert probabilities is not None
+            labels = given.labels
+            chosen = np.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
+        allowed = chosen > theta if self.pool == "confident" else np.ones(len(chosen), dtype=bool)
+        lot = np.array([derive(self.seed, "random selection", round_, id_) for id_ in ids])
+        drawn = np.argsort(lot, kind="stable")
+        selected = np.zeros(len(chosen), dtype=bool)
+        for k in range(classes):
+            of_class = drawn[allowed[drawn] & (labels[drawn] == k)]
+            selected[of_class[: given.kept[k]]] = True
+        return replace(given, selected=selected)

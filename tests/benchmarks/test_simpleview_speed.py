@@ -1,0 +1,58 @@
+"""SimpleView against its released sequence of operations, forward and backward, in one process."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import torch
+from pytest_benchmark.fixture import BenchmarkFixture
+from torch import nn
+from torch.nn import functional as F
+
+from qs3.models.simpleview import simpleview
+from tests.models.reference_simpleview import NaiveSimpleView
+
+
+def boxes(b: int, n: int = 1024) -> torch.Tensor:
+    """Points on the surfaces of boxes of many shapes, in the unit ball: [b, n, 3]."""
+    generator = torch.Generator().manual_seed(0)
+    points = 2 * torch.rand(b, n, 3, generator=generator) - 1
+    side = torch.randint(3, (b, n, 1), generator=generator)
+    points = points.scatter(2, side, points.gather(2, side).sign())
+    points = points * (0.2 + torch.rand(b, 1, 3, generator=generator))
+    return points / points.norm(dim=2).amax(1)[:, None, None]
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_step(training: bool, benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
+    torch.manual_seed(0)
+    b = 18 if benchmark.enabled else 2  # as published
+    model = simpleview(10).train(training)
+    points, labels = boxes(b), torch.arange(b) % 10
+
+    def step(net: nn.Module) -> None:
+        if not training:
+            with torch.no_grad():
+                net(points)
+            return
+        net.zero_grad()
+        F.cross_entropy(net(points), labels).backward()
+
+    benchmark.pedantic(step, (model,), rounds=4, warmup_rounds=1)
+    if not benchmark.enabled:
+        return
+    naive, theirs = NaiveSimpleView(model).train(training), torch.inf
+    for _ in range(4):
+        begin = time.perf_counter()
+        step(naive)
+        theirs = min(theirs, (time.perf_counter() - begin) / b)
+    ours = benchmark.stats.stats.min / b
+    benchmark.extra_info["ms_per_cloud"] = ours * 1e3
+    benchmark.extra_info["times_faster"] = theirs / ours
+    with capsys.disabled():
+        print(  # noqa: T201
+            f"\nSimpleView {'training' if training else 'inference'} {b} x 1024: "
+            f"{ours * 1e3:.1f} ms a cloud, straight {theirs * 1e3:.1f}: "
+            f"{theirs / ours:.2f} times faster, {torch.get_num_threads()} threads"
+        )

@@ -1,0 +1,60 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.methods.deform import VOXELS, deform, voxel_centre, voxel_of
+
+
+def test_voxels_and_centres_known_answers() -> None:
+    third = 1 / 3
+    points = torch.tensor(
+        [[[-1, -1, -1], [0, 0, 0], [0.9, -0.9, 0], [1, 1, 1], [2, -2, 0.5], [-0.34, 0.32, third]]]
+    )
+    # 9 i + 3 j + k; a point outside belongs to the nearest voxel
+    assert voxel_of(points)[0, :5].tolist() == [0, 13, 18 + 0 + 1, 26, 18 + 0 + 2]
+    assert voxel_of(points)[0, 5] // 3 == 1  # x in the first third, y in the second
+    centres = voxel_centre(torch.tensor([0, 13, 19, 26]))
+    expected = torch.tensor([[-2, -2, -2], [0, 0, 0], [2, -2, 0], [2, 2, 2]]) / 3
+    torch.testing.assert_close(centres, expected)
+    every = torch.arange(VOXELS)
+    assert torch.equal(voxel_of(voxel_centre(every)[None])[0], every)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 4), st.integers(1, 80), st.integers(1, 20), st.integers(0, 10_000))
+def test_against_a_loop_over_clouds(b: int, n: int, least: int, seed: int) -> None:
+    points = torch.rand(b, n, 3, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    before = points.clone()
+    found = deform(points, torch.Generator().manual_seed(seed), least)
+    assert torch.equal(points, before)
+    order = torch.randperm(VOXELS, generator=torch.Generator().manual_seed(seed)).tolist()
+    for i in range(b):
+        count = torch.bincount(voxel_of(points)[i], minlength=VOXELS)
+        first = next((v for v in order if count[v] >= least), None)
+        if first is None:
+            assert not found.mask[i].any()
+        else:
+            assert found.voxel[i] == first
+            assert torch.equal(found.mask[i], voxel_of(points)[i] == first)
+        kept = ~found.mask[i]
+        assert torch.equal(found.points[i][kept], points[i][kept])
+
+
+def test_the_blob_s_law() -> None:
+    points = torch.full((8, 500, 3), 0.1)  # all in the middle voxel
+    found = deform(points, torch.Generator().manual_seed(0), 40)
+    assert found.mask.all()
+    assert found.voxel.tolist() == [13] * 8
+    flat = found.points.flatten(0, 1)
+    assert flat.mean(0).abs().max() < 0.003
+    assert flat.var(0).numpy() == pytest.approx(0.001, rel=0.1)
+
+
+def test_all_randomness_is_the_generator_s() -> None:
+    points = torch.rand(3, 90, 3) * 2 - 1
+    state = torch.get_rng_state()
+    draws = [deform(points, torch.Generator().manual_seed(s), 2) for s in (1, 1, 2)]
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.equal(draws[0].points, draws[1].points)
+    assert not torch.equal(draws[0].points, draws[2].points)

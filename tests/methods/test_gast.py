@@ -1,0 +1,95 @@
+import math
+
+import pytest
+import torch
+
+from qs3.methods.deform import VOXELS
+from qs3.methods.gast import Gast, turn_parts
+from tests.methods.shapes import tiny_net
+
+
+def rotation(axis: int, quarters: int) -> torch.Tensor:
+    """What multiplies row vectors from the right, from sines and cosines."""
+    c, s = math.cos(quarters * math.pi / 2), math.sin(quarters * math.pi / 2)
+    if axis == 0:
+        return torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]])
+    return torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_parts_are_turned_as_their_labels_say(seed: int) -> None:
+    points = torch.rand(5, 40, 3, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+    mixed, about_x, about_y, lam = turn_parts(points, torch.Generator().manual_seed(seed))
+    own = round(float(lam) * 40)
+    for i in range(5):
+        first = points[i] @ rotation(0, int(about_x[i]))
+        second = points[i] @ rotation(1, int(about_y[i]))
+        near_first = (mixed[i][:, None] - first).abs().amax(2).amin(1) < 1e-5
+        near_second = (mixed[i][:, None] - second).abs().amax(2).amin(1) < 1e-5
+        assert (near_first | near_second).all()
+        if about_x[i] or about_y[i]:  # else the parts cannot be told apart
+            assert near_first.sum() == own
+            assert near_second.sum() == 40 - own
+
+
+def test_the_two_labels_are_independent() -> None:
+    """The released code keeps both in one tensor: there they are always equal."""
+    points = torch.rand(64, 8, 3)
+    generator = torch.Generator().manual_seed(0)
+    table = torch.zeros(4, 4)
+    for _ in range(20):
+        _, about_x, about_y, _ = turn_parts(points, generator)
+        table.index_put_((about_x, about_y), torch.ones(64), accumulate=True)
+    expected = 20 * 64 / 16
+    chi2 = float(((table - expected) ** 2 / expected).sum())
+    assert chi2 < 38  # 15 degrees of freedom: 0.1 % are above 37.7
+
+
+def test_a_net_that_knows_nothing_pays_ln_27_and_ln_4() -> None:
+    method, net = Gast(min_points=2), tiny_net()
+    method.prepare(net)
+    assert method.def_head is not None
+    assert method.rot_heads is not None
+    for head in (method.def_head, *method.rot_heads):
+        torch.nn.init.zeros_(head.weight)
+        torch.nn.init.zeros_(head.bias)
+    clouds = torch.rand(4, 64, 3) * 2 - 1
+    batch = {
+        "source": {"points": clouds, "y_source": torch.tensor([0, 1, 2, 3])},
+        "target": {"points": clouds},
+    }
+    terms = method.loss(net, batch, torch.Generator().manual_seed(0))
+    for domain in ("source", "target"):
+        assert terms[f"def_{domain}"].item() == pytest.approx(0.5 * math.log(VOXELS), rel=1e-5)
+        assert terms[f"rot_{domain}"].item() == pytest.approx(0.2 * math.log(4), rel=1e-5)
+
+
+def test_clouds_without_a_voxel_to_deform_do_not_count() -> None:
+    method, net = Gast(min_points=65, rot_weight=0.0), tiny_net()
+    method.prepare(net)
+    clouds = torch.rand(4, 64, 3)
+    batch = {
+        "source": {"points": clouds, "y_source": torch.tensor([0, 1, 2, 3])},
+        "target": {"points": clouds},
+    }
+    terms = method.loss(net, batch, torch.Generator().manual_seed(0))
+    assert terms["def_source"].item() == terms["def_target"].item() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({}, {"ce", "def_source", "def_target", "rot_source", "rot_target"}),
+        ({"rot_weight": 0.0}, {"ce", "def_source", "def_target"}),
+        ({"def_weight": 0.0, "pcm": True}, {"pcm", "rot_source", "rot_target"}),
+    ],
+)
+def test_losses_can_be_left_out(settings: dict, names: set) -> None:
+    method, net = Gast(**{"min_points": 2, **settings}), tiny_net()
+    method.prepare(net)
+    clouds = torch.rand(4, 64, 3)
+    batch = {
+        "source": {"points": clouds, "y_source": torch.tensor([0, 1, 2, 3])},
+        "target": {"points": clouds},
+    }
+    assert set(method.loss(net, batch, torch.Generator().manual_seed(0))) == names

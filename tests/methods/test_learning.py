@@ -1,0 +1,172 @@
+"""Each idea at work: on a shift where it should help, a method beats its copy without it.
+
+Net, data, steps and random draws are the same; only the weight of the loss is 0 in the copy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from qs3.methods.base import Method
+from qs3.methods.chamfer import masked_chamfer
+from qs3.methods.dann import Dann
+from qs3.methods.deform import deform
+from qs3.methods.defrec import DefRec
+from qs3.methods.gast import Gast
+from qs3.methods.pcm import Pcm
+from qs3.methods.pointdan import PointDan
+from qs3.methods.source_only import SourceOnly
+from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, tiny_pointdan, train, unit_ball
+
+POINTS = 64
+
+
+def clutter(points: Tensor, generator: torch.Generator) -> Tensor:
+    """A third of each cloud's points are those of another one."""
+    b, n, _ = points.shape
+    other = points[torch.randperm(b, generator=generator)]
+    order = torch.randperm(n, generator=generator)
+    own, foreign = order[n // 3 :], order[: n // 3]
+    return torch.cat([points[:, own], other[:, foreign]], dim=1)
+
+
+def aside(points: Tensor, generator: torch.Generator) -> Tensor:
+    """All clouds moved by 1 along x: the target is not where the source is."""
+    return points + torch.tensor([1.0, 0.0, 0.0])
+
+
+def tilted(points: Tensor, generator: torch.Generator) -> Tensor:
+    """All clouds turned by 0.6 about x: tables lean."""
+    c, s = math.cos(0.6), math.sin(0.6)
+    return points @ torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def noisy(points: Tensor, generator: torch.Generator) -> Tensor:
+    """Noise of a quarter of a cloud's radius, then the unit ball again."""
+    return unit_ball(points + 0.25 * torch.randn(points.shape, generator=generator))
+
+
+def strays(points: Tensor, generator: torch.Generator) -> Tensor:
+    """A tenth of the points lie anywhere in [-1, 1]^3."""
+    b, n, _ = points.shape
+    anywhere = torch.rand(b, n // 10, 3, generator=generator) * 2 - 1
+    return torch.cat([points[:, n // 10 :], anywhere], dim=1)
+
+
+def compare(
+    methods: tuple[Callable[[], Method], Callable[[], Method]],
+    shift: Callable[[Tensor, torch.Generator], Tensor],
+    net: Callable[[int], nn.Module] = tiny_net,
+    steps: int = 150,
+    lr: float = 3e-3,
+    seeds: int = 3,
+) -> Float[Tensor, "seeds 2"]:
+    """Accuracy on shifted clouds that were not trained on, with and without the idea."""
+    result = torch.zeros(seeds, 2)
+    for seed in range(seeds):
+        generator = torch.Generator().manual_seed(seed)
+        y_source = torch.arange(256) % CLASSES
+        source = boxes(y_source, POINTS, generator)
+        labels = [torch.randint(CLASSES, (256,), generator=generator) for _ in range(2)]
+        target, held_out = (shift(boxes(y, POINTS, generator), generator) for y in labels)
+        for i, make in enumerate(methods):
+            student = net(seed)
+            schedule = {"steps": steps, "seed": seed, "batch_size": 16, "lr": lr}
+            train(make(), student, (source, y_source), target, **schedule)
+            result[seed, i] = accuracy(student, held_out, labels[1])
+    return result
+
+
+def gain(result: Tensor) -> float:
+    """Mean difference over the seeds."""
+    difference = result[:, 0] - result[:, 1]
+    return float(difference.mean())
+
+
+@pytest.mark.slow
+def test_pcm_withstands_clutter() -> None:
+    """A net that has learned to name both parts of a mixture is not led astray by a third."""
+    assert gain(compare((Pcm, SourceOnly), clutter)) > 0.05
+
+
+@pytest.mark.slow
+def test_gast_s_questions_carry_over_to_a_target_elsewhere() -> None:
+    """Features that answer them for both domains serve the classifier in both."""
+    off = 1e-9  # 0 would leave out the passes, and what batch norm learns from them
+    on = lambda: Gast(def_weight=0.1, rot_weight=0.1, min_points=3)  # noqa: E731
+    copy = lambda: Gast(def_weight=off, rot_weight=off, min_points=3)  # noqa: E731
+    assert gain(compare((on, copy), aside)) > 0.02
+
+
+@pytest.mark.slow
+def test_pointdan_s_alignment_withstands_strays() -> None:
+    """A tenth of the target's points lie anywhere; aligned nodes and clouds are less led astray."""
+    on = PointDan
+    copy = lambda: PointDan(discrepancy_weight=0.0, node_weight=0.0)  # noqa: E731
+    assert gain(compare((on, copy), strays, tiny_pointdan, steps=200, lr=2e-3)) > 0.01
+
+
+@pytest.mark.slow
+def test_dann_s_features_tell_less_about_the_domain() -> None:
+    """A fresh probe on the features of clouds not trained on names the domain less well.
+
+    This is what its loss asks for. That accuracy follows could not be shown here: for a tilt the
+    gain over six seeds was 0.04 with a standard error of 0.09 (with batch norm in the net).
+    """
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.arange(256) % CLASSES
+    source, new_source = (boxes(labels, POINTS, generator) for _ in range(2))
+    target, new_target = (tilted(boxes(labels, POINTS, generator), generator) for _ in range(2))
+    domain = torch.arange(2).repeat_interleave(256)
+    loss = {}
+    for weight in (1.0, 0.0):
+        net = tiny_net(norm=False)  # no statistics of one domain between train and eval mode
+        method = Dann(domain_weight=weight)
+        train(method, net, (source, labels), target, steps=200, seed=0, batch_size=16)
+        net.eval()
+        with torch.no_grad():
+            x = net.features(torch.cat([new_source, new_target])).global_
+        x = (x - x.mean(0)) / (x.std(0) + 1e-6)
+        probe = nn.Linear(x.shape[1], 2)
+        optimizer = torch.optim.Adam(probe.parameters(), 1e-2)
+        for _ in range(200):
+            loss[weight] = F.cross_entropy(probe(x), domain)
+            optimizer.zero_grad()
+            loss[weight].backward()
+            optimizer.step()
+    assert loss[1.0].item() > 1.5 * loss[0.0].item()
+
+
+@pytest.mark.slow
+def test_defrec_rebuilds_regions_of_target_clouds_it_has_not_seen() -> None:
+    """Nearer than the deformed points themselves, and than its copy without the loss.
+
+    This is what its loss asks for. That accuracy follows could not be shown here: over several
+    shifts the gain was within chance of 0, but for noise: 0.04 with a standard error of 0.02 over
+    six seeds, 0.01 over six others.
+    """
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.arange(256) % CLASSES
+    source = boxes(labels, POINTS, generator)
+    target, held_out = (noisy(boxes(labels, POINTS, generator), generator) for _ in range(2))
+    error = {}
+    deformed = deform(held_out, generator, 3)
+    mask = deformed.mask
+    for scale in (20.0, 0.0):
+        method, net = DefRec(min_points=3, dropout=0.0, scale=scale), tiny_net()
+        train(method, net, (source, labels), target, steps=150, seed=0, batch_size=16)
+        net.eval()
+        method.eval()
+        with torch.no_grad():
+            rebuilt = method.head(net.features(deformed.points))
+        error[scale] = masked_chamfer(rebuilt, held_out, mask, mask).mean()
+    untouched = masked_chamfer(deformed.points, held_out, mask, mask).mean()
+    assert error[20.0] < 0.9 * untouched
+    assert error[20.0] < 0.5 * error[0.0]

@@ -1,0 +1,80 @@
+import math
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from qs3.errors import ConfigError
+from qs3.methods.pointdan import PointDan, discrepancy
+from qs3.models.pointdan import pointdan
+from tests.methods.shapes import tiny_net
+
+
+def test_discrepancy_known_answers() -> None:
+    one, other = torch.tensor([[50.0, 0, 0, 0]]), torch.tensor([[0.0, 50, 0, 0]])
+    assert discrepancy(one, other).item() == pytest.approx(2 / 4)
+    assert discrepancy(one, one).item() == 0
+    mild = torch.tensor([[math.log(3.0), 0.0]])  # 3/4, 1/4 against 1/2, 1/2
+    assert discrepancy(mild, torch.zeros(1, 2)).item() == pytest.approx(0.25)
+
+
+def _setting(**settings):
+    torch.manual_seed(0)
+    net = pointdan(4, nodes=8, neighbours=8).double()
+    method = PointDan(**settings)
+    method.prepare(net)
+    method.double()
+    clouds = torch.rand(3, 32, 3, dtype=torch.float64) * 2 - 1
+    batch = {
+        "source": {"points": clouds, "y_source": torch.tensor([0, 1, 2])},
+        "target": {"points": clouds + 0.1},
+        "progress": 0.5,
+    }
+    return net, method, batch
+
+
+def test_classifiers_enlarge_the_discrepancy_and_the_generator_lowers_it() -> None:
+    net, method, batch = _setting(class_weight=0.0, node_weight=0.0)
+    torch.manual_seed(1)
+    terms = method.loss(net, batch, torch.Generator())
+    terms["discrepancy"].backward()
+    ours = {name: p.grad.clone() for name, p in net.named_parameters() if p.grad is not None}
+    net.zero_grad()
+    torch.manual_seed(1)  # the same starts of farthest point sampling
+    net.backbone.with_nodes(batch["source"]["points"])
+    features = net.backbone.with_nodes(batch["target"]["points"])[0].global_
+    apart = (
+        (F.softmax(net.head.first(features), 1) - F.softmax(net.head.second(features), 1))
+        .abs()
+        .mean()
+    )
+    apart.backward()
+    assert terms["discrepancy"].item() == pytest.approx(-apart.item())
+    alpha = math.sin(math.pi / 4)
+    for name, p in net.named_parameters():
+        if p.grad is None:
+            continue
+        sign = -1.0 if name.startswith("head") else alpha
+        torch.testing.assert_close(ours[name], sign * p.grad, rtol=1e-3, atol=1e-6)
+
+
+def test_attention_belongs_to_a_domain() -> None:
+    net, method, batch = _setting(class_weight=0.0, discrepancy_weight=0.0)
+    method.loss(net, batch, torch.Generator())["nodes"].backward()
+    assert method.attention is not None
+    for domain in ("source", "target"):
+        assert all(p.grad is not None for p in method.attention[domain].parameters())
+    assert net.head.first.weight.grad is None
+    assert net.backbone.node_module.residual.layers[0].weight.grad.abs().max() > 0
+
+
+def test_another_model_is_refused() -> None:
+    with pytest.raises(ConfigError, match="model=pointdan"):
+        PointDan().prepare(tiny_net())
+
+
+def test_classifiers_learn_at_their_own_rate() -> None:
+    net = pointdan(4, nodes=8, neighbours=8)
+    ((module, factor),) = PointDan().learning_rates(net)
+    assert module is net.head
+    assert factor == 2.0

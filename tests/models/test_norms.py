@@ -1,0 +1,186 @@
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from qs3.errors import ConfigError, DataError
+from qs3.models.dgcnn import dgcnn
+from qs3.models.norms import DomainNorm, active, adapt_batchnorm, make_norm, track, use_domain
+from qs3.models.pointnet import pointnet
+from tests.models.reference import NaiveDGCNN
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+BUILDERS = {"dgcnn": dgcnn, "pointnet": pointnet}
+
+
+def _clouds(b: int, seed: int = 0, n: int = 40) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(b, n, 3, generator=generator, dtype=torch.float64)
+
+
+def _running(net: nn.Module) -> list[torch.Tensor]:
+    return [b.clone() for n, b in net.named_buffers() if "running" in n]
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+@pytest.mark.parametrize("kind", ["domain", "domain_statistics"])
+def test_a_pass_on_one_domain_leaves_the_other_alone(name: str, kind: str) -> None:
+    torch.manual_seed(0)
+    net = BUILDERS[name](4, norm=kind).double()
+    before = {k: v.clone() for k, v in net.named_buffers()}
+    with use_domain(net, "target"):
+        net(_clouds(3)).sum().backward()
+    for key, value in net.named_buffers():
+        if "running" in key:
+            assert torch.equal(value, before[key]) == (".source." in key), key
+    source = [p.grad for k, p in net.named_parameters() if k.endswith(".source.weight")]
+    assert source
+    assert all((grad is None) == (kind == "domain") for grad in source)
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_on_source_it_is_batch_norm(name: str) -> None:
+    torch.manual_seed(0)
+    plain = BUILDERS[name](4, dropout=0.0).double()
+    torch.manual_seed(0)
+    several = BUILDERS[name](4, norm="domain", dropout=0.0).double()
+    for training in (True, False):
+        plain.train(training)
+        several.train(training)
+        torch.testing.assert_close(plain(_clouds(3)), several(_clouds(3)), **TIGHT)
+
+
+def test_parameters_of_a_domain() -> None:
+    def count(norm: str) -> int:
+        return sum(p.numel() for p in dgcnn(10, norm=norm).parameters())
+
+    channels = 64 + 64 + 128 + 256 + 512 + 256
+    assert count("domain") == count("batch") + 2 * channels
+    assert count("domain_statistics") == count("batch")
+
+
+def test_shared_affine_stays_shared_in_a_copy_and_after_loading() -> None:
+    norm = copy.deepcopy(DomainNorm(4, shared_affine=True))
+    norm.load_state_dict(DomainNorm(4, shared_affine=True).state_dict())
+    assert norm.source.weight is norm.target.weight
+
+
+def test_domain_comes_back_after_an_error_and_nested() -> None:
+    net = nn.Sequential(DomainNorm(3), DomainNorm(3))
+    with use_domain(net, "target"), use_domain(net, "source"):
+        assert [m.domain for m in net] == ["source", "source"]
+    with pytest.raises(RuntimeError, match="x"), use_domain(net, "target"):
+        raise RuntimeError("x")
+    assert [m.domain for m in net] == ["source", "source"]
+    with pytest.raises(ConfigError, match="'source' or 'target'"), use_domain(net, "s"):
+        pass
+
+
+def test_nets_without_domains_do_not_mind() -> None:
+    net = dgcnn(4).double().eval()
+    with use_domain(net, "target"):
+        inside = net(_clouds(1))
+    assert torch.equal(inside, net(_clouds(1)))
+
+
+@pytest.mark.parametrize("momentum", [0.1, None])
+def test_track_is_what_torch_does(momentum: float | None) -> None:
+    torch.manual_seed(0)
+    ours, theirs = nn.BatchNorm1d(3, momentum=momentum), nn.BatchNorm1d(3, momentum=momentum)
+    for rows in (5, 9, 2):
+        x = torch.randn(rows, 3)
+        theirs(x)
+        track(ours, x.mean(0), x.var(0, correction=0), rows)
+    for a, b in zip(ours.buffers(), theirs.buffers(), strict=True):
+        torch.testing.assert_close(a, b)
+    before = ours.running_mean.clone()
+    track(ours.eval(), torch.ones(3), torch.ones(3), 4)
+    assert torch.equal(ours.running_mean, before)
+
+
+def test_unknown_norm() -> None:
+    with pytest.raises(ConfigError, match="'domain', 'domain_statistics', got 'layer'"):
+        make_norm("layer", 4)
+
+
+def _whole_batch(net: nn.Module, points: torch.Tensor) -> list[torch.Tensor]:
+    """Running statistics after one training pass over everything, dropout off."""
+    twin = copy.deepcopy(net).train()
+    for module in twin.modules():
+        if isinstance(module, nn.Dropout):
+            module.p = 0.0
+        if isinstance(module, nn.BatchNorm1d):
+            module.momentum = 1.0
+    twin(points)
+    return _running(twin)
+
+
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [("dgcnn", "uda"), ("dgcnn", "simpleview"), ("pointnet", "basic"), ("pointnet", "simpleview")],
+)
+def test_adapted_norms_hold_the_statistics_of_what_they_are_given(name: str, variant: str) -> None:
+    """Asked of the straight net in eval, whose norms all see their [B, C, ...] input whole."""
+    torch.manual_seed(0)
+    net = BUILDERS[name](4, variant=variant).double()
+    net(_clouds(4, seed=1))  # statistics of something else
+    points = _clouds(10)
+    net.eval()
+    net.backbone.train()
+    modes = [m.training for m in net.modules()]
+    weights = [p.clone() for p in net.parameters()]
+    adapted = adapt_batchnorm(net, [points[:4], points[4:8], points[8:]], exact=True)
+    assert [m.training for m in net.modules()] == modes
+    assert all(torch.equal(a, b) for a, b in zip(weights, net.parameters(), strict=True))
+    assert all(m.momentum == 0.1 for m in adapted)
+
+    straight = NaiveDGCNN(net) if name == "dgcnn" else net
+    seen = []
+
+    def look(norm: nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:
+        rows = inputs[0].transpose(0, 1).flatten(1)  # [c, values]
+        torch.testing.assert_close(norm.running_mean, rows.mean(1), rtol=1e-9, atol=1e-10)
+        torch.testing.assert_close(norm.running_var, rows.var(1), rtol=1e-9, atol=1e-10)
+        seen.append(norm)
+
+    for module in straight.modules():
+        if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
+            module.register_forward_pre_hook(look)
+    straight.eval()(points)
+    assert len(seen) == len(adapted)
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_one_pass_is_exact_in_the_first_norm_and_for_one_batch(name: str) -> None:
+    torch.manual_seed(0)
+    net = BUILDERS[name](4).double()
+    points = _clouds(9)
+    expected = _whole_batch(net, points)
+    adapt_batchnorm(net, [points])
+    for a, b in zip(_running(net), expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8)
+    adapt_batchnorm(net, [points[:5], points[5:]])
+    for a, b in zip(_running(net)[:2], expected[:2], strict=True):
+        torch.testing.assert_close(a, b, **TIGHT)
+
+
+def test_only_the_current_domain_is_adapted() -> None:
+    net = dgcnn(4, norm="domain").double()
+    with use_domain(net, "target"):
+        adapted = adapt_batchnorm(net, [_clouds(4)])
+    first = net.backbone.edge_convs[0].norm
+    assert first.target in adapted
+    assert first.source not in adapted
+    assert torch.equal(first.source.running_mean, torch.zeros(64, dtype=torch.float64))
+    assert active(first) is first.source
+
+
+def test_nothing_to_adapt_on() -> None:
+    with pytest.raises(DataError, match="no batches"):
+        adapt_batchnorm(dgcnn(4), [])
+
+
+def test_instance_norm_has_nothing_to_adapt_but_in_the_head() -> None:
+    net = dgcnn(4, norm="instance").double()
+    assert len(adapt_batchnorm(net, [_clouds(4)])) == 2

@@ -1,0 +1,212 @@
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from torch import nn
+from torch.nn import functional as F
+
+from qs3.errors import ConfigError, DataError
+from qs3.models import rsconv
+from qs3.models.base import PointClassifier
+from qs3.models.rscnn import RSCNN, group, rscnn
+from qs3.models.rsconv import relations
+from tests.models.reference_rscnn import NaiveRSCNN
+
+CONF = Path(__file__).parents[2] / "conf" / "model"
+RELATIONS = ("released", "original", "paper")
+
+
+def _model(**settings: str) -> PointClassifier:
+    torch.manual_seed(0)
+    model = rscnn(4, dropout=0.0, **settings).double()
+    for name, p in model.named_parameters():  # weights of norms that are negative too
+        if p.ndim == 1:
+            norm = name.endswith("norm.weight")
+            nn.init.normal_(p, 1.0 if norm else 0.0, 0.3)
+            p.data[::3] *= -1
+    return model
+
+
+def _points(b: int = 3, n: int = 150) -> torch.Tensor:
+    x = torch.randn(b, n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return x / x.norm(dim=2).amax(1)[:, None, None]
+
+
+@pytest.mark.parametrize(("classes", "expected"), [(10, 1_281_763), (40, 1_289_505 - 32)])
+@pytest.mark.parametrize("relation", RELATIONS)
+def test_parameter_count(classes: int, expected: int, relation: str) -> None:
+    model = rscnn(classes, relation=relation)
+    assert sum(p.numel() for p in model.parameters()) == expected
+
+
+@pytest.mark.parametrize("relation", RELATIONS)
+@pytest.mark.parametrize("norm", ["batch", "instance"])
+@pytest.mark.parametrize("training", [True, False])
+def test_equals_straight_network(
+    relation: str, norm: str, training: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rsconv, "_AT_ONCE", 1 << 14)  # several parts
+    model = _model(relation=relation, norm=norm).train(training)
+    twin = NaiveRSCNN(model).train(training)
+    points, labels = _points(6), torch.tensor([0, 1, 3, 1, 2, 0])
+    a, b = model(points), twin(points)
+    torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+    F.cross_entropy(a, labels).backward()
+    F.cross_entropy(b, labels).backward()
+    theirs = dict(twin.net.named_parameters(prefix="backbone"))
+    theirs |= dict(twin.head.named_parameters(prefix="head"))
+    for name, p in model.named_parameters():
+        torch.testing.assert_close(p.grad, theirs[name].grad, rtol=1e-10, atol=1e-10)
+    for mine, other in zip(model.backbone.buffers(), twin.net.buffers(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-10, atol=1e-10)
+
+
+def test_float32_error_is_that_of_the_straight_network() -> None:
+    exact = _model()
+    model = copy.deepcopy(exact).float()
+    twin = NaiveRSCNN(model)
+    points, labels = _points(8).float(), torch.arange(8) % 4
+    out = []
+    for net, x in [(exact, points.double()), (model, points), (twin, points)]:
+        logits = net(x)
+        F.cross_entropy(logits, labels).backward()
+        out.append(logits.detach().double())
+    assert (out[1] - out[0]).norm() <= 2 * (out[2] - out[0]).norm()
+    truth = [p.grad for p in exact.backbone.parameters()]
+    total = [
+        sum(
+            (p.grad - q).square().sum() for p, q in zip(net.parameters(), truth, strict=True)
+        ).sqrt()
+        for net in (model.backbone, twin.net)
+    ]
+    assert total[0] <= 2 * total[1]
+
+
+def _line() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Points 0.1 apart on a line; the third is the centre."""
+    points = torch.zeros(1, 6, 3, dtype=torch.float64)
+    points[0, :, 0] = torch.arange(6) / 10 + 1
+    return points, points[:, 2:3], torch.tensor([[2]])
+
+
+@pytest.mark.parametrize(
+    ("relation", "slots", "expected"),
+    [
+        ("released", 5, [1, 2, 3, 1, 1]),
+        ("released", 2, [1, 2]),
+        ("paper", 4, [1, 2, 3, 1]),
+        ("original", 4, [2, 1, 3, 2, 2]),  # the centre, others, filled up with the centre
+        ("original", 1, [2, 1]),
+    ],
+)
+def test_members_of_a_ball(relation: str, slots: int, expected: list[int]) -> None:
+    points, centres, index = _line()
+    assert group(points, centres, index, 0.15, slots, relation)[0, 0].tolist() == expected
+
+
+def test_original_leaves_out_copies_of_the_centre() -> None:
+    points, centres, index = _line()
+    points = torch.cat([points, centres, centres], dim=1)
+    found = group(points, centres, index, 0.15, 3, "original")
+    assert found[0, 0].tolist() == [2, 1, 3, 2]
+
+
+@pytest.mark.parametrize(("relation", "s"), [("released", -0.1), ("paper", 1.2), ("original", 0.0)])
+def test_relation_vector(relation: str, s: float) -> None:
+    points, centres, index = _line()
+    slots = 4
+    found = group(points, centres, index, 0.15, slots, relation)
+    out = relations(points, centres, found, relation)
+    assert (out.count, out.slots) == (1, found.shape[2])
+    (balls,) = out.balls
+    assert balls.weight.sum() == found.shape[2]
+    members, weights, u = balls.index[0], balls.weight[0], balls.u[0]
+    assert {int(m): float(w) for m, w in zip(members, weights, strict=True) if w > 0} == {
+        int(m): float((found[0, 0] == m).sum()) for m in found[0, 0]
+    }
+    at = members.tolist().index(3)  # 0.1 to the right of the centre
+    expected = torch.tensor([0.1, s, 0, 0, 0.1, 0, 0, 1], dtype=torch.float64)
+    torch.testing.assert_close(u[at], expected)
+    rows = torch.cat([u[members == m][:1] for m in found[0, 0]])
+    mean, covariance = out.moments()
+    torch.testing.assert_close(mean, rows.mean(0))
+    torch.testing.assert_close(covariance, torch.cov(rows.T, correction=0))
+
+
+def test_balls_of_all_sizes_are_found_once() -> None:
+    points = _points(2, 100)
+    index = torch.arange(100).expand(2, -1)
+    found = group(points, points, index, 0.4, 20, "released")
+    out = relations(points, points, found, "released")
+    assert len(out.balls) > 1
+    assert torch.cat([b.which for b in out.balls]).sort()[0].tolist() == list(range(200))
+    assert sum(b.weight.sum() for b in out.balls) == out.slots == 200 * 20
+
+
+@pytest.mark.parametrize("relation", RELATIONS)
+def test_order_matters_only_where_it_is_said_to(relation: str) -> None:
+    """Few points, so that all are centres and no ball is full: then only "released" sees order."""
+    model = _model(relation=relation).eval()
+    points = _points(2, 40)
+    order = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(39)])
+    a, b = model(points), model(points[:, order])
+    assert torch.allclose(a, b, rtol=1e-9, atol=1e-9) == (relation != "released")
+
+
+@pytest.mark.parametrize("n", [1, 60, 700])
+def test_batch_of_one_in_eval(n: int) -> None:
+    model = _model().eval()
+    points = _points(2, n)
+    if n == 1:
+        points = torch.tensor([[[0.1, 0.2, 0.3]], [[0.0, 0.5, 0.1]]], dtype=torch.float64)
+    together = model(points)
+    assert torch.isfinite(together).all()
+    torch.testing.assert_close(model(points[:1]), together[:1], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("relation", RELATIONS)
+def test_one_repeated_point_trains(relation: str) -> None:
+    model = _model(relation=relation)
+    points = torch.full((2, 40, 3), 0.3, dtype=torch.float64)
+    F.cross_entropy(model(points), torch.tensor([0, 1])).backward()
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters())
+
+
+def test_features() -> None:
+    features = _model().features(_points())
+    assert features.global_.shape == (3, RSCNN.feature_dim) == (3, 1024)
+    assert features.per_point is None
+
+
+def test_autocast_keeps_the_layers_in_float32() -> None:
+    model, points = _model().float(), _points().float()
+    expected = copy.deepcopy(model).features(points).global_
+    with torch.autocast("cpu", torch.bfloat16):
+        out = model.features(points).global_
+        logits = model(points)
+    assert torch.equal(out, expected)
+    logits.float().sum().backward()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_bad_points_name_the_item(value: float) -> None:
+    points = _points()
+    points[2, 5, 1] = value
+    with pytest.raises(DataError, match="batch item 2 has 1 coordinate"):
+        _model()(points)
+
+
+@pytest.mark.parametrize("setting", [{"relation": "x"}, {"norm": "layer"}])
+def test_bad_settings(setting: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(setting))):
+        RSCNN(**setting)
+
+
+def test_config_builds_it() -> None:
+    config = OmegaConf.create({"num_classes": 7, "model": OmegaConf.load(CONF / "rscnn.yaml")})
+    model = instantiate(config.model)
+    assert isinstance(model, PointClassifier)
+    assert model.eval()(torch.randn(2, 8, 3)).shape == (2, 7)

@@ -1,0 +1,253 @@
+import copy
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from torch import nn
+from torch.nn import functional as F
+
+from qs3.errors import ConfigError, DataError
+from qs3.models import resnet_cpu
+from qs3.models.base import PointClassifier
+from qs3.models.projection import depth_images
+from qs3.models.resnet import ResNet18
+from qs3.models.simpleview import SimpleView, simpleview
+from tests.models.reference_simpleview import NaiveSimpleView, images_reference
+
+CONF = Path(__file__).parents[2] / "conf" / "model"
+
+
+def _points(b: int = 3, n: int = 200) -> torch.Tensor:
+    x = torch.randn(b, n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return x / x.norm(dim=2).amax(1)[:, None, None]
+
+
+def _small(**settings: object) -> PointClassifier:
+    torch.manual_seed(0)
+    model = simpleview(4, image_size=16, channels=4, dropout=0.0, **settings)
+    for p in model.parameters():  # so that every block does something
+        if p.ndim == 1:
+            nn.init.normal_(p, 1.0, 0.3)
+    return model.double()
+
+
+@pytest.mark.parametrize(("classes", "expected"), [(10, 800_122), (40, 803_992)])
+def test_parameter_count(classes: int, expected: int) -> None:
+    model = simpleview(classes)
+    assert sum(p.numel() for p in model.parameters()) == expected
+    assert sum(p.numel() for p in model.backbone.parameters()) == 699_888
+
+
+def test_initial_weights() -> None:
+    net = ResNet18()
+    block = net.blocks[3]
+    assert (block.second.norm.weight == 0).all()
+    assert (block.first.norm.weight == 1).all()
+    assert block.second.conv.weight.std().item() == pytest.approx((2 / (32 * 9)) ** 0.5, rel=0.05)
+
+
+# (0.3, 0.1, -0.2): which pixel by hand, from the table; size 128, so pixel ceil(63.5 + 64 r / d)
+@pytest.mark.parametrize(
+    ("view", "row", "column", "depth"),
+    [
+        (0, -0.1, 0.3, 1.2),
+        (1, -0.1, 0.2, 1.7),
+        (2, -0.1, -0.3, 1.6),
+        (3, -0.1, -0.2, 1.1),
+        (4, 0.2, 0.3, 1.3),
+        (5, -0.2, 0.3, 1.5),
+    ],
+)
+def test_one_point_in_each_view(view: int, row: float, column: float, depth: float) -> None:
+    points = torch.tensor([[[0.3, 0.1, -0.2]]], dtype=torch.float64)
+    image = depth_images(points)[0, view]
+    where = [int(-(-(63.5 + 64 * c / depth) // 1)) for c in (row, column)]
+    assert image.nonzero().tolist() == [where]
+    assert image[tuple(where)].item() == pytest.approx(depth)
+
+
+def test_pixel_by_hand() -> None:
+    # 64 * 0.14 / 1.4 = 6.4: column ceil(69.9), row ceil(63.5)
+    image = depth_images(torch.tensor([[[0.14, 0.0, 0.0]]]))[0, 0]
+    assert image.nonzero().tolist() == [[64, 70]]
+    assert image[64, 70].item() == pytest.approx(1.4)
+
+
+def test_shared_pixel() -> None:
+    points = torch.tensor([[[0.0, 0, -0.4], [0, 0, 0.6]]])  # depths 1 and 2 in view 0
+    harmonic = depth_images(points, views=[0])
+    assert harmonic.max().item() == pytest.approx(2 / (1 + 1 / 2))
+    assert depth_images(points, views=[0], pixel="nearest").max().item() == pytest.approx(1)
+    assert (harmonic > 0).sum() == 1
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0, -1.5), (2.0, 0.0, 0.0), (0.0, -1.5, 0.0)])
+def test_points_out_of_sight_are_dropped(point: tuple[float, ...]) -> None:
+    assert (depth_images(torch.tensor([[point]]), views=[0]) == 0).all()
+
+
+def test_projection_equals_reference_with_overflowing_clouds() -> None:
+    points = 1.5 * _points() + 0.2
+    images = depth_images(points, 64).flatten(0, 1)
+    torch.testing.assert_close(images, images_reference(points, 64), rtol=1e-12, atol=1e-12)
+
+
+def test_up_turns_the_cloud() -> None:
+    points = _points()
+    x, y, z = points.unbind(2)
+    turned = torch.stack([x, z, -y], dim=2)  # a point above (z) comes to lie above (y)
+    assert torch.equal(depth_images(points, up="z"), depth_images(turned, up="y"))
+    above = torch.tensor([[[0.0, 0.0, 0.5]]])
+    rows = depth_images(above, views=[0, 1, 2, 3], up="z")[0].nonzero()[:, 1]
+    assert (rows < 64).all()  # in the upper half of each picture
+
+
+def test_views_are_rows_of_the_table() -> None:
+    points = _points()
+    every = depth_images(points)
+    assert torch.equal(depth_images(points, views=[4, 1]), every[:, [4, 1]])
+    model = _small(views=(4, 1))
+    assert model.features(points).global_.shape == (3, model.backbone.feature_dim) == (3, 64)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_equals_straight_network(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resnet_cpu, "_AT_ONCE", 1 << 12)  # several parts
+    model = _small().train(training)
+    twin = NaiveSimpleView(model).train(training)
+    points, labels = _points(), torch.tensor([0, 1, 3])
+    a, b = model(points), twin(points)
+    torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+    F.cross_entropy(a, labels).backward()
+    F.cross_entropy(b, labels).backward()
+    theirs = {f"backbone.{name}": p for name, p in twin.named_parameters()}
+    theirs |= {name: p for name, p in twin.named_parameters() if name.startswith("head")}
+    for name, p in model.named_parameters():
+        torch.testing.assert_close(p.grad, theirs[name].grad, rtol=1e-10, atol=1e-10)
+    for mine, other in zip(model.backbone.buffers(), twin.images.buffers(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("size", [16, 25])
+def test_step_equals_plain_network(size: int) -> None:
+    torch.manual_seed(0)
+    net = ResNet18(4).double()
+    for p in net.parameters():
+        if p.ndim == 1:
+            nn.init.normal_(p, 1.0, 0.3)
+    images = torch.rand(6, 1, size, size, dtype=torch.float64)
+    assert resnet_cpu.can_step(net, images)
+    other = copy.deepcopy(net)
+    a, b = resnet_cpu.step(net, images), other(images)
+    torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
+    g = torch.randn_like(a)
+    a.backward(g)
+    b.backward(g)
+    for p, q in zip(net.parameters(), other.parameters(), strict=True):
+        torch.testing.assert_close(p.grad, q.grad, rtol=1e-10, atol=1e-10)
+
+
+def test_float32_error_is_that_of_the_straight_network() -> None:
+    exact = _small()
+    model = copy.deepcopy(exact).float()
+    twin = NaiveSimpleView(model)
+    points, labels = _points(8), torch.arange(8) % 4
+    points = points.float().double()  # the same images
+    nets = [(exact, points), (model, points.float()), (twin, points.float())]
+    out = []
+    for net, x in nets:
+        logits = net(x)
+        F.cross_entropy(logits, labels).backward()
+        out.append(logits.detach().double())
+    error = (out[1] - out[0]).norm(), (out[2] - out[0]).norm()
+    assert error[0] <= 2 * error[1]
+    truth = [p.grad for p in exact.backbone.images.parameters()]
+    mine = [p.grad for p in model.backbone.images.parameters()]
+    other = [p.grad for p in twin.images.parameters()]
+    total = [
+        sum((p.double() - q).square().sum() for p, q in zip(grads, truth, strict=True)).sqrt()
+        for grads in (mine, other)
+    ]
+    assert total[0] <= 2 * total[1]
+
+
+def test_norms_of_another_kind_take_the_plain_way() -> None:
+    net = ResNet18(4)
+    images = torch.rand(2, 1, 16, 16)
+    assert resnet_cpu.can_step(net, images)
+    net.blocks[0].first.norm = nn.InstanceNorm2d(4, affine=True)
+    assert not resnet_cpu.can_step(net, images)
+    assert not resnet_cpu.can_step(ResNet18(4).eval(), images)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(1, 60), st.integers(0, 100))
+def test_order_of_points_does_not_matter(n: int, seed: int) -> None:
+    model = _small().eval()
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(2, n, 3, generator=generator, dtype=torch.float64) / 2
+    order = torch.randperm(n, generator=generator)
+    torch.testing.assert_close(model(points), model(points[:, order]), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("n", [1, 50, 2048])
+def test_batch_of_one_in_eval(n: int) -> None:
+    model = _small().eval()
+    points = _points(2, n)
+    together = model(points)
+    torch.testing.assert_close(model(points[:1]), together[:1], rtol=1e-10, atol=1e-10)
+
+
+def test_copies_of_one_point() -> None:
+    model = _small()
+    F.cross_entropy(model(torch.full((2, 40, 3), 0.3).double()), torch.tensor([0, 1])).backward()
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters())
+    once, twice = _points(2, 30)[:, :1], _points(2, 30)[:, :1].expand(-1, 9, -1)
+    model.eval()
+    torch.testing.assert_close(model(once), model(twice), rtol=1e-10, atol=1e-10)
+
+
+def test_points_get_no_gradient_and_parameters_do() -> None:
+    model, points = _small(), _points().requires_grad_()
+    model(points).sum().backward()
+    assert points.grad is None
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters())
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_autocast(training: bool) -> None:
+    model, points = _small().float().train(training), _points().float()
+    expected = copy.deepcopy(model)(points)
+    with torch.autocast("cpu", torch.bfloat16):
+        images = depth_images(points, 16)
+        out = model(points)
+    assert images.dtype == torch.float32
+    torch.testing.assert_close(out.float(), expected, rtol=0.2, atol=0.2)
+    out.float().sum().backward()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_bad_points_name_the_item(value: float) -> None:
+    points = _points()
+    points[1, 5, 1] = value
+    with pytest.raises(DataError, match="batch item 1 has 1 coordinate"):
+        _small()(points)
+
+
+@pytest.mark.parametrize(
+    "setting", [{"image_size": 4}, {"views": (6,)}, {"views": ()}, {"up": "x"}, {"pixel": "mean"}]
+)
+def test_bad_settings(setting: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(setting))):
+        SimpleView(**setting)
+
+
+def test_config_builds_it() -> None:
+    conf = OmegaConf.create({"num_classes": 7, "model": OmegaConf.load(CONF / "simpleview.yaml")})
+    model = instantiate(conf.model)
+    assert isinstance(model, PointClassifier)
+    assert model.eval()(torch.randn(2, 8, 3) / 4).shape == (2, 7)

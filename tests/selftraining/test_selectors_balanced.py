@@ -1,0 +1,216 @@
+"""SPST, CBST, CRST and the random control: tables worked by hand, and what always holds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError
+from qs3.selftraining.cbst import Cbst, class_thresholds
+from qs3.selftraining.controls import Random
+from qs3.selftraining.selectors import Qbst, Spst
+
+
+def select(selector, probabilities, theta=0.0, ids=None, round_=0):
+    """A selection, and the ids kept with their pseudo-labels, e.g. "a0 b1"."""
+    p = np.asarray(probabilities, dtype=float)
+    ids = ids if ids is not None else [chr(ord("a") + i) for i in range(len(p))]
+    confidence, predicted = p.max(axis=1), p.argmax(axis=1)
+    selection = selector.select(
+        confidence, predicted, ids, p.shape[1], theta, probabilities=p, round_=round_
+    )
+    labels = predicted if selection.labels is None else selection.labels
+    kept = sorted(f"{i}{k}" for i, k, s in zip(ids, labels, selection.selected, strict=True) if s)
+    return selection, " ".join(kept)
+
+
+# Portion 0.5. Predicted 0: a b c d (.9 .8 .7 .6): rank floor(2) = 2, theta_0 = .8.
+# Predicted 1: e f g (.6 .5 .4): rank floor(1.5) = 1, theta_1 = .6.
+# Predicted 2: h: rank 0, theta_2 = 1.
+TABLE = [
+    [0.90, 0.05, 0.05],  # a: .9/.8 > 1
+    [0.80, 0.15, 0.05],  # b: .8/.8 = 1: kept
+    [0.70, 0.20, 0.10],  # c: .875
+    [0.60, 0.38, 0.02],  # d: .75
+    [0.30, 0.60, 0.10],  # e: .6/.6 = 1: kept
+    [0.45, 0.50, 0.05],  # f: .5625, .833
+    [0.35, 0.40, 0.25],  # g
+    [0.10, 0.10, 0.80],  # h: .8/1
+]
+
+
+def test_cbst_worked_by_hand() -> None:
+    selection, kept = select(Cbst(portion=0.5), TABLE)
+    assert selection.thresholds.tolist() == [0.8, 0.6, 1.0]
+    assert kept == "a0 b0 e1"
+    assert selection.kept.tolist() == [2, 1, 0]
+    assert selection.confident.tolist() == [4, 3, 1]
+    assert selection.mu.tolist() == [0.5] * 3
+
+
+def test_cbst_at_ties() -> None:
+    # predicted 0: .9 four times, .8, .52, .5 (a tie of classes: the lowest): rank 3, theta_0 = .9.
+    # predicted 1: .55 alone: rank 0, theta_1 = 1.
+    table = [[0.9, 0.1], [0.8, 0.2], [0.5, 0.5], [0.45, 0.55], [0.52, 0.48], *[[0.9, 0.1]] * 3]
+    selection, kept = select(Cbst(portion=0.5), table)
+    assert selection.thresholds.tolist() == [0.9, 1.0]
+    assert kept == "a0 f0 g0 h0"  # four for a rank of three
+
+
+def test_cbst_overrules_the_likeliest_class() -> None:
+    # predicted 0: a b c: rank 1, theta_0 = .99; predicted 1: d e: rank 1, theta_1 = .42
+    table = [[0.99, 0.01, 0.0], [0.98, 0.02, 0.0], [0.55, 0.45, 0.0],
+             [0.30, 0.42, 0.28], [0.30, 0.41, 0.29]]  # fmt: skip
+    selection, kept = select(Cbst(portion=0.5), table)
+    assert selection.thresholds.tolist() == [0.99, 0.42, 1.0]
+    assert selection.labels.tolist() == [0, 0, 1, 1, 1]  # c: .55/.99 < .45/.42
+    assert kept == "a0 c1 d1"
+    assert selection.kept.tolist() == [1, 2, 0]
+
+
+def test_lrent_worked_by_hand() -> None:
+    # portion .5: theta = (.9, .6). q = p / theta; kept if q_0^4 + q_1^4 > 1; soft labels q^4.
+    table = [[0.9, 0.1], [0.8, 0.2], [0.4, 0.6], [0.45, 0.55]]
+    selection, kept = select(Cbst(portion=0.5, labels="lrent"), table)
+    assert selection.thresholds.tolist() == [0.9, 0.6]
+    q = np.array(table) / [0.9, 0.6]
+    powers = q**4
+    assert kept == "a0 c1"  # b: .6243 + .0123; d: .0625 + .706
+    assert (powers.sum(axis=1) > 1).tolist() == [True, False, True, False]
+    np.testing.assert_allclose(selection.soft, powers / powers.sum(axis=1, keepdims=True))
+
+
+probabilities = st.lists(
+    st.lists(st.integers(1, 12), min_size=4, max_size=4), min_size=1, max_size=40
+).map(lambda rows: np.array([[x / sum(row) for x in row] for row in rows]))
+selectors = st.sampled_from(
+    [
+        Spst(),
+        Qbst(),
+        Cbst(),
+        Cbst(portion=0.5),
+        Cbst(portion=0.5, labels="lrent"),
+        Random(Qbst(), seed=3),
+        Random(Qbst(), seed=3, pool="all"),
+        Random(Cbst(portion=0.5), seed=1),
+    ]
+)
+thetas = st.sampled_from([0.3, 0.5, 0.8])
+
+
+@given(probabilities, selectors, thetas, st.integers(0, 9), st.randoms(use_true_random=False))
+def test_the_order_of_samples_does_not_matter(p, selector, theta, round_, rng) -> None:
+    ids = [f"{i:02d}/" for i in range(len(p))]
+    order = rng.sample(range(len(p)), len(p))
+    here = select(selector, p, theta, ids, round_)
+    there = select(selector, p[order], theta, [ids[i] for i in order], round_)
+    assert here[1] == there[1]
+    for name in ("mu", "confident", "kept", "thresholds"):
+        np.testing.assert_array_equal(getattr(here[0], name), getattr(there[0], name))
+    if here[0].soft is not None:
+        np.testing.assert_array_equal(here[0].soft[order], there[0].soft)
+
+
+@given(probabilities, selectors, thetas)
+def test_never_below_theta_and_figures_agree(p, selector, theta) -> None:
+    selection, _ = select(selector, p, theta, [f"{i:02d}" for i in range(len(p))])
+    labels = p.argmax(axis=1) if selection.labels is None else selection.labels
+    if getattr(selector, "pool", "confident") != "all":
+        assert (p[np.arange(len(p)), labels][selection.selected] > theta).all()
+    kept = np.bincount(labels[selection.selected], minlength=4)
+    assert kept.tolist() == selection.kept.tolist()
+
+
+@given(probabilities, thetas)
+def test_spst_keeps_every_confident_sample(p, theta) -> None:
+    ids = [f"{i:02d}" for i in range(len(p))]
+    selection, kept = select(Spst(), p, theta, ids)
+    assert selection.selected.tolist() == (p.max(axis=1) > theta).tolist()
+    assert kept == select(Qbst(mu="one"), p, theta, ids)[1]
+
+
+@given(probabilities, st.sampled_from([0.2, 0.35, 0.5, 1.0]))
+def test_cbst_keeps_at_least_its_portion_of_each_class(p, portion) -> None:
+    """Of the samples predicted k, floor(portion n_k) at least are >= theta_k."""
+    selection, _ = select(Cbst(portion=portion, most=1.0), p)
+    predicted = p.argmax(axis=1)
+    for k in range(4):
+        of_class = p[predicted == k, k]
+        rank = math.floor(portion * len(of_class) + 1e-9)
+        assert (of_class >= selection.thresholds[k]).sum() >= rank
+        assert (of_class > selection.thresholds[k]).sum() <= max(rank - 1, 0)
+    quotient = p / selection.thresholds
+    assert selection.selected.tolist() == (quotient.max(axis=1) >= 1).tolist()
+
+
+@given(probabilities)
+def test_lrent_s_condition_is_that_of_the_paper(p) -> None:
+    selection, _ = select(Cbst(portion=0.5, labels="lrent"), p)
+    y, theta = selection.soft, selection.thresholds
+    np.testing.assert_allclose(y.sum(axis=1), 1)
+    entropy = np.where(y > 0, y * np.log(np.maximum(y, 1e-300)), 0).sum(axis=1)
+    paper = -(y * np.log(p)).sum(axis=1) + 0.25 * entropy
+    bound = -(y * np.log(theta)).sum(axis=1)
+    clear = np.abs(paper - bound) > 1e-9
+    assert (selection.selected == (paper < bound))[clear].all()
+    hard, _ = select(Cbst(portion=0.5), p)
+    assert (selection.selected | ~hard.selected | ~clear).all()  # keeps what CBST keeps
+
+
+def test_thresholds_at_ties_and_empty_classes() -> None:
+    confidence, predicted = np.array([0.7, 0.7, 0.7, 0.9, 0.6]), np.array([0, 0, 0, 0, 1])
+    assert class_thresholds(confidence, predicted, 3, 0.5).tolist() == [0.7, 1.0, 1.0]
+    assert class_thresholds(confidence, predicted, 3, 1.0).tolist() == [0.7, 0.6, 1.0]
+    ten = np.linspace(0.5, 0.95, 10)  # 0.3 * 10 is 3, although 0.1 + 0.2 > 0.3
+    assert class_thresholds(ten, np.zeros(10, int), 1, 0.3)[0] == ten[7]
+
+
+def test_portion_grows_and_stops() -> None:
+    portions = [Cbst().portion_of(r) for r in range(9)]
+    assert portions == [0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.5, 0.5]
+
+
+@given(probabilities, thetas, st.sampled_from(["confident", "all"]))
+def test_random_keeps_as_many_of_each_class(p, theta, pool) -> None:
+    ids = [f"{i:02d}" for i in range(len(p))]
+    given_, _ = select(Qbst(), p, theta, ids)
+    drawn, _ = select(Random(Qbst(), seed=1, pool=pool), p, theta, ids)
+    predicted = p.argmax(axis=1)
+    assert np.bincount(predicted[drawn.selected], minlength=4).tolist() == given_.kept.tolist()
+
+
+def test_random_draws_each_sample_equally_often() -> None:
+    p = np.column_stack([np.linspace(0.81, 0.99, 12), np.linspace(0.19, 0.01, 12)])
+    p = np.concatenate([p, p[:, ::-1]])  # 12 of each class: QBST keeps the 6 most confident
+    ids = [f"cloud {i}" for i in range(24)]
+    hits = np.zeros(24)
+    for seed in range(300):
+        selection, _ = select(Random(Qbst(), seed=seed), p, 0.8, ids)
+        assert selection.selected.sum() == 12
+        hits += selection.selected
+    assert abs(hits / 300 - 0.5).max() < 0.12  # four standard deviations
+    first, second = (select(Random(Qbst()), p, 0.8, ids, r)[1] for r in (0, 1))
+    assert first != second  # each round draws anew
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"portion": 0.0}, "portion=0.0"),
+        ({"portion": 0.6}, "0 < portion <= most"),
+        ({"step": -0.1}, "step >= 0"),
+        ({"alpha": 0.0}, "alpha > 0"),
+        ({"labels": "soft"}, "selftraining.selector.labels"),
+    ],
+)
+def test_wrong_settings_name_the_key(settings, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Cbst(**settings)
+    with pytest.raises(ConfigError, match=r"selftraining\.selector\.pool"):
+        Random(Qbst(), pool="some")
+    with pytest.raises(ConfigError, match="must be a selector"):
+        Random("qbst")
