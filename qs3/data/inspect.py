@@ -3,6 +3,7 @@
     python -m qs3.data.inspect domain=NAME [key=value ...] [out=out/inspection/NAME]
     python -m qs3.data.inspect compare A B [key=value ...] [out=out/inspection/A-B]
 
+What the words mean:
   domain=      a domain (conf/domain), or the folder of a dataset. Counts by class and split, sizes,
                which way is up by the shape, spacing, density, coverage, copies, leaks from train to
                test, odd objects; a contact sheet. Published files are imported first
