@@ -53,5 +53,12 @@ def known_as(name: str, classes: Sequence[str]) -> str | None:
     A name of the list itself comes first: `night_stand` is a class of ModelNet40, and an alias of
     `cabinet` among the ten.
     """
-    plain = name.casefold().replace("-", "_").replace(" ", "_")
-    return next((c for c in (plain, ALIASES.get(plain)) if c in classes), None)
+    if name in classes:
+        return name
+    plain = _plain(name)
+    names = {_plain(known): known for known in classes}
+    return next((names[c] for c in (plain, ALIASES.get(plain)) if c in names), None)
+
+
+def _plain(name: str) -> str:
+    return name.casefold().replace("-", "_").replace(" ", "_")

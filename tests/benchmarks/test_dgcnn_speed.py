@@ -10,9 +10,13 @@ import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch import nn
 from torch.nn import functional as F
+from torch_geometric.nn import EdgeConv as PygEdgeConv
 
+from qs3.geometry.neighbours import knn
 from qs3.models.dgcnn import dgcnn
+from qs3.models.edgeconv import EdgeConv
 from tests.models.reference import NaiveDGCNN
+from tests.models.test_edgeconv_pyg import edges
 
 
 def _step(model: nn.Module, points: torch.Tensor, labels: torch.Tensor) -> Callable[[], None]:
@@ -23,12 +27,20 @@ def _step(model: nn.Module, points: torch.Tensor, labels: torch.Tensor) -> Calla
     return step
 
 
-@pytest.mark.parametrize(("b", "n", "k"), [(16, 1024, 20), (32, 256, 20), (32, 256, 10)])
+@pytest.mark.parametrize(
+    ("variant", "b", "n", "k"),
+    [
+        ("uda", 16, 1024, 20),
+        ("simpleview", 16, 1024, 20),
+        ("uda", 32, 256, 20),
+        ("uda", 32, 256, 10),
+    ],
+)
 def test_training_step(
-    b: int, n: int, k: int, benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture
+    variant: str, b: int, n: int, k: int, benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture
 ) -> None:
     torch.manual_seed(0)
-    model = dgcnn(10, k=k)
+    model = dgcnn(10, k=k, variant=variant)
     points, labels = torch.randn(b, n, 3) / 2, torch.randint(10, (b,))
     step = _step(model, points, labels)
     benchmark.pedantic(step, rounds=4, warmup_rounds=1)
@@ -44,6 +56,33 @@ def test_training_step(
     benchmark.extra_info["times_faster"] = theirs / ours
     with capsys.disabled():
         print(  # noqa: T201
-            f"\nDGCNN {b} x {n}, k {k}: {ours * 1e3:.1f} ms a cloud, naive {theirs * 1e3:.1f}: "
-            f"{theirs / ours:.1f} times faster, {torch.get_num_threads()} threads"
+            f"\nDGCNN {variant}, {b} x {n}, k {k}: {ours * 1e3:.1f} ms a cloud, "
+            f"naive {theirs * 1e3:.1f}: {theirs / ours:.1f} times faster, "
+            f"{torch.get_num_threads()} threads"
         )
+
+
+@pytest.mark.parametrize(("c", "d"), [(3, 64), (64, 128), (128, 256)])
+def test_layer_against_pyg(
+    c: int, d: int, benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture
+) -> None:
+    """One EdgeConv, forward and backward, on edges found beforehand."""
+    torch.manual_seed(0)
+    ours = EdgeConv(c, d)
+    mlp = nn.Sequential(nn.Linear(2 * c, d, bias=False), nn.BatchNorm1d(d), nn.LeakyReLU(0.2))
+    theirs = PygEdgeConv(mlp, aggr="max")
+    x = torch.randn(2, 1024, c, requires_grad=True)
+    index = knn(x.detach(), 20)
+    pairs = edges(index)
+    benchmark.pedantic(lambda: ours(x, index).sum().backward(), rounds=4, warmup_rounds=1)
+    times = []
+    for _ in range(3 if benchmark.enabled else 1):
+        begin = time.perf_counter()
+        theirs(x.flatten(0, 1), pairs).sum().backward()
+        times.append(time.perf_counter() - begin)
+    if not benchmark.enabled:
+        return
+    ratio = min(times) / benchmark.stats.stats.min
+    benchmark.extra_info["times_faster"] = ratio
+    with capsys.disabled():
+        print(f"\nEdgeConv {c} -> {d}: {ratio:.1f} times faster than PyG's")  # noqa: T201

@@ -274,3 +274,40 @@ def test_damage_can_be_skipped_and_is_recorded(tmp_path: Path) -> None:
 def test_wrong_settings(tmp_path: Path, settings: dict) -> None:
     with pytest.raises(ConfigError):
         CloudFolder(tmp_path, **settings)
+
+
+def test_linked_folders_are_refused(tmp_path: Path) -> None:
+    """A link to a folder above would give every cloud some forty times."""
+    write(tmp_path / "a.xyz")
+    (tmp_path / "again").symlink_to(tmp_path)
+    with pytest.raises(DataError, match="again is a link to a folder"):
+        CloudFolder(tmp_path, points=4, layout="none").items(TWO)
+
+
+def test_own_classes_are_found_as_they_are_written(tmp_path: Path) -> None:
+    write(tmp_path / "Box" / "a.xyz")
+    write(tmp_path / "coffee mug" / "a.xyz")
+    _, rows = CloudFolder(tmp_path, points=4, test_every=0).read(("Box", "coffee-mug"))
+    assert [row.cls for row in rows] == ["Box", "coffee-mug"]
+
+
+def test_own_is_composed_as_the_target(tmp_path: Path) -> None:
+    from hydra import compose, initialize_config_dir
+    from hydra.utils import instantiate
+
+    write(tmp_path / "clouds" / "a.xyz")
+    conf = Path(__file__).resolve().parents[2] / "conf"
+    with initialize_config_dir(str(conf), version_base="1.3"):
+        cfg = compose(
+            "train",
+            [
+                "experiment=qs3_s2d",
+                "domain@data.target=own",
+                f"data.target.published.folder={tmp_path / 'clouds'}",
+                f"paths.data_dir={tmp_path}",
+                f"paths.log_dir={tmp_path}",
+            ],
+        )
+    data = instantiate(cfg.data.target).open()
+    assert not data.labelled
+    assert data.ids == ("train/a",)

@@ -1,4 +1,4 @@
-"""Numbers of the authors' own nets, with weights and clouds by formula (`tests.models.golden`).
+"""Numbers of the authors' own nets, with weights and clouds by formula (`tests.models.by_formula`).
 
 Made once with their code on the CPU in float64, dropout 0; see docs/backbones.md. Each row: the ten
 logits of the first cloud and the norm of the gradient in all points.
@@ -12,7 +12,7 @@ from torch import nn
 from qs3.models.base import PointClassifier
 from qs3.models.dgcnn import dgcnn
 from qs3.models.pointnet import pointnet
-from tests.models.golden import clouds, figures, fill
+from tests.models.by_formula import clouds, figures, fill
 
 PUBLISHED = {  # (net, variant, train mode)
     ("dgcnn", "simpleview", True): [

@@ -13,6 +13,7 @@ from qs3.models import rsconv
 from qs3.models.base import PointClassifier
 from qs3.models.rscnn import RSCNN, group, rscnn
 from qs3.models.rsconv import relations
+from tests.models.golden import clouds, gradient_norm, set_weights
 from tests.models.reference_rscnn import NaiveRSCNN
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
@@ -210,3 +211,27 @@ def test_config_builds_it() -> None:
     model = instantiate(config.model)
     assert isinstance(model, PointClassifier)
     assert model.eval()(torch.randn(2, 8, 3)).shape == (2, 7)
+
+
+@pytest.mark.parametrize(
+    ("relation", "training", "logits", "norm"),
+    [
+        ("released", True, [0.04220374, -0.03654153, 0.09100412, -0.10957539], 163.40028718),
+        ("released", False, [0.0898171, -0.08528765, 0.07471872, -0.05036304], 0.51231639),
+        ("original", True, [0.06816785, -0.05890843, 0.07941468, -0.07976023], 148.01160625),
+        ("original", False, [0.08980314, -0.08527046, 0.07472163, -0.05038209], 0.51231922),
+    ],
+)
+def test_numbers_of_the_original(
+    relation: str, training: bool, logits: list[float], norm: float
+) -> None:
+    """Recorded from SimpleView's and from the authors' repository; see docs/backbones.md."""
+    model = rscnn(10, relation=relation, dropout=0.0).double()
+    set_weights(model)
+    if not training:  # they were recorded after the training step, which moved the norms
+        model(clouds())
+        model.eval()
+    out = model(clouds())
+    F.cross_entropy(out, torch.arange(4)).backward()
+    torch.testing.assert_close(out[1, :4].tolist(), logits, rtol=1e-6, atol=1e-7)
+    assert gradient_norm(model) == pytest.approx(norm, rel=1e-6)

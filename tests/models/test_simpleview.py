@@ -16,6 +16,7 @@ from qs3.models.base import PointClassifier
 from qs3.models.projection import depth_images
 from qs3.models.resnet import ResNet18
 from qs3.models.simpleview import SimpleView, simpleview
+from tests.models.golden import clouds, gradient_norm, set_weights
 from tests.models.reference_simpleview import NaiveSimpleView, images_reference
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
@@ -251,3 +252,23 @@ def test_config_builds_it() -> None:
     model = instantiate(conf.model)
     assert isinstance(model, PointClassifier)
     assert model.eval()(torch.randn(2, 8, 3) / 4).shape == (2, 7)
+
+
+@pytest.mark.parametrize(
+    ("training", "logits", "norm"),
+    [
+        (True, [-0.09085458, 0.08415982, -0.05754179, 0.01548372], 54.9939534),
+        (False, [-0.07243522, 0.08327869, -0.07432694, 0.04749585], 0.46095962),
+    ],
+)
+def test_numbers_of_the_original(training: bool, logits: list[float], norm: float) -> None:
+    """Recorded from SimpleView's repository; see docs/backbones.md. Its images are float32."""
+    model = simpleview(10, dropout=0.0).double()
+    set_weights(model)
+    if not training:  # they were recorded after the training step, which moved the norms
+        model(clouds())
+        model.eval()
+    out = model(clouds())
+    F.cross_entropy(out, torch.arange(4)).backward()
+    torch.testing.assert_close(out[1, :4].tolist(), logits, rtol=1e-4, atol=1e-5)
+    assert gradient_norm(model) == pytest.approx(norm, rel=1e-4)

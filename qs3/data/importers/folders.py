@@ -233,6 +233,8 @@ def _files(folder: Path, root: Path) -> Iterator[Path]:
     """All files of known formats below a folder, in order; links may not leave `root`."""
     for path in _visible(folder, root):
         if path.is_dir():
+            if path.is_symlink():  # it could lead in a circle, or give the same clouds twice
+                raise DataError(f"{path} is a link to a folder; move or copy the folder instead")
             yield from _files(path, root)
         elif path.suffix.lower() in SUFFIXES and path.is_file():
             yield path
