@@ -1,4 +1,4 @@
-"""Neighbours of points: kNN, ball query, farthest points, gathering. Batched plain torch.
+"""Neighbours of points: kNN, farthest points, gathering. Batched plain torch.
 
 Written here because torch-cluster is deprecated and pyg-lib is not on PyPI.
 """
@@ -136,28 +136,4 @@ def _farthest_points(x: Tensor, n: int, start: Int[Tensor, " b"] | int = 0) -> T
         distance = (x - gather(x, last)).square().sum(-1)  # [b, total]
         nearest = torch.minimum(nearest, distance).scatter_(1, last, -1.0)  # never again
         last = nearest.argmax(1, keepdim=True)
-    return out
-
-
-def ball_query(
-    x: Float[Tensor, "b n 3"], centres: Float[Tensor, "b m 3"], radius: float, k: int
-) -> Int[Tensor, "b m k"]:
-    """The first k points, in index order, nearer than `radius` (strictly) to each centre.
-
-    Missing ones repeat the first hit, as in PointNet++; a centre without any hit gets its
-    nearest point.
-    """
-    b, n, _ = x.shape
-    m = centres.shape[1]
-    order = torch.arange(n, device=x.device)
-    rows = max(1, (_CPU_BLOCK if x.device.type == "cpu" else _BLOCK) // (b * n))
-    out = torch.empty(b, m, k, dtype=torch.int64, device=x.device)
-    for j in range(0, m, rows):
-        part = centres[:, j : j + rows]
-        distance = (part[:, :, None] - x[:, None]).square().sum(-1)  # [b, rows, n]
-        hits = torch.where(distance < radius**2, order, n)
-        found = hits.topk(min(k, n), dim=2, largest=False)[0].sort(dim=2)[0]
-        first = torch.where(found[:, :, :1] < n, found[:, :, :1], distance.argmin(2, keepdim=True))
-        out[:, j : j + rows] = first
-        out[:, j : j + rows, : found.shape[2]] = torch.where(found < n, found, first)
     return out

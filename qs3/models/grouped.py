@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.models.grouped_maximum import grouped_maximum
+from qs3.models.norms import active, make_norm, track, uses_batch
 
 
 class GroupedMLP(nn.Module):
@@ -22,7 +23,8 @@ class GroupedMLP(nn.Module):
     Args:
         channels: C of the points' features, 0 if they have none.
         widths: of the layers, at least two.
-        norm: "batch" (over all members of all groups of the batch) or "instance" (of each cloud).
+        norm: see `qs3.models.norms`; statistics are of all members of all groups, of the batch or
+            ("instance") of each cloud.
     """
 
     def __init__(self, channels: int, widths: Sequence[int], *, norm: str = "batch") -> None:
@@ -30,9 +32,7 @@ class GroupedMLP(nn.Module):
         sizes = (3 + channels, *widths)
         self.norm = norm
         self.linears = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in pairwise(sizes))
-        self.norms = nn.ModuleList(  # hold parameters and running statistics
-            nn.BatchNorm1d(width, track_running_stats=norm == "batch") for width in widths
-        )
+        self.norms = nn.ModuleList(make_norm(norm, width) for width in widths)
         for linear in self.linears:
             assert isinstance(linear, nn.Linear)
             nn.init.kaiming_normal_(linear.weight)
@@ -67,23 +67,18 @@ class GroupedMLP(nn.Module):
         return out.unflatten(0, centres.shape[:2])
 
     def _groups(self, xyz: Tensor, centres: Tensor, p: Tensor | None, index: Tensor) -> Tensor:
-        norms: list[Any] = list(self.norms)
+        norms: list[Any] = [active(norm) for norm in self.norms]
         weights: list[Any] = [linear.weight for linear in self.linears]
         weights[0] = weights[0][:, :3]
         parameters = []
         for weight, norm in zip(weights, norms, strict=True):
             parameters += [weight, norm.weight, norm.bias]
         running = None
-        if not self.training and self.norm == "batch":
+        if not uses_batch(self.norms[0]):
             running = [(norm.running_mean, norm.running_var) for norm in norms]
         out, statistics = grouped_maximum(
             xyz, centres, p, index, norms[0].eps, running, *parameters
         )
-        if self.training and self.norm == "batch":
-            with torch.no_grad():
-                unbiased = index.numel() / max(index.numel() - 1, 1)
-                for norm, (mean, var) in zip(norms, statistics, strict=True):
-                    norm.running_mean.lerp_(mean, norm.momentum)
-                    norm.running_var.lerp_(var * unbiased, norm.momentum)
-                    norm.num_batches_tracked += 1
+        for norm, (mean, var) in zip(self.norms, statistics, strict=True):
+            track(norm, mean, var, index.numel())
         return out

@@ -88,7 +88,7 @@ class PointNet2(Backbone):
 
     Args:
         variant: "msg" or "ssg".
-        norm: "batch" or "instance".
+        norm: see `qs3.models.norms`.
     """
 
     feature_dim = 1024
@@ -97,8 +97,6 @@ class PointNet2(Backbone):
         super().__init__()
         if variant not in ("ssg", "msg"):
             raise ConfigError(f"variant must be 'ssg' or 'msg', got {variant!r}")
-        if norm not in ("batch", "instance"):
-            raise ConfigError(f"norm must be 'batch' or 'instance', got {norm!r}")
         channels, levels = 0, []
         for centres, scales in SSG if variant == "ssg" else MSG:
             levels.append(SetAbstraction(channels, centres, scales, norm))
@@ -120,7 +118,7 @@ class PointNet2(Backbone):
 def pointnet2(
     num_classes: int, variant: str = "msg", norm: str = "batch", dropout: float = 0.5
 ) -> PointClassifier:
-    """PointNet++ with its class head (512, 256; batch norm, ReLU)."""
+    """PointNet++ with its class head (512, 256; ReLU)."""
     backbone = PointNet2(variant=variant, norm=norm)
     head = ClassHead(
         backbone.feature_dim,
@@ -128,5 +126,6 @@ def pointnet2(
         dropout=dropout,
         negative_slope=0.0,
         hidden_bias=False,
+        norm=norm,
     )
     return PointClassifier(backbone, head)

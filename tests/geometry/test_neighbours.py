@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.geometry import neighbours
-from qs3.geometry.neighbours import ball_query, farthest_point_sampling, gather, knn
+from qs3.geometry.neighbours import farthest_point_sampling, gather, knn
 from tests.geometry.test_sampling import assert_farthest
 
 
@@ -120,28 +120,3 @@ def test_fps_batched(sample: object) -> None:
 def test_fps_paths_agree() -> None:
     x = torch.randn(2, 150, 3)
     assert torch.equal(farthest_point_sampling(x, 80, 3), neighbours._farthest_points(x, 80, 3))
-
-
-def _ball_reference(x: np.ndarray, centre: np.ndarray, radius: float, k: int) -> list[int]:
-    distance = np.square(x - centre).sum(1)
-    hits = np.flatnonzero(distance < radius**2)[:k].tolist()
-    hits = hits or [int(distance.argmin())]
-    return hits + [hits[0]] * (k - len(hits))
-
-
-@pytest.mark.parametrize("block", [1, 1 << 20])
-def test_ball_query_equals_brute_force(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(neighbours, "_CPU_BLOCK", block)
-    x = torch.randn(2, 60, 3, dtype=torch.float64)
-    centres = torch.cat([x[:, :9], x[:, :1] + 100], dim=1)  # the last has nobody near
-    for k in (1, 8, 70):
-        found = ball_query(x, centres, 1.0, k)
-        for b in range(2):
-            for m in range(10):
-                expected = _ball_reference(x[b].numpy(), centres[b, m].numpy(), 1.0, k)
-                assert found[b, m].tolist() == expected
-
-
-def test_ball_query_is_strict() -> None:
-    x = torch.tensor([[[1.0, 0, 0], [0, 0, 0], [0.5, 0, 0]]])
-    assert ball_query(x, torch.zeros(1, 1, 3), 1.0, 3).tolist() == [[[1, 2, 1]]]

@@ -10,6 +10,7 @@ from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models import pointnet2 as pointnet2_module
 from qs3.models.grouped import GroupedMLP
 from qs3.models.pointnet2 import pointnet2
+from tests.models.by_formula import clouds, figures, fill
 from tests.models.reference_pointnet2 import StraightMLP, StraightPointNet2
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -31,7 +32,7 @@ def test_parameters(variant: str, classes: int, count: int) -> None:
 def _scramble(net: nn.Module) -> None:
     """Norms as after training: scales of both signs, own statistics."""
     for module in net.modules():
-        if isinstance(module, nn.BatchNorm1d):
+        if isinstance(module, nn.BatchNorm1d | nn.InstanceNorm1d):
             nn.init.normal_(module.weight, 0.3)
             nn.init.normal_(module.bias)
             if module.running_mean is not None:
@@ -164,6 +165,43 @@ def _error(value: torch.Tensor, truth: torch.Tensor) -> float:
     return float(((value - truth).norm() / truth.norm()).detach())
 
 
+ORIGINAL = {  # logits of the first cloud, norm of the gradient in the points
+    ("ssg", True): (
+        *(0.0298412, 0.151493, -0.135183, -0.117643, 0.20685),
+        *(0.00776706, -0.162699, 0.0530215, 0.0558266, 0.00299757, 17401.6),
+    ),
+    ("ssg", False): (
+        *(-0.0294398, 0.0591844, -0.0735068, -0.0269349, 0.142819),
+        *(-0.0812794, -0.0963575, 0.140346, -0.0127811, -0.0825467, 0.00162204),
+    ),
+    ("msg", True): (
+        *(0.157728, -0.380308, -0.120848, 0.283043, 0.19502),
+        *(-0.275816, -0.282661, 0.373335, 0.27029, -0.467633, 204814),
+    ),
+    ("msg", False): (
+        *(-0.0667892, 0.0209309, 0.0932563, -0.123753, -0.00852767),
+        *(0.136262, -0.0898078, -0.043748, 0.0882605, -0.0458262, 0.000371285),
+    ),
+}
+
+
+@pytest.mark.parametrize(("variant", "training"), ORIGINAL)
+def test_numbers_of_an_original(variant: str, training: bool) -> None:
+    """Of yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/backbones.md."""
+    net = pointnet2(10, variant, dropout=0.0).double()
+    fill([net])
+    if variant == "msg":  # there the features come first
+        for mlp in net.backbone.levels[1].mlps:
+            weight = mlp.linears[0].weight.data
+            weight.copy_(torch.cat([weight[:, -3:], weight[:, :-3]], dim=1))
+    points = clouds(4, 700)
+    points = (points / points.norm(dim=2).amax(1)[:, None, None]).requires_grad_()
+    *expected, gradient = ORIGINAL[variant, training]
+    *found, found_gradient = figures(net.train(training)(points), points)
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert found_gradient == pytest.approx(gradient, rel=1e-5)
+
+
 def test_groups_of_centres_move_with_the_cloud_but_for_the_last_level() -> None:
     """The levels see relative coordinates, so their features do not change under a shift."""
     net = pointnet2(10).double().eval()
@@ -207,5 +245,5 @@ def test_autocast_keeps_neighbours_and_groups_in_float32() -> None:
 def test_unknown_settings() -> None:
     with pytest.raises(ConfigError, match="'ssg' or 'msg'"):
         pointnet2(10, "msgg")
-    with pytest.raises(ConfigError, match="'batch' or 'instance'"):
+    with pytest.raises(ConfigError, match="norm must be one of 'batch'"):
         pointnet2(10, norm="layer")
