@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from qs3.data.augment import rotate_z
 from qs3.data.datamodule import Unlabelled
+from qs3.models.norms import norms_for, use_domain
 from qs3.selftraining.table import read_pseudo_labels
 
 CALIBRATION_BINS = 15
@@ -26,14 +27,19 @@ CALIBRATION_BINS = 15
 def predict(
     net: nn.Module, points: Float[Tensor, "n p 3"], batch_size: int, device: Any = "cpu"
 ) -> Float[np.ndarray, "n c"]:
-    """Class probabilities in eval mode, unaugmented, in the order given: nothing is random."""
+    """Class probabilities in eval mode, unaugmented, in the order given: nothing is random.
+
+    The clouds are of the target: a net with norms for each domain uses the target's, if it was
+    trained on the target at all.
+    """
     training = net.training
     net.eval()
     try:
-        parts = [
-            net(points[i : i + batch_size].to(device)).double().softmax(dim=1).cpu()
-            for i in range(0, len(points), batch_size)
-        ]
+        with use_domain(net, norms_for(net, "target")):
+            parts = [
+                net(points[i : i + batch_size].to(device)).double().softmax(dim=1).cpu()
+                for i in range(0, len(points), batch_size)
+            ]
     finally:
         net.train(training)
     return torch.cat(parts).numpy()

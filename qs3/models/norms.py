@@ -134,6 +134,16 @@ def use_domain(net: nn.Module, domain: str) -> Iterator[None]:
             norm.domain = old
 
 
+def norms_for(net: nn.Module, domain: str) -> str:
+    """The domain whose norms clouds of `domain` should use: "source" if `domain` was never trained.
+
+    So a net with domain-specific norms that has only seen the source serves the target with those.
+    """
+    norms = [m for m in net.modules() if isinstance(m, DomainNorm)]
+    seen = all(int(getattr(norm, domain).num_batches_tracked) > 0 for norm in norms)
+    return domain if seen else "source"
+
+
 class _Pooled:
     """Mean and biased variance of a norm's input over all batches (Chan et al., 1979), float64."""
 

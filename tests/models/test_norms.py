@@ -1,12 +1,22 @@
 import copy
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
 from qs3.errors import ConfigError, DataError
+from qs3.evaluation import predict
 from qs3.models.dgcnn import dgcnn
-from qs3.models.norms import DomainNorm, active, adapt_batchnorm, make_norm, track, use_domain
+from qs3.models.norms import (
+    DomainNorm,
+    active,
+    adapt_batchnorm,
+    make_norm,
+    norms_for,
+    track,
+    use_domain,
+)
 from qs3.models.pointnet import pointnet
 from tests.models.reference import NaiveDGCNN
 
@@ -184,3 +194,20 @@ def test_nothing_to_adapt_on() -> None:
 def test_instance_norm_has_nothing_to_adapt_but_in_the_head() -> None:
     net = dgcnn(4, norm="instance").double()
     assert len(adapt_batchnorm(net, [_clouds(4)])) == 2
+
+
+def test_predictions_of_the_target_use_its_norms_once_it_was_trained_on() -> None:
+    net = pointnet(3, norm="domain")
+    points = torch.randn(4, 20, 3)
+    net(points)  # a pass on the source alone
+    assert norms_for(net, "target") == "source"
+    as_source = predict(net, points, 4)
+    with use_domain(net, "target"):
+        net(points * 3 + 1)
+    assert norms_for(net, "target") == "target"
+    as_target = predict(net, points, 4)
+    assert np.abs(as_source - as_target).max() > 1e-3
+    with torch.no_grad(), use_domain(net.eval(), "target"):
+        np.testing.assert_allclose(as_target, net(points).double().softmax(1).numpy(), atol=1e-6)
+    plain = pointnet(3)
+    assert norms_for(plain, "target") == "target"  # nothing to choose
