@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from qs3.geometry.products import times
 from qs3.geometry.sampling import farthest_point_sampling_np
 
 _BLOCK = 1 << 26  # distances held at once: 256 MB in float32
@@ -47,7 +48,7 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
     """Distances by |x_j|^2 - 2 x_i x_j (|x_i|^2 does not change the order within a row)."""
     b, n, _ = x.shape
     squares = x.square().sum(2)[:, None]  # [b, 1, n]
-    right = (-2 * x).transpose(1, 2)
+    scaled = -2 * x
     on_cpu = x.device.type == "cpu"
     block = _CPU_BLOCK if on_cpu else _BLOCK
     smallest = _smallest_on_cpu if on_cpu else _smallest
@@ -58,7 +59,10 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
         c = slice(i, i + clouds)
         for j in range(0, n, rows):
             part = out[c, j : j + rows]
-            distance = (x[c, j : j + rows] @ right[c]).add_(squares[c])  # [clouds, rows, n]
+            if clouds == 1:
+                distance = times(x[i, j : j + rows], scaled[i])[None].add_(squares[c])
+            else:
+                distance = (x[c, j : j + rows] @ scaled[c].transpose(1, 2)).add_(squares[c])
             part.copy_(smallest(distance.view(-1, n), k).view(part.shape))
     return out
 

@@ -21,6 +21,7 @@ from torch.nn import functional as F
 
 from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather, knn
+from qs3.geometry.products import linear, times
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.models.edgeconv import EdgeConv, max_over_rows
 from qs3.models.norms import head_norm, make_norm
@@ -108,7 +109,7 @@ class DGCNN(Backbone):
         per_point = torch.cat(levels, dim=2)  # [B, N, 512]
         if self.norm5 is None:
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
-        y = F.leaky_relu(self._normed(self.conv5(per_point)), 0.2)  # [B, N, 1024]
+        y = F.leaky_relu(self._normed(linear(per_point, self.conv5.weight)), 0.2)  # [B, N, 1024]
         most, _ = max_over_rows(y)
         if self.variant == "defrec":
             return Features(most, per_point)
@@ -133,7 +134,7 @@ class _PooledLinear(torch.autograd.Function):
         where = torch.empty(b, d, dtype=torch.int64, device=x.device)
         step = max(1, (1 << 22) // (n * d))  # 16 MB of float32
         for i in range(0, b, step):
-            y = x[i : i + step] @ weight.T  # [step, n, d]
+            y = times(x[i : i + step], weight)  # [step, n, d]
             out[i : i + step, :d], where[i : i + step] = max_over_rows(y)
         centre = x.mean(1)  # [b, c]
         torch.mm(centre, weight.T, out=out[:, d:])

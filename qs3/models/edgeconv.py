@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from qs3.geometry.products import linear
 from qs3.models.norms import active, make_norm, track, uses_batch
 
 _GATHERED = 1 << 20  # values gathered at once: 4 MB in float32
@@ -109,6 +110,13 @@ def neighbour_max(x: Float[Tensor, "p c"], index: Int[Tensor, "q k"]) -> Float[T
     return _NeighbourMax.apply(x, index)
 
 
+def _product(x: Tensor, weight: Tensor) -> Tensor:
+    """[g, r, c] and [g, d, c] to [g, r, d]."""
+    if len(x) == 1:
+        return linear(x[0], weight[0])[None]
+    return x @ weight.transpose(1, 2)
+
+
 class EdgeConv(nn.Module):
     """One EdgeConv layer: [B, N, Cin] and neighbours [B, N, k] to [B, N, Cout].
 
@@ -160,8 +168,8 @@ class EdgeConv(nn.Module):
             mean, var = norm.running_mean[None], norm.running_var[None]
         h = norm.weight * torch.rsqrt(var + norm.eps)
         shift = norm.bias - h * mean
-        p = rows @ (h[:, :, None] * w1).transpose(1, 2)  # [g, r, d]
-        q = torch.baddbmm(shift[:, None], rows, (h[:, :, None] * e).transpose(1, 2))
+        p = _product(rows, h[:, :, None] * w1)  # [g, r, d]
+        q = _product(rows, h[:, :, None] * e) + shift[:, None]
         best = neighbour_max(p.flatten(0, 1), flat).view_as(q)
         return F.leaky_relu(best + q, self.negative_slope).view(b, n, -1)
 

@@ -30,8 +30,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from qs3.geometry.products import outer, times
 from qs3.models.edgeconv import max_over_rows
-from qs3.models.products import outer, times
 
 _AT_ONCE = 1 << 18  # values of a layer worked on at once: 1 MB in float32
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from qs3.models import products
-from qs3.models.products import outer, times
+from qs3.geometry import products
+from qs3.geometry.products import linear, outer, times
 
 
 @pytest.mark.parametrize("operator", [True, False])
@@ -28,3 +28,22 @@ def test_equal_to_matmul(
     torch.testing.assert_close(outer(x, y), x.T @ y, **close)
     strided = torch.randn(k, rows, dtype=dtype).T
     torch.testing.assert_close(times(strided, weight), strided @ weight.T, **close)
+
+
+@pytest.mark.parametrize("operator", [True, False])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_linear_has_the_plain_gradients(
+    operator: bool, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not operator:
+        monkeypatch.setattr(products, "_LINEAR", None)
+    x, weight = torch.randn(3, 40, 7, dtype=dtype), torch.randn(5, 7, dtype=dtype)
+    upstream = torch.randn(3, 40, 5, dtype=dtype)
+    grads = []
+    for product in (linear, torch.nn.functional.linear):
+        a, b = x.clone().requires_grad_(), weight.clone().requires_grad_()
+        out = product(a, b)
+        (out * upstream).sum().backward()
+        grads.append((out.detach(), a.grad, b.grad))
+    for ours, theirs in zip(*grads, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)

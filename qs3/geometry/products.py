@@ -3,7 +3,7 @@
 torch hands float32 products on the CPU to MKL, which does not use AVX-512 on processors of other
 makers; oneDNN does, and is there about twice as fast. The operator that reaches it is one that
 torch's compiler uses; where it is missing, or for other types and devices, these are the plain
-products. Neither is differentiable: they are for the inside of autograd functions.
+products. `times` and `outer` are for the inside of autograd functions, `linear` for outside.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
 
 
 def _find() -> Any:
@@ -39,3 +41,28 @@ def times(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 def outer(x: Tensor, y: Tensor) -> Tensor:
     """X'Y, the sum of the outer products of rows: [r, c] and [r, k] to [c, k]."""
     return times(x.T, y.T)
+
+
+class _Linear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        return times(x, weight)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        x, weight = ctx.saved_tensors
+        grad = grad.contiguous()
+        dx = times(grad, weight.T.contiguous()) if ctx.needs_input_grad[0] else None
+        dweight = None
+        if ctx.needs_input_grad[1]:
+            dweight = outer(grad.flatten(0, -2), x.flatten(0, -2))
+        return dx, dweight
+
+
+def linear(x: Tensor, weight: Tensor) -> Tensor:
+    """The product x W', differentiable once: [..., k] and [c, k] to [..., c]."""
+    if _LINEAR is None or x.dtype != torch.float32 or x.device.type != "cpu" or not x.numel():
+        return F.linear(x, weight)
+    return _Linear.apply(x, weight)
