@@ -13,6 +13,7 @@ Only x y z are read. Pickled arrays are refused unopened, sizes are checked befo
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import warnings
 import zipfile
@@ -34,7 +35,8 @@ class CloudFile:
     """What a file holds.
 
     Attributes:
-        clouds: [n, 3] each, in the numbers of the file, as float64 or float32.
+        clouds: [n, 3] each; float32 and finite from `read_clouds`, as in the file from
+            `parse_clouds`.
         labels: of each cloud as the file has them, a number or a word; None if it has none.
         dropped: pixels without a measurement that were left out.
         many: whether the file is made for several clouds (then each has a number in its name).
@@ -47,7 +49,7 @@ class CloudFile:
 
 
 def read_cloud(path: str | Path) -> np.ndarray:
-    """[n, 3] coordinates of the one cloud in a file, n >= 1, finite.
+    """[n, 3] float32 coordinates of the one cloud in a file, n >= 1, finite.
 
     Raises:
         DataError: names the file and what is wrong with it, or it holds several clouds.
@@ -59,10 +61,38 @@ def read_cloud(path: str | Path) -> np.ndarray:
 
 
 def read_clouds(path: str | Path) -> CloudFile:
-    """All clouds of a file.
+    """All clouds of a file, checked.
 
     Raises:
         DataError: names the file, and the line or cloud.
+    """
+    found = parse_clouds(path)
+    places = [f"{path}, cloud {i}" if found.many else str(path) for i in range(len(found.clouds))]
+    clouds = tuple(checked(c, where) for c, where in zip(found.clouds, places, strict=True))
+    return dataclasses.replace(found, clouds=clouds)
+
+
+def checked(cloud: np.ndarray, where: str) -> np.ndarray:
+    """[n, 3] of any numbers to float32.
+
+    Raises:
+        DataError: no points, or a value that is not finite in float32 (above 3.4e38, or NaN).
+    """
+    if len(cloud) == 0:
+        raise DataError(f"{where}: there are no points")
+    with np.errstate(over="ignore"):  # becomes infinite, and is reported as such
+        small = np.asarray(cloud, dtype=np.float32)
+    if not (finite := np.isfinite(small).all(axis=1)).all():
+        row = int(np.flatnonzero(~finite)[0])
+        raise DataError(f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite in float32")
+    return small
+
+
+def parse_clouds(path: str | Path) -> CloudFile:
+    """All clouds of a file with the numbers that it holds; they are not looked at.
+
+    Raises:
+        DataError: names the file, and the line.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -75,13 +105,6 @@ def read_clouds(path: str | Path) -> CloudFile:
         found = reader(path)
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
-    for number, cloud in enumerate(found.clouds):
-        where = f"{path}, cloud {number}" if found.many else str(path)
-        if len(cloud) == 0:
-            raise DataError(f"{where}: there are no points")
-        if not (finite := np.isfinite(cloud).all(axis=1)).all():
-            row = int(np.flatnonzero(~finite)[0])
-            raise DataError(f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite")
     if not found.clouds:
         raise DataError(f"{path}: there are no clouds")
     return found
@@ -124,24 +147,51 @@ def _bad_line(path: Path, lines: list[bytes]) -> str:
     return f"{path}: not a text file of rows with numbers"
 
 
+def npy_clouds(path: Path) -> int | None:
+    """How many clouds an .npy file is made for, from its header alone; None: a single one.
+
+    Raises:
+        DataError: as `read_clouds`, but for the numbers themselves.
+    """
+    try:
+        with open(path, "rb") as file:
+            shape, dtype = _npy_header(path, file)
+    except DataError:
+        raise
+    except Exception as error:  # as in `_npy`
+        raise DataError(f"{path}: not a readable .npy file ({error})") from error
+    _check_array(path, shape, dtype)
+    if len(shape) == 3 and not shape[0]:
+        raise DataError(f"{path}: there are no clouds")
+    return shape[0] if len(shape) == 3 else None
+
+
+def _npy_header(path: Path, file: Any) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of numbers, after comparing them with the file's size."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a header written by Python 2
+        version = np.lib.format.read_magic(file)
+        read: Callable[..., Any] | None = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }.get(version)
+        if read is None:
+            raise ValueError(f"version {version} of the .npy format")
+        shape, _, dtype = read(file)
+    if dtype.hasobject:
+        raise DataError(f"{path}: a pickled array, refused; save it as plain numbers")
+    size = path.stat().st_size
+    expected = file.tell() + dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+    if size != expected:
+        raise DataError(f"{path}: {size} bytes, expected {expected} for shape {shape}")
+    return shape, dtype
+
+
 def _npy(path: Path) -> CloudFile:
     try:
         with open(path, "rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # a header written by Python 2
-            version = np.lib.format.read_magic(file)
-            read: Callable[..., Any] | None = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }.get(version)
-            if read is None:
-                raise ValueError(f"version {version} of the .npy format")
-            shape, _, dtype = read(file)
-            if dtype.hasobject:
-                raise DataError(f"{path}: a pickled array, refused; save it as plain numbers")
-            size = path.stat().st_size
-            expected = file.tell() + dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-            if size != expected:
-                raise DataError(f"{path}: {size} bytes, expected {expected} for shape {shape}")
+            _npy_header(path, file)
             file.seek(0)
             array = np.load(file, allow_pickle=False)
     except DataError:
@@ -233,20 +283,22 @@ def _own_dataset(file: Any, names: tuple[str, ...], path: Path) -> Any:
 
 
 def _of_array(path: Path, array: np.ndarray, labels: np.ndarray | None = None) -> CloudFile:
-    if array.dtype.kind not in "fiu":
-        raise DataError(f"{path}: the array holds {array.dtype}, not numbers")
-    if array.ndim not in (2, 3) or array.shape[-1] < 3:
-        raise DataError(f"{path}: the array has shape {array.shape}, expected [n, 3] or [m, n, 3]")
+    _check_array(path, array.shape, array.dtype)
     many = array.ndim == 3
     clouds = array[..., :3] if many else array[None, :, :3]
-    if clouds.dtype.kind != "f":
-        clouds = clouds.astype(np.float64)
     if labels is not None and labels.shape != (len(clouds),):
         raise DataError(
             f"{path}: {len(clouds)} clouds, but the labels have the shape {labels.shape}"
         )
     words = None if labels is None else tuple(labels.tolist())
     return CloudFile(tuple(clouds), words, many=many)
+
+
+def _check_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    if dtype.kind not in "fiu":
+        raise DataError(f"{path}: the array holds {dtype}, not numbers")
+    if len(shape) not in (2, 3) or shape[-1] < 3:
+        raise DataError(f"{path}: the array has shape {shape}, expected [n, 3] or [m, n, 3]")
 
 
 _READERS: dict[str, Callable[[Path], CloudFile]] = {

@@ -13,6 +13,7 @@ from typing import Any
 
 from qs3.classes import class_list
 from qs3.data.importers import Importer, import_into
+from qs3.data.manifest import read_manifest
 from qs3.data.store import PointSet, is_begun, is_finished, open_pointset, read_meta
 from qs3.errors import ConfigError, DataError, MissingDataError
 
@@ -179,13 +180,21 @@ class Domain:
 
     def _refuse_stale(self, importer: Importer) -> None:
         """Raise DataError if the store was imported with other settings than today's."""
-        imported = read_meta(self.folder).get("imported")
+        meta = read_meta(self.folder)
+        imported = meta.get("imported")
         if imported is None:  # generated here
             return
         now = importer.settings()
         if not importer.is_there():  # the published files were put away after the import
-            now["folder"] = imported.get("folder")
+            now.update({key: imported.get(key) for key in ("folder", "files") if key in now})
         if now != imported:
+            if "files" in imported and now == {**imported, "files": now.get("files")}:
+                origins = {row.origin for row in read_manifest(self.folder, meta["classes"])}
+                raise DataError(
+                    f"{self.folder} is not what its folder holds today: "
+                    f"{importer.changes(origins)}; delete {self.folder} to import it again, or "
+                    "give another `path`"
+                )
             changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
             was = {key: imported.get(key) for key in changed}
             wanted = {key: now.get(key) for key in changed}

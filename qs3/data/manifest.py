@@ -28,7 +28,8 @@ class ManifestRow:
 
     Attributes:
         id: unique in the dataset, e.g. "chair/train/chair_0007".
-        cls: class name (column `class`); empty in all rows of a dataset without labels.
+        cls: class name (column `class`); empty in all rows of a dataset without labels,
+            and where a cloud was left out before its class was known.
         split: one of `SPLITS`.
         seed: the object's own seed; None for published clouds.
         mesh_sha256: hash of the mesh it was made from; empty for published clouds.
@@ -120,7 +121,8 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
         if row.id in seen:
             raise DataError(f"{at}: the same id is already in line {seen[row.id]}")
         seen[row.id] = line
-        if labelled and row.cls not in classes:
+        unread = row.status != OK and not row.cls  # its file could not even tell the class
+        if labelled and row.cls not in classes and not unread:
             raise DataError(f"{at}: unknown class {row.cls!r}; known are {', '.join(classes)}")
         if row.split not in SPLITS:
             raise DataError(f"{at}: unknown split {row.split!r}; known are {', '.join(SPLITS)}")

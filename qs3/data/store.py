@@ -206,6 +206,8 @@ def write_pointset(
         "failed": len(rows) - clouds,
         "sha256": {**hashes, "manifest": sha256_file(folder / MANIFEST)},
     }
+    if not any(row.cls for row in rows if row.status == OK):
+        document["labelled"] = False
     if tables:
         document["tables"] = {key: list(columns) for key, columns in tables.items()}
     if clash := sorted(set(document) & set(meta)):

@@ -1,6 +1,8 @@
-"""A training step of `ResNet18` on the CPU with few passes over memory.
+"""A training step of `ResNet18` on the CPU with few passes over memory and over empty pixels.
 
-The same sums as the plain network. What differs is what is stored and when:
+The same sums as the plain network. What differs is what is computed, stored and when:
+- Depth images are mostly empty: a stage works on windows of them and on one empty image where
+  that pays (`qs3.models.windows`).
 - Of each convolution with its norm only the convolution's output y is kept. A norm is y h + s per
   channel, so relu(y h + s) is made again from y where it is read, some images at a time, which
   then lie in the cache: by the next convolution, and by that convolution's gradient.
@@ -11,6 +13,9 @@ The same sums as the plain network. What differs is what is stored and when:
   is h dz + b y + c per channel, and made some images at a time as well. What has to be whole,
   because those means are over all images, is written in place.
 - Maps lie as [image, row, column, channel], as oneDNN's convolutions like them best.
+
+Maps are lists of parts (`Layout`). In the empty image's part a gradient is the sum of those of all
+images that show it there; the affine term of dy counts once for each of them.
 """
 
 from __future__ import annotations
@@ -24,11 +29,13 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.models.resnet import ConvNorm, ResNet18
+from qs3.models.windows import Layout, cut, reach, recut, recut_back, whole, windows
 
 _AT_ONCE = 1 << 19  # values of a map worked on at once: 2 MB in float32
 _WIDE = 512  # values of a row; short rows are slow, so several pixels make one
 
-Source = Callable[[slice], Tensor]  # of some images, what a layer reads: [i, h, w, c]
+Maps = list[Tensor]  # parts [i, h, w, c]
+Source = Callable[[int], Tensor]  # of a part, what a layer reads: [i, h, w, c]
 
 
 class _Room:
@@ -47,174 +54,264 @@ class _Room:
 class _Layer:
     """A convolution and its norm: the convolution's output, and what the norm makes of it."""
 
-    def __init__(self, modules: ConvNorm, parameters: Iterator[Tensor], room: _Room) -> None:
-        self.norm, self.room = modules.norm, room
+    def __init__(
+        self, modules: ConvNorm, parameters: Iterator[Tensor], room: _Room, layout: Layout
+    ) -> None:
+        self.norm, self.room, self.layout = modules.norm, room, layout
         self.stride, self.padding = modules.conv.stride, modules.conv.padding
         self.weight, self.gamma, self.beta = next(parameters), next(parameters), next(parameters)
+        self.y: Maps = []
 
-    def convolve(self, x: Tensor, part: slice, images: int) -> None:
-        """Convolve x [i, h, w, c], the input of some of all `images`."""
+    def convolve(self, x: Tensor, part: int) -> None:
+        """Convolve x [i, h, w, c], a part of the input. Parts come in order."""
         y = F.conv2d(x.permute(0, 3, 1, 2), self.weight, None, self.stride, self.padding)
-        y = y.permute(0, 2, 3, 1)
-        if part.start == 0:
-            self.y = y.new_empty(images, *y.shape[1:])
-        self.y[part] = y
+        y = y.permute(0, 2, 3, 1).contiguous()
+        piece = self.layout.piece(part)
+        if piece and len(piece.rim):
+            seen = _pixels(self.y[0]).index_select(0, piece.under)
+            _pixels(y).index_copy_(0, piece.rim, seen)
+        self.y.append(y)
 
     def normalise(self) -> None:
         """Statistics of the whole output, running ones too; after it `scaled` can be asked."""
         norm = self.norm
         assert norm.momentum is not None
         assert norm.num_batches_tracked is not None
-        self.mean, var = torch.batch_norm_update_stats(
-            self.y.permute(0, 3, 1, 2), norm.running_mean, norm.running_var, norm.momentum
-        )
+        mean, var, count = self._statistics()
         norm.num_batches_tracked.add_(1)
-        self.inverse = (var + norm.eps).rsqrt()
+        with torch.no_grad():
+            norm.running_mean.lerp_(mean.to(norm.running_mean.dtype), norm.momentum)
+            wide = (var * (count / (count - 1))).to(norm.running_var.dtype)
+            norm.running_var.lerp_(wide, norm.momentum)
+        self.mean = mean.to(self.gamma.dtype)
+        self.inverse = (var + norm.eps).rsqrt().to(self.gamma.dtype)
         self.h = self.gamma * self.inverse
         self.s = self.beta - self.h * self.mean
         self.sums = self.h.new_zeros(2, len(self.h), dtype=torch.float64)  # of dz, of dz y
 
-    def scaled(self, part: slice, room: int = 0) -> Tensor:
-        """The norm's output y h + s of some images, until this room is used again."""
+    def _statistics(self) -> tuple[Tensor, Tensor, int]:
+        """Mean and variance of each channel, from those of the parts; values of a channel."""
+        found = []
+        for part in self.layout.parts:
+            y, empty = self.y[part], self.layout.empty
+            if empty is not None and part == 0:
+                n = int(empty.sum())
+                share = empty.to(y.dtype) / max(n, 1)
+                mean = share @ _pixels(y)
+                var = share @ (_pixels(y) - mean).square()
+            else:
+                n = y.numel() // y.shape[3]
+                mean, var = torch.batch_norm_update_stats(y.permute(0, 3, 1, 2), None, None, 0.0)
+            found.append((mean.double(), var.double(), n))
+        count = sum(n for _, _, n in found)
+        total = sum(mean * (n / count) for mean, _, n in found)
+        spread = sum((var + (mean - total).square()) * (n / count) for mean, var, n in found)
+        return total, spread, count
+
+    def scaled(self, part: int, room: int = 0) -> Tensor:
+        """The norm's output y h + s of a part, until this room is used again."""
         y = self.y[part]
         rows = _rows(y)
         out = self.room(room, rows)
         return torch.addcmul(_wide(self.s, rows), rows, _wide(self.h, rows), out=out).view(y.shape)
 
-    def relu(self, part: slice) -> Tensor:
+    def relu(self, part: int) -> Tensor:
         """The same through ReLU, until room 0 is used again."""
         return self.scaled(part).relu_()
 
-    def count(self, dz: Tensor, part: slice) -> None:
-        """Add dz of some images to the sums of dz and of dz y."""
+    def count(self, dz: Tensor, part: int) -> None:
+        """Add dz of a part to the sums of dz and of dz y."""
         rows, channels = _rows(dz), len(self.h)
         product = torch.mul(rows, _rows(self.y[part]), out=self.room(1, rows))
         for total, values in zip(self.sums, (rows, product), strict=True):
             total += values.sum(0).view(-1, channels).sum(0, dtype=torch.float64)
 
     def counted(self) -> None:
-        """After all images: the norm's gradients are known and `back` can be asked."""
+        """After all parts: the norm's gradients are known and `back` can be asked."""
         dbeta, dzy = self.sums
         dgamma = (dzy - self.mean * dbeta) * self.inverse
-        values = self.y.numel() // len(self.h)
+        values = self.layout.images * self.layout.h * self.layout.w
         b = -self.h * self.inverse * dgamma / values
         c = -self.h * dbeta / values - b * self.mean
         self.b, self.c = b.to(self.h.dtype), c.to(self.h.dtype)
         self.dweight = torch.zeros_like(self.weight)
         self.gradients = (self.dweight, dgamma.to(self.h.dtype), dbeta.to(self.h.dtype))
+        if self.layout.empty is not None:
+            self.rims = torch.zeros_like(_pixels(self.y[0]))  # gradients out of the windows
 
-    def back(self, dz: Tensor, x: Tensor, part: slice, *, need_x: bool = True) -> Tensor:
-        """Gradient of the input x of some images; adds to that of the weight."""
-        y = self.y[part]
+    def back(self, dz: Tensor, x: Tensor, part: int, *, need_x: bool = True) -> Tensor:
+        """Gradient of a part of the input x; adds to that of the weight. The last part first."""
+        y, empty = self.y[part], self.layout.empty
         rows = _rows(y)
         dy = self.room(1, rows)
         torch.addcmul(_wide(self.c, rows), rows, _wide(self.b, rows), out=dy)
+        piece = self.layout.piece(part)
+        if empty is not None and not piece:
+            pixels = dy.view(self.rims.shape)
+            pixels.mul_(empty[:, None]).add_(self.rims)
         dy.addcmul_(_rows(dz), _wide(self.h, rows))
+        if piece and len(piece.rim):
+            pixels = dy.view(-1, len(self.h))
+            self.rims.index_add_(0, piece.under, pixels.index_select(0, piece.rim))
+            pixels.index_fill_(0, piece.rim, 0)
         dx, dweight, _ = torch.ops.aten.convolution_backward(
             dy.view(y.shape).permute(0, 3, 1, 2), x.permute(0, 3, 1, 2), self.weight, None,
             self.stride, self.padding, (1, 1), False, (0, 0), 1, (need_x, True, False),
         )  # fmt: skip
         self.dweight += dweight
-        return dx.permute(0, 2, 3, 1) if need_x else dz
+        return dx.permute(0, 2, 3, 1).contiguous() if need_x else dz
 
 
 class _Block:
-    """What one `BasicBlock` keeps; `out` is its output, `shape` and `source` its input."""
+    """What one `BasicBlock` keeps; `out` is its output, `source` its input."""
 
     def __init__(self, first: _Layer, second: _Layer, shortcut: _Layer | None) -> None:
         self.first, self.second, self.shortcut = first, second, shortcut
         self.layers = [first, second] + ([shortcut] if shortcut else [])
+        self.parts = second.layout.parts
 
-    def forward(self, source: Source, shape: tuple[int, ...]) -> None:
-        self.source, self.shape = source, shape
+    def forward(self, source: Source) -> Maps:
+        self.source = source
         first, second, shortcut = self.first, self.second, self.shortcut
-        for part in _parts(shape):
+        for part in self.parts:
             x = source(part)
             for layer in (first, shortcut):
                 if layer:
-                    layer.convolve(x, part, shape[0])
+                    layer.convolve(x, part)
         first.normalise()
-        for part in _parts(first.y.shape):
-            second.convolve(first.relu(part), part, shape[0])
+        for part in self.parts:
+            second.convolve(first.relu(part), part)
         second.normalise()
         if shortcut:
             shortcut.normalise()
-        self.out = torch.empty_like(second.y)
-        for part in _parts(self.out.shape):
+        self.out = []
+        for part in self.parts:
             skip = shortcut.scaled(part) if shortcut else source(part)
-            torch.add(second.scaled(part, room=1), skip, out=self.out[part]).relu_()
+            self.out.append(torch.add(second.scaled(part, room=1), skip).relu_())
+        return self.out
 
-    def backward(self, g: Tensor) -> Tensor:
+    def backward(self, g: Maps) -> Maps:
         """Gradient of the output, written over, to that of the input."""
         first, second, shortcut = self.first, self.second, self.shortcut
-        for part in _parts(g.shape):
+        for part in self.parts:
             dz = _mask(g[part], self.out[part])
             second.count(dz, part)
             if shortcut:
                 shortcut.count(dz, part)
         second.counted()
-        inner = torch.empty_like(g)  # gradient of the first norm's output
-        for part in _parts(g.shape):
+        inner: dict[int, Tensor] = {}  # gradient of the first norm's output
+        for part in reversed(self.parts):
             x = first.relu(part)
             inner[part] = second.back(g[part], x, part)
             first.count(_mask(inner[part], x), part)
         first.counted()
-        if shortcut is None:
-            for part in _parts(g.shape):
-                g[part] += first.back(inner[part], self.source(part), part)
-            return g
-        shortcut.counted()
-        out = g.new_empty(self.shape)
-        for part in _parts(out.shape):
+        if shortcut:
+            shortcut.counted()
+        for part in reversed(self.parts):
             x = self.source(part)
-            dx, dskip = first.back(inner[part], x, part), shortcut.back(g[part], x, part)
-            torch.add(dx, dskip, out=out[part])
-        return out
+            dx = first.back(inner.pop(part), x, part)
+            skip = shortcut.back(g[part], x, part) if shortcut else g[part]
+            g[part] = dx.add_(skip)
+        return g
 
 
 class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, images: Tensor, net: ResNet18, *parameters: Tensor) -> Tensor:
-        given, room = iter(parameters), _Room()
-        stem = _Layer(net.stem, given, room)
-        blocks = []
-        for modules in net.blocks:
-            layers = (_Layer(m, given, room) if m else None for m in _layers(modules))
-            blocks.append(_Block(*layers))  # type: ignore[arg-type]
-        maps = images.permute(0, 2, 3, 1)
-        for part in _parts((*maps.shape[:3], len(stem.gamma))):
-            stem.convolve(maps[part], part, len(maps))
+        given, room, stages = iter(parameters), _Room(), _stages(net)
+        layouts = _layouts(images[:, 0] != 0, net)
+        stem = _Layer(net.stem, given, room, layouts[0])
+        maps = cut(images.permute(0, 2, 3, 1), layouts[0])
+        for part in layouts[0].parts:
+            stem.convolve(maps[part], part)
         stem.normalise()
         source: Source = stem.relu
-        shape = tuple(stem.y.shape)
-        for block in blocks:
-            block.forward(source, shape)
-            source, shape = block.out.__getitem__, tuple(block.out.shape)
-        ctx.stem, ctx.blocks, ctx.maps = stem, blocks, maps
-        return blocks[-1].out.mean((1, 2))
+        ctx.stem, ctx.maps, ctx.stages, out = stem, maps, [], []
+        for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
+            if k:
+                source = recut(out, layouts[k - 1], _wider(layouts, k)).__getitem__
+            blocks = []
+            for modules in stage:
+                layers = (_Layer(m, given, room, layout) if m else None for m in _layers(modules))
+                blocks.append(_Block(*layers))  # type: ignore[arg-type]
+                out = blocks[-1].forward(source)
+                source = out.__getitem__
+            ctx.stages.append(blocks)
+        ctx.layouts = layouts
+        return _mean(out, layouts[-1])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        stem, blocks = ctx.stem, ctx.blocks
-        _, h, w, _ = blocks[-1].out.shape
-        g = (grad / (h * w))[:, None, None].repeat(1, h, w, 1)
-        for block in reversed(blocks):
-            g = block.backward(g)
-        for part in _parts(g.shape):
+        stem, layouts = ctx.stem, ctx.layouts
+        g = _mean_back(grad, layouts[-1])
+        for k in reversed(range(len(layouts))):
+            for block in reversed(ctx.stages[k]):
+                g = block.backward(g)
+            if k:
+                g = recut_back(g, layouts[k - 1], _wider(layouts, k))
+        for part in layouts[0].parts:
             stem.count(_mask(g[part], stem.relu(part)), part)
         stem.counted()
-        for part in _parts(g.shape):
+        for part in reversed(layouts[0].parts):
             stem.back(g[part], ctx.maps[part], part, need_x=False)
-        layers = [stem, *(layer for block in blocks for layer in block.layers)]
+        layers = [stem, *(layer for s in ctx.stages for block in s for layer in block.layers)]
         return None, None, *(d for layer in layers for d in layer.gradients)
 
 
-def _parts(shape: tuple[int, ...]) -> Iterator[slice]:
-    """All images of maps, some at a time."""
-    images, h, w, c = shape
-    step = max(1, _AT_ONCE // (h * w * c))
-    return (slice(i, min(i + step, images)) for i in range(0, images, step))
+def _mean(maps: Maps, layout: Layout) -> Tensor:
+    """Mean over the pixels of each image: [i, c]."""
+    whole_images = recut(maps, layout, whole(layout.images, layout.h, layout.w, layout.images))
+    return whole_images[0].mean((1, 2))
+
+
+def _mean_back(grad: Tensor, layout: Layout) -> Maps:
+    h, w = layout.h, layout.w
+    g = (grad / (h * w))[:, None, None].repeat(1, h, w, 1)
+    return recut_back([g], layout, whole(layout.images, h, w, layout.images))
+
+
+def _stages(net: ResNet18) -> list[list[Any]]:
+    """Blocks whose outputs are of one size."""
+    stages: list[list[Any]] = [[]]
+    for block in net.blocks:
+        if block.first.conv.stride[0] > 1:  # type: ignore[union-attr]
+            stages.append([])
+        stages[-1].append(block)
+    return stages
+
+
+def _layouts(filled: Tensor, net: ResNet18) -> list[Layout]:
+    """How each stage's maps are kept: windows as long as they are worth it, then whole images."""
+    images, h, w = filled.shape
+    rows, columns = reach(filled.any(2)), reach(filled.any(1))
+    layouts: list[Layout] = []
+    for stage in _stages(net):
+        stride, convs = stage[0].first.conv.stride[0], 2 * len(stage)
+        if layouts:
+            fits = layouts[-1].empty is not None and h % stride == 0 and w % stride == 0
+            h, w, convs = -(-h // stride), -(-w // stride), convs - 1
+            rows, columns = (
+                (first // stride, end // stride + 1) for first, end in (rows, columns)
+            )
+        else:
+            fits, convs = True, convs + 1  # the stem
+        rows, columns = ((first - convs, end + convs) for first, end in (rows, columns))
+        at_once = _AT_ONCE // stage[0].second.conv.out_channels
+        found = windows(rows, columns, h, w, at_once) if fits else None
+        layouts.append(found or whole(images, h, w, max(1, at_once // (h * w))))
+    return layouts
+
+
+def _wider(layouts: list[Layout], stage: int) -> Layout:
+    """A stage's windows in the maps that it reads."""
+    before = layouts[stage - 1]
+    return layouts[stage].before(-(-before.h // layouts[stage].h), before.h, before.w)
+
+
+def _pixels(maps: Tensor) -> Tensor:
+    """[i, h, w, c] as [pixels, c], a view."""
+    return maps.view(-1, maps.shape[3])
 
 
 def _rows(maps: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import struct
+import tracemalloc
 from pathlib import Path
 
 import h5py
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 
 from qs3.clouds.files import read_cloud, read_clouds
-from qs3.data.importers import CloudFolder, import_into
+from qs3.data.domain import Domain
+from qs3.data.importers import CloudFolder, NpyTree, XyzTree, import_into
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError
 
@@ -180,6 +182,7 @@ def test_without_labels(tmp_path: Path) -> None:
     data = open_pointset(tmp_path / "store")
     assert not data.labelled
     assert data.labels.tolist() == [-1, -1]
+    assert data.meta["labelled"] is False
     assert data.ids == ("train/b", "train/deep/a")
     assert data.splits.tolist() == ["train", "train"]
     assert [row.cls for row in read_manifest(tmp_path / "store", TWO)] == ["", ""]
@@ -311,3 +314,139 @@ def test_own_is_composed_as_the_target(tmp_path: Path) -> None:
     data = instantiate(cfg.data.target).open()
     assert not data.labelled
     assert data.ids == ("train/a",)
+
+
+def own(tmp_path: Path, **settings) -> Domain:
+    """The domain of tmp_path/in."""
+    published = CloudFolder(tmp_path / "in", points=4, **settings)
+    return Domain("own", "O", "own clouds", tmp_path / "store", published=published, classes=TWO)
+
+
+def test_changed_files_are_noticed(tmp_path: Path) -> None:
+    for name in ("bed/a.xyz", "bed/b.npy", "chair/a.npz"):
+        write(tmp_path / "in" / name)
+    domain = own(tmp_path, test_every=0)
+    before = domain.open().sha256
+    (tmp_path / "in" / "notes.md").write_text("not a cloud")
+    (tmp_path / "in" / ".hidden.xyz").write_text("1 2 3")
+    assert domain.open().sha256 == before
+
+    new = write(tmp_path / "in" / "chair" / "c.ply")
+    with pytest.raises(DataError, match=r"1 added \(chair/c\.ply\); delete .*store to import"):
+        domain.open()
+    new.unlink()
+    assert domain.open().sha256 == before
+
+    (tmp_path / "in" / "bed" / "b.npy").rename(tmp_path / "in" / "bed" / "d.npy")
+    with pytest.raises(DataError, match=r"1 added \(bed/d\.npy\), 1 removed \(bed/b\.npy\)"):
+        domain.open()
+    (tmp_path / "in" / "bed" / "d.npy").rename(tmp_path / "in" / "bed" / "b.npy")
+
+    path = tmp_path / "in" / "bed" / "b.npy"
+    changed = path.stat().st_mtime_ns + 1
+    os.utime(path, ns=(changed, changed))
+    with pytest.raises(DataError, match="some have changed; delete"):
+        domain.open()
+    (tmp_path / "in").rename(tmp_path / "away")  # put away after the import
+    assert domain.open().sha256 == before
+
+
+def test_files_that_change_during_the_import(tmp_path: Path) -> None:
+    """Half of a folder that is still being copied must not become a store."""
+
+    class Slow(CloudFolder):
+        def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
+            write(tmp_path / "in" / "b.xyz")
+            return cloud
+
+    write(tmp_path / "in" / "a.xyz")
+    with pytest.raises(DataError, match="while they were imported; run the same command again"):
+        import_into(tmp_path / "s", Slow(tmp_path / "in", points=4), name="s", classes=TWO)
+    assert not (tmp_path / "s").exists()
+
+
+def test_one_file_is_in_memory_at_a_time(tmp_path: Path) -> None:
+    """Else a folder of large files would be in memory twice before the first cloud is thinned."""
+    rng = np.random.default_rng(0)
+    for i in range(8):
+        many = rng.standard_normal((10, 5000, 3))  # 1.2 MB
+        np.save(tmp_path / f"a{i}.npy", many)
+        np.savez(tmp_path / f"b{i}.npz", points=many)
+        with h5py.File(tmp_path / f"c{i}.h5", "w") as file:
+            file["data"] = many
+    importer = CloudFolder(tmp_path, points=4)
+    importer.items(TWO[:1])  # modules are imported outside the measurement
+    tracemalloc.start()
+    try:
+        items = importer.items(TWO[:1])
+        total = sum(len(item.load()) for item in items)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert total == 3 * 8 * 10 * 5000
+    assert peak < 4 << 20, "all files together have 29 MB"
+
+
+def test_npy_is_not_read_to_be_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i in range(3):
+        np.save(tmp_path / f"{i}.npy", np.stack([CLOUD, CLOUD + i]))
+    monkeypatch.setattr(np, "load", lambda *a, **k: pytest.fail("read"))
+    assert len(CloudFolder(tmp_path, points=4).items(TWO)) == 6
+
+
+@pytest.mark.parametrize("kind", ["own", "xyz", "npy"])
+def test_names_equal_but_for_case(tmp_path: Path, kind: str) -> None:
+    """Elsewhere one of them would overwrite the other."""
+    suffix = ".npy" if kind == "npy" else ".xyz"
+    write(tmp_path / "bed" / "train" / f"a{suffix}")
+    write(tmp_path / "bed" / "train" / f"A{suffix.upper()}".replace(".NPY", ".npy"))
+    importer = {"own": CloudFolder, "xyz": XyzTree, "npy": NpyTree}[kind](tmp_path, points=4)
+    with pytest.raises(DataError, match=r"a\.\w+ and .*A\.\w+ have one name|A.* and .*a\.\w+ have"):
+        importer.items(("bed",))
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_clouds_come_as_finite_float32(tmp_path: Path, suffix: str) -> None:
+    assert read_cloud(write(tmp_path / f"a{suffix}")).dtype == np.float32
+    if suffix in (".xyz", ".npz", ".h5"):  # these held float64
+        path = write(tmp_path / f"b{suffix}", CLOUD * 1e300)
+        with pytest.raises(DataError, match=rf"b\{suffix}, point 1: .*not finite in float32"):
+            read_cloud(path)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_a_wrong_label_can_be_skipped(tmp_path: Path, suffix: str) -> None:
+    many, labels = np.stack([CLOUD, CLOUD + 1, CLOUD * np.nan, CLOUD]), np.array([1, 7, 0, 0])
+    if suffix == ".npz":
+        np.savez(tmp_path / "a.npz", points=many, label=labels)
+    else:
+        with h5py.File(tmp_path / "a.h5", "w") as file:
+            file["data"], file["label"] = many, labels
+    with pytest.raises(DataError, match=r"cloud 1: label 7 is not 0\.\.1"):
+        CloudFolder(tmp_path, points=4).read(TWO)
+    store = tmp_path.with_name(f"{tmp_path.name}_store")
+    importer = CloudFolder(tmp_path, points=4, on_error="skip")
+    import_into(store, importer, name="mine", classes=TWO)
+    data = open_pointset(store)
+    assert data.ids == ("bed/train/a_0003", "chair/train/a_0000")
+    assert "labelled" not in data.meta
+    left_out = {r.origin: r.reason for r in read_manifest(store, TWO) if r.status == "skipped"}
+    assert sorted(left_out) == [f"a{suffix}[1]", f"a{suffix}[2]"]
+    assert "label 7" in left_out[f"a{suffix}[1]"]
+    assert "not finite" in left_out[f"a{suffix}[2]"]
+
+
+def test_ids_of_splits_without_labels(tmp_path: Path) -> None:
+    for name in ("train/a.xyz", "train/b.npy", "test/a.xyz"):
+        write(tmp_path / name)
+    np.save(tmp_path / "test" / "m.npy", np.stack([CLOUD, CLOUD]))
+    _, rows = CloudFolder(tmp_path, points=4).read(TWO)
+    ids = ["train/a", "train/b", "test/a", "test/m_0000", "test/m_0001"]
+    assert [row.id for row in rows] == ids
+
+
+def test_files_of_one_name_in_several_folders(tmp_path: Path) -> None:
+    for name in ("x/a.npy", "y/a.npy", "y/a_b.npz"):
+        write(tmp_path / name)
+    _, rows = CloudFolder(tmp_path, points=4, layout="none").read(TWO)
+    assert [row.id for row in rows] == ["train/x/a", "train/y/a", "train/y/a_b"]

@@ -7,7 +7,7 @@ import dataclasses
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -128,6 +128,14 @@ class Importer(abc.ABC):
         values["folder"] = str(self.root)
         return {"format": type(self).__name__, **values}
 
+    def changes(self, origins: Collection[str]) -> str:
+        """What is different from an import, in words, if its `settings` had another "files".
+
+        Args:
+            origins: of the imported manifest.
+        """
+        return f"the files in {self.root}"
+
 
 def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequence[str]) -> None:
     """Read the published files and put the finished store at `folder`, all or nothing.
@@ -150,14 +158,20 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
                 "to import the published files"
             )
         shutil.rmtree(building, ignore_errors=True)
+        settings = importer.settings()
         clouds, rows = importer.read(classes)
+        if importer.settings() != settings:
+            raise DataError(
+                f"files in {importer.root} were added, removed or changed while they were "
+                "imported; run the same command again when nothing writes there"
+            )
         write_pointset(
             building,
             name=name,
             classes=classes,
             arrays={"points": clouds},
             rows=rows,
-            meta={"imported": importer.settings()},
+            meta={"imported": settings},
         )
         if folder.is_dir():  # holds a lock at most
             shutil.rmtree(folder)

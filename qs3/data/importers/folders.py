@@ -12,8 +12,11 @@ name_0000, name_0001, ... If it has labels, numbers count the classes from 0 and
 from __future__ import annotations
 
 import functools
+import hashlib
 import logging
-from collections.abc import Iterator, Sequence
+import os
+import re
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,7 +24,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qs3.classes import known_as
-from qs3.clouds.files import SUFFIXES, CloudFile, read_clouds, split_prefix
+from qs3.clouds.files import (
+    SUFFIXES,
+    CloudFile,
+    checked,
+    npy_clouds,
+    parse_clouds,
+    read_clouds,
+    split_prefix,
+)
 from qs3.data.importers.base import Importer, Item, class_of, split_of
 from qs3.data.importers.trees import _visible
 from qs3.data.manifest import SPLITS, ManifestRow
@@ -33,6 +44,8 @@ log = logging.getLogger(__name__)
 LAYOUTS = ("auto", "class/split", "split/class", "class", "none")
 _SPLIT_NAMES = ("train", "test", "val", "validation")
 _MANY = (".npy", ".npz", ".h5", ".hdf5")
+_ENDS = tuple(suffix.encode() for suffix in SUFFIXES)
+_NUMBER = re.compile(r"\[\d+\]$")  # of the cloud in its file, at the end of an origin
 _UP = {
     "z": ((0, 1, 2), (1, 1, 1)),
     "-z": ((0, 1, 2), (1, -1, -1)),
@@ -93,14 +106,19 @@ class CloudFolder(Importer):
         layout = self._layout(classes)
         log.info("%s is read in the layout %s", self.root, layout)
         rows: dict[str, Item] = {}
+        last = _LastFile()
         for path in _files(self.root, self.root):
             cls, split = self._place(path, layout, classes)
-            for item in self._of_file(path, cls, split, classes):
-                if item.row.id in rows:
+            stem = path.stem
+            if not cls and layout == "none":  # any depth; elsewhere the folders are class or split
+                stem = path.relative_to(self.root).with_suffix("").as_posix()
+            for item in self._of_file(path, cls, split, stem, classes, last):
+                name = item.row.id.casefold()  # other systems do not tell a.xyz from A.XYZ
+                if name in rows:
                     raise DataError(
-                        f"{item.where} and {rows[item.row.id].where} have one name; rename one"
+                        f"{item.where} and {rows[name].where} have one name; rename one"
                     )
-                rows[item.row.id] = item
+                rows[name] = item
         if self.test_every and layout == "class":
             rows = _with_tests(rows, self.test_every)
         order = {name: i for i, name in enumerate(classes)}
@@ -108,6 +126,21 @@ class CloudFolder(Importer):
             rows.values(),
             key=lambda f: (SPLITS.index(f.row.split), order.get(f.row.cls, -1), f.row.id),
         )
+
+    def settings(self) -> dict[str, Any]:
+        """See `Importer`; with a digest of the files' names, sizes and times of change."""
+        return {**super().settings(), "files": _digest(self.root)}
+
+    def changes(self, origins: Collection[str]) -> str:
+        """See `Importer`: which files are new, gone, or neither and so changed."""
+        had = {_NUMBER.sub("", origin) for origin in origins}
+        have = {os.fsdecode(name) for name, _, _ in _stats(self.root)}
+        told = [
+            f"{len(names)} {what} ({', '.join(sorted(names)[:3])}{', ...' * (len(names) > 3)})"
+            for names, what in ((have - had, "added"), (had - have, "removed"))
+            if names
+        ]
+        return f"the files in {self.root}: {', '.join(told) or 'some have changed'}"
 
     def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
         """See `Importer`: at most P points, the farthest."""
@@ -165,27 +198,69 @@ class CloudFolder(Importer):
                 split = split_of(name, str(path))
         return cls, split
 
-    def _of_file(self, path: Path, cls: str, split: str, classes: Sequence[str]) -> list[Item]:
+    def _of_file(
+        self,
+        path: Path,
+        cls: str,
+        split: str,
+        stem: str,
+        classes: Sequence[str],
+        last: _LastFile,
+    ) -> list[Item]:
+        """The clouds of a file; of those that may hold several only number and labels are kept."""
         origin = path.relative_to(self.root).as_posix()
+        row = ManifestRow(_id(cls, split, stem), cls, split, origin=origin)
         if path.suffix.lower() not in _MANY:
-            stem = origin.removesuffix(path.suffix) if not cls else path.stem
-            row = ManifestRow(_id(cls, split, stem), cls, split, origin=origin)
             return [Item(row, str(path), functools.partial(_only, path))]
+        labels: tuple[Any, ...] | None = None
         try:
-            file = read_clouds(path)
+            if path.suffix.lower() == ".npy":
+                count = npy_clouds(path)
+                number, many = count or 1, count is not None
+            else:
+                file = last.read(path)
+                number, many, labels = len(file.clouds), file.many, file.labels
         except DataError as error:
-            row = ManifestRow(_id(cls, split, path.stem), cls, split, origin=origin)
             return [Item(row, str(path), functools.partial(_raise, error))]
-        if not cls and (prefix := split_prefix(path.stem)) and file.many:
+        if not cls and (prefix := split_prefix(path.stem)) and many:
             split = split_of(prefix, str(path))
         found = []
-        for number, cloud in enumerate(file.clouds):
-            where = f"{path}, cloud {number}" if file.many else str(path)
-            own = cls or _label(file, number, classes, where)
-            stem = f"{path.stem}_{number:04d}" if file.many else path.stem
-            row = ManifestRow(_id(own, split, stem), own, split, origin=f"{origin}[{number}]")
-            found.append(Item(row, where, functools.partial(_same, cloud)))
+        for i in range(number):
+            where = f"{path}, cloud {i}" if many else str(path)
+            load: Callable[[], np.ndarray] = functools.partial(last.cloud, path, i, number, where)
+            own = cls
+            try:
+                own = cls or _label(labels, i, classes, where)
+            except DataError as error:
+                load = functools.partial(_raise, error)
+            name = path.stem if own else stem
+            name = f"{name}_{i:04d}" if many else name
+            row = ManifestRow(_id(own, split, name), own, split, origin=f"{origin}[{i}]")
+            found.append(Item(row, where, load))
         return found
+
+
+class _LastFile:
+    """The one file of several clouds that is in memory at a time."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._file = CloudFile(())
+
+    def read(self, path: Path) -> CloudFile:
+        """The file's clouds as they are, read again only if another one came between."""
+        if path != self._path:
+            self._path, self._file = None, CloudFile(())  # gone before the next one comes
+            self._file = parse_clouds(path)
+            self._path = path
+        return self._file
+
+    def cloud(self, path: Path, number: int, of: int, where: str) -> np.ndarray:
+        """[n, 3] float32, checked."""
+        clouds = self.read(path).clouds
+        if len(clouds) != of:
+            raise DataError(f"{path} has {len(clouds)} clouds, a moment ago it had {of}")
+        return checked(clouds[number], where)
 
 
 def _with_tests(rows: dict[str, Item], every: int) -> dict[str, Item]:
@@ -211,11 +286,11 @@ def _id(cls: str, split: str, stem: str) -> str:
     return "/".join(part for part in (cls, split, stem) if part)
 
 
-def _label(file: CloudFile, number: int, classes: Sequence[str], where: str) -> str:
+def _label(labels: tuple[Any, ...] | None, number: int, classes: Sequence[str], where: str) -> str:
     """The class in the file's own labels; "" if it has none."""
-    if file.labels is None:
+    if labels is None:
         return ""
-    label: Any = file.labels[number]
+    label: Any = labels[number]
     if isinstance(label, bytes):
         label = label.decode(errors="replace")
     if isinstance(label, str):
@@ -240,15 +315,37 @@ def _files(folder: Path, root: Path) -> Iterator[Path]:
             yield path
 
 
+def _stats(root: Path) -> Iterator[tuple[bytes, int, int]]:
+    """Relative name, size and time of change (ns) of what `_files` gives, in any order."""
+    folders = [(os.fsencode(root), b"")]
+    while folders:
+        folder, prefix = folders.pop()
+        try:
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    if entry.name.startswith(b".") or entry.name == b"__MACOSX":
+                        continue
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append((entry.path, prefix + entry.name + b"/"))
+                    elif os.path.splitext(entry.name)[1].lower() in _ENDS and entry.is_file():
+                        stat = entry.stat()
+                        yield prefix + entry.name, stat.st_size, stat.st_mtime_ns
+        except OSError as error:
+            where = os.fsdecode(folder)
+            raise DataError(f"{where} cannot be read ({error.strerror})") from error
+
+
+def _digest(root: Path) -> str:
+    """SHA-256 of `_stats`; of nothing if the folder is not there. About 5 us a file."""
+    stats = sorted(_stats(root)) if root.is_dir() else []
+    return hashlib.sha256(b"".join(b"%b\0%d\0%d\n" % row for row in stats)).hexdigest()
+
+
 def _only(path: Path) -> np.ndarray:
     file = read_clouds(path)
     if file.dropped:
         log.info("%s: %d pixels without a measurement left out", path, file.dropped)
     return file.clouds[0]
-
-
-def _same(cloud: np.ndarray) -> np.ndarray:
-    return cloud
 
 
 def _raise(error: DataError) -> np.ndarray:

@@ -190,9 +190,10 @@ def list_tree(root: Path, suffix: str, classes: Sequence[str]) -> list[Entry]:
                 if path.suffix.lower() != suffix or not path.is_file():
                     continue
                 entry = Entry(path, cls, split)
-                if entry.id in entries:
-                    raise DataError(f"{path} and {entries[entry.id].path} have one name")
-                entries[entry.id] = entry
+                name = entry.id.casefold()  # other systems do not tell a.xyz from A.XYZ
+                if name in entries:
+                    raise DataError(f"{path} and {entries[name].path} have one name; rename one")
+                entries[name] = entry
     return sorted(
         entries.values(),
         key=lambda e: (SPLITS.index(e.split), classes.index(e.cls), e.path.name),
