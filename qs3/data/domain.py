@@ -196,6 +196,8 @@ class Domain:
                     "give another `path`"
                 )
             changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
+            if len(changed) > 1:  # of other settings there is more to say than a digest
+                changed = [key for key in changed if key != "files"]
             was = {key: imported.get(key) for key in changed}
             wanted = {key: now.get(key) for key in changed}
             raise DataError(

@@ -450,3 +450,11 @@ def test_files_of_one_name_in_several_folders(tmp_path: Path) -> None:
         write(tmp_path / name)
     _, rows = CloudFolder(tmp_path, points=4, layout="none").read(TWO)
     assert [row.id for row in rows] == ["train/x/a", "train/y/a", "train/y/a_b"]
+
+
+def test_other_settings_are_told_without_digests(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "bed" / "a.xyz")
+    own(tmp_path, test_every=0).open()
+    write(tmp_path / "in" / "bed" / "b.xyz")
+    with pytest.raises(DataError, match=r"imported with \{'up': 'z'\}, the config says"):
+        own(tmp_path, test_every=0, up="y").open()
