@@ -1,0 +1,75 @@
+"""One's own folders of clouds from files to a result: classes of their own, a target without labels."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from qs3 import runs
+from qs3.errors import ConfigError
+from qs3.run import train
+from tests.training.toy import _SHAPES, CONF, overrides
+
+
+def write_clouds(folder: Path, layout: str, count: int, noise: float) -> None:
+    """Text files of 40 to 80 points: class/name.xyz, or name.txt without labels."""
+    rng = np.random.default_rng(count)
+    for cls, shape in _SHAPES.items():
+        for i in range(count):
+            points = rng.normal(size=(int(rng.integers(40, 80)), 3)) * shape
+            points += noise * rng.normal(size=points.shape)
+            path = folder / f"{cls}_{i:02d}.txt"
+            if layout == "class":
+                path = folder / cls.capitalize() / f"{i:02d}.xyz"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(path, points, fmt="%.5f")
+
+
+def config(root: Path, *more: str) -> DictConfig:
+    own = [
+        *("domain@data.source=own", "domain@data.target=own"),
+        f"data.source.published.folder={root / 'labelled'}",
+        f"data.target.published.folder={root / 'scans'}",
+        *(f"data.{d}.path={root / 'data' / d}" for d in ("source", "target")),
+        *(f"data.{d}.published.points=48" for d in ("source", "target")),
+        *(f"data.{d}.classes=[ball,rod,slab]" for d in ("source", "target")),
+    ]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("train", overrides(root, *own, *more))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    write_clouds(tmp_path / "labelled", "class", 20, 0.05)
+    write_clouds(tmp_path / "scans", "none", 12, 0.15)
+    return tmp_path
+
+
+def test_pseudo_labels_for_own_scans(root: Path) -> None:
+    cfg = config(root)
+    train(cfg)
+    folder = runs.run_folder(cfg)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["status"] == "finished"
+    assert metrics["final"]["accuracy"] is None
+    assert sum(metrics["final"]["predicted"].values()) == 36
+    assert metrics["evaluation"]["labels"] is False
+    assert len(metrics["rounds"]) == 2
+    assert all("mu" in record for record in metrics["rounds"])
+
+
+def test_own_labels_are_an_upper_bound_or_refused(root: Path) -> None:
+    with pytest.raises(ConfigError, match="labels"):
+        train(config(root, "method=supervised", "selftraining=none"))
+    labelled = f"data.target.published.folder={root / 'labelled'}"
+    other = f"data.target.path={root / 'data' / 'labelled'}"
+    cfg = config(root, "method=supervised", "selftraining=none", labelled, other)
+    train(cfg)
+    metrics = json.loads((runs.run_folder(cfg) / "metrics.json").read_text())
+    assert metrics["final"]["n"] == 12  # every fifth of 3 times 20
+    assert metrics["final"]["accuracy"] > metrics["final"]["majority_rate"]
