@@ -1,4 +1,4 @@
-"""One's own folders of clouds from files to a result: classes of their own, a target without labels."""
+"""One's own folders of clouds, from files to a result; a target without labels."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ def test_own_labels_are_an_upper_bound_or_refused(root: Path) -> None:
         train(config(root, "method=supervised", "selftraining=none"))
     labelled = f"data.target.published.folder={root / 'labelled'}"
     other = f"data.target.path={root / 'data' / 'labelled'}"
-    cfg = config(root, "method=supervised", "selftraining=none", labelled, other)
+    name = "experiment_name=bound"
+    cfg = config(root, "method=supervised", "selftraining=none", labelled, other, name)
     train(cfg)
     metrics = json.loads((runs.run_folder(cfg) / "metrics.json").read_text())
     assert metrics["final"]["n"] == 12  # every fifth of 3 times 20
