@@ -77,6 +77,8 @@ class _Layer:
         norm = self.norm
         assert norm.momentum is not None
         assert norm.num_batches_tracked is not None
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
         mean, var, count = self._statistics()
         norm.num_batches_tracked.add_(1)
         with torch.no_grad():
@@ -91,7 +93,7 @@ class _Layer:
 
     def _statistics(self) -> tuple[Tensor, Tensor, int]:
         """Mean and variance of each channel, from those of the parts; values of a channel."""
-        found = []
+        found: list[tuple[Tensor, Tensor, int]] = []
         for part in self.layout.parts:
             y, empty = self.y[part], self.layout.empty
             if empty is not None and part == 0:
@@ -103,10 +105,11 @@ class _Layer:
                 n = y.numel() // y.shape[3]
                 mean, var = torch.batch_norm_update_stats(y.permute(0, 3, 1, 2), None, None, 0.0)
             found.append((mean.double(), var.double(), n))
-        count = sum(n for _, _, n in found)
-        total = sum(mean * (n / count) for mean, _, n in found)
-        spread = sum((var + (mean - total).square()) * (n / count) for mean, var, n in found)
-        return total, spread, count
+        counts = torch.tensor([n for _, _, n in found], dtype=torch.float64)
+        means, variances = (torch.stack(values) for values in list(zip(*found, strict=True))[:2])
+        share = counts / counts.sum()
+        mean = share @ means
+        return mean, share @ (variances + (means - mean).square()), int(counts.sum())
 
     def scaled(self, part: int, room: int = 0) -> Tensor:
         """The norm's output y h + s of a part, until this room is used again."""
@@ -226,7 +229,8 @@ class _Step(torch.autograd.Function):
             stem.convolve(maps[part], part)
         stem.normalise()
         source: Source = stem.relu
-        ctx.stem, ctx.maps, ctx.stages, out = stem, maps, [], []
+        ctx.stem, ctx.maps, ctx.layouts, ctx.stages = stem, maps, layouts, []
+        out: Maps = []
         for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
             if k:
                 source = recut(out, layouts[k - 1], _wider(layouts, k)).__getitem__
@@ -237,7 +241,6 @@ class _Step(torch.autograd.Function):
                 out = blocks[-1].forward(source)
                 source = out.__getitem__
             ctx.stages.append(blocks)
-        ctx.layouts = layouts
         return _mean(out, layouts[-1])
 
     @staticmethod
@@ -261,21 +264,24 @@ class _Step(torch.autograd.Function):
 
 def _mean(maps: Maps, layout: Layout) -> Tensor:
     """Mean over the pixels of each image: [i, c]."""
-    whole_images = recut(maps, layout, whole(layout.images, layout.h, layout.w, layout.images))
-    return whole_images[0].mean((1, 2))
+    return recut(maps, layout, _one_part(layout))[0].mean((1, 2))
 
 
 def _mean_back(grad: Tensor, layout: Layout) -> Maps:
     h, w = layout.h, layout.w
     g = (grad / (h * w))[:, None, None].repeat(1, h, w, 1)
-    return recut_back([g], layout, whole(layout.images, h, w, layout.images))
+    return recut_back([g], layout, _one_part(layout))
+
+
+def _one_part(layout: Layout) -> Layout:
+    return whole(layout.images, layout.h, layout.w, layout.images * layout.h * layout.w)
 
 
 def _stages(net: ResNet18) -> list[list[Any]]:
     """Blocks whose outputs are of one size."""
     stages: list[list[Any]] = [[]]
     for block in net.blocks:
-        if block.first.conv.stride[0] > 1:  # type: ignore[union-attr]
+        if block.first.conv.stride[0] > 1:  # type: ignore[union-attr, index]
             stages.append([])
         stages[-1].append(block)
     return stages
@@ -287,19 +293,17 @@ def _layouts(filled: Tensor, net: ResNet18) -> list[Layout]:
     rows, columns = reach(filled.any(2)), reach(filled.any(1))
     layouts: list[Layout] = []
     for stage in _stages(net):
-        stride, convs = stage[0].first.conv.stride[0], 2 * len(stage)
-        if layouts:
-            fits = layouts[-1].empty is not None and h % stride == 0 and w % stride == 0
+        stride = stage[0].first.conv.stride[0]
+        convs = 2 * len(stage) + (0 if layouts else 1)  # the stem
+        tight = (layouts[-1].empty is not None) if layouts else True
+        if stride > 1:  # an output pixel sees the inputs from stride * it - 1 to stride * it + 1
+            tight = tight and h % stride == 0 and w % stride == 0
             h, w, convs = -(-h // stride), -(-w // stride), convs - 1
-            rows, columns = (
-                (first // stride, end // stride + 1) for first, end in (rows, columns)
-            )
-        else:
-            fits, convs = True, convs + 1  # the stem
+            rows, columns = ((first // stride, end // stride + 1) for first, end in (rows, columns))
         rows, columns = ((first - convs, end + convs) for first, end in (rows, columns))
         at_once = _AT_ONCE // stage[0].second.conv.out_channels
-        found = windows(rows, columns, h, w, at_once) if fits else None
-        layouts.append(found or whole(images, h, w, max(1, at_once // (h * w))))
+        found = windows(rows, columns, h, w, at_once) if tight else None
+        layouts.append(found or whole(images, h, w, at_once))
     return layouts
 
 

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError, DataError
-from qs3.models import resnet_cpu
+from qs3.models import resnet_cpu, windows
 from qs3.models.base import PointClassifier
 from qs3.models.projection import depth_images
 from qs3.models.resnet import ResNet18
@@ -29,11 +29,20 @@ def _points(b: int = 3, n: int = 200) -> torch.Tensor:
 
 def _small(**settings: object) -> PointClassifier:
     torch.manual_seed(0)
-    model = simpleview(4, image_size=16, channels=4, dropout=0.0, **settings)
+    model = simpleview(4, **{"image_size": 16, "channels": 4, "dropout": 0.0} | settings)
     for p in model.parameters():  # so that every block does something
         if p.ndim == 1:
             nn.init.normal_(p, 1.0, 0.3)
     return model.double()
+
+
+def _network(channels: int) -> ResNet18:
+    torch.manual_seed(0)
+    net = ResNet18(channels).double()
+    for p in net.parameters():
+        if p.ndim == 1:
+            nn.init.normal_(p, 1.0, 0.3)
+    return net
 
 
 @pytest.mark.parametrize(("classes", "expected"), [(10, 800_122), (40, 803_992)])
@@ -135,11 +144,7 @@ def test_equals_straight_network(training: bool, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("size", [16, 25])
 def test_step_equals_plain_network(size: int) -> None:
-    torch.manual_seed(0)
-    net = ResNet18(4).double()
-    for p in net.parameters():
-        if p.ndim == 1:
-            nn.init.normal_(p, 1.0, 0.3)
+    net = _network(4)
     images = torch.rand(6, 1, size, size, dtype=torch.float64)
     assert resnet_cpu.can_step(net, images)
     other = copy.deepcopy(net)
@@ -152,11 +157,63 @@ def test_step_equals_plain_network(size: int) -> None:
         torch.testing.assert_close(p.grad, q.grad, rtol=1e-10, atol=1e-10)
 
 
-def test_float32_error_is_that_of_the_straight_network() -> None:
-    exact = _small()
+@st.composite
+def sparse_images(draw: st.DrawFn) -> torch.Tensor:
+    """Images with a few filled rectangles, at the border too, some with none: [i, 1, h, w]."""
+    count, h, w = draw(st.integers(2, 6)), draw(st.integers(8, 45)), draw(st.integers(8, 45))
+    images = torch.zeros(count, 1, h, w, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 10**6)))
+    for image in images[:, 0]:
+        if draw(st.booleans()) or draw(st.booleans()):
+            top, left = draw(st.integers(0, h - 1)), draw(st.integers(0, w - 1))
+            some = image[top : top + draw(st.integers(1, 5)), left : left + draw(st.integers(1, 5))]
+            some += torch.rand(some.shape, generator=generator, dtype=torch.float64) + 0.5
+    return images
+
+
+@settings(max_examples=25, deadline=None)
+@given(sparse_images(), st.sampled_from([1, 2, 4]), st.sampled_from([0.85, 1.0]))
+def test_windows_change_nothing(images: torch.Tensor, size: int, worth: float) -> None:
+    net = _network(4)
+    other = copy.deepcopy(net)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(windows, "ROUND", size)
+        patch.setattr(windows, "WORTH", worth)
+        patch.setattr(resnet_cpu, "_AT_ONCE", 1 << 11)  # several pieces
+        a = resnet_cpu.step(net, images)
+        g = torch.linspace(-1, 1, a.numel(), dtype=torch.float64).view(a.shape)
+        a.backward(g)
+    b = other(images)
+    b.backward(g)
+    torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+    for p, q in zip(net.parameters(), other.parameters(), strict=True):
+        largest = q.grad.abs().max().clamp(min=1)  # a channel with no variance has huge ones
+        torch.testing.assert_close(p.grad / largest, q.grad / largest, rtol=1e-10, atol=1e-10)
+    for mine, plain in zip(net.buffers(), other.buffers(), strict=True):
+        torch.testing.assert_close(mine, plain, rtol=1e-10, atol=1e-10)
+
+
+def test_two_stages_of_clouds_use_windows() -> None:
+    """As a trained net sees them: 128 pixels, clouds that fill the ball in one view only."""
+    points = _points(4, 1024) * torch.tensor([1.0, 0.4, 0.3])
+    images = depth_images(points).flatten(0, 1)
+    layouts = resnet_cpu._layouts(images != 0, ResNet18())
+    assert [layout.empty is not None for layout in layouts[:2]] == [True, True]
+    for layout in layouts:
+        seen = sorted(image for piece in layout.pieces for image in piece.images)
+        assert seen == list(range(24))
+
+
+@pytest.mark.parametrize("image_size", [16, 64])
+def test_float32_error_is_that_of_the_straight_network(image_size: int) -> None:
+    exact = _small(image_size=image_size)
     model = copy.deepcopy(exact).float()
     twin = NaiveSimpleView(model)
     points, labels = _points(8), torch.arange(8) % 4
+    if image_size > 16:  # small in their images: windows
+        points = 0.3 * points
+        images = depth_images(points, image_size).flatten(0, 1)
+        assert resnet_cpu._layouts(images != 0, model.backbone.images)[0].empty is not None
     points = points.float().double()  # the same images
     nets = [(exact, points), (model, points.float()), (twin, points.float())]
     out = []
