@@ -159,12 +159,16 @@ def test_step_equals_plain_network(size: int) -> None:
 
 @st.composite
 def sparse_images(draw: st.DrawFn) -> torch.Tensor:
-    """Images with a few filled rectangles, at the border too, some with none: [i, 1, h, w]."""
-    count, h, w = draw(st.integers(2, 6)), draw(st.integers(8, 45)), draw(st.integers(8, 45))
+    """Images with a filled rectangle, at the border too, some with none: [i, 1, h, w].
+
+    The first two have one and maps stay larger than a pixel: else norms of channels with next to
+    no variance magnify rounding without bound, in the plain network too.
+    """
+    count, h, w = draw(st.integers(3, 6)), draw(st.integers(16, 45)), draw(st.integers(16, 45))
     images = torch.zeros(count, 1, h, w, dtype=torch.float64)
     generator = torch.Generator().manual_seed(draw(st.integers(0, 10**6)))
-    for image in images[:, 0]:
-        if draw(st.booleans()) or draw(st.booleans()):
+    for index, image in enumerate(images[:, 0]):
+        if index < 2 or draw(st.booleans()):
             top, left = draw(st.integers(0, h - 1)), draw(st.integers(0, w - 1))
             some = image[top : top + draw(st.integers(1, 5)), left : left + draw(st.integers(1, 5))]
             some += torch.rand(some.shape, generator=generator, dtype=torch.float64) + 0.5
@@ -206,7 +210,9 @@ def test_two_stages_of_clouds_use_windows() -> None:
 
 @pytest.mark.parametrize("image_size", [16, 64])
 def test_float32_error_is_that_of_the_straight_network(image_size: int) -> None:
-    exact = _small(image_size=image_size)
+    # 16 channels: oneDNN's float32 gradient of a 1x1 convolution of stride 2 writes out of its
+    # memory with 4 channels (torch 2.13, 48 images of 64 x 64), in the plain network too
+    exact = _small(image_size=image_size, channels=16)
     model = copy.deepcopy(exact).float()
     twin = NaiveSimpleView(model)
     points, labels = _points(8), torch.arange(8) % 4
