@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from qs3.data.augment import rotate_z
 from qs3.data.datamodule import Unlabelled
-from qs3.models.norms import norms_for, use_domain
+from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
+from qs3.predictions import Predictions
 from qs3.selftraining.table import read_pseudo_labels
 
 CALIBRATION_BINS = 15
@@ -43,6 +44,31 @@ def predict(
     finally:
         net.train(training)
     return torch.cat(parts).numpy()
+
+
+def adapt_norms(
+    net: nn.Module,
+    points: Float[Tensor, "n p 3"],
+    batch_size: int,
+    seed: int,
+    device: Any = "cpu",
+) -> None:
+    """AdaBN: give the net's batch norms the statistics of the target's training clouds.
+
+    One pass in random order (a dataset is sorted by class, and a batch should look like the
+    whole), in batches of equal size as far as they can be.
+
+    Args:
+        net: changed in place; its weights stay.
+        points: at least two clouds.
+        batch_size: about how many at once.
+        seed: of the order.
+        device: of the net.
+    """
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
+    batches = torch.tensor_split(order, max(1, round(len(points) / batch_size)))
+    with use_domain(net, norms_for(net, "target")):
+        adapt_batchnorm(net, (points[index].to(device) for index in batches))
 
 
 def predict_turned(
@@ -125,6 +151,7 @@ class Evaluation:
         classes: names in label order.
         batch_size: of the predictions.
         rotations: over how many turns `turned` averages; 0 leaves it out.
+        meshes: of the test clouds by id; None or missing where not known.
     """
 
     def __init__(
@@ -135,11 +162,24 @@ class Evaluation:
         classes: Sequence[str],
         batch_size: int,
         rotations: int = 0,
+        meshes: Mapping[str, str] | None = None,
     ) -> None:
         self.points, self.classes, self.batch_size = test.points, tuple(classes), batch_size
         self.y_target_eval = None if labels is None else labels.numpy()
         self.rotations = rotations
         self._train = train_labels
+        self._ids, self._meshes = test.ids, meshes or {}
+
+    def predictions(self, net: nn.Module, device: Any = "cpu") -> Predictions:
+        """What `net` says of each cloud."""
+        labels = self.y_target_eval
+        return Predictions(
+            self.classes,
+            self._ids,
+            tuple(self._meshes.get(id_) or id_ for id_ in self._ids),
+            np.full(len(self._ids), -1) if labels is None else labels,
+            predict(net, self.points, self.batch_size, device),
+        )
 
     def figures(self, net: nn.Module, device: Any = "cpu") -> dict[str, Any]:
         """What `net` is worth on the target's test clouds: each as it is, in one fixed sample."""

@@ -17,6 +17,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
+from qs3.classifier import Classifier
 from qs3.files import write_text
 from qs3.selftraining.scheme import Phases
 
@@ -33,9 +34,9 @@ class EpochRows(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Send the row of this epoch."""
+        assert isinstance(pl_module, Classifier)
         epoch = trainer.current_epoch
-        lr = trainer.optimizers[0].defaults["lr"] * self.phases.cosine(epoch)
-        row = {"phase": self.phases.phase(epoch), "lr": lr}
+        row = {"phase": self.phases.phase(epoch), "lr": pl_module.learning_rate()}
         row |= {key: float(value) for key, value in sorted(trainer.callback_metrics.items())}
         for logger in trainer.loggers:
             logger.log_metrics(row, step=epoch)

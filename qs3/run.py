@@ -20,6 +20,7 @@ from qs3.settings import number, one_of, whole
 log = logging.getLogger(__name__)
 
 TEACHERS = ("source_val", "last")
+SCHEDULES = ("cosine", "plateau")
 _SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
 
 
@@ -87,8 +88,17 @@ def _check_settings(cfg: DictConfig) -> None:
     whole("data.points", cfg.data.points, 1)
     whole("data.fps_starts", cfg.data.fps_starts, 1)
     whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
+    one_of("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
     whole("evaluation.rotations", cfg.evaluation.rotations, 0)
     whole("protocol.batch_size", cfg.protocol.batch_size, 2)  # batch norm needs two clouds
+    one_of("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
+    highest = 1 - 1 / whole("num_classes", cfg.num_classes, 2)  # there all classes are alike
+    if not 0 <= number("protocol.smoothing", cfg.protocol.smoothing) <= highest:
+        raise ConfigError(
+            f"protocol.smoothing must lie in [0, {highest:g}], got {cfg.protocol.smoothing}"
+        )
+    if number("protocol.regulariser", cfg.protocol.regulariser) < 0:
+        raise ConfigError(f"protocol.regulariser must be >= 0, got {cfg.protocol.regulariser}")
     if "lr" in cfg.protocol.optimizer:
         number("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
     if cfg.trainer.threads is not None:

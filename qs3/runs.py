@@ -9,6 +9,8 @@ written last, and atomically: it is the mark of a finished run.
         started.json         the hashes of the datasets and the config, the versions
         last.ckpt            everything needed to continue
         warmup_selected.pt   weights of the teacher of round 0;  warmup_last.pt, student.pt likewise
+        result.pt            weights of what is reported: those of the warm-up, or the student's
+        predictions.csv      what they say of each of the target's test clouds
         round_03/pseudo_labels.csv
         history.csv          one row an epoch
         metrics.json         the result

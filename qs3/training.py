@@ -25,22 +25,28 @@ from qs3 import runs
 from qs3.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
 from qs3.classifier import Classifier
 from qs3.data.datamodule import UdaData, labels_of, load_clouds, with_labels
+from qs3.data.manifest import read_manifest
 from qs3.data.prepare import remove_old_leftovers
 from qs3.data.store import PointSet
 from qs3.errors import ConfigError, DataError
-from qs3.evaluation import Evaluation
+from qs3.evaluation import Evaluation, adapt_norms
 from qs3.files import remove_leftovers
 from qs3.hydra_glue import build
 from qs3.loggers import CsvHistory, EpochRows
 from qs3.methods.base import Method
 from qs3.methods.student import Student
+from qs3.predictions import FILE as PREDICTIONS
+from qs3.predictions import write_predictions
+from qs3.randomness import derive
 from qs3.runs import Run
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, SelfTraining, WarmupSelection
 from qs3.selftraining.table import path_of
+from qs3.warmups import SharedWarmup, warmup_sha256
 
 log = logging.getLogger(__name__)
 
 STUDENT = "student.pt"
+RESULT = "result.pt"  # of the above, or of the warm-up's selected weights, what is reported
 
 
 def fit(run: Run) -> dict[str, Any]:
@@ -90,6 +96,7 @@ def fit(run: Run) -> dict[str, Any]:
         target_set.classes,
         cfg.data.eval_batch_size,
         cfg.evaluation.rotations,
+        _meshes_by_id(target_set, run.target.folder),
     )
 
     # 2. Classifier and callbacks.
@@ -102,10 +109,21 @@ def fit(run: Run) -> dict[str, Any]:
         ),
         phases=run.phases,
         seed=run.seed,
+        schedule=cfg.protocol.schedule,
+        smoothing=cfg.protocol.smoothing,
+        regulariser_weight=cfg.protocol.regulariser,
     )
     warmup = WarmupSelection(run.folder, run.phases, cfg.selection.teacher)
     rounds = SelfTraining(run.folder, run.phases, run.scheme, target_set.classes)
-    callbacks: list[Callback] = [warmup, rounds, EpochRows(run.phases), SaveLast(run.folder)]
+    shared = SharedWarmup(
+        run.folder,
+        cfg.paths.warmup_dir,
+        warmup_sha256(cfg, started),
+        run.seed,
+        run.phases.warmup,
+    )
+    saving = [SaveLast(run.folder), shared]  # in this order
+    callbacks: list[Callback] = [warmup, rounds, EpochRows(run.phases), *saving]
 
     # 3. One fit over all phases. A checkpoint lies between two epochs; a resume repeats an epoch.
     trainer = _make_trainer(
@@ -116,6 +134,8 @@ def fit(run: Run) -> dict[str, Any]:
         plugins=[AtomicCheckpointIO()],
         default_root_dir=run.folder,
     )
+    if not cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
+        shared.take()
     last = run.folder / LAST
     log.info(
         "%s, %d epochs", "fitting, continued" if last.is_file() else "fitting", run.phases.total
@@ -134,9 +154,17 @@ def fit(run: Run) -> dict[str, Any]:
     for name, file in (("selected", WARMUP_SELECTED), ("last", WARMUP_LAST), ("student", STUDENT)):
         net = classifier.fresh_net(phase=0).to(classifier.device)
         net.load_state_dict(load(run.folder / file, classifier.device))
+        if cfg.evaluation.norms == "adabn":
+            seed = derive(run.seed, "adabn")
+            adapt_norms(net, target.points, cfg.protocol.batch_size, seed, classifier.device)
         scores[name] = evaluation.figures(net, classifier.device)
         if name in (final, "selected"):
             turned[name] = evaluation.turned(net, classifier.device)
+        if name == final and trainer.is_global_zero:
+            save(copy_weights(net), run.folder / RESULT)
+            write_predictions(
+                run.folder / PREDICTIONS, evaluation.predictions(net, classifier.device)
+            )
     validated_on = f"{method.labels}_val"
     teacher = (
         f"{validated_on if warmup.rule == 'source_val' else warmup.rule}, epoch {warmup.epoch}"
@@ -166,6 +194,7 @@ def fit(run: Run) -> dict[str, Any]:
             "split": split,
             "labels": evaluation.y_target_eval is not None,
             "rotations": evaluation.rotations,
+            "norms": cfg.evaluation.norms,
             "final_over_rotations": turned[final],
             "warmup_over_rotations": turned["selected"],
         },
@@ -219,6 +248,11 @@ def _labels_by_id(dataset: PointSet, split: str) -> dict[str, int] | None:
     if labels is None:
         return None
     return dict(zip(dataset.split(split).ids, labels.tolist(), strict=True))
+
+
+def _meshes_by_id(dataset: PointSet, folder: Path) -> dict[str, str]:
+    rows = read_manifest(folder, dataset.classes)
+    return {row.id: row.mesh_sha256 for row in rows if row.mesh_sha256}
 
 
 def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:

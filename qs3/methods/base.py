@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from qs3.errors import ConfigError
 from qs3.settings import number
@@ -25,10 +26,12 @@ class Method(nn.Module):
     Attributes:
         labels: whose labels it trains on: "source", or "target_train" (the upper bound only).
         uses_target: whether its batches hold unlabelled target clouds.
+        smoothing: of class labels (`class_loss`); the trainer sets it to `protocol.smoothing`.
     """
 
     labels: ClassVar[str] = "source"
     uses_target: ClassVar[bool] = False
+    smoothing: float = 0.0
 
     def prepare(self, net: nn.Module) -> None:
         """Make the heads that this method puts on `net`. Called once, before `loss`.
@@ -54,6 +57,23 @@ class Method(nn.Module):
             generator: all randomness of this step comes from it; on the same device.
         """
         raise NotImplementedError
+
+
+def class_loss(
+    logits: Float[Tensor, "b c"], labels: Tensor, smoothing: float = 0.0
+) -> Float[Tensor, ""]:
+    """Cross-entropy with a part of each label spread over the other classes.
+
+    The target is 1 - ε at the label and ε / (C - 1) elsewhere, as in DGCNN's released code and
+    SimpleView's protocol. (torch spreads `label_smoothing` over all C classes: ε C / (C - 1).)
+
+    Args:
+        logits: any real numbers.
+        labels: [B] int64, or [B, C] probabilities, which are smoothed alike.
+        smoothing: ε in [0, 1 - 1 / C].
+    """
+    classes = logits.shape[1]
+    return F.cross_entropy(logits, labels, label_smoothing=smoothing * classes / (classes - 1))
 
 
 def weight(key: str, value: float) -> float:

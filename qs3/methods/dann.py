@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.methods.base import Method, feature_dims, weight
+from qs3.methods.base import Method, class_loss, feature_dims, weight
 from qs3.methods.reversal import dann_alpha, reverse_gradient
 from qs3.models.base import ClassHead
 from qs3.models.norms import use_domain
@@ -62,7 +62,7 @@ class Dann(Method):
         source = net.features(batch["source"]["points"]).global_  # [B, D]
         with use_domain(net, "target"):
             target = net.features(batch["target"]["points"]).global_
-        ce = F.cross_entropy(net.head(source), batch["source"]["y_source"])
+        ce = class_loss(net.head(source), batch["source"]["y_source"], self.smoothing)
         domain = self._domain_loss(source, target, alpha)
         return {"ce": self.class_weight * ce, "domain": self.domain_weight * domain}
 

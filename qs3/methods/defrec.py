@@ -75,7 +75,9 @@ class DefRec(Method):
     ) -> dict[str, Tensor]:
         """Terms "ce" or "pcm", and "defrec" (and "defrec_source"), each >= 0."""
         source = batch["source"]
-        name, supervised = source_loss(net, source, generator, pcm=self.pcm)
+        name, supervised = source_loss(
+            net, source, generator, pcm=self.pcm, smoothing=self.smoothing
+        )
         terms = {name: (1 - self.defrec_weight) * supervised}
         with use_domain(net, "target"):
             terms["defrec"] = self._reconstruction(net, batch["target"]["points"], generator)

@@ -21,9 +21,6 @@ from qs3.models.norms import use_domain
 from qs3.settings import whole
 
 _QUARTERS = 4
-# By quarter turns: what multiplies row vectors from the right, exact.
-_ABOUT_X = [[[1, 0, 0], [0, c, -s], [0, s, c]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
-_ABOUT_Y = [[[c, 0, s], [0, 1, 0], [-s, 0, c]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
 
 
 class Gast(Method):
@@ -80,7 +77,9 @@ class Gast(Method):
 
         Where a head knows nothing, a "def" is w_d ln 27 and a "rot" w_r ln 4.
         """
-        name, supervised = source_loss(net, batch["source"], generator, pcm=self.pcm)
+        name, supervised = source_loss(
+            net, batch["source"], generator, pcm=self.pcm, smoothing=self.smoothing
+        )
         terms = {name: self.class_weight * supervised}
         for domain in ("source", "target"):
             points = batch[domain]["points"]
@@ -127,6 +126,22 @@ def turn_parts(
     shuffle = torch.randperm(n, generator=generator, device=own).to(device)
     twice = torch.cat([points, points])  # both samplings at once
     first, second = gather(twice, farthest_point_sampling(twice, n, start)).chunk(2)
-    tables = torch.tensor([_ABOUT_X, _ABOUT_Y], dtype=points.dtype, device=device)
-    mixed = join(first @ tables[0, turns[0]], second @ tables[1, turns[1]], lam)[:, shuffle]
+    first = first @ quarter_turns(turns[0], "x").to(points.dtype)
+    second = second @ quarter_turns(turns[1], "y").to(points.dtype)
+    mixed = join(first, second, lam)[:, shuffle]
     return mixed, turns[0], turns[1], lam
+
+
+def quarter_turns(turns: Int[Tensor, " b"], axis: str) -> Int[Tensor, "b 3 3"]:
+    """What multiplies row vectors from the right to turn them about "x" or "y", exactly.
+
+    Made of `turns` (0 to 3) alone: a table of constants would have to be carried to the device.
+    """
+    cos = (turns == 0).long() - (turns == 2).long()
+    sin = (turns == 1).long() - (turns == 3).long()
+    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+    if axis == "x":
+        entries = [one, zero, zero, zero, cos, -sin, zero, sin, cos]
+    else:
+        entries = [cos, zero, sin, zero, one, zero, -sin, zero, cos]
+    return torch.stack(entries, dim=1).view(-1, 3, 3)

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.methods.base import class_loss
 
 Labels = Int[Tensor, " b"] | Float[Tensor, "b c"]  # classes, or their probabilities
 
@@ -59,16 +59,23 @@ def pcm_loss(
     labels_a: Labels,
     labels_b: Labels,
     lam: float | Float[Tensor, ""],
+    smoothing: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """λ CE(logits, a) + (1 - λ) CE(logits, b)."""
-    return lam * F.cross_entropy(logits, labels_a) + (1 - lam) * F.cross_entropy(logits, labels_b)
+    """λ CE(logits, a) + (1 - λ) CE(logits, b), each as `class_loss`."""
+    of_a, of_b = (class_loss(logits, labels, smoothing) for labels in (labels_a, labels_b))
+    return lam * of_a + (1 - lam) * of_b
 
 
 def source_loss(
-    net: nn.Module, source: dict[str, Any], generator: torch.Generator, *, pcm: bool
+    net: nn.Module,
+    source: dict[str, Any],
+    generator: torch.Generator,
+    *,
+    pcm: bool,
+    smoothing: float = 0.0,
 ) -> tuple[str, Float[Tensor, ""]]:
     """What methods add their own losses to: "ce", or "pcm" in its place; and its value, >= 0."""
     if not pcm:
-        return "ce", F.cross_entropy(net(source["points"]), source["y_source"])
+        return "ce", class_loss(net(source["points"]), source["y_source"], smoothing)
     mixed, labels_a, labels_b, lam = mix(source["points"], source["y_source"], generator)
-    return "pcm", pcm_loss(net(mixed), labels_a, labels_b, lam)
+    return "pcm", pcm_loss(net(mixed), labels_a, labels_b, lam, smoothing)

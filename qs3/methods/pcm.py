@@ -24,4 +24,4 @@ class Pcm(Method):
         """Mixed cross-entropy, >= 0."""
         source = batch["source"]
         mixed, labels_a, labels_b, lam = mix(source["points"], source["y_source"], generator)
-        return {"pcm": pcm_loss(net(mixed), labels_a, labels_b, lam)}
+        return {"pcm": pcm_loss(net(mixed), labels_a, labels_b, lam, self.smoothing)}

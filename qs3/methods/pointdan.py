@@ -12,10 +12,9 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from qs3.errors import ConfigError
-from qs3.methods.base import Method, weight
+from qs3.methods.base import Method, class_loss, weight
 from qs3.methods.mmd import mmd2
 from qs3.methods.reversal import reverse_gradient, sine_alpha
 from qs3.models.base import check_points
@@ -90,8 +89,8 @@ class PointDan(Method):
             features[domain] = found.global_  # [B, 1024]
             attended[domain] = self.attention[domain](nodes.features.flatten(1))  # [B, M C]
         labels = batch["source"]["y_source"]
-        ce = F.cross_entropy(net.head.first(features["source"]), labels) + F.cross_entropy(
-            net.head.second(features["source"]), labels
+        ce = class_loss(net.head.first(features["source"]), labels, self.smoothing) + class_loss(
+            net.head.second(features["source"]), labels, self.smoothing
         )
         reversed_ = reverse_gradient(features["target"], sine_alpha(batch["progress"]))
         apart = discrepancy(net.head.first(reversed_), net.head.second(reversed_))

@@ -6,9 +6,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from qs3.methods.base import Method
+from qs3.methods.base import Method, class_loss
 
 
 class SourceOnly(Method):
@@ -19,4 +18,4 @@ class SourceOnly(Method):
     ) -> dict[str, Tensor]:
         """Cross-entropy, >= 0."""
         source = batch["source"]
-        return {"ce": F.cross_entropy(net(source["points"]), source["y_source"])}
+        return {"ce": class_loss(net(source["points"]), source["y_source"], self.smoothing)}

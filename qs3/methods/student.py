@@ -7,9 +7,8 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from qs3.methods.base import Method
+from qs3.methods.base import Method, class_loss
 from qs3.methods.mixup import mix, pcm_loss
 from qs3.models.norms import use_domain
 
@@ -63,10 +62,10 @@ class Student(Method):
         """Cross-entropy, mixed or not, and logits."""
         if not self.pcm:
             logits = net(points)
-            return F.cross_entropy(logits, labels), logits
+            return class_loss(logits, labels, self.smoothing), logits
         mixed, labels_a, labels_b, lam = mix(points, labels, generator)
         logits = net(mixed)
-        return pcm_loss(logits, labels_a, labels_b, lam), logits
+        return pcm_loss(logits, labels_a, labels_b, lam, self.smoothing), logits
 
 
 def uniform_divergence(logits: Float[Tensor, "b c"]) -> Float[Tensor, ""]:

@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from qs3.methods.base import Method
+from qs3.methods.base import Method, class_loss
 
 
 class Supervised(Method):
@@ -25,4 +24,6 @@ class Supervised(Method):
     ) -> dict[str, Tensor]:
         """Cross-entropy, >= 0."""
         labelled = batch["source"]
-        return {"ce": F.cross_entropy(net(labelled["points"]), labelled["y_target_train"])}
+        return {
+            "ce": class_loss(net(labelled["points"]), labelled["y_target_train"], self.smoothing)
+        }

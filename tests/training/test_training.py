@@ -220,6 +220,7 @@ def test_metrics_say_how_clouds_were_loaded_and_judged(finished):
         "split": "test",
         "labels": True,
         "rotations": 0,
+        "norms": "trained",
         "final_over_rotations": None,
         "warmup_over_rotations": None,
     }

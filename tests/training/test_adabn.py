@@ -1,0 +1,64 @@
+"""`evaluation.norms=adabn`: the result's norms hold the target's statistics, its weights stay."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from qs3 import runs
+from qs3.checkpoints import load
+from qs3.data.datamodule import load_clouds
+from qs3.data.store import open_pointset
+from qs3.evaluation import adapt_norms, predict
+from qs3.predictions import read_predictions
+from qs3.run import train
+from tests.training.toy import TinyNet
+
+
+def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
+    changes = ("method=source_only", "selftraining=none")
+    plain, adapted = toy(*changes), toy(*changes, "evaluation.norms=adabn")
+    plain_metrics, metrics = train(plain), train(adapted)
+    assert (plain_metrics["evaluation"]["norms"], metrics["evaluation"]["norms"]) == (
+        "trained",
+        "adabn",
+    )
+    before = load(runs.run_folder(plain) / "result.pt")
+    after = load(runs.run_folder(adapted) / "result.pt")
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed >= {"norm.running_mean", "norm.running_var"}
+    assert changed <= {"norm.running_mean", "norm.running_var", "norm.num_batches_tracked"}
+
+    target = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", 32)
+    x = torch.relu(target.points @ after["lift.weight"].T + after["lift.bias"]).amax(1)  # [n, 16]
+    torch.testing.assert_close(after["norm.running_mean"], x.mean(0), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(after["norm.running_var"], x.var(0), rtol=1e-4, atol=1e-5)
+
+
+def test_order_of_clouds_is_mixed_and_batches_are_even():
+    seen = []
+
+    class Net(TinyNet):
+        def forward(self, points):
+            seen.append(points[:, 0, 0].tolist())
+            return super().forward(points)
+
+    points = torch.arange(65.0)[:, None, None].expand(65, 4, 3)
+    adapt_norms(Net(3), points, 16, seed=0)
+    assert [len(batch) for batch in seen] == [17, 16, 16, 16]  # never one of a single cloud
+    flat = [value for batch in seen for value in batch]
+    assert sorted(flat) == list(range(65))
+    assert flat != sorted(flat)
+
+
+def test_predictions_are_those_of_the_result(toy, toy_data):
+    cfg = toy()
+    metrics = train(cfg)
+    found = read_predictions(runs.run_folder(cfg) / "predictions.csv")
+    net = TinyNet(3)
+    net.load_state_dict(load(runs.run_folder(cfg) / "result.pt"))
+    test = load_clouds(open_pointset(toy_data / "kinectsim10"), "test", 32)
+    np.testing.assert_array_equal(found.probabilities, predict(net, test.points, 64))
+    assert found.ids == found.meshes == test.ids  # no meshes are known here
+    accuracy = float((found.predicted == found.labels).mean())
+    assert accuracy == metrics["final"]["accuracy"]

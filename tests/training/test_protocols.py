@@ -1,0 +1,132 @@
+"""Schedules, label smoothing and a net's own regulariser, as a protocol sets them."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from qs3 import runs
+from qs3.classifier import Classifier
+from qs3.errors import ConfigError
+from qs3.methods.base import class_loss
+from qs3.methods.source_only import SourceOnly
+from qs3.methods.student import Student
+from qs3.models.pointnet import pointnet, transform_regulariser
+from qs3.run import train
+from qs3.schedules import Plateau
+from qs3.selftraining.scheme import Phases
+from tests.training.conftest import result_of
+from tests.training.test_resume import interrupt
+
+
+def test_smoothing_spreads_over_the_other_classes():
+    logits, labels = torch.randn(5, 4, dtype=torch.float64), torch.tensor([0, 3, 1, 1, 2])
+    target = torch.full((5, 4), 0.2 / 3, dtype=torch.float64)
+    target[torch.arange(5), labels] = 0.8
+    by_hand = -(target * logits.log_softmax(1)).sum(1).mean()
+    torch.testing.assert_close(class_loss(logits, labels, 0.2), by_hand)
+    torch.testing.assert_close(class_loss(logits, F.one_hot(labels, 4).double(), 0.2), by_hand)
+    torch.testing.assert_close(class_loss(logits, labels), F.cross_entropy(logits, labels))
+
+
+def test_plateau_halves_after_eleven_epochs_without_a_lower_loss():
+    optimizer = torch.optim.Adam([nn.Parameter(torch.zeros(1))], lr=1e-3)
+    plateau, rates = Plateau(optimizer), []
+    for loss in [2.0, 1.0, *[1.0] * 11, 0.5, *[0.6] * 11]:
+        plateau.step(loss)
+        rates.append(optimizer.param_groups[0]["lr"])
+    assert rates[:12] == [1e-3] * 12
+    assert rates[12:24] == [5e-4] * 12
+    assert rates[24] == 2.5e-4
+    for _ in range(200):
+        plateau.step(0.6)
+    assert optimizer.param_groups[0]["lr"] == 1e-5
+    plateau.start_phase()
+    assert optimizer.param_groups[0]["lr"] == 1e-3
+    assert plateau.state_dict()["best"] == math.inf
+
+
+SIMPLEVIEW = ("protocol=simpleview", "protocol.epochs=40", "protocol.optimizer.lr=4.0")
+
+
+def lrs(folder) -> list[float]:
+    with open(folder / "history.csv", newline="") as file:
+        return [float(row["lr"]) for row in csv.DictReader(file)]
+
+
+def test_a_run_with_a_plateau_resumes_exactly(toy):
+    cfg = toy(*SIMPLEVIEW)
+    train(cfg)
+    rates, expected = lrs(runs.run_folder(cfg)), result_of(runs.run_folder(cfg))
+    assert rates[0] == 4.0
+    assert rates[39] < 4.0  # it came to a plateau
+    assert rates[40:] == [4.0] * 6  # each round begins anew
+    again = toy(*SIMPLEVIEW, "force=true")
+    interrupt(again, "on_train_batch_end", 78)  # in the warm-up
+    train(toy(*SIMPLEVIEW))
+    assert result_of(runs.run_folder(cfg)) == expected
+
+
+def test_smoothing_reaches_warmup_and_students(toy):
+    plain, smooth = toy("seed=3"), toy("seed=3", "protocol.smoothing=0.3")
+    with open_history(plain) as a, open_history(smooth) as b:
+        for row_a, row_b in zip(csv.DictReader(a), csv.DictReader(b), strict=True):
+            assert row_a["train/loss"] != row_b["train/loss"]
+
+
+def open_history(cfg):
+    train(cfg)
+    return open(runs.run_folder(cfg) / "history.csv", newline="")
+
+
+def test_the_nets_regulariser_is_added():
+    torch.manual_seed(0)
+    classifier = Classifier(
+        lambda: pointnet(4, variant="simpleview", dropout=0.0),
+        torch.optim.Adam,
+        SourceOnly(),
+        Student(),
+        Phases(1),
+        seed=0,
+        regulariser_weight=0.001,
+    )
+    classifier.log = lambda *args, **kwargs: None  # type: ignore[method-assign]
+    points, labels = torch.randn(6, 32, 3), torch.tensor([0, 1, 2, 3, 0, 1])
+    batch = {"source": {"points": points, "y_source": labels}}
+    features = classifier.net.features(points)
+    classifier._regularisers.clear()
+    plain = SourceOnly().loss(classifier.net, batch, torch.Generator())["ce"]
+    assert len(classifier._regularisers) == 1  # one pass
+    torch.testing.assert_close(classifier._regularisers[0], features.regulariser)
+    assert features.regulariser > 0
+    assert plain > 0
+    assert transform_regulariser(torch.eye(3)[None]) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("protocol.smoothing=0.7", r"protocol\.smoothing must lie in \[0, 0\.666667\], got 0\.7"),
+        ("protocol.smoothing=-0.1", r"protocol\.smoothing must lie in"),
+        ("protocol.schedule=step", r"protocol\.schedule must be one of"),
+        ("protocol.regulariser=-1", r"protocol\.regulariser must be >= 0"),
+        ("evaluation.norms=ada", r"evaluation\.norms must be one of"),
+    ],
+)
+def test_wrong_settings(toy, change, message):
+    with pytest.raises(ConfigError, match=message):
+        train(toy(change))
+
+
+def test_smoothing_keeps_the_optimum_where_it_should_be():
+    """The loss is least where the net says 1 - ε at the label."""
+    best = np.log([0.8, 0.2 / 3, 0.2 / 3, 0.2 / 3])
+    logits = torch.tensor(best[None]).requires_grad_()
+    class_loss(logits, torch.tensor([0]), 0.2).backward()
+    torch.testing.assert_close(logits.grad, torch.zeros(1, 4, dtype=torch.float64))

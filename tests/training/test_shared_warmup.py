@@ -1,0 +1,82 @@
+"""A warm-up trained by another run gives the same result, to the bit, as one's own."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from qs3 import runs
+from qs3.checkpoints import load
+from qs3.run import train
+from tests.training.conftest import result_of
+
+
+@pytest.fixture(autouse=True)
+def _all_messages(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
+
+def taken(caplog: pytest.LogCaptureFixture) -> bool:
+    return "the warm-up was trained before" in caplog.text
+
+
+def shared_folders(folder: Path) -> list[Path]:
+    return sorted((folder / "logs" / "warmups").glob("*"))
+
+
+@pytest.mark.parametrize("selftraining", ["qbst", "spst", "cbst"])
+def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
+    more = [f"selftraining={selftraining}", "selftraining.missing_class=warn"]
+    alone = toy(*more, "paths.warmup_dir=null")
+    train(alone)
+    expected = result_of(runs.run_folder(alone))
+    weights = load(runs.run_folder(alone) / "student.pt")
+    shutil.rmtree(runs.run_folder(alone))
+    assert not shared_folders(tmp_path)
+
+    train(toy("selftraining=none", "experiment_name=other"))
+    assert len(shared_folders(tmp_path)) == 1
+    assert not taken(caplog)
+    train(toy(*more))
+    assert taken(caplog)
+    assert result_of(runs.run_folder(alone)) == expected
+    again = load(runs.run_folder(alone) / "student.pt")
+    assert all(torch.equal(weights[name], again[name]) for name in weights)
+
+
+CHANGES = ("protocol.epochs=5", "seed=1", "method=source_only", "data.points=48")
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_another_warmup_is_not_taken(toy, tmp_path, caplog, change):
+    train(toy("selftraining=none"))
+    train(toy("selftraining=none", change))
+    assert not taken(caplog)
+    assert len(shared_folders(tmp_path)) == 2
+
+
+def test_a_damaged_mark_is_as_good_as_none(toy, tmp_path, caplog):
+    train(toy("selftraining=none"))
+    (folder,) = shared_folders(tmp_path)
+    (folder / "started.json").write_text("{")
+    train(toy("selftraining=none", "experiment_name=other"))
+    assert not taken(caplog)
+    train(toy("selftraining=none", "experiment_name=third"))  # it was mended
+    assert taken(caplog)
+
+
+def test_force_trains_anew(toy, caplog):
+    train(toy("selftraining=none"))
+    train(toy("selftraining=none", "experiment_name=other", "force=true"))
+    assert not taken(caplog)
+
+
+def test_what_cannot_be_written_is_a_warning(toy, tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    metrics = train(toy("selftraining=none", f"paths.warmup_dir={tmp_path / 'file'}"))
+    assert metrics["status"] == "finished"
+    assert "the warm-up cannot be shared" in caplog.text
