@@ -7,6 +7,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from qs3 import runs
+from qs3.hydra_glue import build
 from qs3.run import train
 from tests.fixtures.published import write_all
 
@@ -31,7 +32,7 @@ def test_experiment_runs(experiment, data_dir, tmp_path):
     ]  # fmt: skip
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         cfg = compose("train", overrides)
-        rounds = cfg.selftraining.get("rounds", 0)
+        rounds = build(cfg.selftraining).rounds  # without self-training they may be set in vain
         if rounds:
             cfg = compose("train", [*overrides, "selftraining.rounds=2"])
     metrics = train(cfg)
