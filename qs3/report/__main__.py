@@ -2,12 +2,17 @@
 
     python -m qs3.report table=uda [log_dir=logs] [out=logs/tables] [target=kinectsim10]
                                    [overrides="trainer=gpu data.points=512"]
+    python -m qs3.report run table=cad10 [seeds=0,1,2] [rows=gast,pcm] [jobs=1] [log_dir=logs]
+                                 [target=...] [overrides=...]
+    python -m qs3.report compare table=cad10 base="source only" [log_dir=logs] [out=...] [...]
     python -m qs3.report pictures domains=[modelnet10,specklenet10,kinectsim10]
                                   [data_dir=data] [split=train] [out=data/pictures]
 
 A table is printed as Markdown and saved as .md, .csv and .tex. `overrides` are those that the runs
-had beyond the table's. Pictures: a contact sheet of each domain, and one that compares them; with
-out=NAME.png the latter alone. `paths.log_dir` and `paths.data_dir` are understood as well.
+had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time; called
+again it goes on. `compare` prints the difference of each row to the row `base`, with its interval.
+Pictures: a contact sheet of each domain, and one that compares them; with out=NAME.png the latter
+alone. `paths.log_dir` and `paths.data_dir` are understood as well.
 """
 
 from __future__ import annotations
@@ -18,8 +23,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qs3.errors import ConfigError, Qs3Error
+from qs3.report.tables import Table
 
 _TABLE = {"table", "log_dir", "data_dir", "out", "target", "overrides"}
+_RUN = {"table", "log_dir", "data_dir", "target", "overrides", "seeds", "rows", "jobs"}
+_COMPARE = _TABLE | {"base"}
 _PICTURES = {"domains", "data_dir", "out", "split"}
 
 
@@ -31,6 +39,10 @@ def main(argv: Sequence[str]) -> int:
     try:
         if argv[0] == "pictures":
             _pictures(_options(argv[1:], _PICTURES))
+        elif argv[0] == "run":
+            return _run(_options(argv[1:], _RUN))
+        elif argv[0] == "compare":
+            _compare(_options(argv[1:], _COMPARE))
         else:
             _table(_options(argv, _TABLE))
     except Qs3Error as error:
@@ -55,19 +67,71 @@ def _options(argv: Sequence[str], known: set[str]) -> dict[str, str]:
     return found
 
 
-def _table(options: dict[str, str]) -> None:
-    from qs3.files import write_text
-    from qs3.report.tables import build_table, csv_text, latex, markdown, table_names
+def _built(options: dict[str, str]) -> Table:
+    """The table that the options ask for, with our runs."""
+    from qs3.report.tables import build_table, table_names
 
     if "table" not in options:
         raise ConfigError(f"which table? table={'|'.join(table_names())}")
-    log_dir = Path(options.get("log_dir", "logs"))
     extra = shlex.split(options.get("overrides", ""))
     extra += [f"paths.data_dir={options['data_dir']}"] if "data_dir" in options else []
-    table = build_table(options["table"], log_dir, extra, options.get("target"))
-    text = markdown(table)
+    log_dir = options.get("log_dir", "logs")
+    return build_table(options["table"], log_dir, extra, options.get("target"))
+
+
+def _saved_at(table: Table, options: dict[str, str]) -> Path:
+    """Where a table's files go, without their suffix."""
     name = "-".join([table.name, *([options["target"]] if "target" in options else [])])
-    at = Path(options.get("out", log_dir / "tables")) / name
+    return Path(options.get("out", Path(options.get("log_dir", "logs")) / "tables")) / name
+
+
+def _run(options: dict[str, str]) -> int:
+    from qs3.report.running import missing, run_all
+
+    seeds = [_whole("seeds", word) for word in options.get("seeds", "0,1,2").split(",")]
+    rows = [word.strip() for word in options.get("rows", "").split(",") if word.strip()]
+    table, at_once = _built(options), _whole("jobs", options.get("jobs", "1"))
+    if at_once < 1:
+        raise ConfigError("jobs must be at least 1")
+    jobs = missing(table, seeds, rows)
+    print(f"table {table.name}: {len(jobs)} runs to do")
+    failed = run_all(jobs, at_once, lambda line: print(line, flush=True))
+    if failed:
+        print(f"{len(failed)} of {len(jobs)} runs failed:")
+        for job in failed:
+            print(f"  {job.command}")
+        return 1
+    print(f"next: python -m qs3.report table={table.name}")
+    return 0
+
+
+def _whole(key: str, word: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise ConfigError(f"{key} must be whole numbers, got {word!r}") from None
+
+
+def _compare(options: dict[str, str]) -> None:
+    from qs3.files import write_text
+    from qs3.report.comparison import against, text
+
+    table = _built(options)
+    if "base" not in options:
+        raise ConfigError(f"against which row? base={'|'.join(table.rows)}")
+    found = against(table, options["base"])
+    at = _saved_at(table, options)
+    write_text(f"{at}-compared.md", text(found, options["base"], markdown=True))
+    print(text(found, options["base"]))
+    print(f"saved {at}-compared.md")
+
+
+def _table(options: dict[str, str]) -> None:
+    from qs3.files import write_text
+    from qs3.report.tables import csv_text, latex, markdown
+
+    table = _built(options)
+    text, at = markdown(table), _saved_at(table, options)
     for suffix, content in ((".md", text), (".csv", csv_text(table)), (".tex", latex(table))):
         write_text(f"{at}{suffix}", content)
     print(text)

@@ -133,7 +133,7 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
 
 
 def test_wrong_tables(tmp_path, monkeypatch):
-    with pytest.raises(ConfigError, match="there is no table 'x'; there are ablation, noise"):
+    with pytest.raises(ConfigError, match="there is no table 'x'; there are ablation, cad10, "):
         build_table("x")
     monkeypatch.setattr(tables, "CONF", tmp_path)
     (tmp_path / "table").mkdir()

@@ -1,0 +1,157 @@
+"""`report run` fills a table with real trainings, `report compare` says how rows differ."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import ConfigError
+from qs3.predictions import FILE, Predictions, write_predictions
+from qs3.report.comparison import against, text
+from qs3.report.running import Job, missing, run_all
+from qs3.report.tables import build_table
+from tests.report.test_tables import run_cell
+from tests.training.toy import overrides, write_toy
+
+ROOT = Path(__file__).parents[2]
+
+
+def jobs_of(tmp_path, *rows, seeds=(0, 1, 2)):
+    return missing(build_table("cad10", tmp_path), seeds, rows)
+
+
+def test_only_what_is_missing_is_run(tmp_path):
+    table = build_table("cad10", tmp_path)
+    cells = {cell.row: cell for cell in table.cells}
+    run_cell(tmp_path, cells["DANN"], seeds=(0, 2))
+    assert [job.name for job in jobs_of(tmp_path, "dann")] == ["DANN, seed 1"]
+    assert [job.name for job in jobs_of(tmp_path, "adabn", "dann", seeds=(0,))] == ["AdaBN, seed 0"]
+    everything = jobs_of(tmp_path)
+    assert len(everything) == 3 * len(table.rows) - 2
+    assert everything[0].command.startswith("python train.py experiment=cad10 ")
+
+
+def test_runs_that_cells_share_are_run_once(tmp_path):
+    """factorial's last row is one run in two columns."""
+    table = build_table("factorial", tmp_path)
+    jobs = missing(table, [0])
+    assert len(jobs) == len(table.cells) - 1
+    assert len({job.overrides for job in jobs}) == len(jobs)
+
+
+def test_unknown_row(tmp_path):
+    with pytest.raises(ConfigError, match="no row of table cad10 has 'danm' in its name"):
+        jobs_of(tmp_path, "danm")
+
+
+def start(job: Job, output: Path) -> subprocess.Popen[bytes]:
+    code = (
+        "import sys, time; time.sleep(0.3); print('[12:00:00] accuracy', sys.argv[1:]);"
+        "sys.exit('bad' in sys.argv[1])"
+    )
+    with open(output, "wb") as file:
+        return subprocess.Popen([sys.executable, "-c", code, *job.overrides], stdout=file)
+
+
+def test_a_failure_stops_nothing_and_is_told():
+    jobs = [Job(name, (name,)) for name in ("one", "bad", "three", "four")]
+    lines: list[str] = []
+    failed = run_all(jobs, 2, lines.append, start)
+    assert [job.name for job in failed] == ["bad"]
+    assert len(lines) == 4
+    assert lines[-1].startswith("[4/4] ")
+    (told,) = [line for line in lines if "FAILED" in line]
+    assert "python train.py bad" in told
+    assert "accuracy ['bad']" in told  # the end of its output
+    assert sum("accuracy ['one']" in line for line in lines) == 1
+
+
+def test_processes_do_not_outlive_an_interruption():
+    started: list[subprocess.Popen[bytes]] = []
+
+    def slow(job: Job, output: Path) -> subprocess.Popen[bytes]:
+        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]))
+        if len(started) == 2:
+            raise KeyboardInterrupt
+        return started[-1]
+
+    with pytest.raises(KeyboardInterrupt):
+        run_all([Job("a", ()), Job("b", ())], 2, print, slow)
+    assert started[0].returncode is not None
+    last = started.pop()  # never handed over
+    last.kill()
+    last.wait()
+
+
+def test_compare_by_hand(tmp_path):
+    table = build_table("cad10", tmp_path)
+    right_of = {"source only": 10, "DANN": 14, "PCM": 10}  # of 20 clouds, all seeds alike
+    for row, right in right_of.items():
+        (cell,) = (cell for cell in table.cells if cell.row == row)
+        run_cell(tmp_path, cell)
+        filled = build_table("cad10", tmp_path)
+        (cell,) = (cell for cell in filled.cells if cell.row == row)
+        assert cell.group is not None
+        for run in cell.group.finished:
+            labels = np.zeros(20, dtype=int)
+            predicted = (np.arange(20) >= right).astype(int)
+            names = tuple(map(str, range(20)))
+            write_predictions(
+                run.folder / FILE,
+                Predictions(("a", "b"), names, names, labels, np.eye(2)[predicted]),
+            )
+    table = build_table("cad10", tmp_path)
+    found = {one.name: one for one in against(table, "source only")}
+    assert len(found) == len(table.rows) - 1
+    dann, pcm = found["DANN"].differences, found["PCM"].differences
+    assert dann is not None
+    assert pcm is not None
+    assert dann[0].mean == pytest.approx(0.2)
+    assert (dann[0].seeds, dann[0].meshes) == (3, 20)
+    assert pcm[0].mean == 0
+    assert found["GAST"].why == "fewer than two seeds in common ([])"
+    shown = text(list(found.values()), "source only")
+    assert "minus source only" in shown
+    assert "DANN" in shown
+    assert "+20.0 [" in shown
+    assert "(20 meshes)" in shown
+    assert "GAST: fewer than two seeds" in shown
+    with pytest.raises(ConfigError, match="no row 'x'"):
+        against(table, "x")
+
+
+@pytest.mark.slow
+def test_a_table_of_real_trainings(tmp_path):
+    """Two rows, two seeds, two at a time; a second call has nothing to do; rows are compared."""
+    write_toy(tmp_path / "data")
+    toy = [word for word in overrides(tmp_path)[1:] if not word.startswith("paths.")]
+    rows = [word for word in toy if not word.startswith("selftraining.")]
+    options = [
+        "table=quickstart", f"log_dir={tmp_path / 'logs'}", f"data_dir={tmp_path / 'data'}",
+        f"overrides={shlex.join(rows)}",
+    ]  # fmt: skip
+
+    def report(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "qs3.report", *words, *options],
+            cwd=ROOT, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
+            check=False,
+        )  # fmt: skip
+
+    first = report("run", "rows=speckle", "seeds=0,1", "jobs=2")
+    assert first.returncode == 0, first.stdout + first.stderr
+    assert "4 runs to do" in first.stdout
+    assert "[4/4]" in first.stdout
+    again = report("run", "rows=speckle", "seeds=0,1")
+    assert "0 runs to do" in again.stdout
+    compared = report("compare", "base=source only, speckle scans (S)")
+    assert compared.returncode == 0, compared.stderr
+    assert "QS3 = PCM + QBST, speckle scans  " in compared.stdout
+    assert "PCM, speckle scans: a warm-up's predictions are not kept" in compared.stdout
+    assert (tmp_path / "logs" / "tables" / "quickstart-compared.md").is_file()
