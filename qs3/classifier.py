@@ -136,13 +136,16 @@ class Classifier(LightningModule):
             group["lr"] *= factor
         return optimizer
 
-    def start_phase(self, weights: Mapping[str, Tensor] | None) -> None:
-        """Forget the optimiser's moments; go on with `weights`, or with the net's if None."""
+    def start_phase(
+        self, weights: Mapping[str, Tensor] | None, *, keep_moments: bool = False
+    ) -> None:
+        """Go on with `weights`, or with the net's if None; forget the optimiser's moments."""
         if weights is not None:
             self.net.load_state_dict(weights)
         optimizer = self.optimizers()
         assert isinstance(optimizer, torch.optim.Optimizer)
-        optimizer.state.clear()
+        if not keep_moments:
+            optimizer.state.clear()
         if self._plateau is not None:
             self._plateau.start_phase()
 

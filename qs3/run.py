@@ -15,6 +15,7 @@ from qs3.errors import ConfigError
 from qs3.hydra_glue import build, in_multirun
 from qs3.runs import Run
 from qs3.selftraining.scheme import Phases, Scheme
+from qs3.selftraining.student_rules import LAST, STUDENT_RULES
 from qs3.settings import number, one_of, whole
 
 log = logging.getLogger(__name__)
@@ -41,6 +42,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         target=build(cfg.data.target),
     )
     _refuse_rounds_of_upper_bound(run)
+    _refuse_choice_without_rounds(run)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
         return _fit(run)
@@ -68,11 +70,19 @@ def headline(metrics: dict[str, Any]) -> str:
     target = f"{metrics['target']}{' (simulated)' if metrics['simulated'] else ''}"
     if final["accuracy"] is None:
         counts = ", ".join(f"{name} {count}" for name, count in final["predicted"].items() if count)
-        return f"{run}: no labels to judge {target} by; predicted {counts}"
+        return f"{run}: no labels to judge {target} by; predicted {counts}{_chosen(metrics)}"
     return (
         f"{run}: accuracy {final['accuracy']:.1%}, balanced {final['balanced_accuracy']:.1%} "
-        f"on {target}, majority rate {final['majority_rate']:.1%}"
+        f"on {target}, majority rate {final['majority_rate']:.1%}{_chosen(metrics)}"
     )
+
+
+def _chosen(metrics: dict[str, Any]) -> str:
+    """How teacher and student were selected, for the end of the headline."""
+    teacher, student = metrics["selection"]["teacher"], metrics["selection"]["student"]
+    if teacher == student:  # no rounds
+        return f"; selected by {teacher}"
+    return f"; teacher selected by {teacher}; student by {student}"
 
 
 def _fit(run: Run) -> dict[str, Any]:
@@ -85,6 +95,7 @@ def _fit(run: Run) -> dict[str, Any]:
 def _check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
     one_of("selection.teacher", cfg.selection.teacher, TEACHERS)
+    one_of("selection.student", cfg.selection.student, STUDENT_RULES)
     whole("data.points", cfg.data.points, 1)
     whole("data.fps_starts", cfg.data.fps_starts, 1)
     whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
@@ -114,6 +125,16 @@ def _refuse_rounds_of_upper_bound(run: Run) -> None:
         raise ConfigError(
             "method=supervised trains on the target's labels and has no use for pseudo-labels; "
             "set selftraining=none"
+        )
+
+
+def _refuse_choice_without_rounds(run: Run) -> None:
+    rule = run.cfg.selection.student
+    if rule != LAST and not run.scheme.rounds:
+        raise ConfigError(
+            f"selection.student={rule} chooses among the epochs of the last round, and this run "
+            "has no rounds: selection.teacher decides what is reported; set "
+            f"selection.student={LAST}, or a selftraining with rounds"
         )
 
 

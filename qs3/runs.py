@@ -11,6 +11,8 @@ written last, and atomically: it is the mark of a finished run.
         warmup_selected.pt   weights of the teacher of round 0;  warmup_last.pt, student.pt likewise
         result.pt            weights of what is reported: those of the warm-up, or the student's
         predictions.csv      what they say of each of the target's test clouds
+        student_selected.pt  of another epoch than the last, if selection.student asks for one;
+                             candidates/epoch_095.pt  of each epoch of the last round (oracle)
         round_03/pseudo_labels.csv
         history.csv          one row an epoch
         metrics.json         the result
@@ -59,6 +61,7 @@ _UNHASHED = (
         )
     ),
 )
+_LAST_EPOCH = "last"
 _NO_ROUNDS = "qs3.selftraining.scheme.no_rounds"
 _KEPT_WHEN_CLEARED = (".hydra", ".lock")
 
@@ -92,6 +95,9 @@ def config_sha256(cfg: DictConfig) -> str:
             node.pop(leaf, None)
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None
+    selection = plain.get("selection")
+    if isinstance(selection, dict) and selection.get("student") == _LAST_EPOCH:
+        selection.pop("student")  # a younger key: runs from before it are still found
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
 

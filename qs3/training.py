@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 import warnings
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,10 @@ from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
+from torch import nn
 
 import qs3
-from qs3 import runs
+from qs3 import oracle, runs
 from qs3.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
 from qs3.classifier import Classifier
 from qs3.data.datamodule import UdaData, labels_of, load_clouds, with_labels
@@ -40,6 +42,10 @@ from qs3.predictions import write_predictions
 from qs3.randomness import derive
 from qs3.runs import Run
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, SelfTraining, WarmupSelection
+from qs3.selftraining.scheme import Phases
+from qs3.selftraining.student_rules import LAST as LAST_EPOCH
+from qs3.selftraining.student_rules import ORACLE
+from qs3.selftraining.student_selection import CANDIDATES, Choice, StudentSelection
 from qs3.selftraining.table import path_of
 from qs3.warmups import SharedWarmup, warmup_sha256
 
@@ -98,6 +104,8 @@ def fit(run: Run) -> dict[str, Any]:
         cfg.evaluation.rotations,
         _meshes_by_id(target_set, run.target.folder),
     )
+    if cfg.selection.student == ORACLE:
+        oracle.check(evaluation)
 
     # 2. Classifier and callbacks.
     classifier = Classifier(
@@ -115,6 +123,7 @@ def fit(run: Run) -> dict[str, Any]:
     )
     warmup = WarmupSelection(run.folder, run.phases, cfg.selection.teacher)
     rounds = SelfTraining(run.folder, run.phases, run.scheme, target_set.classes)
+    student = StudentSelection(run.folder, run.phases, cfg.selection.student, target_set.classes)
     shared = SharedWarmup(
         run.folder,
         cfg.paths.warmup_dir,
@@ -123,7 +132,7 @@ def fit(run: Run) -> dict[str, Any]:
         run.phases.warmup,
     )
     saving = [SaveLast(run.folder), shared]  # in this order
-    callbacks: list[Callback] = [warmup, rounds, EpochRows(run.phases), *saving]
+    callbacks: list[Callback] = [warmup, rounds, student, EpochRows(run.phases), *saving]
 
     # 3. One fit over all phases. A checkpoint lies between two epochs; a resume repeats an epoch.
     trainer = _make_trainer(
@@ -149,14 +158,28 @@ def fit(run: Run) -> dict[str, Any]:
     if trainer.is_global_zero:
         save(copy_weights(classifier.net), run.folder / STUDENT)
     trainer.strategy.barrier("student saved")
-    final = "student" if run.scheme.rounds else "selected"
-    scores, turned = {}, {}
-    for name, file in (("selected", WARMUP_SELECTED), ("last", WARMUP_LAST), ("student", STUDENT)):
+
+    def trained(file: Path) -> nn.Module:
         net = classifier.fresh_net(phase=0).to(classifier.device)
-        net.load_state_dict(load(run.folder / file, classifier.device))
+        net.load_state_dict(load(file, classifier.device))
         if cfg.evaluation.norms == "adabn":
             seed = derive(run.seed, "adabn")
             adapt_norms(net, target.points, cfg.protocol.batch_size, seed, classifier.device)
+        return net
+
+    final = "student" if run.scheme.rounds else "selected"
+    names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
+    files = {name: run.folder / file for name, file in names.items()}
+    choice = None  # the last epoch's student
+    if student.rule == ORACLE:
+        choice = oracle.choose(run.folder, run.phases, evaluation, trained, classifier.device)
+    elif student.rule != LAST_EPOCH:
+        choice = student.choice()
+    if choice is not None:
+        final, files["chosen"] = "chosen", choice.file
+    scores, turned = {}, {}
+    for name, file in files.items():
+        net = trained(file)
         scores[name] = evaluation.figures(net, classifier.device)
         if name in (final, "selected"):
             turned[name] = evaluation.turned(net, classifier.device)
@@ -169,6 +192,7 @@ def fit(run: Run) -> dict[str, Any]:
     teacher = (
         f"{validated_on if warmup.rule == 'source_val' else warmup.rule}, epoch {warmup.epoch}"
     )
+    reported = teacher if not run.scheme.rounds else choice.in_words if choice else LAST_EPOCH
     return {
         "experiment": cfg.experiment_name,
         "hash": runs.config_hash(cfg),
@@ -181,7 +205,7 @@ def fit(run: Run) -> dict[str, Any]:
         **_names(run),
         "selection": {
             "teacher": teacher,
-            "student": "last" if run.scheme.rounds else teacher,
+            "student": reported,
             "validation": cfg.data.val,
         },
         "loading": {
@@ -211,6 +235,7 @@ def fit(run: Run) -> dict[str, Any]:
             }
             for record in rounds.records
         ],
+        **_students(choice, run.phases, scores),
         "data": started["data"],
         "times": {"seconds_since_last_start": round(time.time() - began, 1)},
         "versions": started["versions"],
@@ -270,7 +295,7 @@ def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:
         return now
-    for folder in (run.folder, *run.folder.glob("round_*")):
+    for folder in (run.folder, run.folder / CANDIDATES, *run.folder.glob("round_*")):
         remove_leftovers(folder)
     if run.cfg.data.cache_dir:
         remove_old_leftovers(Path(run.cfg.data.cache_dir))
@@ -288,6 +313,14 @@ def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
             now["versions"],
         )
     return started
+
+
+def _students(choice: Choice | None, phases: Phases, scores: Mapping[str, Any]) -> dict[str, Any]:
+    """How the reported student was chosen, beside the last epoch's; {} if it is the last one."""
+    if choice is None:
+        return {}
+    last = {**scores["student"], "epoch": phases.total - 1}
+    return {"student": {**choice.record(), "selected": scores["chosen"], "last": last}}
 
 
 def _names(run: Run) -> dict[str, str]:

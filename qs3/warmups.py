@@ -31,7 +31,8 @@ from qs3.files import atomic_path, make_folder, write_json
 log = logging.getLogger(__name__)
 
 HISTORY = "history.csv"
-_AFTERWARDS = ("selftraining", "selection", "evaluation", "experiment_name")
+# Not `selection`: the checkpoint holds the teacher chosen so far.
+_AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_name")
 
 
 def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
@@ -42,9 +43,10 @@ def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
         started: hashes of the datasets and versions, as in `started.json`.
     """
     before: Any = OmegaConf.to_container(cfg, resolve=False)
+    before = OmegaConf.create(before)
     for key in _AFTERWARDS:
-        before[key] = None
-    parts = [runs.config_sha256(OmegaConf.create(before)), started["data"], started["versions"]]
+        OmegaConf.update(before, key, None)
+    parts = [runs.config_sha256(before), started["data"], started["versions"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

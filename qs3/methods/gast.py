@@ -34,7 +34,7 @@ class Gast(Method):
     Args:
         class_weight: w_c; the released code's default is 0.5, its logs have 0.5 to 1.
         def_weight: w_d; 0.5, in the logs 0.2 to 1; 0 leaves it out.
-        rot_weight: w_r; 0.2, in the logs 0.1 to 0.5; 0 leaves it out, as the released code does
+        rot_weight: w_r; 0.2, in the logs 0.1 to 1; 0 leaves it out, as the released code does
             unless asked (RotCls_on_src, RotCls_on_trgt), although the paper has it.
         min_points: of a voxel that may be deformed: 20, of clouds of 1024 points.
         pcm: mix source clouds for L_s (a switch of the released code).

@@ -16,7 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from qs3.selftraining.student_rules import ORACLE_IN_WORDS, took_target_labels
+
 FINISHED = "finished"
+DIAGNOSTIC = "diagnostic"
 FEW_SEEDS = 3
 """Below this number of seeds a mean is marked."""
 
@@ -34,9 +37,10 @@ class Run:
         experiment: name.
         hash: of the config without its seed.
         seed: None if not known.
-        status: "finished", "unfinished" or "damaged".
+        status: "finished", "unfinished", "damaged", or "diagnostic": finished, but its epoch was
+            chosen by the target's test labels, so that it is no result.
         metrics: contents of metrics.json; empty unless finished.
-        problem: why it is not finished.
+        problem: why it is not finished, or no result.
     """
 
     folder: Path
@@ -88,6 +92,8 @@ class Group:
         finished: runs with a result, by seed.
         problems: for the reader: unfinished seeds, different datasets, a seed twice.
         comparable: whether the finished runs may be averaged.
+        diagnostic: whether a run of it was chosen by the target's test labels; none of these is
+            among the finished ones.
     """
 
     experiment: str
@@ -95,6 +101,7 @@ class Group:
     finished: tuple[Run, ...]
     problems: tuple[str, ...]
     comparable: bool
+    diagnostic: bool = False
 
     @property
     def first(self) -> Mapping[str, Any]:
@@ -160,6 +167,11 @@ def load_run(folder: str | Path) -> Run:
         return broken("damaged", f"{path.name} has no {', '.join(missing)}")
     if metrics["status"] != FINISHED:
         return broken("unfinished", str(metrics["status"]))
+    if took_target_labels(metrics):
+        why = f"left out, because its student was chosen by the {ORACLE_IN_WORDS}"
+        return Run(
+            folder, metrics["experiment"], metrics["hash"], metrics["seed"], DIAGNOSTIC, {}, why
+        )
     return Run(folder, metrics["experiment"], metrics["hash"], metrics["seed"], FINISHED, metrics)
 
 
@@ -191,7 +203,8 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
             comparable = False
             seen = "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in hashes.items())
             problems.append(f"the {role} dataset differs ({seen}): not averaged")
-    return Group(*key, tuple(finished), tuple(problems), comparable)
+    diagnostic = any(run.status == DIAGNOSTIC for run in runs)
+    return Group(*key, tuple(finished), tuple(problems), comparable, diagnostic)
 
 
 def _list(seeds: Sequence[int | None]) -> str:
@@ -219,6 +232,10 @@ def summarise(folders: list[Path]) -> str:
         accuracy, balanced = g.stat("final", "accuracy"), g.stat("final", "balanced_accuracy")
         majority = g.stat("final", "majority_rate")
         few = 0 < len(g.finished) < FEW_SEEDS
+        problems = [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
+        if g.diagnostic and not g.finished:
+            notes += problems
+            continue
         lines.append(
             (
                 g.experiment,
@@ -233,7 +250,7 @@ def summarise(folders: list[Path]) -> str:
         )
         if g.unlabelled:
             notes.append(f"{g.experiment} {g.hash}: no target labels, so no accuracy")
-        notes += [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
+        notes += problems
     if any("(!)" in line[6] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."

@@ -18,7 +18,8 @@ from typing import Any
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
 from qs3.errors import ConfigError
-from qs3.report.aggregate import FEW_SEEDS, Group, Stat, group, load_runs, task
+from qs3.report.aggregate import DIAGNOSTIC, FEW_SEEDS, Group, Stat, group, load_runs, task
+from qs3.selftraining.student_rules import ORACLE, ORACLE_IN_WORDS
 
 CONF = Path(__file__).parents[2] / "conf"
 SEEDS = "0,1,2"
@@ -125,7 +126,8 @@ def build_table(
         spec = yaml.safe_load(path.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: {error}") from error
-    groups = {(g.experiment, g.hash): g for g in group(load_runs(log_dir))}
+    runs = load_runs(log_dir)
+    groups = {(g.experiment, g.hash): g for g in group(runs)}
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
     if str(log_dir) != "logs":
         more.append(f"paths.log_dir={log_dir}")
@@ -155,6 +157,8 @@ def build_table(
         raise ConfigError(f"{path}: unknown metrics {unknown}; known are {', '.join(METRICS)}")
     if target:
         notes = [*notes, f"all cells on the target {target}, which is not the paper's"]
+    if left_out := sum(run.status == DIAGNOSTIC for run in runs):
+        notes = [*notes, f"runs left out: {left_out}, chosen by the {ORACLE_IN_WORDS}"]
     return Table(name, title, tuple(notes), metrics, columns, rows)
 
 
@@ -176,9 +180,19 @@ def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> lis
                 raise ConfigError(
                     f"table cell {cell.row!r}, {cell.column!r}: {_first_line(error)}"
                 ) from error
+            _refuse_oracle(cell, cfg)
             key = (str(cfg.experiment_name), config_hash(cfg))
             filled.append(replace(cell, group=groups.get(key)))
     return filled
+
+
+def _refuse_oracle(cell: Cell, cfg: Any) -> None:
+    if cfg.selection.student == ORACLE:
+        raise ConfigError(
+            f"table cell {cell.row!r}, {cell.column!r}: selection.student={ORACLE} chooses by the "
+            "target's test labels. That is a diagnostic and enters no table; take it out of the "
+            "cell's line, of its experiment, or of overrides="
+        )
 
 
 @contextlib.contextmanager

@@ -12,6 +12,8 @@ follows from the epoch alone, so there is no flag that a resume could lose.
 
 With `init=continue` round 0 goes on with the teacher that labelled it, which is the warm-up's
 selected epoch and seldom its last; each further round goes on with the student before.
+With `init=persistent` round 0 begins with new weights, and the further rounds also keep the
+optimiser's moments.
 """
 
 from __future__ import annotations
@@ -109,7 +111,8 @@ class SelfTraining(Callback):
         assert isinstance(pl_module, Classifier)
         phase = self.phases.phase(trainer.current_epoch)
         if phase > 0 and self.phases.starts(trainer.current_epoch):
-            pl_module.start_phase(self._first_weights(pl_module, phase))
+            goes_on = self.scheme.init == "persistent" and phase > 1
+            pl_module.start_phase(self._first_weights(pl_module, phase), keep_moments=goes_on)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """In the last epoch of a phase: label the target and choose the next training set."""
@@ -120,7 +123,7 @@ class SelfTraining(Callback):
 
     def _first_weights(self, classifier: Classifier, phase: int) -> dict[str, Any] | None:
         """What a round begins with; None goes on with the student of the round before."""
-        if self.scheme.init == "scratch":
+        if self.scheme.init == "scratch" or (self.scheme.init == "persistent" and phase == 1):
             return classifier.fresh_net(phase).state_dict()
         if phase == 1:
             return load(self.folder / WARMUP_SELECTED, classifier.device)

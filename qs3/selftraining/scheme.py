@@ -73,7 +73,9 @@ class Scheme:
             thresholds of their own (CBST), and for them alone.
         epsilon: added to theta in each further round.
         init: "scratch" draws new weights each round; "continue" begins round 0 with the weights of
-            the teacher that labelled it, and each further round with the student before.
+            the teacher that labelled it, and each further round with the student before;
+            "persistent" draws new weights in round 0 alone, and keeps them and the optimiser's
+            moments from then on, as in QS3's released code.
         use_source: whether labelled source clouds are trained on in the rounds, too.
         pcm: whether the student's clouds are mixed (see `qs3.methods.pcm`).
         weight_step: by how much the weight of both losses falls each epoch of the rounds, from 1
@@ -105,7 +107,7 @@ class Scheme:
             raise ConfigError("selftraining.rounds > 0 needs a selector, e.g. selftraining=qbst")
         whole("selftraining.epochs", self.epochs, 1)
         whole("selftraining.batch_size", self.batch_size, 2)  # batch norm needs two clouds
-        one_of("selftraining.init", self.init, ("scratch", "continue"))
+        one_of("selftraining.init", self.init, ("scratch", "continue", "persistent"))
         one_of("selftraining.missing_class", self.missing_class, ("warn", "error"))
         number("selftraining.theta", self.theta)
         number("selftraining.epsilon", self.epsilon)

@@ -1,0 +1,32 @@
+"""Which epoch of the last round is reported: the rules of `selection.student`, by name. Light.
+
+    last        the last epoch. Nothing is computed.
+    pseudo_val  accuracy on pseudo-labelled target clouds that were held out of the last round, as
+                in QS3's released code (there in each round; see `validators.hold_out`).
+    entropy     three scores that need no labels at all, of the predictions for the target's
+    infomax     training clouds (see `validators`).
+    snd
+    oracle      accuracy on the target's test clouds. This is no rule that anybody could follow:
+                a diagnostic of how much the others leave on the table. It never enters a table
+                of results, and training cannot reach what it takes (see `qs3.oracle`).
+
+The earliest epoch wins a tie.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+LAST = "last"
+PSEUDO_VAL = "pseudo_val"
+ORACLE = "oracle"
+ORACLE_IN_WORDS = "oracle (target test labels: diagnostic only)"
+STUDENT_RULES = (LAST, PSEUDO_VAL, "entropy", "infomax", "snd", ORACLE)
+
+
+def took_target_labels(metrics: Mapping[str, Any]) -> bool:
+    """Whether a run's result was chosen by the target's test labels: no table may have it."""
+    selection = metrics.get("selection")
+    student = selection.get("student") if isinstance(selection, Mapping) else None
+    return str(student).startswith(ORACLE)

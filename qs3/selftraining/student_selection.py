@@ -1,0 +1,206 @@
+"""Keeps the student of that epoch of the last round which `selection.student` prefers.
+
+    epoch:    ... | last round ............... |
+                  ^  ^   ^   ^   ^   ^         ^
+                  |  score each epoch          save the best one's weights
+                  hold out a fifth (pseudo_val)
+
+It only looks: with every rule but `pseudo_val` the run trains as with `last`, to the bit, and with
+`pseudo_val` as far as the last round. Target labels cannot be reached from here. For `oracle` the
+weights of all these epochs are kept, and `qs3.oracle` chooses when training is over.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor, nn
+
+from qs3.checkpoints import copy_weights, save
+from qs3.classifier import Classifier
+from qs3.data.datamodule import UdaData
+from qs3.errors import SelectionError
+from qs3.evaluation import predict
+from qs3.randomness import derive
+from qs3.selftraining.scheme import Phases
+from qs3.selftraining.student_rules import LAST, ORACLE, ORACLE_IN_WORDS, PSEUDO_VAL
+from qs3.selftraining.validators import LABEL_FREE, hold_out, is_better
+
+log = logging.getLogger(__name__)
+
+STUDENT_SELECTED = "student_selected.pt"
+CANDIDATES = "candidates"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An epoch of the last round, and why it is this one.
+
+    Attributes:
+        rule: by which it was chosen.
+        epoch: of the run, counted from 0.
+        score: its score, by the rule.
+        scores: of all epochs of the last round.
+        file: its weights.
+        held_out: number of pseudo-labelled clouds that were not trained on.
+    """
+
+    rule: str
+    epoch: int
+    score: float
+    scores: Mapping[int, float]
+    file: Path
+    held_out: int = 0
+
+    @property
+    def in_words(self) -> str:
+        """Such as "snd, epoch 57, score 4.2"; what `metrics.json` has as `selection.student`."""
+        name = ORACLE_IN_WORDS if self.rule == ORACLE else self.rule
+        return f"{name}, epoch {self.epoch}, score {self.score:.6g}"
+
+    def record(self) -> dict[str, Any]:
+        """What `metrics.json` has under `student`."""
+        return {
+            "rule": ORACLE_IN_WORDS if self.rule == ORACLE else self.rule,
+            "epoch": self.epoch,
+            "score": _finite(self.score),
+            "scores": {str(epoch): _finite(score) for epoch, score in self.scores.items()},
+            "held_out": self.held_out,
+        }
+
+
+def _finite(score: float) -> float | None:
+    return score if math.isfinite(score) else None  # of a net that has diverged
+
+
+def candidate_path(folder: Path, epoch: int) -> Path:
+    """Where the weights of an epoch of the last round lie, for the oracle."""
+    return folder / CANDIDATES / f"epoch_{epoch:03d}.pt"
+
+
+class StudentSelection(Callback):
+    """Scores each epoch of the last round; saves the best weights as `student_selected.pt`.
+
+    It belongs behind `SelfTraining` in the list of callbacks, whose last selection it divides, and
+    before the checkpoint. Figures of every process are those of the first one.
+
+    Args:
+        folder: of the run.
+        phases: of the run.
+        rule: one of `student_rules.STUDENT_RULES`.
+        classes: names in label order.
+
+    Attributes:
+        scores: by epoch, of those of the last round so far; none with `last` and `oracle`.
+        epoch, score: the best so far; None before there is one.
+        held_out: positions in the target's training clouds [h], and their pseudo-labels [h].
+    """
+
+    def __init__(self, folder: Path, phases: Phases, rule: str, classes: Sequence[str]) -> None:
+        self.folder, self.phases, self.rule = folder, phases, rule
+        self.classes = tuple(classes)
+        self.scores: dict[int, float] = {}
+        self.epoch: int | None = None
+        self.score: float | None = None
+        self.held_out: tuple[Tensor, Tensor] | None = None
+        self._weights: dict[str, Any] | None = None  # only during the last round
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Hold clouds out before the last round begins; score the epochs of the last round."""
+        assert isinstance(pl_module, Classifier)
+        epoch, last_phase = trainer.current_epoch, self.phases.rounds
+        if self.rule == LAST or last_phase == 0:
+            return
+        phase, ends = self.phases.phase(epoch), self.phases.ends(epoch)
+        data = trainer.datamodule  # type: ignore[attr-defined]
+        assert isinstance(data, UdaData)
+        if self.rule == PSEUDO_VAL and phase == last_phase - 1 and ends:
+            self._hold_out(data)
+        if phase != last_phase:
+            return
+        if self.rule == ORACLE:
+            if trainer.is_global_zero:
+                save(copy_weights(pl_module.net), candidate_path(self.folder, epoch))
+        else:
+            self._compare(trainer, pl_module, data, epoch)
+            if ends:
+                if trainer.is_global_zero:
+                    save(self._weights, self.folder / STUDENT_SELECTED)
+                self._weights = None
+        trainer.strategy.barrier("epoch of the student kept")
+
+    def _compare(self, trainer: Trainer, classifier: Classifier, data: UdaData, epoch: int) -> None:
+        # One process scores for all: batch norm's statistics differ between processes.
+        mine = self._score(classifier.net, data, classifier) if trainer.is_global_zero else 0.0
+        score = float(trainer.strategy.broadcast(mine))
+        self.scores[epoch] = score
+        if is_better(self.rule, score, self.score):
+            self.epoch, self.score = epoch, score
+            self._weights = copy_weights(classifier.net)
+
+    def _score(self, net: nn.Module, data: UdaData, classifier: Classifier) -> float:
+        clouds = data.target.clouds
+        if self.rule != PSEUDO_VAL:
+            table = predict(net, clouds.all(), data.eval_batch_size, classifier.device)
+            return LABEL_FREE[self.rule].score(table)
+        assert self.held_out is not None
+        index, labels = self.held_out
+        table = predict(
+            net, clouds.at(index.numpy()).all(), data.eval_batch_size, classifier.device
+        )
+        return float((table.argmax(axis=1) == labels.numpy()).mean())
+
+    def _hold_out(self, data: UdaData) -> None:
+        """Move a part of the set that the last round would train on aside."""
+        assert data.pseudo is not None
+        index, labels = data.pseudo
+        hard = labels.argmax(dim=1) if labels.is_floating_point() else labels
+        round_ = self.phases.rounds - 1
+        ids = [data.target.ids[i] for i in index.tolist()]
+        held = hold_out(hard.numpy(), ids, derive(data.seed, PSEUDO_VAL, round_))
+        if not held.any():
+            counts = np.bincount(hard.numpy(), minlength=len(self.classes))
+            found = ", ".join(f"{n} {c}" for n, c in zip(self.classes, counts, strict=True))
+            raise SelectionError(
+                f"round {round_}: selection.student={PSEUDO_VAL} holds out a fifth of each class's "
+                f"pseudo-labels, but no class has three ({found}); lower selftraining.theta, or "
+                f"set selection.student={LAST}"
+            )
+        mask = torch.from_numpy(held)
+        self.held_out = (index[mask], hard[mask])
+        data.set_pseudo_labels(index[~mask], labels[~mask])
+        log.info("round %d: %d pseudo-labelled samples held out", round_, int(held.sum()))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Scores, the best epoch and its weights, the held-out clouds; {} while there are none."""
+        if not self.scores and self.held_out is None:
+            return {}
+        return {
+            "scores": dict(self.scores),
+            "epoch": self.epoch,
+            "score": self.score,
+            "held_out": self.held_out,
+            "weights": self._weights,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore `state_dict`."""
+        self.scores = dict(state_dict["scores"])
+        self.epoch, self.score = state_dict["epoch"], state_dict["score"]
+        self.held_out, self._weights = state_dict["held_out"], state_dict["weights"]
+
+    def choice(self) -> Choice:
+        """What was chosen, when training is over; not for `last` and `oracle`."""
+        assert self.epoch is not None
+        assert self.score is not None
+        held = 0 if self.held_out is None else len(self.held_out[0])
+        file = self.folder / STUDENT_SELECTED
+        return Choice(self.rule, self.epoch, self.score, dict(self.scores), file, held)

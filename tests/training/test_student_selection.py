@@ -1,0 +1,487 @@
+"""Which epoch of the last round is reported: each rule in whole runs, and what it may not do."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import open_dict
+
+import qs3.oracle
+import qs3.selftraining.student_selection
+from qs3 import runs
+from qs3.checkpoints import copy_weights, load
+from qs3.classifier import Classifier
+from qs3.data.store import open_pointset
+from qs3.errors import ConfigError, SelectionError
+from qs3.evaluation import predict
+from qs3.hydra_glue import build
+from qs3.report.aggregate import group, load_runs, summarise
+from qs3.report.tables import build_table, markdown
+from qs3.run import headline, train
+from qs3.selftraining.student_rules import ORACLE_IN_WORDS, STUDENT_RULES
+from qs3.selftraining.student_selection import StudentSelection, candidate_path
+from qs3.selftraining.table import read_pseudo_labels
+from qs3.selftraining.validators import LABEL_FREE, hold_out
+from tests.training.conftest import result_of
+from tests.training.test_resume import interrupt
+from tests.training.test_target_labels import (  # noqa: F401 (watch is a fixture)
+    truth_of,
+    watch,
+    write_shuffled_target,
+)
+from tests.training.test_training import copy_with_other_labels
+from tests.training.toy import CLASSES, overrides, toy_config, write_domain
+
+RULES = STUDENT_RULES[1:]
+FAST = ("pseudo_val", "oracle")  # beside these, `make test-all` runs the rules without labels
+SOME_RULES = (*FAST, *(pytest.param(rule, marks=pytest.mark.slow) for rule in LABEL_FREE))
+LAST_ROUND = range(7, 10)  # epochs; 0 to 3 are the warm-up, 4 to 6 round 0
+WEIGHTS = ("warmup_selected.pt", "warmup_last.pt", "student.pt")
+
+Trained = Callable[[str], Path]
+
+
+@pytest.fixture(scope="module")
+def by_rule(toy_data: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """Folder of the toy run with a rule, trained when first asked for."""
+    folders = {"last": finished}
+
+    def trained(rule: str) -> Path:
+        if rule not in folders:
+            root = tmp_path_factory.mktemp(rule)
+            cfg = toy_config(root, f"paths.data_dir={toy_data}", f"selection.student={rule}")
+            train(cfg)
+            folders[rule] = runs.run_folder(cfg)
+        return folders[rule]
+
+    return trained
+
+
+def metrics_of(folder: Path) -> dict[str, Any]:
+    metrics = runs.read_metrics(folder)
+    assert metrics is not None
+    return metrics
+
+
+def same_weights(one: Path, other: Path) -> bool:
+    a, b = load(one), load(other)
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def table_of(cfg: Any, weights: Path, points: torch.Tensor) -> np.ndarray:
+    net = build(cfg.model)
+    net.load_state_dict(load(weights))
+    return predict(net, points, 64)
+
+
+# --- what is chosen ----------------------------------------------------------------------------
+
+
+def test_last_is_the_default_and_leaves_nothing_behind(finished):
+    metrics = metrics_of(finished)
+    assert metrics["selection"]["student"] == "last"
+    assert "student" not in metrics
+    assert not (finished / "student_selected.pt").exists()
+    assert not (finished / "candidates").exists()
+    assert "StudentSelection" not in load(finished / "last.ckpt")["callbacks"]
+    assert headline(metrics).endswith(
+        f"; teacher selected by {metrics['selection']['teacher']}; student by last"
+    )
+
+
+def test_runs_from_before_there_was_a_choice_are_found(toy):
+    cfg = toy()
+    old = cfg.copy()
+    with open_dict(old):
+        del old.selection["student"]
+    assert runs.config_sha256(old) == runs.config_sha256(cfg)
+    hashes = {runs.config_sha256(toy(f"selection.student={rule}")) for rule in RULES}
+    assert len(hashes | {runs.config_sha256(cfg)}) == 6
+
+
+@pytest.mark.parametrize("rule", [*LABEL_FREE, "oracle"])
+def test_a_rule_without_held_out_clouds_only_looks(by_rule, finished, rule):
+    ours, theirs = result_of(by_rule(rule)), result_of(finished)
+    ours, theirs = ({k: v for k, v in r.items() if k != "metrics"} for r in (ours, theirs))
+    assert ours == theirs  # history and pseudo-labels
+    for name in WEIGHTS:
+        assert same_weights(by_rule(rule) / name, finished / name), name
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
+    metrics = metrics_of(by_rule(rule))
+    student = metrics["student"]
+    assert list(student["scores"]) == [str(epoch) for epoch in LAST_ROUND]
+    scores = {int(epoch): score for epoch, score in student["scores"].items()}
+    best = (min if rule == "entropy" else max)(scores.values())
+    assert student["score"] == best
+    assert student["epoch"] == min(epoch for epoch in scores if scores[epoch] == best)
+    name = ORACLE_IN_WORDS if rule == "oracle" else rule
+    said = f"{name}, epoch {student['epoch']}, score {best:.6g}"
+    assert metrics["selection"]["student"] == said
+    assert headline(metrics).endswith(f"; student by {said}")
+    assert student["rule"] == name
+    assert metrics["final"] == student["selected"]
+    assert student["last"]["epoch"] == 9
+    if rule != "pseudo_val":  # there the last round was trained on fewer clouds
+        last = {k: v for k, v in student["last"].items() if k != "epoch"}
+        assert last == metrics_of(finished)["final"]
+
+
+@pytest.mark.parametrize("rule", LABEL_FREE)
+def test_scores_are_those_of_each_epoch_on_the_targets_training_clouds(
+    by_rule, toy, toy_data, rule
+):
+    """Again from the weights of each epoch, which the run with the oracle has kept."""
+    from qs3.data.datamodule import load_clouds
+
+    kept, cfg = by_rule("oracle"), toy()
+    points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
+    student = metrics_of(by_rule(rule))["student"]
+    for epoch in LAST_ROUND:
+        table = table_of(cfg, candidate_path(kept, epoch), points)
+        score = LABEL_FREE[rule].score(table)
+        assert student["scores"][str(epoch)] == pytest.approx(score, abs=1e-6)
+    chosen = by_rule(rule) / "student_selected.pt"
+    assert same_weights(chosen, candidate_path(kept, student["epoch"]))
+    assert same_weights(by_rule(rule) / "result.pt", chosen)
+
+
+def test_another_epoch_than_the_last_is_reported(toy, monkeypatch):
+    """The score is made to fall, so that the first epoch of the round is the best."""
+    first: dict[str, torch.Tensor] = {}
+
+    def falling(self, net, data, classifier):
+        if classifier.current_epoch == LAST_ROUND[0]:
+            first.update(copy_weights(net))
+        return -float(classifier.current_epoch)
+
+    monkeypatch.setattr(StudentSelection, "_score", falling)
+    cfg = toy("selection.student=snd")
+    metrics = train(cfg)
+    folder = runs.run_folder(cfg)
+    assert metrics["student"]["epoch"] == LAST_ROUND[0]
+    for file in ("student_selected.pt", "result.pt"):
+        found = load(folder / file)
+        assert all(torch.equal(found[name], first[name]) for name in first)
+    assert not same_weights(folder / "student.pt", folder / "student_selected.pt")
+
+
+def test_a_score_that_is_no_number_is_no_number_in_the_result(toy, monkeypatch):
+    monkeypatch.setattr(StudentSelection, "_score", lambda *args: math.nan)
+    metrics = train(toy("selection.student=snd"))
+    assert metrics["student"]["score"] is None
+    assert metrics["student"]["epoch"] == LAST_ROUND[0]
+    assert metrics["final"]["n"] == 24
+
+
+# --- held-out pseudo-labels --------------------------------------------------------------------
+
+
+def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
+    sets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
+    selection: list[StudentSelection] = []
+
+    def spy(self, batch, batch_idx, real=Classifier.training_step):
+        data = self.trainer.datamodule
+        if data.pseudo is not None:
+            sets[self.current_epoch] = data.pseudo
+            assert len(self.trainer.train_dataloader.tables["target"].clouds) == len(data.pseudo[0])
+        selection[:] = [c for c in self.trainer.callbacks if isinstance(c, StudentSelection)]
+        return real(self, batch, batch_idx)
+
+    monkeypatch.setattr(Classifier, "training_step", spy)
+    cfg = toy("selection.student=pseudo_val")
+    metrics = train(cfg)
+    held, held_labels = selection[0].held_out
+    rows = read_pseudo_labels(runs.run_folder(cfg) / "round_01" / "pseudo_labels.csv")
+    selected = [i for i, row in enumerate(rows) if row.selected]
+    for epoch in LAST_ROUND:
+        index, labels = sets[epoch]
+        assert sorted([*index.tolist(), *held.tolist()]) == selected
+        both = [*zip(index.tolist(), labels.tolist(), strict=True)]
+        both += zip(held.tolist(), held_labels.tolist(), strict=True)
+        assert all(CLASSES[label] == rows[i].label for i, label in both)
+    assert len(sets[4][0]) == metrics["rounds"][0]["total_selected"]  # round 0 holds nothing out
+    assert metrics["student"]["held_out"] == len(held)
+    assert metrics["rounds"][1]["total_selected"] == len(selected)
+    assert len(held) == pytest.approx(len(selected) / 5, abs=1.5)
+
+
+def test_held_out_accuracy(by_rule, toy, toy_data):
+    """Of the epoch that was chosen, again from its weights, the seed and the round's table."""
+    from qs3.data.datamodule import load_clouds
+    from qs3.randomness import derive
+
+    folder = by_rule("pseudo_val")
+    student = metrics_of(folder)["student"]
+    rows = read_pseudo_labels(folder / "round_01" / "pseudo_labels.csv")
+    selected = [i for i, row in enumerate(rows) if row.selected]
+    labels = np.array([CLASSES.index(rows[i].label) for i in selected])
+    held = hold_out(labels, [rows[i].id for i in selected], derive(0, "pseudo_val", 1))
+    assert held.sum() == student["held_out"] > 0
+    points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
+    table = table_of(toy(), folder / "student_selected.pt", points[np.array(selected)[held]])
+    assert student["score"] == (table.argmax(axis=1) == labels[held]).mean()
+
+
+def test_all_before_the_last_round_is_as_without_holding_out(by_rule, finished):
+    ours, theirs = result_of(by_rule("pseudo_val")), result_of(finished)
+    for name in theirs:
+        if name.startswith("round_"):
+            assert ours[name] == theirs[name], name
+    rows, expected = (r["history.csv"].splitlines() for r in (ours, theirs))
+    assert rows[: 1 + LAST_ROUND[0]] == expected[: 1 + LAST_ROUND[0]]
+    assert rows[1 + LAST_ROUND[0] :] != expected[1 + LAST_ROUND[0] :]
+    assert not same_weights(by_rule("pseudo_val") / "student.pt", finished / "student.pt")
+
+
+def test_soft_pseudo_labels_are_held_out_by_their_likeliest_class(toy):
+    metrics = train(
+        toy(
+            "selftraining=crst_lrent",
+            "selftraining.theta=0",
+            "selftraining.epsilon=0",
+            "selection.student=pseudo_val",
+        )
+    )
+    assert metrics["student"]["held_out"] > 0
+    assert 0 <= metrics["student"]["score"] <= 1
+
+
+def test_too_few_to_hold_out(toy, monkeypatch):
+    def two_of_each(net, points, batch_size, device="cpu"):
+        table = np.full((len(points), 3), 1 / 3)
+        for i in range(6):
+            table[i] = np.where(np.arange(3) == i % 3, 0.96 + i / 1000, 0.02 - i / 2000)
+        return table
+
+    monkeypatch.setattr("qs3.selftraining.callback.predict", two_of_each)
+    with pytest.raises(SelectionError, match=r"round 1: .*pseudo_val.*no class has three \(ball"):
+        train(toy("selection.student=pseudo_val"))
+
+
+# --- the oracle --------------------------------------------------------------------------------
+
+
+def test_the_oracle_is_the_best_epoch_on_the_test_set(by_rule, toy, toy_data):
+    from qs3.data.datamodule import load_clouds
+
+    folder, cfg = by_rule("oracle"), toy()
+    target = open_pointset(toy_data / "kinectsim10")
+    points = load_clouds(target, "test", points=32).points
+    labels = target.labels[target.indices("test")]
+    student = metrics_of(folder)["student"]
+    files = sorted((folder / "candidates").iterdir())
+    assert [file.name for file in files] == [f"epoch_{epoch:03d}.pt" for epoch in LAST_ROUND]
+    for file, score in zip(files, student["scores"].values(), strict=True):
+        assert score == (table_of(cfg, file, points).argmax(axis=1) == labels).mean()
+    assert metrics_of(folder)["final"]["accuracy"] == max(student["scores"].values())
+    assert same_weights(folder / "result.pt", candidate_path(folder, student["epoch"]))
+
+
+def test_the_oracle_is_loud(toy, caplog):
+    with caplog.at_level(logging.INFO):
+        train(toy("selection.student=oracle"))
+    said = [line for line in caplog.text.splitlines() if ORACLE_IN_WORDS in line]
+    assert len(said) == 2  # a warning when it chooses, and the headline
+    assert "accuracy" in said[1]
+
+
+def test_the_oracle_judges_with_the_norms_that_are_reported(toy):
+    metrics = train(toy("selection.student=oracle", "evaluation.norms=adabn"))
+    assert metrics["final"]["accuracy"] == metrics["student"]["score"]
+
+
+@pytest.mark.parametrize("rule", SOME_RULES)
+def test_other_target_labels_change_no_weights(by_rule, toy, toy_data, tmp_path, rule):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "specklenet10").symlink_to(toy_data / "specklenet10")
+    copy_with_other_labels(toy_data, other / "kinectsim10")
+    cfg = toy(f"paths.data_dir={other}", f"selection.student={rule}")
+    metrics = train(cfg)
+    folder, theirs = runs.run_folder(cfg), metrics_of(by_rule(rule))
+    for name in WEIGHTS:
+        assert same_weights(folder / name, by_rule(rule) / name)
+    if rule == "oracle":
+        assert metrics["student"]["scores"] != theirs["student"]["scores"]
+        for epoch in LAST_ROUND:
+            assert same_weights(candidate_path(folder, epoch), candidate_path(by_rule(rule), epoch))
+    else:
+        assert metrics["selection"] == theirs["selection"]
+        assert same_weights(folder / "student_selected.pt", by_rule(rule) / "student_selected.pt")
+
+
+@pytest.mark.parametrize("rule", SOME_RULES)
+def test_no_target_label_within_reach(toy, tmp_path, request, rule):
+    watching = request.getfixturevalue("watch")
+    write_domain(tmp_path / "data", "specklenet10", noise=0.05)
+    write_shuffled_target(tmp_path / "data", class_in_id=False)
+    watching.truth = truth_of(tmp_path / "data")
+    metrics = train(toy(f"paths.data_dir={tmp_path / 'data'}", f"selection.student={rule}"))
+    assert metrics["final"]["accuracy"] < 1  # else pseudo-labels would be the labels
+    assert watching.planted == [True]
+    assert watching.found == set()
+    assert watching.keys == {"points", "y_source", "y_pseudo"}
+
+
+# --- tables ------------------------------------------------------------------------------------
+
+
+def test_no_table_has_the_oracle(by_rule, finished):
+    folder = by_rule("oracle")
+    (found,) = group(load_runs(folder.parent))
+    assert found.finished == ()
+    assert found.stat("final", "accuracy") is None
+    text = summarise([folder, finished])
+    said = f"seed 0: left out, because its student was chosen by the {ORACLE_IN_WORDS} ({folder})"
+    assert text.endswith(said) or f"{said}\n" in text
+    rows = [line for line in text.splitlines() if line.startswith("quickstart  ")]
+    assert len(rows) == 1
+    assert f"{100 * metrics_of(finished)['final']['accuracy']:.1f}" in rows[0]
+    assert summarise([folder]).count("quickstart  ") == 0
+    table = build_table("quickstart", folder.parents[1])
+    assert f"- runs left out: 1, chosen by the {ORACLE_IN_WORDS}\n" in markdown(table)
+
+
+def test_a_cell_may_not_ask_for_it(tmp_path):
+    with pytest.raises(ConfigError, match=r"table cell '.*', '.*': selection\.student=oracle.*out"):
+        build_table("quickstart", tmp_path, extra=["selection.student=oracle"])
+    build_table("quickstart", tmp_path, extra=["selection.student=snd"])
+
+
+# --- interruptions -----------------------------------------------------------------------------
+
+
+def everywhere() -> list[Any]:
+    """Each rule at each place; the fast ones where something can go wrong."""
+    places = [
+        ("on_train_epoch_end", 7),  # selected, held out, but not yet in a checkpoint
+        ("on_train_epoch_start", 8),  # between the last selection and the last round
+        ("on_train_epoch_start", 10),  # two epochs of the last round are scored
+        ("on_train_epoch_end", 10),
+        ("on_train_end", 1),
+    ]
+    fast = [("pseudo_val", *places[1]), ("snd", *places[2]), ("oracle", *places[3])]
+    every = [(rule, *place) for rule in RULES for place in places]
+    return [pytest.param(*p, marks=[] if p in fast else pytest.mark.slow) for p in every]
+
+
+@pytest.mark.parametrize(("rule", "hook", "count"), everywhere())
+def test_interrupted_in_a_hook(by_rule, toy, rule, hook, count):
+    cfg = toy(f"selection.student={rule}")
+    interrupt(cfg, hook, count)
+    train(cfg)
+    folder = runs.run_folder(cfg)
+    assert result_of(folder) == result_of(by_rule(rule))
+    assert same_weights(folder / "result.pt", by_rule(rule) / "result.pt")
+
+
+@pytest.mark.parametrize(
+    ("rule", "module", "name", "call"),
+    [
+        ("pseudo_val", qs3.selftraining.student_selection, "hold_out", 1),
+        ("oracle", qs3.selftraining.student_selection, "save", 2),
+        ("oracle", qs3.oracle, "is_better", 2),  # training is over
+    ],
+)
+def test_interrupted_in_a_function(by_rule, toy, monkeypatch, rule, module, name, call):
+    cfg, calls, real = toy(f"selection.student={rule}"), 0, getattr(module, name)
+
+    class Stop(Exception):
+        pass
+
+    def stop(*args, **kwargs):
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            raise Stop
+        return real(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, name, stop)
+        with pytest.raises(Stop):
+            train(cfg)
+    train(cfg)
+    assert result_of(runs.run_folder(cfg)) == result_of(by_rule(rule))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rule", RULES)
+def test_two_processes_choose_one_student(toy_data, tmp_path, rule):
+    """The score is that of the first process, whose weights are saved."""
+    root = Path(__file__).parents[2]
+    more = [f"paths.data_dir={toy_data}", f"selection.student={rule}"]
+    more += ["trainer.devices=2", "trainer.strategy=ddp"]
+    done = subprocess.run(
+        [sys.executable, str(root / "train.py"), *overrides(tmp_path, *more)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    cfg = toy_config(tmp_path, *more)
+    folder = runs.run_folder(cfg)
+    student = metrics_of(folder)["student"]
+    if rule in LABEL_FREE:
+        from qs3.data.datamodule import load_clouds
+
+        points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
+        table = table_of(cfg, folder / "student_selected.pt", points)
+        assert student["score"] == pytest.approx(LABEL_FREE[rule].score(table), abs=1e-6)
+    scores = student["scores"].values()
+    assert student["score"] == (min if rule == "entropy" else max)(scores)
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+def test_wrong_rule(toy):
+    with pytest.raises(ConfigError, match=r"selection\.student must be one of .*'snd'.*'best'"):
+        train(toy("selection.student=best"))
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_no_choice_without_rounds(toy, rule):
+    more = ["selftraining=none", f"selection.student={rule}"]
+    with pytest.raises(ConfigError, match=rf"selection\.student={rule} .*set selection\.student="):
+        train(toy(*more))
+
+
+def test_an_oracle_needs_labels(toy, toy_data, tmp_path):
+    import shutil
+
+    from qs3.data.store import ManifestRow, write_pointset
+
+    old, other = open_pointset(toy_data / "kinectsim10"), tmp_path / "other"
+    shutil.copytree(toy_data / "specklenet10", other / "specklenet10")
+    train_only = old.indices("train")
+    rows = [
+        ManifestRow(id=old.ids[i], cls=CLASSES[old.labels[i]], split="train") for i in train_only
+    ]
+    write_pointset(
+        other / "kinectsim10",
+        name="kinectsim10",
+        classes=CLASSES,
+        arrays={"points": np.array(old.points)[train_only]},
+        rows=rows,
+        meta={},
+    )
+    cfg = toy(f"paths.data_dir={other}", "selection.student=oracle")
+    with pytest.raises(ConfigError, match=r"no labelled test split; set selection\.student=last"):
+        train(cfg)
+    assert not (runs.run_folder(cfg) / "last.ckpt").exists()
