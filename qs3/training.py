@@ -294,6 +294,12 @@ def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
         "config_sha256": runs.config_sha256(run.cfg),
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:
+        first = runs.read_started(run.folder) or {}
+        if first.get("config_sha256") != now["config_sha256"]:
+            raise ConfigError(
+                "the processes of this run have different settings (was a file of conf/ changed "
+                "while they started?); start it again"
+            )
         return now
     for folder in (run.folder, run.folder / CANDIDATES, *run.folder.glob("round_*")):
         remove_leftovers(folder)

@@ -1,0 +1,86 @@
+"""Every loss that a step can have, and a batch for it: shared by tests and benchmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import nn
+
+from qs3.methods.base import Method
+from qs3.methods.dann import Dann
+from qs3.methods.defrec import DefRec
+from qs3.methods.gast import Gast
+from qs3.methods.pcm import Pcm
+from qs3.methods.pointdan import PointDan
+from qs3.methods.source_only import SourceOnly
+from qs3.methods.student import Student
+from qs3.methods.supervised import Supervised
+
+
+@dataclass(frozen=True)
+class Case:
+    """One loss.
+
+    Attributes:
+        make: the method.
+        passes: how often a batch passes through the net (PointDAN's through its generator).
+        source: whether its batches have labelled source clouds.
+        pseudo: pseudo-labels of its target clouds: "hard", "soft", or "" for none.
+    """
+
+    make: Callable[[], Method]
+    passes: int
+    source: bool = True
+    pseudo: str = ""
+
+
+# A voxel of a toy cloud holds few points.
+CASES = {
+    "source_only": Case(SourceOnly, 1),
+    "supervised": Case(Supervised, 1),
+    "pcm": Case(Pcm, 1),
+    "dann": Case(Dann, 2),
+    "dann_apart": Case(lambda: Dann(domain_batches="apart"), 2),
+    "pointdan": Case(PointDan, 2),
+    "defrec": Case(lambda: DefRec(min_points=2), 2),
+    "defrec_on_source": Case(lambda: DefRec(min_points=2, on_source=True), 3),
+    "defrec_pcm": Case(lambda: DefRec(min_points=2, pcm=True), 2),
+    "gast": Case(lambda: Gast(min_points=2), 5),
+    "gast_no_rotation": Case(lambda: Gast(min_points=2, rot_weight=0.0), 3),
+    "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),
+    "student": Case(Student, 1, source=False, pseudo="hard"),
+    "student_pcm": Case(lambda: Student(pcm=True), 1, source=False, pseudo="hard"),
+    "student_source": Case(lambda: Student(weight_step=0.005), 2, pseudo="hard"),
+    "student_source_pcm": Case(lambda: Student(pcm=True), 2, pseudo="hard"),
+    "student_mrkld": Case(lambda: Student(mrkld=0.1), 2, pseudo="hard"),
+    "student_lrent": Case(Student, 2, pseudo="soft"),
+}
+
+
+def batch_of(
+    case: Case, method: Method, b: int, n: int, classes: int, device: str = "cpu"
+) -> dict[str, Any]:
+    """b clouds of n points in the unit ball, of each domain that the case asks for."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(2, b, n, 3, generator=generator)
+    points = (points / points.norm(dim=3).amax(2)[:, :, None, None]).to(device)
+    labels = torch.arange(b, device=device) % classes
+    batch: dict[str, Any] = {"index": 0, "epoch": 3, "progress": 0.5}
+    if case.source:
+        batch["source"] = {"points": points[0], f"y_{method.labels}": labels}
+    if method.uses_target or case.pseudo:
+        batch["target"] = {"points": points[1]}
+    if case.pseudo:
+        soft = nn.functional.one_hot(labels, classes).float() * 0.7 + 0.3 / classes
+        batch["target"]["y_pseudo"] = soft if case.pseudo == "soft" else labels
+    return batch
+
+
+def total(
+    method: Method, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
+) -> torch.Tensor:
+    """The loss that is minimised, as `Classifier.training_step` adds it up."""
+    return torch.stack(list(method.loss(net, batch, generator).values())).sum()

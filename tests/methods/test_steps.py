@@ -1,0 +1,225 @@
+"""A step costs what its forward passes cost: no waiting for the device, no loop over clouds.
+
+Methods are run on torch's `meta` device. Its tensors have shapes but no values, so whatever asks
+for a value fails: `.item()`, `.tolist()`, `.cpu()`, `if tensor:`, indexing by a mask, `nonzero`. On
+a GPU all of these wait for it. And it takes the paths of `qs3.geometry` that a GPU takes: on the
+CPU sampling and neighbours go through numpy, cloud by cloud, which is not a method's business.
+Nets are tiny ones, for the same reason: what a backbone does is tested with it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from qs3.data.augment import Augment
+from qs3.methods.base import Method
+from tests.methods.cases import CASES, batch_of, total
+from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
+
+CONF = Path(__file__).parents[2] / "conf"
+parametrize = pytest.mark.parametrize("name", CASES)
+
+
+class Autocast(torch.autocast):
+    """`meta` has none: the CPU's stands in."""
+
+    def __init__(self, device_type: str, **settings: Any) -> None:
+        super().__init__("cpu" if device_type == "meta" else device_type, **settings)
+
+
+@pytest.fixture(autouse=True)
+def _autocast_on_meta(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "autocast", Autocast)
+
+
+class Constants(TorchFunctionMode):
+    """Notes tensors made of Python numbers: on a GPU they come from the CPU's memory."""
+
+    def __init__(self, carried: list[str]) -> None:
+        super().__init__()
+        self.carried = carried
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if func in (torch.tensor, torch.as_tensor) and not isinstance(args[0], Tensor):
+            self.carried.append(func.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+class Watch(TorchDispatchMode):
+    """Counts operations, and notes those that carry values from one device to another.
+
+    What was drawn from a generator may be carried: a generator is on the device of the batch, so
+    only here, where `meta` has none, do its numbers have to travel.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+        self.carried: list[str] = []
+        self._drawn: list[Tensor] = []  # kept, so that no other tensor gets their place
+        self._constants = Constants(self.carried)
+
+    def __enter__(self) -> Watch:
+        self._constants.__enter__()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        super().__exit__(*error)
+        self._constants.__exit__(*error)
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        result = func(*args, **(kwargs or {}))
+        given = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+        made = [x for x in tree_leaves(result) if isinstance(x, Tensor)]
+        self.counts[str(func)] += 1
+        drawn = all(any(x is d for d in self._drawn) for x in given)
+        if drawn and (given or "generator" in (kwargs or {})):
+            self._drawn += [x for x in made if x.device.type == "cpu"]
+        elif len({x.device for x in (*given, *made)}) > 1:
+            self.carried.append(str(func))
+        return result
+
+
+def _made(name: str) -> tuple[nn.Module, Method]:
+    net = tiny_pointdan() if name == "pointdan" else tiny_net()
+    method = CASES[name].make()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        method.prepare(net)
+    return net, method
+
+
+def _watched(name: str, b: int, n: int = 64) -> Watch:
+    """Forward and backward of one step on the device without values."""
+    net, method = _made(name)
+    net, method = net.to("meta"), method.to("meta")
+    batch = batch_of(CASES[name], method, b, n, CLASSES, "meta")
+    watch = Watch()
+    with watch:
+        total(method, net, batch, torch.Generator().manual_seed(0)).backward()
+    return watch
+
+
+def test_every_method_has_a_case() -> None:
+    targets = {
+        str(OmegaConf.load(path)["_target_"]).rsplit(".", 1)[-1]
+        for path in (CONF / "method").glob("*.yaml")
+        if "_target_" in OmegaConf.load(path)
+    }
+    assert len(targets) >= 7
+    assert targets <= {type(case.make()).__name__ for case in CASES.values()}
+
+
+@parametrize
+def test_no_value_is_asked_for_and_none_is_carried(name: str) -> None:
+    watch = _watched(name, b=4)
+    assert watch.carried == []
+    assert sum(watch.counts.values()) > 20  # it did watch
+
+
+@parametrize
+def test_operations_do_not_grow_with_the_batch(name: str) -> None:
+    assert _watched(name, b=4).counts == _watched(name, b=8).counts
+
+
+@parametrize
+def test_as_many_passes_as_stated(name: str) -> None:
+    """The benchmark compares with them; a pass is a call of the backbone."""
+    net, method = _made(name)
+    batch = batch_of(CASES[name], method, 4, 64, CLASSES)
+    calls = 0
+    backbone = net.backbone
+    real = "with_nodes" if name == "pointdan" else "forward"
+    call = getattr(backbone, real)
+
+    def counted(*args: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        return call(*args)
+
+    setattr(backbone, real, counted)
+    total(method, net, batch, torch.Generator().manual_seed(0))
+    assert calls == CASES[name].passes
+
+
+def test_augmentation_is_part_of_a_step() -> None:
+    """On the CPU, as its generator must be where its clouds are."""
+    augment = Augment(scale=1.2, shift=0.1)
+    counts = []
+    for b in (4, 8):
+        with Watch() as watch:
+            augment(torch.zeros(b, 16, 3), torch.Generator())
+        counts.append(watch.counts)
+    assert counts[0] == counts[1]
+    assert not any("_local_scalar_dense" in name or "nonzero" in name for name in counts[0])
+
+
+class _Wrong(Method):
+    """A loss with a fault of its own."""
+
+    def __init__(self, fault: str) -> None:
+        super().__init__()
+        self.fault = fault
+
+    def loss(
+        self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        points, y = batch["source"]["points"], batch["source"]["y_source"]
+        logits = net(points)
+        if self.fault == "item":
+            logits = logits * (1 + 0 * logits.detach().sum().item())
+        elif self.fault == "mask":
+            logits = logits[y >= 0]
+        elif self.fault == "cpu":
+            y = y.cpu().to(points.device)
+        elif self.fault == "if" and (y > 0).any():
+            logits = 2 * logits
+        elif self.fault == "constant":
+            logits = logits + torch.tensor([0.0] * CLASSES, device=points.device)
+        elif self.fault == "loop":
+            logits = torch.stack([row * 1.0 for row in logits])
+        return {"ce": nn.functional.cross_entropy(logits, y)}
+
+
+@pytest.mark.parametrize("fault", ["item", "mask", "cpu", "if", "constant"])
+def test_the_watch_sees_waiting(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CASES, fault, type(CASES["pcm"])(lambda: _Wrong(fault), 1))
+    try:
+        watch = _watched(fault, b=4)
+    except (RuntimeError, NotImplementedError):
+        return
+    assert watch.carried
+
+
+def test_the_watch_sees_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CASES, "loop", type(CASES["pcm"])(lambda: _Wrong("loop"), 1))
+    assert _watched("loop", b=4).counts != _watched("loop", b=8).counts
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@parametrize
+def test_a_gpu_is_never_waited_for(name: str) -> None:
+    net, method = _made(name)
+    net, method = net.cuda(), method.cuda()
+    batch = batch_of(CASES[name], method, 4, 64, CLASSES, "cuda")
+    generator = torch.Generator("cuda").manual_seed(0)
+    total(method, net, batch, generator).backward()  # loads libraries, which waits
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        total(method, net, batch, generator).backward()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

@@ -1,0 +1,178 @@
+"""What holds for every selector of `conf/selftraining`, whatever the table; and naive twins."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hypothesis import given
+from hypothesis import strategies as st
+
+import qs3.hydra_glue  # noqa: F401 (registers the resolvers)
+from qs3.hydra_glue import build
+from qs3.selftraining.cbst import Cbst
+from qs3.selftraining.scheme import Scheme
+from qs3.selftraining.selectors import Qbst, Spst
+from tests.selftraining.test_selectors_balanced import select
+from tests.training.toy import CONF
+
+NAMES = sorted(p.stem for p in (CONF / "selftraining").glob("*.yaml") if p.stem != "none")
+
+
+def scheme_of(name: str) -> Scheme:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return build(compose("train", [f"selftraining={name}"]).selftraining)
+
+
+SCHEMES = {name: scheme_of(name) for name in NAMES}
+schemes = st.sampled_from(sorted(SCHEMES))
+# Whole numbers from a small range: many ties, within a row and between rows.
+tables = st.lists(st.lists(st.integers(1, 9), min_size=3, max_size=3), min_size=1, max_size=40).map(
+    lambda rows: np.array([[x / sum(row) for x in row] for row in rows])
+)
+thetas = st.sampled_from([0.4, 0.5, 0.6, 0.8])
+
+
+def ids_of(p: np.ndarray) -> list[str]:
+    return [f"{i:02d}" for i in range(len(p))]
+
+
+def theta_for(name: str, theta: float) -> float:
+    """A threshold of the round; a scheme with thresholds of its own has none."""
+    return 0.0 if SCHEMES[name].theta == 0 else theta
+
+
+def test_all_are_here() -> None:
+    assert {"qbst", "spst", "cbst", "crst_lrent", "crst_mrkld", "random", "confident"} <= {*NAMES}
+    assert SCHEMES["crst_mrkld"].mrkld > 0
+
+
+@given(schemes, tables, thetas, st.integers(0, 9), st.randoms(use_true_random=False))
+def test_the_order_of_samples_does_not_matter(name, p, theta, round_, rng) -> None:
+    """The same ids with the same labels, hard or soft, and the same figures."""
+    selector, theta = SCHEMES[name].selector, theta_for(name, theta)
+    ids, order = ids_of(p), rng.sample(range(len(p)), len(p))
+    here, kept = select(selector, p, theta, ids, round_)
+    there, kept_there = select(selector, p[order], theta, [ids[i] for i in order], round_)
+    assert kept == kept_there
+    assert here.selected[order].tolist() == there.selected.tolist()
+    for figure in ("mu", "confident", "kept", "thresholds"):
+        np.testing.assert_array_equal(getattr(here, figure), getattr(there, figure))
+    if here.soft is not None:
+        np.testing.assert_array_equal(here.soft[order], there.soft)
+
+
+@given(schemes, tables, thetas)
+def test_no_pseudo_label_at_or_below_theta(name, p, theta) -> None:
+    theta = theta_for(name, theta)
+    selection, _ = select(SCHEMES[name].selector, p, theta, ids_of(p))
+    labels = p.argmax(axis=1) if selection.labels is None else selection.labels
+    assert (p[np.arange(len(p)), labels][selection.selected] > theta).all()
+    assert selection.kept.sum() == selection.selected.sum()
+
+
+# --- QBST ------------------------------------------------------------------------------------
+
+
+def qbst_by_hand(p: np.ndarray, theta: float, ids: list[str]) -> list[str]:
+    """One sample after the other, in fractions."""
+    above = [(i, int(row.argmax()), row.max()) for i, row in zip(ids, p, strict=True)]
+    above = [row for row in above if row[2] > theta]
+    kept = []
+    for k in range(p.shape[1]):
+        of_class = sorted((-c, i) for i, label, c in above if label == k)
+        mu = 1 - Fraction(len(of_class), len(above)) if above else Fraction(0)
+        kept += [f"{i}{k}" for _, i in of_class[: math.ceil(mu * len(of_class))]]
+    return sorted(kept)
+
+
+@given(tables, thetas)
+def test_qbst_is_its_naive_twin(p, theta) -> None:
+    assert select(Qbst(), p, theta, ids_of(p))[1] == " ".join(qbst_by_hand(p, theta, ids_of(p)))
+
+
+@given(tables, thetas, st.sampled_from(["descending", "ascending"]))
+def test_qbst_keeps_just_its_quota(p, theta, order) -> None:
+    """ceil(mu_k n_k), never more, and never fewer; counted in fractions."""
+    selection, _ = select(Qbst(order=order), p, theta, ids_of(p))
+    n_k = [int(n) for n in selection.confident]
+    quotas = [math.ceil((1 - Fraction(n, sum(n_k))) * n) if n else 0 for n in n_k]
+    assert selection.kept.tolist() == quotas
+
+
+@given(tables, thetas)
+def test_qbst_of_all_counts_never_exceeds_its_quota(p, theta) -> None:
+    selection, _ = select(Qbst(counts="all"), p, theta, ids_of(p))
+    counts, n = np.bincount(p.argmax(axis=1), minlength=3), int(selection.confident.sum())
+    for k in range(3):
+        mu = max(1 - Fraction(int(counts[k]), n), Fraction(0)) if n else Fraction(0)
+        assert float(mu) == pytest.approx(selection.mu[k], abs=1e-12)
+        assert selection.kept[k] <= math.ceil(mu * int(selection.confident[k]))
+
+
+@given(tables, thetas, st.integers(0, 2), st.integers(1, 5))
+def test_mu_falls_as_its_class_grows(p, theta, k, more) -> None:
+    """One more confident sample of class k: its mu falls, every other class's rises."""
+    sure = np.full((more, 3), 0.05)
+    sure[:, k] = 0.9
+    grown = np.concatenate([p, sure])
+    before, _ = select(Qbst(), p, theta, ids_of(p))
+    after, _ = select(Qbst(), grown, theta, ids_of(grown))
+    n_k, n = before.confident, before.confident.sum()
+    if n == 0:
+        return
+    others = np.arange(3) != k
+    assert after.confident[k] == n_k[k] + more
+    if n_k[k] < n:
+        assert after.mu[k] < before.mu[k]
+    else:  # the only class: its mu is 0 and stays so
+        assert after.mu[k] == before.mu[k] == 0
+    assert (after.mu[others] >= before.mu[others]).all()
+    assert (after.mu[others] > before.mu[others])[n_k[others] > 0].all()
+
+
+# --- SPST ------------------------------------------------------------------------------------
+
+
+def test_spst_worked_by_hand() -> None:
+    # theta = .6: a and d exceed it, b is just at it; c's two likeliest classes tie at .5
+    table = [[0.7, 0.2, 0.1], [0.6, 0.3, 0.1], [0.5, 0.5, 0.0], [0.1, 0.28, 0.62]]
+    selection, kept = select(Spst(), table, 0.6)
+    assert kept == "a0 d2"
+    assert selection.confident.tolist() == selection.kept.tolist() == [1, 0, 1]
+    assert select(Spst(), table, 0.49)[1] == "a0 b0 c0 d2"  # a tie is of the lowest class
+    assert select(Spst(), table, 0.7)[1] == ""
+
+
+@given(tables, thetas, thetas)
+def test_spst_keeps_less_as_theta_grows(p, low, high) -> None:
+    low, high = min(low, high), max(low, high)
+    more, fewer = (select(Spst(), p, theta, ids_of(p))[0].selected for theta in (low, high))
+    assert (more | ~fewer).all()
+
+
+# --- CBST ------------------------------------------------------------------------------------
+
+
+def cbst_by_hand(p: np.ndarray, portion: float, ids: list[str]) -> list[str]:
+    """Class after class, sample after sample."""
+    thresholds = []
+    for k in range(p.shape[1]):
+        scores = sorted((row.max() for row in p if row.argmax() == k), reverse=True)
+        rank = math.floor(Fraction(str(portion)) * len(scores))
+        thresholds.append(scores[rank - 1] if rank else 1.0)
+    kept = []
+    for i, row in zip(ids, p, strict=True):
+        quotients = [x / t for x, t in zip(row, thresholds, strict=True)]
+        if max(quotients) >= 1:
+            kept.append(f"{i}{quotients.index(max(quotients))}")
+    return sorted(kept)
+
+
+@given(tables, st.sampled_from([0.2, 0.3, 0.45, 0.5]))
+def test_cbst_is_its_naive_twin(p, portion) -> None:
+    kept = select(Cbst(portion=portion), p, 0.0, ids_of(p))[1]
+    assert kept == " ".join(cbst_by_hand(p, portion, ids_of(p)))

@@ -1,0 +1,19 @@
+"""A toy net with features of clouds and points, for methods that put heads on them."""
+
+from __future__ import annotations
+
+from qs3.models.base import ClassHead, PointClassifier
+from qs3.models.pointdan import TwoHeads
+from tests.methods.shapes import TinyBackbone, TinyNodes
+
+
+def featured(num_classes: int) -> PointClassifier:
+    """With batch norm and dropout, like the real nets."""
+    backbone = TinyBackbone()
+    head = ClassHead(backbone.feature_dim, num_classes, hidden=(16,), dropout=0.3)
+    return PointClassifier(backbone, head)
+
+
+def with_nodes(num_classes: int) -> PointClassifier:
+    """PointDAN's in small."""
+    return PointClassifier(TinyNodes(), TwoHeads(TinyNodes.feature_dim, num_classes))

@@ -1,0 +1,167 @@
+"""What a phase begins with and leaves: fresh students, whole checkpoints, a teacher apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import open_dict
+
+from qs3 import runs
+from qs3.checkpoints import load
+from qs3.data.datamodule import Unlabelled, load_clouds
+from qs3.data.store import open_pointset
+from qs3.evaluation import predict
+from qs3.hydra_glue import build
+from qs3.run import train
+from qs3.selftraining.callback import SelfTraining
+from qs3.selftraining.table import read_pseudo_labels
+from tests.training.toy import CLASSES, toy_config
+
+# 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1
+STARTS, ENDS = (0, 4, 7), (3, 6, 9)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A finished run, and what `watching.Keep` kept of it."""
+
+    cfg: Any
+    folder: Path
+    kept: Path
+    metrics: dict[str, Any]
+    target: Unlabelled
+
+    def before(self, epoch: int, batch: int = 0) -> dict[str, Any]:
+        return load(self.kept / f"{epoch}-{batch}.pt")
+
+    def checkpoint(self, epoch: int) -> dict[str, Any]:
+        return load(self.kept / f"{epoch}.ckpt")
+
+    def net(self, epoch: int) -> dict[str, torch.Tensor]:
+        """The weights in an epoch's checkpoint."""
+        state = self.checkpoint(epoch)["state_dict"]
+        return {k.removeprefix("net."): v for k, v in state.items() if k.startswith("net.")}
+
+
+def kept_run(root: Path, toy_data: Path, *settings: str) -> Kept:
+    cfg = toy_config(root, f"paths.data_dir={toy_data}", *settings)
+    with open_dict(cfg):
+        target = "tests.training.watching.Keep"
+        cfg.callbacks.progress = {"_target_": target, "folder": str(root / "kept")}
+    metrics = train(cfg)
+    clouds = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32)
+    return Kept(cfg, runs.run_folder(cfg), root / "kept", metrics, clouds)
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
+    return kept_run(tmp_path_factory.mktemp("scratch"), toy_data)
+
+
+@pytest.fixture(scope="module")
+def continued(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
+    root = tmp_path_factory.mktemp("continued")
+    return kept_run(root, toy_data, "selftraining=spst", "selftraining.theta=0.35")
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    assert a.keys() == b.keys()
+    return all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_each_student_is_new(scratch: Kept) -> None:
+    first = [scratch.before(epoch)["weights"] for epoch in STARTS]
+    norms = {k: v for k, v in first[0].items() if "running" in k or "num_batches" in k}
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert not torch.equal(first[a]["lift.weight"], first[b]["lift.weight"])
+        assert not torch.equal(first[a]["head.weight"], first[b]["head.weight"])
+    for weights in first:  # no statistics of the teacher's
+        assert all(torch.equal(weights[key], value) for key, value in norms.items())
+        assert weights["norm.num_batches_tracked"] == 0
+    for start, end in zip(STARTS[1:], ENDS, strict=False):
+        assert not same(scratch.before(start)["weights"], scratch.net(end))
+
+
+@pytest.mark.parametrize("name", ["scratch", "continued"])
+def test_the_optimiser_begins_anew(name: str, request: pytest.FixtureRequest) -> None:
+    run: Kept = request.getfixturevalue(name)
+    for start in STARTS:
+        assert run.before(start)["moments"] == 0
+        assert run.before(start, 1)["moments"] > 0
+        assert run.before(start + 1)["moments"] > 0  # in a phase's other epochs they are kept
+
+
+@pytest.mark.parametrize("name", ["scratch", "continued"])
+def test_the_schedule_begins_anew(name: str, request: pytest.FixtureRequest) -> None:
+    run: Kept = request.getfixturevalue(name)
+    rates = [run.before(epoch)["rates"][0] for epoch in range(10)]
+    for start, end in zip(STARTS, ENDS, strict=True):
+        assert rates[start] == 0.02
+        phase = rates[start : end + 1]
+        assert phase == sorted(phase, reverse=True)
+        assert len(set(phase)) == len(phase)
+
+
+@pytest.mark.parametrize("name", ["scratch", "continued"])
+def test_checkpoints_hold_what_was_trained(name: str, request: pytest.FixtureRequest) -> None:
+    """At the end of a phase, too: steps of its own in the optimiser, trained weights."""
+    run: Kept = request.getfixturevalue(name)
+    for epoch in range(10):
+        start = max(s for s in STARTS if s <= epoch)
+        checkpoint = run.checkpoint(epoch)
+        assert checkpoint["epoch"] == epoch
+        steps = {int(s["step"]) for s in checkpoint["optimizer_states"][0]["state"].values()}
+        batches = sum(len(list(run.kept.glob(f"{e}-*.pt"))) for e in range(start, epoch + 1))
+        assert steps == {batches}
+        assert not same(run.net(epoch), run.before(start)["weights"])
+        if epoch + 1 not in (*STARTS, 10):  # the next epoch goes on with just these
+            assert same(run.net(epoch), run.before(epoch + 1)["weights"])
+    assert same(run.net(9), load(run.folder / "student.pt"))
+    assert same(run.net(3), load(run.folder / "warmup_last.pt"))
+
+
+def table_by(run: Kept, weights: dict[str, torch.Tensor]) -> list[tuple[str, str, float]]:
+    net = build(run.cfg.model)
+    net.load_state_dict(weights)
+    p = predict(net, run.target.points, 64)
+    labels = (CLASSES[k] for k in p.argmax(axis=1))
+    return list(zip(run.target.ids, labels, p.max(axis=1).tolist(), strict=True))
+
+
+@pytest.mark.parametrize("name", ["scratch", "continued"])
+def test_each_round_is_labelled_by_its_teacher(name: str, request: pytest.FixtureRequest) -> None:
+    """Round 0 by the warm-up's selected epoch, although the last one stands in the trainer."""
+    run: Kept = request.getfixturevalue(name)
+    selected = load(run.folder / "warmup_selected.pt")
+    epoch = run.metrics["warmup"]["selected"]["epoch"]
+    assert epoch < ENDS[0]
+    assert same(selected, run.net(epoch))
+    for round_, teacher in ((0, selected), (1, run.net(ENDS[1]))):
+        file = run.folder / f"round_{round_:02d}" / "pseudo_labels.csv"
+        table = [(row.id, row.label, row.confidence) for row in read_pseudo_labels(file)]
+        assert table == table_by(run, teacher)
+        assert table != table_by(run, run.net(ENDS[0]))
+
+
+def test_labelling_leaves_the_model_alone(toy, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = 0
+
+    def select(self: Any, trainer: Any, module: Any, *args: Any, real=SelfTraining._select, **more):
+        nonlocal seen
+        seen += 1
+        before = {k: v.clone() for k, v in module.state_dict().items()}
+        moments = {id(p): len(s) for p, s in trainer.optimizers[0].state.items()}
+        training, state = module.training, torch.get_rng_state()
+        real(self, trainer, module, *args, **more)
+        assert same(before, module.state_dict())
+        assert moments == {id(p): len(s) for p, s in trainer.optimizers[0].state.items()}
+        assert module.training == training
+        assert torch.equal(state, torch.get_rng_state())
+
+    monkeypatch.setattr(SelfTraining, "_select", select)
+    train(toy())
+    assert seen == 2

@@ -1,0 +1,96 @@
+"""Every scheme of self-training and every method, stopped in the middle of an epoch and continued.
+
+`test_resume` stops one run in every possible place; here every kind of run is stopped in one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import open_dict
+
+from qs3 import runs
+from qs3.checkpoints import load
+from qs3.run import train
+from tests.training.conftest import result_of
+from tests.training.toy import CONF
+from tests.training.watching import Stop
+
+# 7 epochs: 0-2 warm-up, 3-4 round 0, 5-6 round 1
+SHORT = ("protocol.epochs=3", "selftraining.epochs=2")
+FIRST, LAST = 3, 6
+FEATURED = "model._target_=tests.training.nets.featured"
+NODES = "model._target_=tests.training.nets.with_nodes"
+FREE = "selftraining.theta=0"  # CBST has thresholds of its own
+SCHEMES = {
+    "qbst": ("selftraining=qbst",),
+    "spst": ("selftraining=spst", "selftraining.weight_step=0.1"),
+    "cbst": ("selftraining=cbst", FREE),
+    "crst_lrent": ("selftraining=crst_lrent", FREE),
+    "crst_mrkld": ("selftraining=crst_mrkld", FREE),
+    "random": ("selftraining=random",),
+    "confident": ("selftraining=confident",),
+    "continued_alone": ("selftraining=qbst", "selftraining.init=continue", "selftraining.pcm=true"),
+}
+METHODS = {
+    "source_only": ("method=source_only",),
+    "dann": ("method=dann", FEATURED),
+    "defrec_pcm": ("method=defrec_pcm", "method.min_points=2", FEATURED),
+    "gast": ("method=gast", "method.min_points=2", FEATURED),
+    "pointdan": ("method=pointdan", NODES),
+    "supervised": ("method=supervised",),
+}
+
+
+def check(toy: Any, tmp_path: Path, settings: tuple[str, ...], *epochs: int) -> None:
+    """Stopped after the first batch of each of `epochs`, a run ends as if it had not been."""
+    whole, broken = (toy(*settings, f"paths.log_dir={tmp_path / x}") for x in ("whole", "broken"))
+    train(whole)
+    for epoch in epochs:
+        stopping = broken.copy()
+        with open_dict(stopping):
+            stopping.callbacks.progress = {
+                "_target_": "tests.training.watching.StopIn",
+                "epoch": epoch,
+            }
+        with pytest.raises(Stop):
+            train(stopping)
+        assert load(runs.run_folder(broken) / "last.ckpt")["epoch"] == epoch - 1
+    train(broken)
+    ours, theirs = runs.run_folder(broken), runs.run_folder(whole)
+    assert result_of(ours) == result_of(theirs)
+    for name in ("warmup_selected.pt", "student.pt"):
+        weights = load(theirs / name)
+        assert all(torch.equal(load(ours / name)[key], value) for key, value in weights.items())
+    state = load(theirs / "last.ckpt")["state_dict"]  # the method's heads, too
+    ours_state = load(ours / "last.ckpt")["state_dict"]
+    assert all(torch.equal(ours_state[key], value) for key, value in state.items())
+
+
+def fast_are(fast: set[str], names: dict[str, Any]) -> list[Any]:
+    return [pytest.param(n, marks=[] if n in fast else pytest.mark.slow) for n in names]
+
+
+@pytest.mark.parametrize("name", fast_are({"spst", "crst_lrent", "random"}, SCHEMES))
+def test_every_scheme_goes_on_in_the_middle_of_a_round(toy, tmp_path, name):
+    check(toy, tmp_path, (*SHORT, *SCHEMES[name]), FIRST, LAST)
+
+
+@pytest.mark.parametrize("name", fast_are({"gast", "pointdan"}, METHODS))
+def test_every_method_goes_on_in_the_middle_of_the_warmup(toy, tmp_path, name):
+    check(toy, tmp_path, ("protocol.epochs=3", "selftraining=none", *METHODS[name]), 1)
+
+
+def test_every_config_of_both_groups_is_tried():
+    groups = {"selftraining": {"none"}, "method": set()}
+    for settings in (*SCHEMES.values(), *METHODS.values()):
+        for setting in settings:
+            group, _, choice = setting.partition("=")
+            if group in groups:
+                groups[group].add(choice)
+    groups["method"] |= {"pcm", "defrec"}  # of all schemes; of defrec_pcm
+    for group, tried in groups.items():
+        assert {path.stem for path in (CONF / group).glob("*.yaml")} == tried

@@ -1,0 +1,127 @@
+"""Callbacks that look on: put at `callbacks.progress`, which no hash covers, in real processes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback
+
+from qs3.checkpoints import copy_weights, save
+
+
+class Watch(Callback):
+    """Writes what each process trains on, and its weights: `<folder>/<epoch>-<process>.pt`.
+
+    A file holds "clouds" (by domain: positions in the training split, in the order in which they
+    came; found by their coordinates, so augmentation must be off), "selection" (indices and labels
+    as the process holds them) and "weights" at the end of the epoch.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.seen: dict[str, list[int]] = {}
+
+    def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
+        self.seen = {"source": [], "target": []}
+
+    def on_train_batch_start(
+        self, trainer: Any, pl_module: Any, batch: dict[str, Any], batch_idx: int
+    ) -> None:
+        data = trainer.datamodule
+        for domain, clouds in (("source", data.labelled.clouds), ("target", data.target.clouds)):
+            if domain in batch:
+                same = (batch[domain]["points"][:, None] == clouds.all()[None]).all(dim=(2, 3))
+                assert (same.sum(1) == 1).all()
+                self.seen[domain] += same.int().argmax(1).tolist()
+
+    def on_train_epoch_end(self, trainer: Any, pl_module: Any) -> None:
+        """Before the rounds' callback selects: what this epoch was trained on."""
+        file = self.folder / f"{trainer.current_epoch}-{trainer.global_rank}.pt"
+        index, labels = trainer.datamodule.pseudo or (None, None)
+        save(
+            {
+                "clouds": self.seen,
+                "selection": {"index": index, "labels": labels},
+                "weights": copy_weights(pl_module.net),
+            },
+            file,
+        )
+
+
+class Keep(Callback):
+    """Copies each epoch's checkpoint to `<folder>/<epoch>.ckpt`, before the next one begins.
+
+    Beside it, in `<folder>/<epoch>-<batch>.pt`: weights, optimiser and rates before each batch.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def _copy(self, trainer: Any, epoch: int) -> None:
+        last = Path(trainer.default_root_dir) / "last.ckpt"
+        if last.is_file():
+            shutil.copy(last, self.folder / f"{epoch}.ckpt")
+
+    def on_train_epoch_start(self, trainer: Any, pl_module: Any) -> None:
+        self._copy(trainer, trainer.current_epoch - 1)
+
+    def on_train_end(self, trainer: Any, pl_module: Any) -> None:
+        self._copy(trainer, trainer.max_epochs - 1)
+
+    def on_train_batch_start(
+        self, trainer: Any, pl_module: Any, batch: dict[str, Any], batch_idx: int
+    ) -> None:
+        (optimizer,) = trainer.optimizers
+        save(
+            {
+                "weights": copy_weights(pl_module.net),
+                "moments": len(optimizer.state),
+                "rates": [group["lr"] for group in optimizer.param_groups],
+            },
+            self.folder / f"{trainer.current_epoch}-{batch_idx}.pt",
+        )
+
+
+class KillAt(Callback):
+    """Kills its process, as a power cut does, after a batch of an epoch."""
+
+    def __init__(self, epoch: int, batch: int) -> None:
+        self.epoch, self.batch = epoch, batch
+
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if (trainer.current_epoch, batch_idx) == (self.epoch, self.batch):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Stop(Exception):
+    """Stands for a kill."""
+
+
+class StopIn(Callback):
+    """Raises `Stop` in the middle of an epoch: after its first batch, of several."""
+
+    def __init__(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if trainer.current_epoch == self.epoch:
+            assert trainer.num_training_batches > 1
+            raise Stop
+
+
+def seen_by(folder: Path, epoch: int, processes: int = 2) -> list[dict[str, Any]]:
+    """What `Watch` wrote of an epoch, by process."""
+    return [
+        torch.load(folder / f"{epoch}-{rank}.pt", weights_only=True) for rank in range(processes)
+    ]
