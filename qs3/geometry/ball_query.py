@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from qs3.errors import DataError
+from qs3.geometry.exporting import takes_numpy
 
 _BLOCK = 1 << 26  # distances held at once on a device: 256 MB in float32
 _CPU_BLOCK = 1 << 18  # 1 MB in float32, to stay in the cache
@@ -58,7 +59,7 @@ def ball_queries(
         b, n, _ = points.shape
         m = centres.shape[1]
         out = [torch.empty(b, m, k, dtype=torch.int64, device=points.device) for k in counts]
-        on_cpu = points.device.type == "cpu"
+        on_cpu = takes_numpy(points)
         rows = max(1, min(m, (_CPU_BLOCK if on_cpu else _BLOCK) // n))
         clouds = max(1, (_CPU_BLOCK if on_cpu else _BLOCK) // (n * rows))
         for i in range(0, b, clouds):

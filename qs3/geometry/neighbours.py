@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from qs3.geometry.exporting import takes_numpy
 from qs3.geometry.products import times
 from qs3.geometry.sampling import farthest_point_sampling_np
 
@@ -33,7 +34,7 @@ def knn(x: Float[Tensor, "b n c"], k: int) -> Int[Tensor, "b n k"]:
     with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
         if x.dtype in (torch.float16, torch.bfloat16):
             x = x.float()
-        if x.device.type == "cpu" and x.shape[2] == 3 and n >= _TREE_FROM:
+        if takes_numpy(x) and x.shape[2] == 3 and n >= _TREE_FROM:
             return _knn_tree(x, k)
         return _knn_dense(x - x.mean(dim=1, keepdim=True), k)
 
@@ -49,7 +50,7 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
     b, n, _ = x.shape
     squares = x.square().sum(2)[:, None]  # [b, 1, n]
     scaled = -2 * x
-    on_cpu = x.device.type == "cpu"
+    on_cpu = takes_numpy(x)
     block = _CPU_BLOCK if on_cpu else _BLOCK
     smallest = _smallest_on_cpu if on_cpu else _smallest
     rows = max(1, min(n, block // n))
@@ -116,7 +117,7 @@ def farthest_point_sampling(
     decides, elsewhere the lowest index). Indices are distinct, copies of taken points come last.
     With n > N the order of all N points starts over.
     """
-    if x.device.type != "cpu":
+    if not takes_numpy(x):
         return _farthest_points(x, n, start)
     starts = torch.as_tensor(start).expand(len(x)).tolist()
     clouds = zip(x.detach().float().numpy(), starts, strict=True)

@@ -30,9 +30,16 @@ def _find() -> Any:
 _LINEAR = _find()
 
 
+def _applies(x: Tensor) -> bool:
+    """Whether the operator is there and for this; torch's compiler takes it for its own."""
+    if _LINEAR is None or torch.compiler.is_compiling():
+        return False
+    return x.dtype == torch.float32 and x.device.type == "cpu" and x.numel() > 0
+
+
 def times(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The product x W' + bias: [..., k], [c, k] and [c] to [..., c]."""
-    if _LINEAR is not None and x.dtype == torch.float32 and x.device.type == "cpu" and x.numel():
+    if _applies(x):
         return _LINEAR(x, weight, bias, "none", [], "")
     product = x @ weight.T
     return product if bias is None else product.add_(bias)
@@ -63,6 +70,4 @@ class _Linear(torch.autograd.Function):
 
 def linear(x: Tensor, weight: Tensor) -> Tensor:
     """The product x W', differentiable once: [..., k] and [c, k] to [..., c]."""
-    if _LINEAR is None or x.dtype != torch.float32 or x.device.type != "cpu" or not x.numel():
-        return F.linear(x, weight)
-    return _Linear.apply(x, weight)
+    return _Linear.apply(x, weight) if _applies(x) else F.linear(x, weight)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -94,11 +94,22 @@ class PointClassifier(nn.Module):
         """Logits."""
         return self.head(self.features(points).global_)
 
+    def compile(self, *args: Any, **settings: Any) -> None:
+        """`nn.Module.compile` of backbone and head, in place: methods call them by themselves."""
+        self.backbone.compile(*args, **settings)
+        self.head.compile(*args, **settings)
+
 
 def check_points(points: Tensor) -> None:
-    """Raise `DataError`, naming the item, unless `points` is a finite, not empty [B, N, 3]."""
+    """Raise `DataError`, naming the item, unless `points` is a finite, not empty [B, N, 3].
+
+    A training step on a device would wait for the answer in each of its passes, so there values
+    are looked at on the CPU and in evaluation alone: what is trained on was checked by the store.
+    """
     if points.ndim != 3 or points.shape[2] != 3 or points.shape[1] == 0:
         raise DataError(f"expected points [B, N >= 1, 3], got {list(points.shape)}")
+    if points.device.type != "cpu" and torch.is_grad_enabled():
+        return
     if torch.isfinite(points).all():
         return
     bad = (~torch.isfinite(points)).flatten(1).sum(1)  # [B]

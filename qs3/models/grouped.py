@@ -73,9 +73,9 @@ class GroupedMLP(nn.Module):
         parameters = []
         for weight, norm in zip(weights, norms, strict=True):
             parameters += [weight, norm.weight, norm.bias]
-        running = None
-        if not uses_batch(self.norms[0]):
-            running = [(norm.running_mean, norm.running_var) for norm in norms]
+        running = [
+            None if uses_batch(norm) else (norm.running_mean, norm.running_var) for norm in norms
+        ]
         out, statistics = grouped_maximum(
             xyz, centres, p, index, norms[0].eps, running, *parameters
         )

@@ -42,7 +42,7 @@ def grouped_maximum(
     p: Tensor | None,
     index: Tensor,
     eps: float,
-    running: Sequence[tuple[Tensor, Tensor]] | None,
+    running: Sequence[tuple[Tensor, Tensor] | None],
     *parameters: Tensor,
 ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
     """The maximum over each group of its mapped members.
@@ -53,7 +53,7 @@ def grouped_maximum(
         p: [R, C] the first convolution of the points' features, or None if they have none.
         index: [G, K] int64 rows of `xyz` and `p`.
         eps: of the norms.
-        running: mean and variance [C] of each norm (evaluation), or None: those of the members.
+        running: for each norm its mean and variance [C] (evaluation), or None: the members'.
         *parameters: weight [C', C], gamma and beta of each layer, at least two; the first weight
             is [C, 3], of the coordinates.
 
@@ -158,33 +158,32 @@ class _GroupedMaximum(torch.autograd.Function):
         p: Tensor | None,
         index: Tensor,
         eps: float,
-        running: Sequence[tuple[Tensor, Tensor]] | None,
+        running: Sequence[tuple[Tensor, Tensor] | None],
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         weights, gammas, betas = parameters[0::3], parameters[1::3], parameters[2::3]
         source = _Members(xyz, centres, p, index, weights[0])
         groups, members = index.shape
-        given = running or []
-        training = running is None
+        training = [given is None for given in running]
         layers: list[_Layer] = []
         parts = _parts(groups, members * max(len(weight) for weight in weights))
         z: list[Tensor] = []  # of the layers between, part by part
 
         def norm(moments: _Moments) -> None:
             i = len(layers)
-            mean, var = moments.result() if training else given[i]
+            mean, var = running[i] or moments.result()
             layers.append(_Layer(gammas[i], betas[i], mean, var, eps))
 
         moments = _Moments()
-        for part in parts if training else []:
+        for part in parts if training[0] else []:
             moments.add(source(part))
         norm(moments)
-        for weight in weights[1:-1]:
+        for level, weight in enumerate(weights[1:-1], 1):
             moments, make = _Moments(), _maker(source, layers, z, parts)
             after = []
             for i in range(len(parts)):
                 after.append(times(make(i), weight))
-                if training:
+                if training[level]:
                     moments.add(after[i])
             z += after
             norm(moments)
@@ -197,17 +196,17 @@ class _GroupedMaximum(torch.autograd.Function):
         for i, part in enumerate(parts):
             y = make(i)
             best[part], where[part] = max_over_rows(times(y, signed))
-            if training:
+            if training[-1]:
                 covariance.add(y)
         best *= sign
-        if training:
+        if running[-1] is None:
             mean, cov = covariance.result()
             wide = weight.double()
             z_var = ((wide @ cov) * wide).sum(1).clamp_min(0).to(xyz.dtype)
             z_mean = (wide @ mean).to(xyz.dtype)
             ctx.mean, ctx.cov = mean, cov
         else:
-            z_mean, z_var = given[-1]
+            z_mean, z_var = running[-1]
         layers.append(_Layer(gammas[-1], betas[-1], z_mean, z_var, eps))
         out = F.relu(best * layers[-1].h + layers[-1].s)
         ctx.save_for_backward(xyz, centres, p, index, best, where, *weights, *z)
@@ -233,7 +232,7 @@ class _GroupedMaximum(torch.autograd.Function):
         dgamma, dbeta, scale, b, _ = last.gradient(grad.sum(0), (grad * best).sum(0), rows)
         at_max = grad * scale  # D
         dweight = torch.zeros_like(weight)
-        if ctx.training:
+        if ctx.training[-1]:
             a = -scale * dbeta / rows
             mean = ctx.mean.to(weight.dtype)
             product = weight.T @ (weight * b[:, None])  # W' diag(b) W, symmetric
@@ -245,7 +244,7 @@ class _GroupedMaximum(torch.autograd.Function):
         dy: list[Tensor] = []
         for i, part in enumerate(parts):
             y = make(i)
-            out = times(y, product, bias) if ctx.training else torch.zeros_like(y)
+            out = times(y, product, bias) if ctx.training[-1] else torch.zeros_like(y)
             _at_maxima(out, dweight, y, weight, at_max[part], where[part])
             out.mul_(y > 0)
             sums.add(out, z[len(z) - len(parts) + i] if z else source(part))
@@ -260,7 +259,7 @@ class _GroupedMaximum(torch.autograd.Function):
             make, sums = _maker(source, layers[:level], z, parts), _Sums()
             dweight = torch.zeros_like(weight)
             for i, part in enumerate(parts):
-                dz = _dz(dy[i], here[i], affine, ctx.training)
+                dz = _dz(dy[i], here[i], affine, ctx.training[level])
                 y = make(i)
                 dweight += outer(dz.flatten(0, 1), y.flatten(0, 1))
                 out = times(dz, transposed).mul_(y > 0)
@@ -276,7 +275,8 @@ class _GroupedMaximum(torch.autograd.Function):
         dweight = torch.zeros_like(weights[0])
         for i, part in enumerate(parts):
             relative = source.relative(part)
-            dz = _dz(dy[i], source.first(part, relative), affine, ctx.training).flatten(0, 1)
+            z_first = source.first(part, relative)
+            dz = _dz(dy[i], z_first, affine, ctx.training[0]).flatten(0, 1)
             dweight += outer(dz, relative)
             if dxyz is not None or dcentres is not None:
                 drelative = dz @ weights[0]  # [g * k, 3]

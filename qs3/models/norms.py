@@ -1,8 +1,8 @@
 """Norms by name, and what adaptation does with them: one a domain, or estimated anew.
 
 - "batch": batch norm; its running statistics serve in eval.
-- "instance": over each cloud alone, in eval too (Ulyanov et al., 2016). In class heads, where a
-  cloud is one vector and has no statistics, it is batch norm.
+- "instance": over each cloud (of SimpleView, each image) alone, in eval too (Ulyanov et al., 2016).
+  In class heads, where a cloud is one vector and has no statistics, it is batch norm.
 - "domain": a whole batch norm for each domain, statistics and affine, as in DSBN (Chang et al.,
   "Domain-Specific Batch Normalization for Unsupervised Domain Adaptation", CVPR 2019, eq. 3).
 - "domain_statistics": statistics for each domain, one affine for both.
@@ -17,12 +17,15 @@ from contextlib import contextmanager
 from weakref import WeakKeyDictionary
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError
 
 KINDS = ("batch", "instance", "domain", "domain_statistics")
 DOMAINS = ("source", "target")
+_Norm = nn.modules.batchnorm._NormBase
+_BatchNorm = nn.modules.batchnorm._BatchNorm
 _LAST_COUNT: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()  # of `track`, for AdaBN
 
 
@@ -32,22 +35,24 @@ class DomainNorm(nn.Module):
     Args:
         channels: C, of [R, C] or [B, C, N].
         shared_affine: the domains share scale and shift (and both names hold the same parameter).
+        images: it is for [B, C, H, W] instead.
     """
 
-    def __init__(self, channels: int, *, shared_affine: bool = False) -> None:
+    def __init__(self, channels: int, *, shared_affine: bool = False, images: bool = False) -> None:
         super().__init__()
-        self.source, self.target = nn.BatchNorm1d(channels), nn.BatchNorm1d(channels)
+        plain = nn.BatchNorm2d if images else nn.BatchNorm1d
+        self.source, self.target = plain(channels), plain(channels)
         if shared_affine:
             self.target.weight, self.target.bias = self.source.weight, self.source.bias
         self.domain = "source"
 
     @property
-    def current(self) -> nn.BatchNorm1d:
+    def current(self) -> nn.BatchNorm1d | nn.BatchNorm2d:
         """The norm of the current domain."""
         return self.target if self.domain == "target" else self.source
 
     def forward(self, x: Tensor) -> Tensor:
-        """As `nn.BatchNorm1d`."""
+        """As the current domain's batch norm."""
         return self.current(x)
 
     def extra_repr(self) -> str:
@@ -55,18 +60,20 @@ class DomainNorm(nn.Module):
         return f"domain={self.domain}"
 
 
-def make_norm(kind: str, channels: int) -> nn.Module:
-    """The norm of that name for [R, C] (not "instance") or [B, C, N].
+def make_norm(kind: str, channels: int, *, images: bool = False) -> nn.Module:
+    """The norm of that name for [R, C] (not "instance") or [B, C, N], or for `images` [B, C, H, W].
 
     Layers that compute the statistics themselves take parameters and running statistics from
     `active(norm)` and hand in what they found with `track`.
     """
     if kind == "batch":
-        return nn.BatchNorm1d(channels)
+        return nn.BatchNorm2d(channels) if images else nn.BatchNorm1d(channels)
     if kind == "instance":
-        return nn.InstanceNorm1d(channels, affine=True)
+        plain = nn.InstanceNorm2d if images else nn.InstanceNorm1d
+        return plain(channels, affine=True)
     if kind in KINDS:
-        return DomainNorm(channels, shared_affine=kind == "domain_statistics")
+        shared = kind == "domain_statistics"
+        return DomainNorm(channels, shared_affine=shared, images=images)
     names = ", ".join(f"'{k}'" for k in KINDS)
     raise ConfigError(f"norm must be one of {names}, got {kind!r}")
 
@@ -76,11 +83,18 @@ def head_norm(kind: str) -> str:
     return "batch" if kind == "instance" else kind
 
 
-def active(norm: nn.Module) -> nn.BatchNorm1d | nn.InstanceNorm1d:
+def active(norm: nn.Module) -> _Norm:
     """The plain norm that a pass uses now: of the current domain, if `norm` has several."""
     found = norm.current if isinstance(norm, DomainNorm) else norm
-    assert isinstance(found, nn.BatchNorm1d | nn.InstanceNorm1d)
+    assert isinstance(found, _Norm)
     return found
+
+
+def norm_rows(norm: nn.Module, rows: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
+    """Rows [R, C] through a norm; of an instance norm they are the places of one cloud."""
+    if isinstance(norm, nn.InstanceNorm1d):
+        return norm(rows.T).T  # it takes [c, r]
+    return norm(rows)
 
 
 def uses_batch(norm: nn.Module) -> bool:
@@ -147,7 +161,7 @@ def norms_for(net: nn.Module, domain: str) -> str:
 class _Pooled:
     """Mean and biased variance of a norm's input over all batches (Chan et al., 1979), float64."""
 
-    def __init__(self, norm: nn.BatchNorm1d) -> None:
+    def __init__(self, norm: _BatchNorm) -> None:
         assert norm.running_mean is not None
         self.norm, self.seen = norm, 0
         self.total = 0
@@ -196,7 +210,7 @@ def adapt_batchnorm(
         The adapted norms.
 
     Raises:
-        ConfigError: `exact`, and the net has norms that cannot be asked one by one.
+        ConfigError: a norm takes no statistics in a pass, so there are none to store.
         DataError: there are no batches.
     """
     norms = _running(net)
@@ -204,10 +218,7 @@ def adapt_batchnorm(
     momenta = [norm.momentum for norm in norms]
     try:
         for group in [[norm] for norm in norms] if exact else [norms]:
-            net.eval()
-            if not exact:
-                for module in net.modules():
-                    module.training = not isinstance(module, nn.modules.dropout._DropoutNd)
+            net.eval()  # no dropout, and nothing else that is left to chance
             for norm in group:
                 norm.training, norm.momentum = True, 1.0
             _estimate(net, group, batches)
@@ -219,19 +230,18 @@ def adapt_batchnorm(
     return list(norms)
 
 
-def _running(net: nn.Module) -> list[nn.BatchNorm1d]:
+def _running(net: nn.Module) -> list[_BatchNorm]:
     """Norms with running statistics that a pass would use now."""
     asleep = {
         norm.source if norm.domain == "target" else norm.target
         for norm in net.modules()
         if isinstance(norm, DomainNorm)
     }
-    kind = nn.modules.batchnorm._BatchNorm
-    found = [m for m in net.modules() if isinstance(m, kind) and m.running_mean is not None]
-    return [norm for norm in found if norm not in asleep]  # type: ignore[misc]
+    found = [m for m in net.modules() if isinstance(m, _BatchNorm) and m.running_mean is not None]
+    return [norm for norm in found if norm not in asleep]
 
 
-def _estimate(net: nn.Module, norms: list[nn.BatchNorm1d], batches: Iterable[Tensor]) -> None:
+def _estimate(net: nn.Module, norms: list[_BatchNorm], batches: Iterable[Tensor]) -> None:
     pooled = [_Pooled(norm) for norm in norms]
 
     def count(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
@@ -241,17 +251,18 @@ def _estimate(net: nn.Module, norms: list[nn.BatchNorm1d], batches: Iterable[Ten
     seen = 0
     try:
         for points in batches:
-            before = [int(norm.num_batches_tracked) for norm in norms]  # type: ignore[arg-type]
+            for norm in norms:
+                _LAST_COUNT.pop(norm, None)
             net(points)
             seen += 1
-            for norm, pool, number in zip(norms, pooled, before, strict=True):
-                if norm.num_batches_tracked == number:
+            for norm, pool in zip(norms, pooled, strict=True):
+                if norm not in _LAST_COUNT:
+                    name = next(n for n, m in net.named_modules() if m is norm)
                     raise ConfigError(
-                        "a layer of this net takes statistics of all its norms together; "
-                        "use adapt_batchnorm(exact=False)"
+                        f"{name} takes no statistics in a pass; a layer that does not call its "
+                        "norm must use qs3.models.norms.track"
                     )
-                # a layer that neither calls its norm nor `track` has so many that n - 1 is n
-                pool.add(_LAST_COUNT.get(norm, len(points) * 1_000_000))
+                pool.add(_LAST_COUNT[norm])
     finally:
         for hook in hooks:
             hook.remove()

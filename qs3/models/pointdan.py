@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.base import Backbone, Features, PointClassifier
+from qs3.models.norms import head_norm, make_norm
 from qs3.models.pointnet import PointMLP
 
 
@@ -45,15 +46,21 @@ class NodeModule(nn.Module):
         nodes: M.
         neighbours: K; also the size of a ball.
         radius: of the balls, in the unit of the points.
+        norm: see `qs3.models.norms`.
     """
 
     def __init__(
-        self, channels: int = 64, nodes: int = 64, neighbours: int = 64, radius: float = 0.3
+        self,
+        channels: int = 64,
+        nodes: int = 64,
+        neighbours: int = 64,
+        radius: float = 0.3,
+        norm: str = "batch",
     ) -> None:
         super().__init__()
         self.nodes, self.neighbours, self.radius = nodes, neighbours, radius
         self.offset = nn.Linear(channels, 3, bias=False)
-        self.residual = PointMLP(channels, channels)
+        self.residual = PointMLP(channels, channels, norm=norm)
 
     def forward(self, x: Float[Tensor, "b n 3"], f: Float[Tensor, "b n c"]) -> Nodes:
         """Points [B, N, 3] and their features [B, N, C] to `Nodes`."""
@@ -82,40 +89,44 @@ class NodeModule(nn.Module):
 class _Turn(nn.Module):
     """T-Net as PointDAN has it: LeakyReLU 0.01 in its second half, ReLU in the first."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, norm: str) -> None:
         super().__init__()
         self.channels = channels
-        self.points = PointMLP(channels, 64, 128, 1024)
+        self.points = PointMLP(channels, 64, 128, 1024, norm=norm)
+        kind = head_norm(norm)
         self.cloud = nn.Sequential(
-            *(nn.Linear(1024, 512), nn.BatchNorm1d(512), nn.LeakyReLU()),
-            *(nn.Linear(512, 256), nn.BatchNorm1d(256), nn.LeakyReLU()),
+            *(nn.Linear(1024, 512), make_norm(kind, 512), nn.LeakyReLU()),
+            *(nn.Linear(512, 256), make_norm(kind, 256), nn.LeakyReLU()),
             nn.Linear(256, channels**2),
         )
 
     def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b c c"]:
         """The matrix that multiplies row vectors from the right."""
-        flat = self.cloud(self.points(x).amax(1))  # [b, c * c]
+        flat = self.cloud(self.points.maximum(x))  # [b, c * c]
         identity = torch.eye(self.channels, dtype=x.dtype, device=x.device)
         return flat.view(-1, self.channels, self.channels) + identity
 
 
 class PointDanBackbone(Backbone):
-    """T-Net 3, 64, 64, T-Net 64, nodes (64 to 128), 128, 1024, maximum, batch norm.
+    """T-Net 3, 64, 64, T-Net 64, nodes (64 to 128), 128, 1024, maximum, norm.
 
     Args:
         nodes, neighbours, radius: of `NodeModule`.
+        norm: see `qs3.models.norms`; the last one is of one vector a cloud, as in a head.
     """
 
     feature_dim = 1024
 
-    def __init__(self, *, nodes: int = 64, neighbours: int = 64, radius: float = 0.3) -> None:
+    def __init__(
+        self, *, nodes: int = 64, neighbours: int = 64, radius: float = 0.3, norm: str = "batch"
+    ) -> None:
         super().__init__()
-        self.input_transform = _Turn(3)
-        self.first = PointMLP(3, 64, 64)
-        self.feature_transform = _Turn(64)
-        self.node_module = NodeModule(64, nodes, neighbours, radius)
-        self.last = PointMLP(128, 128, 1024)
-        self.norm = nn.BatchNorm1d(1024)
+        self.input_transform = _Turn(3, norm)
+        self.first = PointMLP(3, 64, 64, norm=norm)
+        self.feature_transform = _Turn(64, norm)
+        self.node_module = NodeModule(64, nodes, neighbours, radius, norm)
+        self.last = PointMLP(128, 128, 1024, norm=norm)
+        self.norm = make_norm(head_norm(norm), 1024)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
         """One vector a cloud; per point 128 features."""
@@ -123,10 +134,12 @@ class PointDanBackbone(Backbone):
 
     def with_nodes(self, points: Float[Tensor, "b n 3"]) -> tuple[Features, Nodes]:
         """The same, and the nodes, for alignment."""
-        x = self.first(points @ self.input_transform(points))
+        with torch.autocast(points.device.type, enabled=False):  # as in PointNet
+            turned = points @ self.input_transform(points)
+        x = self.first(turned)
         x = x @ self.feature_transform(x)  # [b, n, 64]
         nodes = self.node_module(points, x)
-        return Features(self.norm(self.last(nodes.points).amax(1)), nodes.points), nodes
+        return Features(self.norm(self.last.maximum(nodes.points)), nodes.points), nodes
 
 
 class TwoHeads(nn.Module):
@@ -143,10 +156,14 @@ class TwoHeads(nn.Module):
 
 
 def pointdan(
-    num_classes: int, nodes: int = 64, neighbours: int = 64, radius: float = 0.3
+    num_classes: int,
+    nodes: int = 64,
+    neighbours: int = 64,
+    radius: float = 0.3,
+    norm: str = "batch",
 ) -> PointClassifier:
     """PointDAN's net; any method can train it, `method=pointdan` needs it."""
-    backbone = PointDanBackbone(nodes=nodes, neighbours=neighbours, radius=radius)
+    backbone = PointDanBackbone(nodes=nodes, neighbours=neighbours, radius=radius, norm=norm)
     return PointClassifier(backbone, TwoHeads(backbone.feature_dim, num_classes))
 
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.largest import normed_maximum
 from qs3.models.norms import head_norm, make_norm
 
 VARIANTS = ("simpleview", "uda", "basic")
@@ -53,6 +54,21 @@ class PointMLP(nn.Module):
             x = layer(x.transpose(1, 2)).transpose(1, 2) if normed else layer(x)
         return x
 
+    def maximum(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
+        """`self(x).amax(1)`; on the CPU without the last layer's output at every point."""
+        plain = self.by_cloud or x.device.type != "cpu" or torch.is_autocast_enabled("cpu")
+        if plain or torch.compiler.is_compiling():
+            return self(x).max(1)[0]
+        last_relu = isinstance(self.layers[-1], nn.ReLU)
+        layers = list(self.layers)[: -1 if last_relu else None]
+        layer, norm = layers[-2:]
+        y = x.flatten(0, 1)
+        for module in layers[:-2]:
+            y = module(y)
+        assert isinstance(layer, nn.Linear)
+        best = normed_maximum(y.unflatten(0, x.shape[:2]), layer, norm)
+        return best.relu() if last_relu else best
+
 
 class TNet(nn.Module):
     """A matrix for each cloud, the identity plus what the cloud asks for: [B, C, C]."""
@@ -70,7 +86,7 @@ class TNet(nn.Module):
 
     def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b c c"]:
         """The matrix that multiplies row vectors from the right."""
-        flat = self.cloud(self.points(x).amax(1))  # [b, c * c]
+        flat = self.cloud(self.points.maximum(x))  # [b, c * c]
         identity = torch.eye(self.channels, dtype=x.dtype, device=x.device)
         return flat.view(-1, self.channels, self.channels) + identity
 
@@ -117,7 +133,9 @@ class PointNet(Backbone):
         """
         x, levels, regulariser = points, [], None
         if self.input_transform is not None:
-            x = x @ self.input_transform(x)
+            # bfloat16 has 8 bits for a coordinate: rounding would differ as much as clouds do
+            with torch.autocast(points.device.type, enabled=False):
+                x = x @ self.input_transform(x)
         for layer in self.first:
             x = layer(x)
             levels.append(x)
@@ -131,7 +149,7 @@ class PointNet(Backbone):
             levels.append(x)
         if self.every_level:
             per_point = torch.cat(levels, dim=2)
-        return Features(self.last(x).amax(1), per_point, regulariser)
+        return Features(self.last.maximum(x), per_point, regulariser)
 
 
 def transform_regulariser(transform: Float[Tensor, "b c c"]) -> Float[Tensor, ""]:

@@ -11,18 +11,22 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from qs3.models.norms import active, make_norm
+
 
 class ConvNorm(nn.Module):
-    """Convolution without bias, then batch norm. In eval the norm is folded into the weights."""
+    """Convolution without bias, then a norm. In eval a batch norm is folded into the weights."""
 
-    def __init__(self, wide: int, narrow: int, kernel: int, stride: int = 1) -> None:
+    def __init__(
+        self, wide: int, narrow: int, kernel: int, stride: int = 1, norm: str = "batch"
+    ) -> None:
         super().__init__()
         self.conv = nn.Conv2d(wide, narrow, kernel, stride, kernel // 2, bias=False)
-        self.norm = nn.BatchNorm2d(narrow)
+        self.norm = make_norm(norm, narrow, images=True)
 
     def forward(self, x: Float[Tensor, "i c h w"]) -> Float[Tensor, "i d r s"]:
         """norm(conv(x))."""
-        conv, norm = self.conv, self.norm
+        conv, norm = self.conv, active(self.norm)
         if (
             norm.training
             or type(norm) is not nn.BatchNorm2d
@@ -38,12 +42,12 @@ class ConvNorm(nn.Module):
 class BasicBlock(nn.Module):
     """relu(x' + norm(conv(relu(norm(conv(x)))))); x' is x, or a 1x1 convolution of it."""
 
-    def __init__(self, wide: int, narrow: int, stride: int) -> None:
+    def __init__(self, wide: int, narrow: int, stride: int, norm: str = "batch") -> None:
         super().__init__()
-        self.first = ConvNorm(wide, narrow, 3, stride)
-        self.second = ConvNorm(narrow, narrow, 3)
+        self.first = ConvNorm(wide, narrow, 3, stride, norm)
+        self.second = ConvNorm(narrow, narrow, 3, norm=norm)
         plain = stride == 1 and wide == narrow
-        self.shortcut = None if plain else ConvNorm(wide, narrow, 1, stride)
+        self.shortcut = None if plain else ConvNorm(wide, narrow, 1, stride, norm)
 
     def forward(self, x: Float[Tensor, "i c h w"]) -> Float[Tensor, "i d r s"]:
         """The block's output."""
@@ -57,23 +61,30 @@ class ResNet18(nn.Module):
 
     Kaiming-normal weights (fan out) except at the stem, which has torch's default; the last norm
     of each block starts with weight 0. Maps are kept in channels-last layout.
+
+    Args:
+        channels: at the stem.
+        norm: see `qs3.models.norms`; "instance" is over each image.
     """
 
-    def __init__(self, channels: int = 16) -> None:
+    def __init__(self, channels: int = 16, norm: str = "batch") -> None:
         super().__init__()
         self.feature_dim = 8 * channels
-        self.stem = ConvNorm(1, channels, 3)
+        self.stem = ConvNorm(1, channels, 3, norm=norm)
         blocks, wide = [], channels
         for stage in range(4):
             narrow = channels * 2**stage
-            blocks += [BasicBlock(wide, narrow, 1 + (stage > 0)), BasicBlock(narrow, narrow, 1)]
+            first = BasicBlock(wide, narrow, 1 + (stage > 0), norm)
+            blocks += [first, BasicBlock(narrow, narrow, 1, norm)]
             wide = narrow
         self.blocks = nn.ModuleList(blocks)
         for block in blocks:
             for layer in block.modules():
                 if isinstance(layer, nn.Conv2d):
                     nn.init.kaiming_normal_(layer.weight, mode="fan_out", nonlinearity="relu")
-            nn.init.zeros_(block.second.norm.weight)
+            for name, parameter in block.second.norm.named_parameters():
+                if name.endswith("weight"):  # of each domain
+                    nn.init.zeros_(parameter)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, images: Float[Tensor, "i 1 h w"]) -> Float[Tensor, "i d"]:

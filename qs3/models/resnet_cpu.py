@@ -28,6 +28,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from qs3.models.norms import active, track
 from qs3.models.resnet import ConvNorm, ResNet18
 from qs3.models.windows import Layout, cut, reach, recut, recut_back, whole, windows
 
@@ -57,7 +58,7 @@ class _Layer:
     def __init__(
         self, modules: ConvNorm, parameters: Iterator[Tensor], room: _Room, layout: Layout
     ) -> None:
-        self.norm, self.room, self.layout = modules.norm, room, layout
+        self.norm, self.room, self.layout = active(modules.norm), room, layout
         self.stride, self.padding = modules.conv.stride, modules.conv.padding
         self.weight, self.gamma, self.beta = next(parameters), next(parameters), next(parameters)
         self.y: Maps = []
@@ -74,19 +75,10 @@ class _Layer:
 
     def normalise(self) -> None:
         """Statistics of the whole output, running ones too; after it `scaled` can be asked."""
-        norm = self.norm
-        assert norm.momentum is not None
-        assert norm.num_batches_tracked is not None
-        assert norm.running_mean is not None
-        assert norm.running_var is not None
         mean, var, count = self._statistics()
-        norm.num_batches_tracked.add_(1)
-        with torch.no_grad():
-            norm.running_mean.lerp_(mean.to(norm.running_mean.dtype), norm.momentum)
-            wide = (var * (count / (count - 1))).to(norm.running_var.dtype)
-            norm.running_var.lerp_(wide, norm.momentum)
+        track(self.norm, mean, var, count)
         self.mean = mean.to(self.gamma.dtype)
-        self.inverse = (var + norm.eps).rsqrt().to(self.gamma.dtype)
+        self.inverse = (var + self.norm.eps).rsqrt().to(self.gamma.dtype)
         self.h = self.gamma * self.inverse
         self.s = self.beta - self.h * self.mean
         self.sums = self.h.new_zeros(2, len(self.h), dtype=torch.float64)  # of dz, of dz y
@@ -342,11 +334,10 @@ def _layers(block: nn.Module) -> tuple[ConvNorm, ConvNorm, ConvNorm | None]:
 
 
 def can_step(net: ResNet18, images: Tensor) -> bool:
-    """Whether `step` gives what `net(images)` does: plain norms in training, on the CPU."""
-    norms = [m.norm for m in net.modules() if isinstance(m, ConvNorm)]
+    """Whether `step` gives what `net(images)` does: batch norms in training, on the CPU."""
+    norms = [active(m.norm) for m in net.modules() if isinstance(m, ConvNorm)]
     plain = all(
         type(n) is nn.BatchNorm2d and n.training and n.affine and n.track_running_stats
-        and n.momentum is not None
         for n in norms
     )  # fmt: skip
     same = images.device.type == "cpu" and images.dtype == net.stem.conv.weight.dtype
@@ -356,5 +347,8 @@ def can_step(net: ResNet18, images: Tensor) -> bool:
 def step(net: ResNet18, images: Tensor) -> Tensor:
     """`net(images)` in train mode: [I, 1, H, W] to [I, D]. The images get no gradient."""
     modules = [net.stem, *(m for block in net.blocks for m in _layers(block) if m)]
-    parameters = [p for m in modules for p in (m.conv.weight, m.norm.weight, m.norm.bias)]
+    norms = [active(m.norm) for m in modules]
+    parameters = [
+        p for m, n in zip(modules, norms, strict=True) for p in (m.conv.weight, n.weight, n.bias)
+    ]
     return _Step.apply(images, net, *parameters)

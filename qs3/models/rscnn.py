@@ -21,6 +21,7 @@ from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.norms import make_norm, norm_rows
 from qs3.models.rsconv import RSConv, relations
 
 # centres, radius (of a cloud in the unit ball), slots of a ball, of each layer
@@ -36,7 +37,7 @@ class RSCNN(Backbone):
 
     Args:
         relation: "released", "original" or "paper", see the module.
-        norm: "batch" or "instance" (statistics of each cloud, in eval too).
+        norm: see `qs3.models.norms`; statistics are of all slots of all balls.
     """
 
     feature_dim = 1024
@@ -47,15 +48,12 @@ class RSCNN(Backbone):
             raise ConfigError(
                 f"relation must be 'released', 'original' or 'paper', got {relation!r}"
             )
-        if norm not in ("batch", "instance"):
-            raise ConfigError(f"norm must be 'batch' or 'instance', got {norm!r}")
         self.relation, self.norm = relation, norm
-        tracked = norm == "batch"
         self.layers = nn.ModuleList(
-            [RSConv(0, 64, 128, tracked=tracked), RSConv(128, 128, 512, tracked=tracked)]
+            [RSConv(0, 64, 128, norm=norm), RSConv(128, 128, 512, norm=norm)]
         )
         self.last = nn.Linear(3 + 512, self.feature_dim)
-        self.last_norm = nn.BatchNorm1d(self.feature_dim, track_running_stats=tracked)
+        self.last_norm = make_norm(norm, self.feature_dim)
         nn.init.kaiming_normal_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
@@ -63,9 +61,9 @@ class RSCNN(Backbone):
         """Maximum over the 128 centres, in float32 at least."""
         with torch.autocast(points.device.type, enabled=False):
             points = points.detach().to(self.last.weight.dtype)
-            if self.norm == "batch":
-                return Features(self._forward(points), None)
-            return Features(torch.cat([self._forward(cloud[None]) for cloud in points]), None)
+            if self.norm == "instance":
+                return Features(torch.cat([self._forward(cloud[None]) for cloud in points]), None)
+            return Features(self._forward(points), None)
 
     def _forward(self, points: Tensor) -> Tensor:
         b = len(points)
@@ -80,7 +78,8 @@ class RSCNN(Backbone):
             points = centres
         assert features is not None
         rows = torch.cat([points.flatten(0, 1), features], dim=1)  # [b * 128, 515]
-        return self.last_norm(self.last(rows)).relu().view(b, -1, self.feature_dim).amax(1)
+        rows = norm_rows(self.last_norm, self.last(rows))
+        return rows.relu().view(b, -1, self.feature_dim).amax(1)
 
 
 def group(
@@ -122,9 +121,14 @@ def rscnn(
     norm: str = "batch",
     dropout: float = 0.5,
 ) -> PointClassifier:
-    """RS-CNN with its class head (512, 256; batch norm, ReLU)."""
+    """RS-CNN with its class head (512, 256; ReLU)."""
     backbone = RSCNN(relation=relation, norm=norm)
     head = ClassHead(
-        backbone.feature_dim, num_classes, dropout=dropout, negative_slope=0.0, hidden_bias=False
+        backbone.feature_dim,
+        num_classes,
+        dropout=dropout,
+        negative_slope=0.0,
+        hidden_bias=False,
+        norm=norm,
     )
     return PointClassifier(backbone, head)

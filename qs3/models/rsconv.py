@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from qs3.models.edgeconv import max_over_rows
+from qs3.models.norms import active, make_norm, norm_rows, track, uses_batch
 
 _AT_ONCE = 1 << 18  # values of p worked on at once: 1 MB in float32
 _STEP = 4  # sizes of balls are rounded up to multiples of it
@@ -231,24 +232,20 @@ class RSConv(nn.Module):
         channels: of the points' features; 0 at the first layer, which raises d to 16 channels.
         hidden: channels between the two layers of M.
         out_channels: of the result.
-        tracked: keep running statistics of the norms; without them eval uses the batch's too.
+        norm: see `qs3.models.norms`; with "instance" it must be given one cloud at a time.
     """
 
     def __init__(
-        self, channels: int, hidden: int, out_channels: int, *, tracked: bool = True
+        self, channels: int, hidden: int, out_channels: int, *, norm: str = "batch"
     ) -> None:
         super().__init__()
         inner = channels + 3 if channels else 16
-
-        def norm(width: int) -> nn.BatchNorm1d:
-            return nn.BatchNorm1d(width, track_running_stats=tracked)
-
         self.raising = None if channels else nn.Linear(3, inner)
-        self.raising_norm = None if channels else norm(inner)
+        self.raising_norm = None if channels else make_norm(norm, inner)
         self.mapping, self.weighing = nn.Linear(10, hidden), nn.Linear(hidden, inner)  # M
-        self.mapping_norm, self.norm = norm(hidden), norm(inner)
+        self.mapping_norm, self.norm = make_norm(norm, hidden), make_norm(norm, inner)
         self.channel_raising = nn.Linear(inner, out_channels)
-        self.channel_norm = norm(out_channels)
+        self.channel_norm = make_norm(norm, out_channels)
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 nn.init.kaiming_normal_(module.weight)
@@ -257,27 +254,25 @@ class RSConv(nn.Module):
     def forward(self, features: Tensor | None, relations: Relations, relation: str) -> Tensor:
         """Features [P, channels] of the points of all clouds to [centres, out_channels]."""
         moments = relations.moments()
-        norm, slots = self.norm, relations.slots
+        slots = relations.slots
         mapping = _in_u(self.mapping, relation)
         mapping = _fold(mapping, self.mapping_norm, moments, slots)
         raising = None
         if self.raising is not None:
-            assert isinstance(self.raising_norm, nn.BatchNorm1d)
+            assert self.raising_norm is not None
             weight, bias = self.raising.weight, self.raising.bias
             none = weight.new_zeros(len(weight), 4)
             raising = torch.cat([none, weight, bias[:, None]], dim=1)  # [16, 8]
             raising = _fold(raising, self.raising_norm, moments, slots)
-        sign = torch.where(norm.weight < 0, -1.0, 1.0).to(norm.weight.dtype)
+        gamma = active(self.norm).weight
+        sign = torch.where(gamma < 0, -1.0, 1.0).to(gamma.dtype)
         best, mean, var = _LargestProduct.apply(
             relations, features, mapping, raising,
-            self.weighing.weight * sign[:, None], self.weighing.bias * sign, _uses_batch(norm),
+            self.weighing.weight * sign[:, None], self.weighing.bias * sign, uses_batch(self.norm),
         )  # fmt: skip
-        h, shift = _affine(norm, sign * mean, var, slots)
-        return self.channel_norm(self.channel_raising((best * (sign * h) + shift).relu())).relu()
-
-
-def _uses_batch(norm: nn.BatchNorm1d) -> bool:
-    return norm.training or norm.running_mean is None
+        h, shift = _affine(self.norm, sign * mean, var, slots)
+        out = self.channel_raising((best * (sign * h) + shift).relu())
+        return norm_rows(self.channel_norm, out).relu()
 
 
 def _in_u(layer: nn.Linear, relation: str) -> Tensor:
@@ -287,9 +282,7 @@ def _in_u(layer: nn.Linear, relation: str) -> Tensor:
     return torch.cat([length, s, xj + d, layer.bias[:, None]], dim=1)
 
 
-def _fold(
-    layer: Tensor, norm: nn.BatchNorm1d, moments: tuple[Tensor, Tensor], slots: int
-) -> Tensor:
+def _fold(layer: Tensor, norm: nn.Module, moments: tuple[Tensor, Tensor], slots: int) -> Tensor:
     """The norm of a linear map [c, 8] of u as one map of u."""
     mean, covariance = moments
     wide = layer.double()
@@ -298,18 +291,14 @@ def _fold(
     return torch.cat([h[:, None] * layer[:, :7], (h * layer[:, 7] + shift)[:, None]], dim=1)
 
 
-def _affine(norm: nn.BatchNorm1d, mean: Tensor, var: Tensor, slots: int) -> tuple[Tensor, Tensor]:
+def _affine(norm: nn.Module, mean: Tensor, var: Tensor, slots: int) -> tuple[Tensor, Tensor]:
     """Scale and shift of a norm, of these statistics or of the running ones, which it updates."""
-    running_mean, running_var = norm.running_mean, norm.running_var
-    if running_mean is not None and running_var is not None:
-        if not norm.training:
-            mean, var = running_mean, running_var
-        else:
-            assert norm.momentum is not None
-            assert norm.num_batches_tracked is not None
-            unbiased = var.detach() * (slots / max(slots - 1, 1))
-            running_mean.lerp_(mean.detach().to(running_mean), norm.momentum)
-            running_var.lerp_(unbiased.to(running_var), norm.momentum)
-            norm.num_batches_tracked.add_(1)
-    h = norm.weight * torch.rsqrt(var + norm.eps)
-    return h.to(norm.weight.dtype), (norm.bias - h * mean).to(norm.weight.dtype)
+    plain = active(norm)
+    if uses_batch(plain):
+        track(plain, mean.detach(), var.detach(), slots)
+    else:
+        assert plain.running_mean is not None
+        assert plain.running_var is not None
+        mean, var = plain.running_mean, plain.running_var
+    h = plain.weight * torch.rsqrt(var + plain.eps)
+    return h.to(plain.weight.dtype), (plain.bias - h * mean).to(plain.weight.dtype)

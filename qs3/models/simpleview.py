@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError
 from qs3.models.base import Backbone, Features, PointClassifier
+from qs3.models.norms import head_norm, make_norm
 from qs3.models.projection import VIEWS, depth_images
 from qs3.models.resnet import ResNet18
 from qs3.models.resnet_cpu import can_step, step
@@ -27,6 +28,7 @@ class SimpleView(Backbone):
         views, up, pixel: of `depth_images`; `views` are rows of its table, in the order in which
             the head sees them.
         channels: at the stem of the network; a view has 8 times as many features.
+        norm: see `qs3.models.norms`; "instance" is over each image.
     """
 
     def __init__(
@@ -37,11 +39,15 @@ class SimpleView(Backbone):
         up: str = "y",
         pixel: str = "harmonic",
         channels: int = 16,
+        norm: str = "batch",
     ) -> None:
         super().__init__()
         self.views = tuple(views)
-        if image_size < 8:
-            raise ConfigError(f"image_size must be at least 8, got {image_size}")
+        smallest = 9 if norm == "instance" else 8  # one pixel has no statistics
+        if image_size < smallest:
+            raise ConfigError(
+                f"image_size must be at least {smallest} with norm={norm}, got {image_size}"
+            )
         if not self.views or not set(self.views) <= set(range(VIEWS)):
             raise ConfigError(f"views must be some of 0 to {VIEWS - 1}, got {list(views)}")
         if up not in ("y", "z"):
@@ -49,7 +55,7 @@ class SimpleView(Backbone):
         if pixel not in ("harmonic", "nearest"):
             raise ConfigError(f"pixel must be 'harmonic' or 'nearest', got {pixel!r}")
         self.image_size, self.up, self.pixel = image_size, up, pixel
-        self.images = ResNet18(channels)
+        self.images = ResNet18(channels, norm)
         self.feature_dim = len(self.views) * self.images.feature_dim
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
@@ -66,19 +72,27 @@ class SimpleView(Backbone):
 class FusionHead(nn.Module):
     """Norm and dropout of each view's features, then Linear - BN - ReLU - dropout - Linear.
 
-    The first norm is shared by the views and its statistics are over all of them.
+    The first norm is shared by the views and its statistics are over all of them. What `norm` of
+    the backbone means here: `qs3.models.norms.head_norm`.
     """
 
     def __init__(
-        self, views: int, view_dim: int, num_classes: int, *, dropout: float = 0.5
+        self,
+        views: int,
+        view_dim: int,
+        num_classes: int,
+        *,
+        dropout: float = 0.5,
+        norm: str = "batch",
     ) -> None:
         super().__init__()
+        kind = head_norm(norm)
         self.view_dim = view_dim
-        self.view_norm = nn.BatchNorm1d(view_dim)
+        self.view_norm = make_norm(kind, view_dim)
         self.layers = nn.Sequential(
             nn.Dropout(dropout),
             nn.Linear(views * view_dim, view_dim),
-            nn.BatchNorm1d(view_dim),
+            make_norm(kind, view_dim),
             nn.ReLU(),
             nn.Dropout(dropout),
             nn.Linear(view_dim, num_classes),
@@ -97,11 +111,14 @@ def simpleview(
     up: str = "y",
     pixel: str = "harmonic",
     channels: int = 16,
+    norm: str = "batch",
     dropout: float = 0.5,
 ) -> PointClassifier:
     """SimpleView with its fusion head."""
-    backbone = SimpleView(image_size=image_size, views=views, up=up, pixel=pixel, channels=channels)
+    backbone = SimpleView(
+        image_size=image_size, views=views, up=up, pixel=pixel, channels=channels, norm=norm
+    )
     head = FusionHead(
-        len(backbone.views), backbone.images.feature_dim, num_classes, dropout=dropout
+        len(backbone.views), backbone.images.feature_dim, num_classes, dropout=dropout, norm=norm
     )
     return PointClassifier(backbone, head)

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.base import PointClassifier
+from qs3.models.norms import active
 from qs3.models.rscnn import LEVELS, group
 from qs3.models.rsconv import RSConv
 
@@ -20,8 +21,9 @@ def _conv(x: Tensor, layer: nn.Linear) -> Tensor:
     return (F.conv2d if x.ndim == 4 else F.conv1d)(x, weight, layer.bias)
 
 
-def _norm(norm: nn.BatchNorm1d, x: Tensor) -> Tensor:
+def _norm(norm: nn.Module, x: Tensor) -> Tensor:
     """Batch norm of [b, c, ...]; norms without running statistics are norms of each cloud."""
+    norm = active(norm)
     if norm.running_mean is None:
         return F.instance_norm(x, weight=norm.weight, bias=norm.bias, eps=norm.eps)
     if norm.training:

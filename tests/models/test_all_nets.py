@@ -1,11 +1,16 @@
 """What every net of conf/model must do; a new file there is tested without another word."""
 
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from torch import nn
+from torch.nn import functional as F
 
 from qs3.errors import DataError
 from qs3.models.base import PointClassifier
@@ -20,16 +25,18 @@ ORDER_MATTERS = {
 }
 
 
-def _build(name: str) -> PointClassifier:
+def build(name: str, **settings: Any) -> PointClassifier:
+    """The net of conf/model/`name`.yaml for 5 classes, float64."""
     torch.manual_seed(0)
     config = OmegaConf.load(CONF / f"{name}.yaml")
     bases = [b for b in config.pop("defaults", []) if b != "_self_"]
     config = OmegaConf.merge(*(OmegaConf.load(CONF / f"{b}.yaml") for b in bases), config)
     config.num_classes = 5
-    return instantiate(config).double().eval()
+    return instantiate(config, **settings).double().eval()
 
 
-def _clouds(b: int, n: int) -> torch.Tensor:
+def clouds(b: int, n: int) -> torch.Tensor:
+    """Normal clouds in the unit ball: [b, n, 3] float64."""
     generator = torch.Generator().manual_seed(n)
     points = torch.randn(b, n, 3, generator=generator, dtype=torch.float64)
     return points / points.norm(dim=2).amax(1)[:, None, None]
@@ -37,7 +44,7 @@ def _clouds(b: int, n: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", NETS)
 def test_interface(name: str) -> None:
-    net, points = _build(name), _clouds(2, 70)
+    net, points = build(name), clouds(2, 70)
     assert isinstance(net, PointClassifier)
     features = net.features(points)
     assert features.global_.shape == (2, net.backbone.feature_dim)
@@ -48,7 +55,7 @@ def test_interface(name: str) -> None:
 
 @pytest.mark.parametrize("name", NETS)
 def test_a_cloud_alone_gives_what_it_gives_among_others(name: str) -> None:
-    net, points = _build(name), _clouds(3, 70)
+    net, points = build(name), clouds(3, 70)
     alone = torch.cat([net(cloud[None]) for cloud in points])
     torch.testing.assert_close(net(points), alone, rtol=1e-6, atol=1e-8)
 
@@ -56,28 +63,89 @@ def test_a_cloud_alone_gives_what_it_gives_among_others(name: str) -> None:
 @pytest.mark.parametrize("n", [1, 7, 130])
 @pytest.mark.parametrize("name", NETS)
 def test_any_number_of_points(name: str, n: int) -> None:
-    assert _build(name)(_clouds(1, n)).isfinite().all()
+    assert build(name)(clouds(1, n)).isfinite().all()
 
 
 @pytest.mark.parametrize("name", NETS)
 def test_one_point_many_times(name: str) -> None:
     points = torch.full((2, 60, 3), 0.3, dtype=torch.float64)
-    assert _build(name)(points).isfinite().all()
+    assert build(name)(points).isfinite().all()
 
 
 @pytest.mark.parametrize("name", NETS)
 def test_order_of_points(name: str) -> None:
-    net, points = _build(name), _clouds(2, 90)
+    net, points = build(name), clouds(2, 90)
     if name in ORDER_MATTERS:
         pytest.skip(ORDER_MATTERS[name])
     shuffled = points[:, torch.randperm(90, generator=torch.Generator().manual_seed(1))]
     torch.testing.assert_close(net(shuffled), net(points), rtol=1e-6, atol=1e-8)
 
 
+COMPILED = """
+import copy, sys, torch
+from tests.models.test_all_nets import build, clouds
+net, points = build(sys.argv[1]), clouds(3, 70)
+twin = copy.deepcopy(net)
+twin.compile(backend="eager")
+assert list(twin.state_dict()) == list(net.state_dict())
+torch.testing.assert_close(twin(points), net(points), rtol=1e-9, atol=1e-9)
+outs = []
+for some in (net, twin):
+    torch.manual_seed(0)  # dropout
+    outs.append(some.train()(points))
+    outs[-1].square().sum().backward()
+torch.testing.assert_close(*outs, rtol=1e-9, atol=1e-9)
+for mine, theirs in zip(twin.parameters(), net.parameters(), strict=True):
+    torch.testing.assert_close(mine.grad, theirs.grad, rtol=1e-7, atol=1e-7)
+assert torch._dynamo.utils.counters["stats"]["unique_graphs"] > 0
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NETS)
+def test_compiled(name: str) -> None:
+    """As torch's compiler records it: the same numbers, under the same names.
+
+    Without its kernels, which take minutes to make; without jaxtyping, which it cannot follow.
+    """
+    command = [sys.executable, "-W", "ignore", "-c", COMPILED, name]
+    run = subprocess.run(command, cwd=CONF.parents[1], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("name", NETS)
 def test_bad_points_name_the_item(name: str, value: float) -> None:
-    points = _clouds(3, 40)
+    points = clouds(3, 40)
     points[1, 3, 2] = value
     with pytest.raises(DataError, match="batch item 1"):
-        _build(name)(points)
+        build(name)(points)
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_autocast(name: str) -> None:
+    """bfloat16 moves logits by much less than they differ from cloud to cloud.
+
+    Neighbours and coordinates in bfloat16 would move them by half of that and more. Gradients are
+    finite, float32, and there for each parameter.
+    """
+    net, points = build(name).float(), clouds(8, 200).float()
+    for module in net.modules():
+        if isinstance(module, nn.Dropout):
+            module.p = 0.0
+        if isinstance(module, nn.modules.batchnorm._BatchNorm):
+            module.momentum = 1.0
+    net.train()(points)  # statistics of these clouds
+    expected = net.eval()(points)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = net(points)
+    error = (found.float() - expected).square().mean().sqrt()
+    assert error < 0.25 * expected.std(0).mean()
+    net.train()
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = F.cross_entropy(net(points), torch.arange(8) % 5)
+    loss.backward()
+    for key, parameter in net.named_parameters():
+        assert parameter.grad is not None, key
+        assert parameter.grad.dtype == torch.float32
+        assert parameter.grad.isfinite().all(), key

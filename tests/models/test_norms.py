@@ -17,7 +17,7 @@ from qs3.models.norms import (
     track,
     use_domain,
 )
-from qs3.models.pointnet import pointnet
+from qs3.models.pointnet import PointMLP, pointnet
 from tests.models.reference import NaiveDGCNN
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
@@ -31,34 +31,6 @@ def _clouds(b: int, seed: int = 0, n: int = 40) -> torch.Tensor:
 
 def _running(net: nn.Module) -> list[torch.Tensor]:
     return [b.clone() for n, b in net.named_buffers() if "running" in n]
-
-
-@pytest.mark.parametrize("name", BUILDERS)
-@pytest.mark.parametrize("kind", ["domain", "domain_statistics"])
-def test_a_pass_on_one_domain_leaves_the_other_alone(name: str, kind: str) -> None:
-    torch.manual_seed(0)
-    net = BUILDERS[name](4, norm=kind).double()
-    before = {k: v.clone() for k, v in net.named_buffers()}
-    with use_domain(net, "target"):
-        net(_clouds(3)).sum().backward()
-    for key, value in net.named_buffers():
-        if "running" in key:
-            assert torch.equal(value, before[key]) == (".source." in key), key
-    source = [p.grad for k, p in net.named_parameters() if k.endswith(".source.weight")]
-    assert source
-    assert all((grad is None) == (kind == "domain") for grad in source)
-
-
-@pytest.mark.parametrize("name", BUILDERS)
-def test_on_source_it_is_batch_norm(name: str) -> None:
-    torch.manual_seed(0)
-    plain = BUILDERS[name](4, dropout=0.0).double()
-    torch.manual_seed(0)
-    several = BUILDERS[name](4, norm="domain", dropout=0.0).double()
-    for training in (True, False):
-        plain.train(training)
-        several.train(training)
-        torch.testing.assert_close(plain(_clouds(3)), several(_clouds(3)), **TIGHT)
 
 
 def test_parameters_of_a_domain() -> None:
@@ -130,7 +102,9 @@ def _whole_batch(net: nn.Module, points: torch.Tensor) -> list[torch.Tensor]:
     ("name", "variant"),
     [("dgcnn", "uda"), ("dgcnn", "simpleview"), ("pointnet", "basic"), ("pointnet", "simpleview")],
 )
-def test_adapted_norms_hold_the_statistics_of_what_they_are_given(name: str, variant: str) -> None:
+def test_adapted_norms_hold_the_statistics_of_what_they_are_given(
+    name: str, variant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Asked of the straight net in eval, whose norms all see their [B, C, ...] input whole."""
     torch.manual_seed(0)
     net = BUILDERS[name](4, variant=variant).double()
@@ -146,6 +120,7 @@ def test_adapted_norms_hold_the_statistics_of_what_they_are_given(name: str, var
     assert all(m.momentum == 0.1 for m in adapted)
 
     straight = NaiveDGCNN(net) if name == "dgcnn" else net
+    monkeypatch.setattr(PointMLP, "maximum", lambda mlp, x: mlp(x).amax(1))
     seen = []
 
     def look(norm: nn.Module, inputs: tuple[torch.Tensor, ...]) -> None:

@@ -4,11 +4,13 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from torch import nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError, DataError
 from qs3.models.base import PointClassifier
 from qs3.models.pointnet import PointNet, TNet, pointnet, transform_regulariser
+from tests.models.reference_pointnet import NaivePointNet
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
 
@@ -38,6 +40,25 @@ def test_instance_norm_is_of_each_cloud_alone() -> None:
     backbone.feature_transform.cloud.eval()
     together = backbone(points).global_
     torch.testing.assert_close(together[1:2], backbone(points[1:2]).global_)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_equals_straight_network(training: bool) -> None:
+    torch.manual_seed(0)
+    model = pointnet(4, dropout=0.0).double()
+    for p in model.parameters():  # weights of norms that are negative too
+        if p.ndim == 1:
+            nn.init.normal_(p, 0.3, 1.0)
+    model(torch.randn(6, 30, 3).double())
+    twin = NaivePointNet(model.train(training)).train(training)
+    points, labels = torch.randn(6, 50, 3).double(), torch.arange(6) % 4
+    a, b = model(points), twin(points)
+    torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
+    F.cross_entropy(a, labels).backward()
+    F.cross_entropy(b, labels).backward()
+    theirs = [*twin.net.parameters(), *twin.head.parameters()]
+    for p, q in zip(model.parameters(), theirs, strict=True):
+        torch.testing.assert_close(p.grad, q.grad, rtol=1e-9, atol=1e-10)
 
 
 def test_unknown_variant() -> None:

@@ -124,10 +124,13 @@ def test_views_are_rows_of_the_table() -> None:
     assert model.features(points).global_.shape == (3, model.backbone.feature_dim) == (3, 64)
 
 
+@pytest.mark.parametrize("norm", ["batch", "instance", "domain_statistics"])
 @pytest.mark.parametrize("training", [True, False])
-def test_equals_straight_network(training: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equals_straight_network(
+    training: bool, norm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(resnet_cpu, "_AT_ONCE", 1 << 12)  # several parts
-    model = _small().train(training)
+    model = _small(norm=norm).train(training)
     twin = NaiveSimpleView(model).train(training)
     points, labels = _points(), torch.tensor([0, 1, 3])
     a, b = model(points), twin(points)
@@ -243,9 +246,9 @@ def test_norms_of_another_kind_take_the_plain_way() -> None:
     net = ResNet18(4)
     images = torch.rand(2, 1, 16, 16)
     assert resnet_cpu.can_step(net, images)
-    net.blocks[0].first.norm = nn.InstanceNorm2d(4, affine=True)
-    assert not resnet_cpu.can_step(net, images)
+    assert not resnet_cpu.can_step(ResNet18(4, "instance"), images)
     assert not resnet_cpu.can_step(ResNet18(4).eval(), images)
+    assert resnet_cpu.can_step(ResNet18(4, "domain"), images)  # of one domain they are plain
 
 
 @settings(max_examples=10, deadline=None)
@@ -303,7 +306,16 @@ def test_bad_points_name_the_item(value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "setting", [{"image_size": 4}, {"views": (6,)}, {"views": ()}, {"up": "x"}, {"pixel": "mean"}]
+    "setting",
+    [
+        {"image_size": 4},
+        {"image_size": 8, "norm": "instance"},
+        {"norm": "layer"},
+        {"views": (6,)},
+        {"views": ()},
+        {"up": "x"},
+        {"pixel": "mean"},
+    ],
 )
 def test_bad_settings(setting: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(setting))):
