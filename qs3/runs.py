@@ -16,6 +16,7 @@ written last, and atomically: it is the mark of a finished run.
         round_03/pseudo_labels.csv
         history.csv          one row an epoch
         metrics.json         the result
+        pictures/            of the above, drawn last; see `qs3.report.run_pictures`
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ _UNHASHED = (
     "hydra",
     "force",
     "callbacks.progress",
+    "report",
     "data.cache_dir",
     *(
         f"data.{domain}.{key}"
@@ -98,6 +100,8 @@ def config_sha256(cfg: DictConfig) -> str:
     selection = plain.get("selection")
     if isinstance(selection, dict) and selection.get("student") == _LAST_EPOCH:
         selection.pop("student")  # a younger key: runs from before it are still found
+    if plain.get("compile") is False:  # likewise
+        plain.pop("compile")
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -1,0 +1,37 @@
+"""`compile=true`: the same training through torch's compiler."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from omegaconf import open_dict
+
+from qs3 import runs
+from qs3.checkpoints import load
+from qs3.run import train
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch's compiler needs g++")
+def test_compiled_training_comes_to_the_same(toy):
+    # dropout is drawn otherwise, so weights are alike and not equal
+    changes = ("selftraining=none", "method=source_only", "protocol.epochs=2")
+    plain, compiled = toy(*changes), toy(*changes, "compile=true")
+    assert runs.run_folder(plain) != runs.run_folder(compiled)
+    assert train(plain)["final"]["n"] == train(compiled)["final"]["n"]
+    a, b = (load(runs.run_folder(cfg) / "student.pt") for cfg in (plain, compiled))
+    assert a.keys() == b.keys()  # names of weights stay
+    for name in a:
+        np.testing.assert_allclose(a[name], b[name], atol=0.3, err_msg=name)
+
+
+def test_it_is_off_and_outside_the_hash(toy):
+    cfg = toy()
+    assert cfg.compile is False
+    older = cfg.copy()
+    with open_dict(older):
+        del older["compile"]
+    assert runs.config_sha256(older) == runs.config_sha256(cfg)
+    assert runs.config_sha256(toy("compile=true")) != runs.config_sha256(cfg)
