@@ -95,9 +95,8 @@ class PointClassifier(nn.Module):
         return self.head(self.features(points).global_)
 
     def compile(self, *args: Any, **settings: Any) -> None:
-        """`nn.Module.compile` of backbone and head, in place: methods call them by themselves."""
+        """`nn.Module.compile` of the backbone, in place: methods call it by itself."""
         self.backbone.compile(*args, **settings)
-        self.head.compile(*args, **settings)
 
 
 def check_points(points: Tensor) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -103,6 +104,9 @@ class PointNet2(Backbone):
             channels = levels[-1].out_channels
         self.levels = nn.ModuleList(levels)
         self.last = GroupedMLP(channels, (256, 512, 1024), norm=norm)
+
+    def compile(self, *args: Any, **settings: Any) -> None:
+        """Nothing: torch 2.13's compiler gives other numbers in training, whatever its backend."""
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
         """[B, 1024]; there are no features of all N points."""

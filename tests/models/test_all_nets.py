@@ -97,7 +97,8 @@ for some in (net, twin):
 torch.testing.assert_close(*outs, rtol=1e-9, atol=1e-9)
 for mine, theirs in zip(twin.parameters(), net.parameters(), strict=True):
     torch.testing.assert_close(mine.grad, theirs.grad, rtol=1e-7, atol=1e-7)
-assert torch._dynamo.utils.counters["stats"]["unique_graphs"] > 0
+left_out = sys.argv[1] in ("pointnet2", "pointnet2_ssg", "rscnn")
+assert (torch._dynamo.utils.counters["stats"]["unique_graphs"] == 0) == left_out
 """
 
 
