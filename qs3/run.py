@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import sys
+from collections.abc import Iterator
 from typing import Any
 
 from omegaconf import DictConfig
@@ -45,7 +48,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     _refuse_choice_without_rounds(run)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
-        return _fit(run)
+        with _wandb_forgotten():
+            return _fit(run)
 
     _warn_of_one_domain(run)
     with runs.locked(run.folder):
@@ -53,8 +57,11 @@ def train(cfg: DictConfig) -> dict[str, Any]:
             runs.clear(run.folder)
         metrics = runs.read_metrics(run.folder)
         if metrics is None:
-            metrics = _fit(run)
-            runs.write_metrics(run.folder, metrics)
+            with _wandb_forgotten():
+                metrics = _fit(run)
+                runs.write_metrics(run.folder, metrics)
+                if cfg.report.pictures:
+                    _draw(run)
         else:
             runs.check_config(run.folder, metrics.get("config_sha256"), runs.config_sha256(cfg))
             _refuse_other_data(run, metrics["data"])
@@ -92,6 +99,23 @@ def _fit(run: Run) -> dict[str, Any]:
     return fit(run)
 
 
+def _draw(run: Run) -> None:
+    from qs3.report.run_pictures import after_training  # matplotlib from here on
+
+    after_training(run.folder)
+
+
+@contextlib.contextmanager
+def _wandb_forgotten() -> Iterator[None]:
+    """End wandb's run after the block: it would live on into the next job of a multirun."""
+    try:
+        yield
+    finally:
+        if "wandb" in sys.modules:
+            sys.modules["wandb"].finish()
+            os.environ.pop("WANDB_MODE", None)  # set by Lightning's logger when offline
+
+
 def _check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
     one_of("selection.teacher", cfg.selection.teacher, TEACHERS)
@@ -112,6 +136,8 @@ def _check_settings(cfg: DictConfig) -> None:
         raise ConfigError(f"protocol.regulariser must be >= 0, got {cfg.protocol.regulariser}")
     if "lr" in cfg.protocol.optimizer:
         number("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
+    if not isinstance(cfg.report.pictures, bool):
+        raise ConfigError(f"report.pictures must be true or false, got {cfg.report.pictures!r}")
     if cfg.trainer.threads is not None:
         whole("trainer.threads", cfg.trainer.threads, 1)
 

@@ -9,7 +9,8 @@ written last, and atomically: it is the mark of a finished run.
         started.json         the hashes of the datasets and the config, the versions
         last.ckpt            everything needed to continue
         warmup_selected.pt   weights of the teacher of round 0;  warmup_last.pt, student.pt likewise
-        result.pt            weights of what is reported: those of the warm-up, or the student's
+        result.pt            what is reported, the warm-up's net or the student's, with all that
+                             using it takes (`qs3.load`, qs3/result.py)
         predictions.csv      what they say of each of the target's test clouds
         student_selected.pt  of another epoch than the last, if selection.student asks for one;
                              candidates/epoch_095.pt  of each epoch of the last round (oracle)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import platform
-import sys
 import time
 import warnings
 from collections.abc import Mapping
@@ -32,6 +31,7 @@ from qs3.data.prepare import remove_old_leftovers
 from qs3.data.store import PointSet
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation import Evaluation, adapt_norms
+from qs3.familiar import limits
 from qs3.files import remove_leftovers
 from qs3.hydra_glue import build
 from qs3.loggers import CsvHistory, EpochRows
@@ -40,6 +40,8 @@ from qs3.methods.student import Student
 from qs3.predictions import FILE as PREDICTIONS
 from qs3.predictions import write_predictions
 from qs3.randomness import derive
+from qs3.result import FILE as RESULT
+from qs3.result import Result, write_result
 from qs3.runs import Run
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, SelfTraining, WarmupSelection
 from qs3.selftraining.scheme import Phases
@@ -52,7 +54,6 @@ from qs3.warmups import SharedWarmup, warmup_sha256
 log = logging.getLogger(__name__)
 
 STUDENT = "student.pt"
-RESULT = "result.pt"  # of the above, or of the warm-up's selected weights, what is reported
 
 
 def fit(run: Run) -> dict[str, Any]:
@@ -121,6 +122,8 @@ def fit(run: Run) -> dict[str, Any]:
         smoothing=cfg.protocol.smoothing,
         regulariser_weight=cfg.protocol.regulariser,
     )
+    if cfg.compile:
+        classifier.net.compile()  # in place; nets that are only evaluated stay as they are
     warmup = WarmupSelection(run.folder, run.phases, cfg.selection.teacher)
     rounds = SelfTraining(run.folder, run.phases, run.scheme, target_set.classes)
     student = StudentSelection(run.folder, run.phases, cfg.selection.student, target_set.classes)
@@ -143,16 +146,15 @@ def fit(run: Run) -> dict[str, Any]:
         plugins=[AtomicCheckpointIO()],
         default_root_dir=run.folder,
     )
+    for logger in trainer.loggers:
+        logger.log_hyperparams(_settings(cfg))
     if not cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
         shared.take()
     last = run.folder / LAST
     log.info(
         "%s, %d epochs", "fitting, continued" if last.is_file() else "fitting", run.phases.total
     )
-    try:
-        trainer.fit(classifier, data, ckpt_path=last if last.is_file() else None, weights_only=True)
-    finally:
-        _forget_wandb()
+    trainer.fit(classifier, data, ckpt_path=last if last.is_file() else None, weights_only=True)
 
     # 4. What came of it, from saved weights: the same after any interruption.
     if trainer.is_global_zero:
@@ -184,7 +186,8 @@ def fit(run: Run) -> dict[str, Any]:
         if name in (final, "selected"):
             turned[name] = evaluation.turned(net, classifier.device)
         if name == final and trainer.is_global_zero:
-            save(copy_weights(net), run.folder / RESULT)
+            usual = limits(labelled.clouds, target.clouds)
+            write_result(run.folder / RESULT, _result(run, target_set, net, usual))
             write_predictions(
                 run.folder / PREDICTIONS, evaluation.predictions(net, classifier.device)
             )
@@ -240,6 +243,21 @@ def fit(run: Run) -> dict[str, Any]:
         "times": {"seconds_since_last_start": round(time.time() - began, 1)},
         "versions": started["versions"],
     }
+
+
+def _result(run: Run, target: PointSet, net: nn.Module, usual: Mapping[str, list[float]]) -> Result:
+    """What is reported, with all that using it elsewhere takes."""
+    model: Any = OmegaConf.to_container(run.cfg.model, resolve=True)
+    return Result(
+        model=model,
+        classes=tuple(target.classes),
+        points=run.cfg.data.points,
+        stored_points=target.points.shape[1],
+        target=run.target.name,
+        gravity=run.target.gravity,
+        usual=usual,
+        weights=copy_weights(net),
+    )
 
 
 def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:
@@ -363,6 +381,12 @@ def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
     }
 
 
+def _settings(cfg: DictConfig) -> dict[str, Any]:
+    """The composed config, for loggers that show it."""
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    return settings
+
+
 def _build_each(group: DictConfig | None) -> list[Any]:
     return [build(node) for node in (group or {}).values() if node is not None]
 
@@ -376,10 +400,3 @@ def _quieten() -> None:
         logger.handlers.clear()
         logger.setLevel(logging.WARNING)
         logger.propagate = True
-
-
-def _forget_wandb() -> None:
-    """End wandb's run: it would live on into the next job of a multirun."""
-    if "wandb" in sys.modules:
-        sys.modules["wandb"].finish()
-        os.environ.pop("WANDB_MODE", None)  # set by Lightning's logger when offline

@@ -5,14 +5,17 @@
     python -m qs3.report run table=cad10 [seeds=0,1,2] [rows=gast,pcm] [jobs=1] [log_dir=logs]
                                  [target=...] [overrides=...]
     python -m qs3.report compare table=cad10 base="source only" [log_dir=logs] [out=...] [...]
+    python -m qs3.report pictures run=PATH [data_dir=data] [out=PATH/pictures]
     python -m qs3.report pictures domains=[modelnet10,specklenet10,kinectsim10]
                                   [data_dir=data] [split=train] [out=data/pictures]
 
 A table is printed as Markdown and saved as .md, .csv and .tex. `overrides` are those that the runs
 had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time; called
 again it goes on. `compare` prints the difference of each row to the row `base`, with its interval.
-Pictures: a contact sheet of each domain, and one that compares them; with out=NAME.png the latter
-alone. `paths.log_dir` and `paths.data_dir` are understood as well.
+Pictures of a run, the folder that training names: curves, confusion, pseudo-labels, classes,
+calibration, features of both domains (if its data are there), and a page of all, index.html.
+Pictures of domains: a contact sheet of each domain, and one that compares them; with out=NAME.png
+the latter alone. `paths.log_dir` and `paths.data_dir` are understood as well.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from qs3.report.tables import Table
 _TABLE = {"table", "log_dir", "data_dir", "out", "target", "overrides"}
 _RUN = {"table", "log_dir", "data_dir", "target", "overrides", "seeds", "rows", "jobs"}
 _COMPARE = _TABLE | {"base"}
-_PICTURES = {"domains", "data_dir", "out", "split"}
+_PICTURES = {"domains", "run", "data_dir", "out", "split"}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -138,7 +141,24 @@ def _table(options: dict[str, str]) -> None:
     print(f"saved {at}.md, .csv, .tex")
 
 
+def _pictures_of_run(options: dict[str, str]) -> None:
+    from qs3.report.run_pictures import draw
+
+    for other in ("domains", "split"):
+        if other in options:
+            raise ConfigError(f"run= and {other}= are two commands; give one of them")
+    drawn = draw(options["run"], options.get("out"), data_dir=options.get("data_dir"))
+    for note in drawn.notes:
+        print(f"note: {note}")
+    for name, reason in drawn.skipped.items():
+        print(f"no {name}: {reason}")
+    for path in (*drawn.pictures.values(), drawn.page):
+        print(path)
+
+
 def _pictures(options: dict[str, str]) -> None:
+    if "run" in options:
+        return _pictures_of_run(options)
     from hydra.utils import instantiate
 
     from qs3.report.pictures import contact_sheet, scan_picture
@@ -146,7 +166,7 @@ def _pictures(options: dict[str, str]) -> None:
 
     names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]
     if not names:
-        raise ConfigError("which domains? domains=[modelnet10,specklenet10,kinectsim10]")
+        raise ConfigError("of what? run=PATH, or domains=[modelnet10,specklenet10,kinectsim10]")
     data_dir = Path(options.get("data_dir", "data"))
     out, split = Path(options.get("out", data_dir / "pictures")), options.get("split", "train")
     alone = out.suffix == ".png"

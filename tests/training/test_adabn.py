@@ -23,8 +23,8 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
         "trained",
         "adabn",
     )
-    before = load(runs.run_folder(plain) / "result.pt")
-    after = load(runs.run_folder(adapted) / "result.pt")
+    before = load(runs.run_folder(plain) / "result.pt")["weights"]
+    after = load(runs.run_folder(adapted) / "result.pt")["weights"]
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed >= {"norm.running_mean", "norm.running_var"}
     assert changed <= {"norm.running_mean", "norm.running_var", "norm.num_batches_tracked"}
@@ -56,7 +56,7 @@ def test_predictions_are_those_of_the_result(toy, toy_data):
     metrics = train(cfg)
     found = read_predictions(runs.run_folder(cfg) / "predictions.csv")
     net = TinyNet(3)
-    net.load_state_dict(load(runs.run_folder(cfg) / "result.pt"))
+    net.load_state_dict(load(runs.run_folder(cfg) / "result.pt")["weights"])
     test = load_clouds(open_pointset(toy_data / "kinectsim10"), "test", 32)
     np.testing.assert_array_equal(found.probabilities, predict(net, test.points, 64))
     assert found.ids == found.meshes == test.ids  # no meshes are known here

@@ -78,6 +78,7 @@ def overrides(root: Path, *more: str) -> list[str]:
         "trainer.threads=1",
         "callbacks=none",
         "logger=csv",
+        "report.pictures=false",
         *more,
     ]
 

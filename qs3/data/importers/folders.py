@@ -56,6 +56,9 @@ _UP = {
 }
 """Axis that points up -> which columns with which signs give x y z with z up: rotations by 90°."""
 
+UP_AXES: tuple[str, ...] = tuple(_UP)
+"""What `up` may be."""
+
 
 @dataclass(frozen=True)
 class CloudFolder(Importer):
