@@ -9,9 +9,10 @@
     python -m qs3.report pictures domains=[modelnet10,specklenet10,kinectsim10]
                                   [data_dir=data] [split=train] [out=data/pictures]
 
-A table is printed as Markdown and saved as .md, .csv and .tex. `overrides` are those that the runs
-had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time; called
-again it goes on. `compare` prints the difference of each row to the row `base`, with its interval.
+A table is printed as Markdown and saved as .md, .csv, .tex and .html. `overrides` are those that
+the runs had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time;
+called again it goes on. `compare` prints the difference of each row to the row `base`, with its
+interval.
 Pictures of a run, the folder that training names: curves, confusion, pseudo-labels, classes,
 calibration, features of both domains (if its data are there), and a page of all, index.html.
 Pictures of domains: a contact sheet of each domain, and one that compares them; with out=NAME.png
@@ -131,14 +132,16 @@ def _compare(options: dict[str, str]) -> None:
 
 def _table(options: dict[str, str]) -> None:
     from qs3.files import write_text
-    from qs3.report.tables import csv_text, latex, markdown
+    from qs3.report.formats import csv_text, latex, markdown
+    from qs3.report.table_page import page
 
     table = _built(options)
     text, at = markdown(table), _saved_at(table, options)
-    for suffix, content in ((".md", text), (".csv", csv_text(table)), (".tex", latex(table))):
-        write_text(f"{at}{suffix}", content)
+    write_text(f"{at}.md", text)
+    for suffix, write in ((".csv", csv_text), (".tex", latex), (".html", page)):
+        write_text(f"{at}{suffix}", write(table))
     print(text)
-    print(f"saved {at}.md, .csv, .tex")
+    print(f"saved {at}.md, .csv, .tex, .html")
 
 
 def _pictures_of_run(options: dict[str, str]) -> None:

@@ -42,7 +42,7 @@ def against(table: Table, base: str) -> list[Compared]:
         if row == base:
             continue
         for column, cell, other in zip(table.columns, cells, table.rows[base], strict=True):
-            if cell is None or other is None:
+            if cell is None or other is None or not cell.runnable:
                 continue
             name = f"{row}, {column}" if len(table.columns) > 1 else row
             found.append(_compared(name, cell, other))

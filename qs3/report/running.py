@@ -60,11 +60,11 @@ def missing(table: Table, seeds: Sequence[int], rows: Sequence[str] = ()) -> lis
     Raises:
         ConfigError: `rows` fit no row.
     """
-    cells = [cell for cell in table.cells if not cell.missing and _chosen(cell, rows)]
+    cells = [c for c in table.cells if c.runnable and not c.missing and _chosen(c, rows)]
     if rows and not cells:
         raise ConfigError(
             f"no row of table {table.name} has {' or '.join(map(repr, rows))} in its name; rows "
-            f"are {', '.join(table.rows)}"
+            f"to run are {', '.join(dict.fromkeys(c.row for c in table.cells if c.runnable))}"
         )
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in cells:

@@ -1,99 +1,44 @@
-"""The paper's tables with our numbers beside them. A table is a file of conf/table/.
+"""The paper's tables and the field's benchmarks, with our numbers beside theirs.
 
-Each cell names a run by its command line; composing it gives the config hash by which the runs
-of its seeds are found under the log folder.
+A table is a file of conf/table/. Each cell names a run by its command line; composing it gives the
+config hash by which the runs of its seeds are found under the log folder. This module reads the
+file and finds the runs; `formats` and `table_page` print.
 """
 
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
 from qs3.errors import ConfigError
-from qs3.report.aggregate import DIAGNOSTIC, FEW_SEEDS, Group, Stat, group, load_runs, task
+from qs3.report.aggregate import DIAGNOSTIC, Group, group, load_runs
+from qs3.report.formats import csv_text, grid, latex, markdown, remarks, to_run
+from qs3.report.table_cells import METRICS, Cell, Published, Table
 from qs3.selftraining.student_rules import ORACLE, ORACLE_IN_WORDS
 
+__all__ = [
+    "CONF",
+    "Cell",
+    "Table",
+    "build_table",
+    "composing",
+    "csv_text",
+    "grid",
+    "latex",
+    "markdown",
+    "remarks",
+    "table_names",
+    "to_run",
+]
 CONF = Path(__file__).parents[2] / "conf"
-SEEDS = "0,1,2"
-METRICS = {"accuracy": "accuracy %", "balanced_accuracy": "balanced accuracy %"}
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One number of a table.
-
-    Attributes:
-        row, column: its place.
-        overrides: of train.py, without the seed.
-        paper: mean and SEM in percent as published, or None.
-        take: "final", or "warmup": the run's teacher before self-training. It equals the
-            final result of the same run with selftraining=none, which need not be trained.
-        group: our runs; None if there are none yet.
-        missing: why the cell cannot be run at all ("" if it can).
-    """
-
-    row: str
-    column: str
-    overrides: tuple[str, ...]
-    paper: tuple[float, float] | None
-    take: str = "final"
-    group: Group | None = None
-    missing: str = ""
-
-    @property
-    def command(self) -> str:
-        """The command that fills the cell."""
-        return f"python train.py {shlex.join(self.overrides)} seed={SEEDS} -m"
-
-    def ours(self, metric: str) -> Stat | None:
-        """Our mean of a metric; None if there is none."""
-        where = ("warmup", "selected") if self.take == "warmup" else ("final",)
-        return self.group.stat(*where, metric) if self.group else None
-
-    def text(self, metric: str) -> str:
-        """What the table shows: the number, or why there is none."""
-        if (stat := self.ours(metric)) is not None:
-            few = f" (n={stat.n})" if stat.n < FEW_SEEDS else ""
-            return stat.percent() + few
-        if self.missing:
-            return "not available yet"
-        if self.group and self.group.unlabelled:
-            return "no target labels"
-        return "not averaged" if self.group and self.group.finished else "not run"
-
-
-@dataclass(frozen=True)
-class Table:
-    """A filled table.
-
-    Attributes:
-        name: of its file.
-        title: one line.
-        notes: lines that belong below it.
-        metrics: keys of METRICS.
-        columns: names of the tasks.
-        rows: cells by row name, in the order of `columns`.
-    """
-
-    name: str
-    title: str
-    notes: tuple[str, ...]
-    metrics: tuple[str, ...]
-    columns: tuple[str, ...]
-    rows: Mapping[str, tuple[Cell | None, ...]]
-
-    @property
-    def cells(self) -> list[Cell]:
-        """All cells."""
-        return [cell for row in self.rows.values() for cell in row if cell]
+BENCHMARK = "benchmark"
+_KEYS = ("title", "layout", "notes", "metrics", "columns", "rows", "sources")
 
 
 def table_names() -> list[str]:
@@ -117,7 +62,8 @@ def build_table(
             measured on another target, are then left out.
 
     Raises:
-        ConfigError: no such table, or its file or an override is wrong.
+        ConfigError: no such table, its file or an override is wrong, or `target` is given for
+            a benchmark, whose columns have targets of their own.
     """
     if name not in table_names():
         raise ConfigError(f"there is no table {name!r}; there are {', '.join(table_names())}")
@@ -132,26 +78,27 @@ def build_table(
     if str(log_dir) != "logs":
         more.append(f"paths.log_dir={log_dir}")
     try:
-        cells = [
-            Cell(
-                row["name"],
-                column,
-                (*shlex.split(row[column]["run"]), *more),
-                None if target or "paper" not in row[column] else tuple(row[column]["paper"]),
-                row[column].get("take", "final"),
+        benchmark = _is_benchmark(spec, path)
+        if benchmark and target:
+            raise ConfigError(
+                f"target={target}: the columns of table {name} have several targets; leave it out"
             )
+        cells = [
+            replace(cell, column=_column(column, target))
             for row in spec["rows"]
-            for column in spec["columns"]
-            if column in row
+            for i, column in enumerate(spec["columns"])
+            if (cell := _cell(spec, row, i, column, more, published=not target))
         ]
         filled = {(c.row, c.column): c for c in _fill(cells, groups)}
         metrics = tuple(spec["metrics"])
+        columns = tuple(_column(column, target) for column in spec["columns"])
         rows = {
-            row["name"]: tuple(filled.get((row["name"], column)) for column in spec["columns"])
+            row["name"]: tuple(filled.get((row["name"], column)) for column in columns)
             for row in spec["rows"]
         }
-        title, notes, columns = spec["title"], spec.get("notes", []), tuple(spec["columns"])
-    except (KeyError, TypeError, AttributeError) as error:
+        title, notes = spec["title"], spec.get("notes", [])
+        averages = {r["name"]: float(r["average"]) for r in spec["rows"] if "average" in r}
+    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
     if unknown := sorted(set(metrics) - set(METRICS)):
         raise ConfigError(f"{path}: unknown metrics {unknown}; known are {', '.join(METRICS)}")
@@ -159,7 +106,62 @@ def build_table(
         notes = [*notes, f"all cells on the target {target}, which is not the paper's"]
     if left_out := sum(run.status == DIAGNOSTIC for run in runs):
         notes = [*notes, f"runs left out: {left_out}, chosen by the {ORACLE_IN_WORDS}"]
-    return Table(name, title, tuple(notes), metrics, columns, rows)
+    return Table(name, title, tuple(notes), metrics, columns, rows, benchmark, averages)
+
+
+def _is_benchmark(spec: Mapping[str, Any], path: Path) -> bool:
+    if unknown := sorted(set(spec) - set(_KEYS)):
+        raise ConfigError(f"{path}: unknown keys {unknown}; known are {', '.join(_KEYS)}")
+    layout = spec.get("layout", "")
+    if layout not in ("", BENCHMARK):
+        raise ConfigError(f"{path}: layout: {layout!r} is not known; leave it out or {BENCHMARK}")
+    return bool(layout)
+
+
+def _column(name: str, target: str | None) -> str:
+    """A column's name with another target: "S → D" becomes "S → kinectsim10"."""
+    source, arrow, _ = name.partition(" → ")
+    return f"{source}{arrow}{target}" if target and arrow else name
+
+
+def _cell(
+    spec: Mapping[str, Any],
+    row: Mapping[str, Any],
+    i: int,
+    column: str,
+    more: Sequence[str],
+    published: bool,
+) -> Cell | None:
+    """Of an entry `<column>: {run:, paper:, ...}`, or of what the row says for all columns.
+
+    A row's `run` is followed by the overrides of its columns; its `paper` has a number a column.
+    """
+    own = row.get(column, {})
+    line = own.get("run")
+    if line is None and "run" in row:
+        line = f"{row['run']} {spec['columns'][column]}"
+    numbers = row.get("paper")
+    if numbers is not None and len(numbers) != len(spec["columns"]):
+        raise ConfigError(
+            f"table row {row['name']!r}: paper: has {len(numbers)} numbers, one for each of the "
+            f"{len(spec['columns'])} columns is needed"
+        )
+    number = own.get("paper", numbers[i] if numbers else None)
+    if line is None and number is None:
+        return None
+    paper = None
+    if published and number is not None:
+        mean, sem = number if isinstance(number, list) else (number, None)
+        source = own.get("source", row.get("source", ""))
+        paper = Published(
+            float(mean),
+            None if sem is None else float(sem),
+            own.get("selected", row.get("selected", "")),
+            spec.get("sources", {}).get(source, source),
+        )
+    overrides = () if line is None else (*shlex.split(line), *more)
+    take = own.get("take", row.get("take", "final"))
+    return Cell(row["name"], column, overrides, paper, take)
 
 
 def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> list[Cell]:
@@ -171,6 +173,9 @@ def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> lis
     filled = []
     with composing() as compose:
         for cell in cells:
+            if not cell.runnable:
+                filled.append(cell)
+                continue
             try:
                 cfg = compose("train", list(cell.overrides))
             except MissingConfigException as error:
@@ -182,7 +187,15 @@ def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> lis
                 ) from error
             _refuse_oracle(cell, cfg)
             key = (str(cfg.experiment_name), config_hash(cfg))
-            filled.append(replace(cell, group=groups.get(key)))
+            domain = cfg.data.target
+            filled.append(
+                replace(
+                    cell,
+                    group=groups.get(key),
+                    target=str(domain.name),
+                    simulated=bool(domain.simulated),
+                )
+            )
     return filled
 
 
@@ -214,143 +227,3 @@ def composing() -> Iterator[Callable[[str, list[str]], Any]]:
 
 def _first_line(error: Exception) -> str:
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
-
-
-# ----------------------------------------------------------------------------- what is printed
-
-
-def grid(table: Table) -> list[list[str]]:
-    """The table as strings, header first: for each task our metrics, then the paper's if any."""
-    many = len(table.columns) > 1
-    header = ["method"]
-    for i, column in enumerate(table.columns):
-        header += [f"{column}, {METRICS[m]}" if many else METRICS[m] for m in table.metrics] + (
-            ["paper"] if _has_paper(table, i) else []
-        )
-    lines = [header if many else [*header, "seeds"]]
-    for name, cells in table.rows.items():
-        line = [name]
-        for i, cell in enumerate(cells):
-            line += [cell.text(metric) if cell else "" for metric in table.metrics]
-            if _has_paper(table, i):
-                paper = cell.paper if cell else None
-                line.append(f"{paper[0]:.1f} ± {paper[1]:.1f}" if paper else "")
-        if not many:
-            finished = cells[0].group.seeds if cells[0] and cells[0].group else []
-            line.append(", ".join(map(str, finished)) or "-")
-        lines.append(line)
-    return lines
-
-
-def _has_paper(table: Table, column: int) -> bool:
-    return any((cell := row[column]) and cell.paper for row in table.rows.values())
-
-
-def remarks(table: Table) -> list[str]:
-    """The lines below a table: what it is measured on, how models were chosen, what is missing."""
-    found = [g for cell in table.cells if (g := cell.group) and g.finished]
-    lines = list(table.notes)
-    for target in dict.fromkeys(str(g.first["target"]) for g in found):
-        of = [g for g in found if str(g.first["target"]) == target]
-        simulated = "simulated target" if of[0].first.get("simulated") else "target"
-        rates = sorted(
-            {f"{100 * s.mean:.1f} %" for g in of if (s := g.stat("final", "majority_rate"))}
-        )
-        lines.append(
-            f"majority rate of the {simulated} {target}: {' or '.join(rates) or 'unknown'}"
-        )
-    for role in ("teacher", "student"):
-        rules = {
-            str(rule).split(", epoch")[0]
-            for g in found
-            for run in g.finished
-            if (rule := run.metrics.get("selection", {}).get(role))
-        }
-        if rules:
-            lines.append(f"{role} selected by: {', '.join(sorted(rules))}")
-    splits = {
-        str(run.metrics.get("selection", {}).get("validation", "lineage"))
-        for g in found
-        for run in g.finished
-    }
-    if splits - {"lineage"}:
-        lines.append(f"validation split: {', '.join(sorted(splits))}")
-    if found:
-        counts = sorted({len(g.finished) for g in found})
-        seeds = f"{' or '.join(map(str, counts))} seed{'s' * (counts[-1] > 1)}"
-        lines.append(f"mean ± standard error over {seeds}; (n=...) marks fewer than {FEW_SEEDS}")
-    for cell in table.cells:
-        for problem in cell.group.problems if cell.group else ():
-            lines.append(f"{cell.row}, {cell.column}: {problem}")
-    missing = [c for c in table.cells if c.missing]
-    for reason in dict.fromkeys(c.missing for c in missing):
-        lines.append(f"not available yet: {reason}")
-    return list(dict.fromkeys(lines))
-
-
-def to_run(table: Table) -> list[str]:
-    """Commands that fill the cells without a number, each once."""
-    empty = [
-        cell
-        for cell in table.cells
-        if not cell.missing
-        and cell.ours(table.metrics[0]) is None
-        and not (cell.group and cell.group.unlabelled)
-    ]
-    return list(dict.fromkeys(cell.command for cell in empty))
-
-
-def markdown(table: Table) -> str:
-    """Title, table, remarks, and the commands of what is not run."""
-    header, *body = grid(table)
-    widths = [max(len(row[i]) for row in [header, *body]) for i in range(len(header))]
-
-    def row(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)) + " |"
-
-    lines = [f"## {table.title}", "", row(header)]
-    lines.append("|" + "|".join("-" * (width + 2) for width in widths) + "|")
-    lines += [row(cells) for cells in body]
-    lines += ["", *(f"- {remark}" for remark in remarks(table))]
-    if commands := to_run(table):
-        lines += ["", "Not run yet:", "", "```", *commands, "```"]
-    return "\n".join(lines) + "\n"
-
-
-def latex(table: Table) -> str:
-    """A booktabs tabular; remarks as comments."""
-    header, *body = grid(table)
-    lines = [f"% {remark}" for remark in remarks(table)]
-    lines += [rf"\begin{{tabular}}{{@{{}}l{'c' * (len(header) - 1)}@{{}}}}", r"\toprule"]
-    lines += [_latex_row(header), r"\midrule", *map(_latex_row, body), r"\bottomrule"]
-    return "\n".join([*lines, r"\end{tabular}"]) + "\n"
-
-
-def _latex_row(cells: Sequence[str]) -> str:
-    text = " & ".join(cell.replace("%", r"\%").replace("_", r"\_") for cell in cells)
-    return text.replace("±", r"$\pm$").replace("→", r"$\rightarrow$") + r" \\"
-
-
-def csv_text(table: Table) -> str:
-    """A line a cell and metric, in percent, with the command."""
-    file = io.StringIO(newline="")
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(
-        ["row", "column", "metric", "mean", "sem", "n", "seeds", "paper_mean", "paper_sem",
-         "task", "hash", "command"]
-    )  # fmt: skip
-    for cell in table.cells:
-        for metric in table.metrics:
-            stat, paper = cell.ours(metric), cell.paper if metric == "accuracy" else None
-            values: list[Any] = [cell.row, cell.column, METRICS[metric].removesuffix(" %")]
-            values += [100 * stat.mean, _percent(stat.sem), stat.n] if stat else ["", "", 0]
-            values.append(" ".join(map(str, cell.group.seeds)) if cell.group else "")
-            values += list(paper or ("", ""))
-            known = cell.group.first if cell.group else {}
-            values += [task(known) if known else "", cell.group.hash if cell.group else ""]
-            writer.writerow([*values, cell.command])
-    return file.getvalue()
-
-
-def _percent(value: float | None) -> float | str:
-    return "" if value is None else 100 * value

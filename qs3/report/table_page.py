@@ -1,0 +1,65 @@
+"""A table as one HTML page. Nothing in it comes from elsewhere, so it can be sent as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+from qs3.report.formats import details, grid, marks, remarks, to_run
+from qs3.report.table_cells import INCOMPLETE, Table
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; max-width: 76rem; margin: 2rem auto;
+       padding: 0 1rem; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .9rem .25rem 0; text-align: left; vertical-align: top; }
+td { white-space: nowrap; } th { font-weight: 500; color: #6b7482; }
+tr { border-bottom: 1px solid #e3e6eb; }
+tr > :first-child { position: sticky; left: 0; background: #fff; white-space: normal;
+  min-width: 8rem; }
+li { overflow-wrap: anywhere; }
+.mark { background: #fdf3dc; border-left: 4px solid #c98a1b; padding: .4rem .8rem; }
+.warn { color: #a4441a; }
+.published { color: #6b7482; }
+pre { background: #f7f8fa; padding: .8rem; overflow-x: auto; font-size: 13px; user-select: all; }
+"""
+
+
+def page(table: Table) -> str:
+    """Title, what must not be overlooked, table, remarks, each number, commands to copy."""
+    title = escape(table.title)
+    notes = [remark for remark in remarks(table) if remark not in marks(table)]
+    parts = [
+        "<!doctype html>",
+        '<html lang="en"><head><meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{title}</h1>",
+        *(f'<p class="mark">{escape(mark)}</p>' for mark in marks(table)),
+        _table(grid(table)),
+        "<h2>Remarks</h2><ul>",
+        *(f"<li>{escape(note)}</li>" for note in notes),
+        "</ul>",
+    ]
+    if len(behind := details(table)) > 1:
+        parts += ["<h2>Behind each number</h2>", _table(behind)]
+    if commands := to_run(table):
+        parts.append("<h2>Not run yet</h2>")
+        parts += [f"<pre>{escape(command)}</pre>" for command in commands]
+    return "\n".join([*parts, "</body></html>", ""])
+
+
+def _table(lines: Sequence[Sequence[str]]) -> str:
+    header, *body = lines
+    rows = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in header) + "</tr>"]
+    for line in body:
+        kind = ' class="published"' if "published" in line[1:2] else ""
+        rows.append(f"<tr{kind}>" + "".join(map(_cell, line)) + "</tr>")
+    return '<div class="wide"><table>\n' + "\n".join(rows) + "\n</table></div>"
+
+
+def _cell(text: str) -> str:
+    kind = ' class="warn"' if INCOMPLETE in text or text.startswith("not ") else ""
+    return f"<td{kind}>{escape(text)}</td>"
