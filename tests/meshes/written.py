@@ -1,0 +1,155 @@
+"""Mesh files written for the tests, and what two meshes are compared by."""
+
+import base64
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import MeshError
+from qs3.meshes.files import load_mesh
+
+SQUARE_OFF = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
+PYRAMID = trimesh.Trimesh(
+    [[0, 0, 0], [1.5, 0, 0], [1.25, 1, 0], [0, 1, 0.125], [0.5, 0.5, 2]],
+    [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [0, 2, 1], [0, 3, 2]],
+    process=False,
+)
+
+
+def corners(mesh):
+    """[F, 3, 3]: what is compared, since formats order and repeat vertices as they like."""
+    return np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+
+
+def save(folder, name, content):
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def refused(folder, name, content, reason):
+    path = save(folder, name, content)
+    with pytest.raises(MeshError, match=reason) as caught:
+        load_mesh(path)
+    assert str(path) in str(caught.value)
+
+
+def z_up(mesh):
+    turned = mesh.copy()
+    turned.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    return turned
+
+
+def export(name):
+    """Bytes of the pyramid in a format of trimesh's, by file name."""
+    kind = name.rpartition(".")[2]
+    if name == "ascii.ply":
+        return PYRAMID.export(file_type="ply", encoding="ascii")
+    if name == "ascii.stl":
+        return PYRAMID.export(file_type="stl_ascii").encode()
+    content = PYRAMID.export(file_type=kind)
+    return content.encode() if isinstance(content, str) else content
+
+
+EXPORTS = ["a.off", "a.ply", "ascii.ply", "a.stl", "ascii.stl", "a.obj", "a.glb"]
+
+
+def mixed_ply(order, extras=b""):
+    """A quad and two triangles, with properties before, between and behind."""
+    kind = {"<": b"binary_little_endian", ">": b"binary_big_endian"}[order]
+    header = (
+        b"ply\nformat " + kind + b" 1.0\ncomment made by hand\nelement junk 2\n"
+        b"property list uchar short stuff\nelement vertex 5\nproperty uchar quality\n"
+        b"property double x\nproperty float y\nproperty float z\nelement face 3\n"
+        b"property uchar red\nproperty list uchar int vertex_indices\nproperty float area\n"
+        b"end_header\n"
+    )
+    body = struct.pack(order + "BhBhh", 1, 7, 2, 8, 9)
+    for point in PYRAMID.vertices:
+        body += struct.pack(order + "Bdff", 9, *point)
+    for face in ([0, 3, 2, 1], [0, 1, 4], [1, 2, 4]):
+        body += struct.pack(order + "BB", 200, len(face))
+        body += struct.pack(f"{order}{len(face)}if", *face, 0.5)
+    return header + body + extras
+
+
+def gltf(**changes):
+    """A square as triangles, strip and fan, in one mesh, placed by two nodes."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype="<f4")
+    indices = np.array([0, 1, 2, 2, 1, 3, 0, 1, 2, 3, 0, 1, 3, 2], dtype="<u2")
+    blob = points.tobytes() + indices.tobytes()
+    accessor = {"bufferView": 1, "componentType": 5123, "type": "SCALAR"}
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 2]}],
+        "nodes": [
+            {"children": [1], "translation": [10, 0, 0], "scale": [2, 2, 2]},
+            {"mesh": 0, "camera": 0, "rotation": [0, 0, 2**-0.5, 2**-0.5]},
+            {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 7, 1]},
+        ],
+        "meshes": [
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 0}, "indices": 1},
+                    {"attributes": {"POSITION": 0}, "indices": 2, "mode": 5},
+                    {"attributes": {"POSITION": 0}, "indices": 3, "mode": 6},
+                    {"attributes": {"POSITION": 0}, "mode": 0},
+                ]
+            }
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4},
+            {**accessor, "count": 6},
+            {**accessor, "count": 4, "byteOffset": 12},
+            {**accessor, "count": 4, "byteOffset": 20},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 28},
+        ],
+        "buffers": [
+            {
+                "byteLength": 76,
+                "uri": "data:application/octet-stream;base64," + base64.b64encode(blob).decode(),
+            }
+        ],
+    }
+    return {**tree, **changes}, blob
+
+
+GEOMETRY = """
+<library_geometries>
+  <geometry id="g"><mesh>
+    <source id="p"><float_array id="pa" count="18">9 0 0 0 1 0 0 1 1 0 0 1 0 5 5 5 6 6</float_array>
+      <technique_common><accessor source="#pa" count="4" stride="3" offset="1"/></technique_common>
+    </source>
+    <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+    {primitive}
+  </mesh></geometry>
+</library_geometries>"""
+TRIANGLES = """<triangles count="2"><input semantic="VERTEX" source="#v" offset="0"/>
+  <input semantic="NORMAL" source="#v" offset="1"/><p>0 9 1 9 2 9 0 9 2 9 3 9</p></triangles>"""
+PRIMITIVES = {
+    "triangles": TRIANGLES,
+    "polylist": """<polylist count="1"><input semantic="NORMAL" source="#v" offset="0"/>
+      <input semantic="VERTEX" source="#v" offset="1"/><vcount>4</vcount>
+      <p>7 0 7 1 7 2 7 3</p></polylist>""",
+    "polygons": """<polygons count="2"><input semantic="VERTEX" source="#v" offset="0"/>
+      <p>0 1 2</p><p>0 2 3</p></polygons><lines><input semantic="VERTEX" source="#v"/></lines>""",
+}
+
+
+def dae(
+    primitive=TRIANGLES, nodes='<node><instance_geometry url="#g"/></node>', head="", up="Z_UP"
+):
+    return f"""<?xml version="1.0" encoding="utf-8"?>{head}
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="0.5" name="half"/><up_axis>{up}</up_axis></asset>
+{GEOMETRY.format(primitive=primitive)}
+<library_nodes><node id="n"><instance_geometry url="#g"/></node>
+  <node id="loop"><instance_node url="#loop"/></node></library_nodes>
+<library_visual_scenes><visual_scene id="s">{nodes}</visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
