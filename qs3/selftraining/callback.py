@@ -23,7 +23,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
@@ -32,7 +31,7 @@ from qs3.classifier import Classifier
 from qs3.data.datamodule import UdaData
 from qs3.evaluation import predict
 from qs3.selftraining.scheme import Phases, Scheme
-from qs3.selftraining.selectors import check_selection, keep_all
+from qs3.selftraining.selectors import Predictions, check_selection, keep_all
 from qs3.selftraining.table import path_of, write_pseudo_labels
 
 log = logging.getLogger(__name__)
@@ -140,33 +139,24 @@ class SelfTraining(Callback):
         probabilities = trainer.strategy.broadcast(
             predict(teacher, data.target.points, data.eval_batch_size, pl_module.device)
         )
-        confidence, predicted = probabilities.max(axis=1), probabilities.argmax(axis=1)
-        selection = self.scheme.selector.select(
-            confidence,
-            predicted,
-            data.target.ids,
-            len(self.classes),
-            self.scheme.theta_of(round_),
-            probabilities=probabilities,
-            round_=round_,
-        )
+        said = Predictions.of(probabilities, data.target.ids)
+        selection = self.scheme.selector.select(said, self.scheme.theta_of(round_), round_)
         if selection.labels is not None:  # a selector may name another class than the likeliest
-            predicted = selection.labels
-            confidence = np.take_along_axis(probabilities, predicted[:, None], axis=1)[:, 0]
+            said = said.relabelled(selection.labels)
         if self.scheme.rehearsal:
-            selection = keep_all(selection, predicted)
+            selection = keep_all(selection, said.predicted)
         if trainer.is_global_zero:
             write_pseudo_labels(
                 path_of(self.folder, round_),
-                data.target.ids,
-                predicted,
-                confidence,
+                said.ids,
+                said.predicted,
+                said.confidence,
                 selection.selected,
                 self.classes,
             )
         missing = check_selection(selection, self.classes, round_, self.scheme.missing_class)
 
-        labels = torch.from_numpy(predicted)
+        labels = torch.from_numpy(said.predicted)
         index = torch.from_numpy(selection.selected.nonzero()[0])
         if selection.soft is None:
             data.set_pseudo_labels(index, labels[index])

@@ -8,7 +8,6 @@ about pixels; what is done here with clouds is said in the docstrings.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import ClassVar
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import ConfigError
-from qs3.selftraining.selectors import Selection
+from qs3.selftraining.selectors import Predictions, Selection
 from qs3.settings import number, one_of
 
 _KEY = "selftraining.selector"
@@ -91,23 +90,13 @@ class Cbst:
         grown = Decimal(repr(self.portion)) + round_ * Decimal(repr(self.step))
         return float(min(grown, Decimal(repr(self.most))))
 
-    def select(
-        self,
-        confidence: Float[np.ndarray, " n"],
-        predicted: Int[np.ndarray, " n"],
-        ids: Sequence[str],
-        classes: int,
-        theta: float,
-        *,
-        probabilities: Float[np.ndarray, "n k"] | None = None,
-        round_: int = 0,
-    ) -> Selection:
+    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; the figure "confident" counts predictions above theta."""
-        if probabilities is None:
+        if teacher.probabilities is None:
             raise ConfigError("CBST needs the probabilities of all classes")
-        portion = self.portion_of(round_)
-        thresholds = class_thresholds(confidence, predicted, classes, portion)
-        quotient = probabilities / thresholds  # [n, K]; thresholds > 0, as a largest p is
+        classes, portion = teacher.classes, self.portion_of(round_)
+        thresholds = class_thresholds(teacher.confidence, teacher.predicted, classes, portion)
+        quotient = teacher.probabilities / thresholds  # [n, K]; thresholds > 0, as a largest p is
         labels = quotient.argmax(axis=1)
         soft = None
         keep = quotient.max(axis=1) >= 1
@@ -118,13 +107,13 @@ class Cbst:
             total = powers.sum(axis=1, keepdims=True)
             soft = powers / total
             keep = (top + np.log(total))[:, 0] > 0
-        chosen = np.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
-        selected = keep & (chosen > theta)
+        selected = keep & (teacher.relabelled(labels).confidence > theta)
+        confident = teacher.predicted[teacher.confidence > theta]
         return Selection(
             selected=selected,
             theta=theta,
             mu=np.full(classes, portion),
-            confident=np.bincount(predicted[np.asarray(confidence) > theta], minlength=classes),
+            confident=np.bincount(confident, minlength=classes),
             kept=np.bincount(labels[selected], minlength=classes),
             labels=labels,
             soft=soft,

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from qs3.errors import ConfigError
 from qs3.randomness import derive
-from qs3.selftraining.selectors import Selection, Selector
+from qs3.selftraining.selectors import Predictions, Selection, Selector
 from qs3.settings import one_of, whole
 
 
@@ -42,31 +40,17 @@ class Random:
         """Whether the other selector has thresholds of its own."""
         return bool(getattr(self.of, "own_thresholds", False))
 
-    def select(
-        self,
-        confidence: Float[np.ndarray, " n"],
-        predicted: Int[np.ndarray, " n"],
-        ids: Sequence[str],
-        classes: int,
-        theta: float,
-        *,
-        probabilities: Float[np.ndarray, "n k"] | None = None,
-        round_: int = 0,
-    ) -> Selection:
+    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; figures are those of the other selector."""
-        given = self.of.select(
-            confidence, predicted, ids, classes, theta, probabilities=probabilities, round_=round_
-        )
-        labels, chosen = predicted, np.asarray(confidence)
+        given = self.of.select(teacher, theta, round_)
         if given.labels is not None:
-            assert probabilities is not None
-            labels = given.labels
-            chosen = np.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
-        allowed = chosen > theta if self.pool == "confident" else np.ones(len(chosen), dtype=bool)
-        lot = np.array([derive(self.seed, "random selection", round_, id_) for id_ in ids])
+            teacher = teacher.relabelled(given.labels)
+        every = np.ones(len(teacher.ids), dtype=bool)
+        allowed = teacher.confidence > theta if self.pool == "confident" else every
+        lot = np.array([derive(self.seed, "random selection", round_, id_) for id_ in teacher.ids])
         drawn = np.argsort(lot, kind="stable")
-        selected = np.zeros(len(chosen), dtype=bool)
-        for k in range(classes):
-            of_class = drawn[allowed[drawn] & (labels[drawn] == k)]
+        selected = np.zeros(len(teacher.ids), dtype=bool)
+        for k in range(teacher.classes):
+            of_class = drawn[allowed[drawn] & (teacher.predicted[drawn] == k)]
             selected[of_class[: given.kept[k]]] = True
         return replace(given, selected=selected)

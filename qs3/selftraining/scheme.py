@@ -65,7 +65,7 @@ class Scheme:
     """The settings of config group `selftraining`.
 
     Attributes:
-        selector: object with `select(confidence, labels, ids, classes, theta) -> Selection`.
+        selector: a `qs3.selftraining.selectors.Selector`.
         rounds: number of rounds; 0 is no self-training.
         epochs: of each round.
         batch_size: of each round.

@@ -1,9 +1,8 @@
 """Which pseudo-labels to trust: pure functions on a table of predictions (numpy only).
 
-A selector sees one row a target sample: its predicted class, that class's probability, its id, and
-the probabilities of all classes. It never sees a label. The result does not depend on the order of
-the rows: ties are broken by id. Here: QBST and SPST; CBST and CRST in `cbst`, controls in
-`controls`.
+A selector sees one row a target sample: its id and the probabilities that the teacher gives it. It
+never sees a label. The result does not depend on the order of the rows: ties are broken by id.
+Here: QBST and SPST; CBST and CRST in `cbst`, controls in `controls`.
 """
 
 from __future__ import annotations
@@ -17,6 +16,38 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.errors import SelectionError
 from qs3.settings import one_of
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """What a teacher says of each target sample.
+
+    Attributes:
+        ids: of the samples, all different.
+        confidence: [n] probability of the predicted class, float64.
+        predicted: [n] that class.
+        classes: K.
+        probabilities: [n, K] of all classes; only some selectors look at them.
+    """
+
+    ids: Sequence[str]
+    confidence: Float[np.ndarray, " n"]
+    predicted: Int[np.ndarray, " n"]
+    classes: int
+    probabilities: Float[np.ndarray, "n k"] | None = None
+
+    @classmethod
+    def of(cls, probabilities: Float[np.ndarray, "n k"], ids: Sequence[str]) -> Predictions:
+        """Those of the likeliest classes; the lowest on ties."""
+        predicted = probabilities.argmax(axis=1)
+        confidence = probabilities.max(axis=1).astype(np.float64)
+        return cls(ids, confidence, predicted, probabilities.shape[1], probabilities)
+
+    def relabelled(self, labels: Int[np.ndarray, " n"]) -> Predictions:
+        """The same with other classes named, and the probabilities of those."""
+        assert self.probabilities is not None
+        chosen = np.take_along_axis(self.probabilities, labels[:, None], axis=1)[:, 0]
+        return replace(self, predicted=labels, confidence=chosen.astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,26 +78,12 @@ class Selection:
 class Selector(Protocol):
     """Chooses among predictions; an object built from config group `selftraining`."""
 
-    def select(
-        self,
-        confidence: Float[np.ndarray, " n"],
-        predicted: Int[np.ndarray, " n"],
-        ids: Sequence[str],
-        classes: int,
-        theta: float,
-        *,
-        probabilities: Float[np.ndarray, "n k"] | None = None,
-        round_: int = 0,
-    ) -> Selection:
+    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
         """Choose the samples to train on; may choose none (the caller decides what that means).
 
         Args:
-            confidence: probability of the predicted class.
-            predicted: that class.
-            ids: of the samples, all different.
-            classes: K.
+            teacher: its predictions.
             theta: the probability of every chosen pseudo-label exceeds it.
-            probabilities: of all classes; only some selectors look at them.
             round_: counted from 0.
         """
         ...
@@ -97,19 +114,10 @@ class Qbst:
         one_of("selftraining.selector.order", self.order, ("descending", "ascending"))
         one_of("selftraining.selector.counts", self.counts, ("confident", "all"))
 
-    def select(
-        self,
-        confidence: Float[np.ndarray, " n"],
-        predicted: Int[np.ndarray, " n"],
-        ids: Sequence[str],
-        classes: int,
-        theta: float,
-        *,
-        probabilities: Float[np.ndarray, "n k"] | None = None,
-        round_: int = 0,
-    ) -> Selection:
+    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes alone."""
-        confidence = np.asarray(confidence, dtype=np.float64)
+        confidence, predicted = teacher.confidence, teacher.predicted
+        classes = teacher.classes
         above = confidence > theta
         n_k = np.bincount(predicted[above], minlength=classes)
         n = int(n_k.sum())
@@ -118,7 +126,7 @@ class Qbst:
         quota = -(-(rest * n_k) // max(n, 1))  # ceil(mu_k n_k), in whole numbers: no rounding error
 
         ranked = np.lexsort(
-            (np.asarray(ids), confidence if self.order == "ascending" else -confidence)
+            (np.asarray(teacher.ids), confidence if self.order == "ascending" else -confidence)
         )
         selected = np.zeros(len(confidence), dtype=bool)
         for k in range(classes):
@@ -141,21 +149,11 @@ class Spst:
     `Qbst(mu="one")` chooses.
     """
 
-    def select(
-        self,
-        confidence: Float[np.ndarray, " n"],
-        predicted: Int[np.ndarray, " n"],
-        ids: Sequence[str],
-        classes: int,
-        theta: float,
-        *,
-        probabilities: Float[np.ndarray, "n k"] | None = None,
-        round_: int = 0,
-    ) -> Selection:
+    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes alone."""
-        selected = np.asarray(confidence, dtype=np.float64) > theta
-        kept = np.bincount(predicted[selected], minlength=classes)
-        return Selection(selected, theta, mu=np.ones(classes), confident=kept, kept=kept)
+        selected = teacher.confidence > theta
+        kept = np.bincount(teacher.predicted[selected], minlength=teacher.classes)
+        return Selection(selected, theta, mu=np.ones(len(kept)), confident=kept, kept=kept)
 
 
 def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
