@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from qs3.files import atomic_path
-from qs3.report.pictures import project
+from qs3.geometry.orthographic import project
 
 OBJECTS = 4  # a class, in clouds.png
 _PANEL, _LABEL, _TOP = 1.25, 1.0, 0.62  # inches

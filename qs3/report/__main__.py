@@ -2,12 +2,17 @@
 
     python -m qs3.report table=uda [log_dir=logs] [out=logs/tables] [target=kinectsim10]
                                    [overrides="trainer=gpu data.points=512"]
-    python -m qs3.report run table=cad10 [seeds=0,1,2] [rows=gast,pcm] [jobs=1] [log_dir=logs]
-                                 [target=...] [overrides=...]
+    python -m qs3.report run table=cad10 [seeds=0,1,2] [rows=gast,pcm] [columns=...] [jobs=1]
+                                 [log_dir=logs] [target=...] [overrides=...]
+                                 [launcher=joblib|submitit_local|slurm]
+                                 [hydra.launcher.partition=... and other settings of the launcher]
     python -m qs3.report compare table=cad10 base="source only" [log_dir=logs] [out=...] [...]
     python -m qs3.report pictures run=PATH [data_dir=data] [out=PATH/pictures]
     python -m qs3.report pictures domains=[modelnet10,specklenet10,kinectsim10]
                                   [data_dir=data] [split=train] [out=data/pictures]
+    python -m qs3.report pipeline domain=specklenet10 [object=ID | mesh=FILE] [view=0]
+                                  [out=pipeline.png] [renderer=mitsuba sensor=kinect_v1 ...]
+    python -m qs3.report pipeline dataset=FOLDER object=ID [meshes=PATH] [view=0] [out=...]
 
 A table is printed as Markdown and saved as .md, .csv, .tex and .html. `overrides` are those that
 the runs had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time;
@@ -15,8 +20,11 @@ called again it goes on. `compare` prints the difference of each row to the row 
 interval.
 Pictures of a run, the folder that training names: curves, confusion, pseudo-labels, classes,
 calibration, features of both domains (if its data are there), and a page of all, index.html.
-Pictures of domains: a contact sheet of each domain, and one that compares them; with out=NAME.png
-the latter alone. `paths.log_dir` and `paths.data_dir` are understood as well.
+Pictures of domains: a contact sheet of each domain, one that compares them, and classes.png, how
+many clouds each class has; with out=NAME.png the comparison alone.
+`pipeline` draws one object on its way from images to residuals. It scans it now (any override of
+generate.py is understood), or reads it from a dataset that was made with keep_views=true.
+`paths.log_dir` and `paths.data_dir` are understood as well.
 """
 
 from __future__ import annotations
@@ -30,7 +38,11 @@ from qs3.errors import ConfigError, Qs3Error
 from qs3.report.tables import Table
 
 _TABLE = {"table", "log_dir", "data_dir", "out", "target", "overrides"}
-_RUN = {"table", "log_dir", "data_dir", "target", "overrides", "seeds", "rows", "jobs"}
+_LAUNCHER = "hydra.launcher."
+_RUN = {
+    *("table", "log_dir", "data_dir", "target", "overrides", "seeds", "rows", "columns", "jobs"),
+    *("launcher", _LAUNCHER),
+}
 _COMPARE = _TABLE | {"base"}
 _PICTURES = {"domains", "run", "data_dir", "out", "split"}
 
@@ -43,6 +55,8 @@ def main(argv: Sequence[str]) -> int:
     try:
         if argv[0] == "pictures":
             _pictures(_options(argv[1:], _PICTURES))
+        elif argv[0] == "pipeline":
+            _pipeline(argv[1:])
         elif argv[0] == "run":
             return _run(_options(argv[1:], _RUN))
         elif argv[0] == "compare":
@@ -65,6 +79,9 @@ def _options(argv: Sequence[str], known: set[str]) -> dict[str, str]:
     for word in argv:
         key, equals, value = word.partition("=")
         key = key.removeprefix("paths.")
+        if key.startswith(_LAUNCHER) and _LAUNCHER in known:
+            found[key] = value
+            continue
         if not equals or key not in known:
             raise ConfigError(f"unknown argument {word!r}; known are {', '.join(sorted(known))}=")
         found[key] = value
@@ -90,15 +107,27 @@ def _saved_at(table: Table, options: dict[str, str]) -> Path:
 
 
 def _run(options: dict[str, str]) -> int:
-    from qs3.report.running import missing, run_all
+    from qs3.report.running import LAUNCHERS, launch, missing, run_all
 
     seeds = [_whole("seeds", word) for word in options.get("seeds", "0,1,2").split(",")]
-    rows = [word.strip() for word in options.get("rows", "").split(",") if word.strip()]
-    table, at_once = _built(options), _whole("jobs", options.get("jobs", "1"))
+    rows, columns = (
+        [word.strip() for word in options.get(key, "").split(",") if word.strip()]
+        for key in ("rows", "columns")
+    )
+    at_once = _whole("jobs", options.get("jobs", "1"))
     if at_once < 1:
         raise ConfigError("jobs must be at least 1")
-    jobs = missing(table, seeds, rows)
-    print(f"table {table.name}: {len(jobs)} runs to do")
+    launcher = options.get("launcher")
+    settings = [f"{key}={value}" for key, value in options.items() if key.startswith(_LAUNCHER)]
+    if launcher not in (*LAUNCHERS, None) or (settings and launcher is None):
+        what = f"launcher={launcher}" if launcher else f"{settings[0]} needs a launcher"
+        raise ConfigError(f"{what}; set launcher={'|'.join(LAUNCHERS)}")
+    table = _built(options)
+    jobs = missing(table, seeds, rows, columns)
+    print(f"table {table.name}: {len(jobs)} runs to do", flush=True)
+    if launcher:
+        several = at_once if "jobs" in options else None
+        return launch(jobs, launcher, several, options.get("log_dir", "logs"), settings)
     failed = run_all(jobs, at_once, lambda line: print(line, flush=True))
     if failed:
         print(f"{len(failed)} of {len(jobs)} runs failed:")
@@ -159,11 +188,32 @@ def _pictures_of_run(options: dict[str, str]) -> None:
         print(path)
 
 
+def _pipeline(words: Sequence[str]) -> None:
+    from qs3.report.pipeline import kept_object, scan_object
+    from qs3.report.pipeline_figure import save_pipeline
+
+    if odd := [word for word in words if "=" not in word]:
+        raise ConfigError(f"unknown argument {odd[0]!r}; arguments are key=value")
+    given = dict(word.split("=", 1) for word in words)
+    if "dataset" in given:
+        options = _options(words, {"dataset", "object", "meshes", "view", "out"})
+        one = kept_object(options["dataset"], options.get("object"), options.get("meshes"))
+    elif "domain" in given:
+        ours = ("object", "mesh", "view", "out")
+        overrides = [word for word in words if word.split("=", 1)[0] not in ours]
+        one = scan_object(overrides, given.get("object"), given.get("mesh"))
+    else:
+        raise ConfigError("of what? domain=NAME scans an object, dataset=FOLDER reads one")
+    view = _whole("view", given.get("view", "0"))
+    print(save_pipeline(one, given.get("out", "pipeline.png"), view))
+
+
 def _pictures(options: dict[str, str]) -> None:
     if "run" in options:
         return _pictures_of_run(options)
     from hydra.utils import instantiate
 
+    from qs3.report.class_balance import class_picture
     from qs3.report.pictures import contact_sheet, scan_picture
     from qs3.report.tables import composing
 
@@ -173,7 +223,7 @@ def _pictures(options: dict[str, str]) -> None:
     data_dir = Path(options.get("data_dir", "data"))
     out, split = Path(options.get("out", data_dir / "pictures")), options.get("split", "train")
     alone = out.suffix == ".png"
-    sets, simulated = {}, []
+    sets, simulated, counts = {}, [], {}
     with composing() as compose:
         for name in names:
             cfg = compose(
@@ -184,6 +234,7 @@ def _pictures(options: dict[str, str]) -> None:
             words = f"{domain.title}{' (simulated)' if domain.simulated else ''}"
             sets[f"{domain.symbol}: {words}"] = data
             simulated += [domain.title] if domain.simulated else []
+            counts[domain.label] = data
             if alone:
                 continue
             part = data.split(split)
@@ -199,6 +250,8 @@ def _pictures(options: dict[str, str]) -> None:
                     heading=f"{domain.label}, {split}",
                 )
             )
+    if not alone:
+        print(class_picture(counts, out / "classes.png"))
     note = f"simulated: {', '.join(simulated)}" if simulated else ""
     print(scan_picture(sets, out if alone else out / "domains.png", split=split, note=note))
 

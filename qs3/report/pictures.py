@@ -15,39 +15,12 @@ import numpy as np
 from qs3.data.store import PointSet
 from qs3.errors import DataError
 from qs3.files import atomic_path
+from qs3.geometry.orthographic import project
 
-AZIMUTH_DEG, ELEVATION_DEG = -55.0, 18.0
 _PANEL = 1.45  # inches
 _DPI = 130
 _PALE = np.array([0.93, 0.94, 0.96])  # what colours fade to with distance
 _INK, _SOFT, _PAPER = "#1d2430", "#6b7482", "#ffffff"
-
-
-def project(cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the points of a cloud appear, nearest last.
-
-    Args:
-        cloud: [P, 3], z up, any unit.
-
-    Returns:
-        [P, 2] right and up in the picture, within the unit disc; [P] depth from 0 (far) to 1
-        (near), ascending; [P] height from 0 to 1.
-    """
-    xyz = np.asarray(cloud, dtype=np.float64)
-    xyz = xyz - (xyz.min(axis=0) + xyz.max(axis=0)) / 2
-    xyz = xyz / max(float(np.linalg.norm(xyz, axis=1).max()), 1e-12)
-    a, e = np.deg2rad([AZIMUTH_DEG, ELEVATION_DEG])
-    towards = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])  # to the viewer
-    right = np.array([-np.sin(a), np.cos(a), 0.0])
-    up = np.cross(towards, right)
-    depth = xyz @ towards
-    order = np.argsort(depth, kind="stable")
-    seen = np.stack([xyz @ right, xyz @ up], axis=1)[order]
-    return seen, _unit(depth)[order], _unit(xyz[:, 2])[order]
-
-
-def _unit(values: np.ndarray) -> np.ndarray:
-    return (values - values.min()) / max(float(np.ptp(values)), 1e-12)
 
 
 def contact_sheet(

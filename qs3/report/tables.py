@@ -55,7 +55,7 @@ def build_table(
     """Read a table's file and find our runs of its cells.
 
     Args:
-        name: of a file in conf/table.
+        name: of a file in conf/table, or the path of one's own, NAME.yaml.
         log_dir: `paths.log_dir` of the runs.
         extra: overrides of train.py for every cell, as the runs had them.
         target: another target domain for all cells, e.g. "kinectsim10"; the paper's numbers,
@@ -65,12 +65,16 @@ def build_table(
         ConfigError: no such table, its file or an override is wrong, or `target` is given for
             a benchmark, whose columns have targets of their own.
     """
-    if name not in table_names():
-        raise ConfigError(f"there is no table {name!r}; there are {', '.join(table_names())}")
-    path = CONF / "table" / f"{name}.yaml"
+    path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(
+            f"there is no table {name!r}; there are {', '.join(table_names())}; or give a "
+            "file of your own, NAME.yaml"
+        )
+    name = path.stem
     try:
         spec = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {error}") from error
     runs = load_runs(log_dir)
     groups = {(g.experiment, g.hash): g for g in group(runs)}
@@ -100,6 +104,8 @@ def build_table(
         averages = {r["name"]: float(r["average"]) for r in spec["rows"] if "average" in r}
     except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
+    if odd := [note for note in notes if not isinstance(note, str)]:
+        raise ConfigError(f"{path}: notes: {odd[0]} is no line of text; put quotes around it")
     if unknown := sorted(set(metrics) - set(METRICS)):
         raise ConfigError(f"{path}: unknown metrics {unknown}; known are {', '.join(METRICS)}")
     if target:
@@ -166,7 +172,11 @@ def _cell(
 
 def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> list[Cell]:
     """The cells with their runs, or with the reason why they cannot be run."""
-    from hydra.errors import ConfigCompositionException, MissingConfigException
+    from hydra.errors import (
+        ConfigCompositionException,
+        MissingConfigException,
+        OverrideParseException,
+    )
 
     from qs3.runs import config_hash
 
@@ -181,7 +191,7 @@ def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> lis
             except MissingConfigException as error:
                 filled.append(replace(cell, missing=_first_line(error)))
                 continue
-            except ConfigCompositionException as error:
+            except (ConfigCompositionException, OverrideParseException) as error:
                 raise ConfigError(
                     f"table cell {cell.row!r}, {cell.column!r}: {_first_line(error)}"
                 ) from error

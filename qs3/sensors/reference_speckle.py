@@ -155,11 +155,12 @@ class ReferenceSpeckle:
         )
         gain = self.infrared.gain(image.radiance, np.isfinite(image.depth_m))
         grey = self.infrared.expose(image.radiance, gain, rng)
-        rows, _ = window.slices
+        rows, columns = window.slices
         match = self.matcher.match(grey, self.reference[rows], window.left)
         depth, disparity, reason = self.triangulation.depth(match, self.quantiser, self.filters)
         pictures = {"left": grey, "disparity": disparity, "clean": image.depth_m}
         if explain:
+            pictures["reference"] = self.reference[rows, columns]
             here = Camera(self.intrinsics, world_from_camera, window)
             lit = reached_from(bodies, here, projector.world_from_projector, renderer)
             reason = explained(reason, image.depth_m, lit, None)

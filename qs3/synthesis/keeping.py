@@ -15,7 +15,7 @@ PROVENANCE = ("view", "u_px", "v_px", "residual_m", "incidence_deg")
 NO_RESIDUAL_M = -99.0
 NO_INCIDENCE_DEG = -1.0
 
-_NOT_A_PHOTOGRAPH = ("right", "disparity", "clean", "lit", "seen")
+_NOT_A_PHOTOGRAPH = ("right", "reference", "disparity", "clean", "lit", "seen")
 
 
 @dataclass(frozen=True)

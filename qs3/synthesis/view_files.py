@@ -13,15 +13,18 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
+import zipfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
 import cv2
 import numpy as np
 
-from qs3.errors import Qs3Error
+from qs3.errors import DataError, Qs3Error
 from qs3.files import remove_leftovers, write_bytes
+from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.reasons import Reason
 from qs3.synthesis.keeping import photograph
@@ -29,7 +32,7 @@ from qs3.synthesis.keeping import photograph
 _LONGEST_NAME = 200  # bytes; file systems allow 255, and the temporary name is longer
 _DARK = (24, 20, 18)  # BGR, where nothing was measured
 _LEAST_PX = 300  # height of a panel
-_REASON_COLOURS = {  # BGR
+REASON_COLOURS = {  # BGR
     Reason.OK: (120, 160, 60),
     Reason.EMPTY: (24, 20, 18),
     Reason.SHADOW: (120, 90, 90),
@@ -122,6 +125,62 @@ def save_view(
         write_bytes(folder / f"view_{view}.npz", compressed.getvalue())
 
 
+@dataclass(frozen=True, eq=False)
+class KeptView:
+    """A view as `save_view` was given it.
+
+    Attributes:
+        number: among the object's views, from 0.
+        frame: what was measured.
+        world_from_camera: [4, 4] the true pose.
+        believed: [4, 4] the pose that tracking believes.
+    """
+
+    number: int
+    frame: DepthFrame
+    world_from_camera: np.ndarray
+    believed: np.ndarray
+
+
+def load_views(root: Path, object_id: str) -> tuple[KeptView, ...]:
+    """The views of an object that `save_view` wrote, by number; none if there are none.
+
+    Raises:
+        DataError: a file is damaged.
+    """
+    found = []
+    for path in view_folder(root, object_id).glob("view_*.npz"):
+        try:
+            with np.load(io.BytesIO(path.read_bytes())) as file:
+                arrays = dict(file)
+            found.append(_kept(int(path.stem.removeprefix("view_")), arrays))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path} is damaged ({error}); generate the dataset again") from error
+    return tuple(sorted(found, key=lambda view: view.number))
+
+
+def _kept(number: int, arrays: dict[str, np.ndarray]) -> KeptView:
+    width, height = (int(value) for value in arrays["size_px"])
+    cx, cy = (float(value) for value in arrays["centre_px"])
+    left, top, step = (int(value) for value in arrays["grid_px"])
+    intrinsics = Intrinsics(width, height, float(arrays["focal_px"]), cx, cy)
+    images = {name[6:]: image for name, image in arrays.items() if name.startswith("image_")}
+    frame = DepthFrame(
+        camera=Camera(intrinsics, arrays["world_from_camera"]),
+        left=left,
+        top=top,
+        step_px=step,
+        depth_m=arrays["depth_m"],
+        clean_m=arrays["clean_m"],
+        label=arrays["label"],
+        cosine=arrays["cosine"],
+        reason=arrays["reason"],
+        images=images,
+    )
+    believed = arrays["world_from_camera_believed"]
+    return KeptView(number, frame, arrays["world_from_camera"], believed)
+
+
 def view_picture(frame: DepthFrame) -> np.ndarray:
     """[H, W, 3] uint8 BGR: infrared image, disparity, depth and reasons side by side."""
     seen = photograph(frame.images)
@@ -133,7 +192,7 @@ def view_picture(frame: DepthFrame) -> np.ndarray:
         panels.append(_panel(_coloured(disparity), _range("disparity", disparity, "px"), height))
     panels.append(_panel(_coloured(frame.depth_m), _range("depth", frame.depth_m, "m"), height))
     reasons = np.zeros((*frame.reason.shape, 3), dtype=np.uint8)
-    for reason, colour in _REASON_COLOURS.items():
+    for reason, colour in REASON_COLOURS.items():
         reasons[frame.reason == reason] = colour
     panels.append(_panel(reasons, "why there is a depth or none", height))
     panels.append(_legend(frame.reason, panels[0].shape[0]))
@@ -180,7 +239,7 @@ def _panel(image: np.ndarray, title: str, height: int) -> np.ndarray:
 def _legend(reason: np.ndarray, height: int) -> np.ndarray:
     out = np.full((max(height, 22 + 20 * len(Reason)), 190, 3), 255, dtype=np.uint8)[:height]
     y = 40
-    for kind, colour in _REASON_COLOURS.items():
+    for kind, colour in REASON_COLOURS.items():
         share = float((reason == kind).mean()) if reason.size else 0.0
         if share > 0:
             out[y - 10 : y + 2, 6:18] = colour

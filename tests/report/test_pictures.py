@@ -6,8 +6,9 @@ import pytest
 
 from qs3.data.store import ManifestRow, write_pointset
 from qs3.errors import DataError
+from qs3.geometry.orthographic import project
 from qs3.report.__main__ import main
-from qs3.report.pictures import contact_sheet, project, scan_picture
+from qs3.report.pictures import contact_sheet, scan_picture
 from tests.fixtures.published import CLASSES, cloud, write_domain
 
 
@@ -83,7 +84,8 @@ def test_command_line(tmp_path, capsys):
     domains = "domains=[specklenet10,kinectsim10]"
     assert main(["pictures", domains, f"data_dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        str(tmp_path / "out" / f"{name}.png") for name in ("specklenet10", "kinectsim10", "domains")
+        str(tmp_path / "out" / f"{name}.png")
+        for name in ("specklenet10", "kinectsim10", "classes", "domains")
     ]
     alone = tmp_path / "alone" / "scans.png"
     assert main(["pictures", domains, f"paths.data_dir={tmp_path}", f"out={alone}"]) == 0

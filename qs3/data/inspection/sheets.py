@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from qs3.files import atomic_path
+from qs3.geometry.orthographic import project
 
 _PANEL, _LABEL, _GAP = 1.25, 1.0, 0.2  # inches
 _INK, _SOFT = "#1d2430", "#6b7482"
@@ -32,8 +33,6 @@ def sheet(
     from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-
-    from qs3.report.pictures import project
 
     widths = [max(1, *(len(blocks[k]) for blocks in rows.values())) for k in range(len(titles))]
     lefts = [_LABEL + k * _GAP + sum(widths[:k]) * _PANEL for k in range(len(titles))]

@@ -1,0 +1,77 @@
+"""train.py and generate.py as functions, for notebooks: the words are those of the command line.
+
+from qs3.calling import generate, train
+
+generate("domain=modelnet10", "limit=5", "paths.data_dir=/tmp/data")
+folder = train("experiment=quickstart", "seed=1", "paths.data_dir=/tmp/data")
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from qs3.data.store import PointSet
+
+
+def train(*overrides: str) -> Path:
+    """Train a run as `python train.py <overrides>` does, in this process.
+
+    A finished run is not trained again. One seed at a time: there is no `-m` here.
+
+    Returns:
+        The run's folder; `qs3.report.run_data.read_run` and `qs3.load` read it.
+
+    Raises:
+        ConfigError, MissingDataError, ...: as the command says them.
+    """
+    from omegaconf import OmegaConf
+
+    from qs3.files import write_text
+    from qs3.run import train as run_of
+    from qs3.runs import run_folder
+
+    cfg = composed("train", *overrides)
+    folder = run_folder(cfg)
+    run_of(cfg)
+    # What Hydra leaves in a run's folder, which pictures and `qs3.report` read.
+    write_text(folder / ".hydra" / "config.yaml", OmegaConf.to_yaml(cfg))
+    write_text(folder / ".hydra" / "overrides.yaml", OmegaConf.to_yaml(list(overrides)))
+    return folder
+
+
+def generate(*overrides: str) -> PointSet:
+    """Make a dataset as `python generate.py <overrides>` does; see there.
+
+    Workers are processes of their own; workers=0 uses this one.
+    """
+    from qs3.generation import generate as made
+
+    return made(composed("generate", *overrides))
+
+
+def composed(command: str, *overrides: str) -> DictConfig:
+    """The config that a command would run with.
+
+    Args:
+        command: "train" or "generate".
+        overrides: words of its command line.
+
+    Raises:
+        ConfigError: no such group, choice or key.
+    """
+    from hydra.errors import ConfigCompositionException, OverrideParseException
+
+    from qs3.errors import ConfigError
+    from qs3.report.tables import composing
+
+    with composing() as compose:
+        try:
+            cfg: Any = compose(command, list(overrides))
+        except (ConfigCompositionException, OverrideParseException) as error:
+            lines = str(error).strip().splitlines()
+            raise ConfigError(lines[0] if lines else type(error).__name__) from error
+    return cfg
