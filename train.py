@@ -7,11 +7,11 @@ from qs3.hydra_glue import speak_plainly
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
-def main(cfg: DictConfig) -> None:
-    """Run, continue or skip the run that the config describes."""
-    from qs3.run import train
+def main(cfg: DictConfig) -> float | None:
+    """Run, continue or skip the run that the config describes; returns what a search asks for."""
+    from qs3.run import objective_of, train
 
-    speak_plainly(train, cfg)
+    return speak_plainly(lambda cfg: objective_of(cfg, train(cfg)), cfg)
 
 
 if __name__ == "__main__":

@@ -26,17 +26,22 @@ CALIBRATION_BINS = 15
 
 @torch.no_grad()
 def predict(
-    net: nn.Module, points: Float[Tensor, "n p 3"], batch_size: int, device: Any = "cpu"
+    net: nn.Module,
+    points: Float[Tensor, "n p 3"],
+    batch_size: int,
+    device: Any = "cpu",
+    *,
+    domain: str = "target",
 ) -> Float[np.ndarray, "n c"]:
     """Class probabilities in eval mode, unaugmented, in the order given: nothing is random.
 
-    The clouds are of the target: a net with norms for each domain uses the target's, if it was
-    trained on the target at all.
+    A net with norms for each domain uses those of `domain`, the clouds' own, if it was trained on
+    that domain at all.
     """
     training = net.training
     net.eval()
     try:
-        with use_domain(net, norms_for(net, "target")):
+        with use_domain(net, norms_for(net, domain)):
             parts = [
                 net(points[i : i + batch_size].to(device)).double().softmax(dim=1).cpu()
                 for i in range(0, len(points), batch_size)

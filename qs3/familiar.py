@@ -54,21 +54,17 @@ def measure(stored: Float[np.ndarray, "p 3"], sample: Float[np.ndarray, "m 3"]) 
     }
 
 
-def limits(*domains: Clouds) -> dict[str, list[float]]:
+def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
     """Of each measure the least and the largest usual value: [low, high].
 
     From 0.1 % to 99.9 % of the clouds of each domain, and of these ranges the lowest and highest
-    end. Of fewer than a thousand clouds this is about the range of all. At most a thousand of a
-    domain are measured, evenly spaced. Having many points is no fault: `points` has no upper end
+    end. Of fewer than a thousand clouds this is about the range of all. At most `most` of a domain
+    are measured, evenly spaced. Having many points is no fault: `points` has no upper end
     (infinity).
     """
     ranges = []
     for clouds in domains:
-        chosen = np.unique(np.linspace(0, len(clouds) - 1, min(len(clouds), _MOST)).astype(int))
-        found = []
-        for i in chosen:
-            stored = np.asarray(clouds.stored[clouds.rows[i]])
-            found.append(measure(stored, clouds.take(torch.tensor([i]))[0].numpy()))
+        found = _measured(clouds, most)
         table = np.array([list(each.values()) for each in found])  # [clouds, measures]
         ranges.append(np.quantile(table, [_TAIL, 1 - _TAIL], axis=0))
     low = np.min([each[0] for each in ranges], axis=0)
@@ -88,6 +84,24 @@ def strange(measured: Mapping[str, float], usual: Mapping[str, list[float]]) -> 
         limit = f"under {low:.4g}" if value < low else f"over {high:.4g}"
         told.append(f"{name} {value:.4g} is {limit}")
     return told
+
+
+def strange_clouds(
+    clouds: Clouds, usual: Mapping[str, list[float]], most: int | None = None
+) -> list[list[str]]:
+    """What `strange` says of each cloud, or of at most `most`, evenly spaced."""
+    found = _measured(clouds, len(clouds) if most is None else most)
+    return [strange(each, usual) for each in found]
+
+
+def _measured(clouds: Clouds, most: int) -> list[dict[str, float]]:
+    """Of at most `most` clouds, evenly spaced."""
+    chosen = np.unique(np.linspace(0, len(clouds) - 1, min(len(clouds), most)).astype(int))
+    found = []
+    for i in chosen:
+        stored = np.asarray(clouds.stored[clouds.rows[i]])
+        found.append(measure(stored, clouds.take(torch.tensor([i]))[0].numpy()))
+    return found
 
 
 def _different(points: Float[np.ndarray, "p 3"]) -> int:

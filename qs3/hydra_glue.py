@@ -1,19 +1,14 @@
-"""What Hydra needs from us: the run folder as a resolver, instantiation, the multirun summary.
+"""What Hydra needs from us: resolvers, instantiation, plain errors. See `qs3.multirun` for sweeps.
 
-Importing this module registers the resolvers `${qs3.run_name:}` and `${qs3.wandb_id:}`, and for
-help texts `${qs3.choices:GROUP}` and `${qs3.described:GROUP}`.
+Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
+`${qs3.tags:}` and `${qs3.gpu_in_turn:N}`, and for help texts `${qs3.choices:GROUP}` and
+`${qs3.described:GROUP}`.
 """
 
 from __future__ import annotations
 
-import atexit
 import itertools
-import json
-import logging
-import os
 import re
-import sys
-import tempfile
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -21,15 +16,12 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, InstantiationException
-from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from qs3 import runs
 from qs3.errors import ConfigError, Qs3Error
-
-log = logging.getLogger(__name__)
 
 
 def _run_name(*, _root_: DictConfig) -> str:
@@ -38,6 +30,45 @@ def _run_name(*, _root_: DictConfig) -> str:
 
 def _wandb_id(*, _root_: DictConfig) -> str:
     return runs.run_name(_root_).replace("/", "-")
+
+
+def _tags(*, _root_: DictConfig) -> list[str]:
+    """For loggers: method, self-training, net and domains, and whether the target is simulated."""
+    names, data = called(_root_), _root_.data
+    tags = [f"{data.source.name} -> {data.target.name}", *dict.fromkeys(names.values())]
+    return [tag for tag in tags if tag != "none"] + ["simulated"] * bool(
+        data.target.get("simulated")
+    )
+
+
+def _gpu_in_turn(gpus: int | None = None) -> int:
+    """The GPU for this job: its number in the sweep, modulo `gpus`; 0 outside of a sweep.
+
+    Whatever process a job runs in: a variable such as CUDA_VISIBLE_DEVICES would come too late in
+    a process that has run a job before.
+
+    Args:
+        gpus: how many there are; None: as many as CUDA finds.
+    """
+    if gpus is None:
+        import torch  # counts without occupying a GPU
+
+        gpus = max(1, torch.cuda.device_count())
+    if isinstance(gpus, bool) or not isinstance(gpus, int) or gpus < 1:
+        raise ConfigError(f"trainer.gpus must be a whole number of at least 1, got {gpus!r}")
+    return int(HydraConfig.get().job.num) % gpus if in_multirun() else 0
+
+
+def called(cfg: DictConfig) -> dict[str, str]:
+    """How method, self-training and model were called on the command line (or their classes)."""
+    choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
+    selector = cfg.selftraining.get("selector") or {"_target_": "none"}
+    nodes = {"method": cfg.method, "selftraining": selector, "model": cfg.model}
+    names = {
+        group: str(choices.get(group) or node.get("_target_", "none").rsplit(".", 1)[-1].lower())
+        for group, node in nodes.items()
+    }
+    return names if runs.has_rounds(cfg) else {**names, "selftraining": "none"}
 
 
 def _choices(group: str, indent: int = 0) -> str:
@@ -77,6 +108,8 @@ def _files(group: str) -> list[Path]:
 
 OmegaConf.register_new_resolver("qs3.choices", _choices, replace=True)
 OmegaConf.register_new_resolver("qs3.described", _described, replace=True)
+OmegaConf.register_new_resolver("qs3.gpu_in_turn", _gpu_in_turn, replace=True)
+OmegaConf.register_new_resolver("qs3.tags", _tags, replace=True)
 OmegaConf.register_new_resolver("qs3.run_name", _run_name, replace=True)
 OmegaConf.register_new_resolver("qs3.wandb_id", _wandb_id, replace=True)
 
@@ -117,62 +150,3 @@ def speak_plainly(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
 def in_multirun() -> bool:
     """Whether this job is one of a sweep."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-
-
-class SummaryOfSeeds(Callback):
-    """After a multirun: mean and SEM over the seeds of each config.
-
-    The list of folders and errors is a file, because jobs may run in other processes (joblib,
-    submitit); its name travels to them inside this object.
-    """
-
-    def __init__(self) -> None:
-        self.journal: Path | None = None
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Begin a new list."""
-        handle, name = tempfile.mkstemp(prefix="qs3-multirun-", suffix=".txt")
-        os.close(handle)
-        self.journal = Path(name)
-        # Hydra leaves a sweep by the first failed job's exception, past `on_multirun_end`; the
-        # finished seeds are worth a table nevertheless.
-        atexit.register(self._summarise)
-
-    def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
-        """Add this job's folder (and say what went wrong: Hydra shows the first error only).
-
-        What all jobs lack, say the data, is said once.
-        """
-        if self.journal is None:
-            return
-        error = getattr(job_return, "_return_value", None)
-        text = (str(error) or type(error).__name__) if isinstance(error, Exception) else ""
-        if text and text not in (entry["error"] for entry in self._entries()):
-            log.error("%s failed: %s", " ".join(job_return.overrides), text.splitlines()[0])
-        entry = {"folder": str(config.hydra.runtime.output_dir), "error": text}
-        with open(self.journal, "a", encoding="utf-8") as file:  # one short write: atomic
-            file.write(json.dumps(entry) + "\n")
-
-    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Print the summary."""
-        self._summarise()
-
-    def _summarise(self) -> None:
-        if self.journal is None:
-            return
-        folders = sorted({Path(entry["folder"]) for entry in self._entries()})
-        self.journal.unlink(missing_ok=True)
-        self.journal = None
-        if any((folder / runs.METRICS).is_file() for folder in folders):
-            sys.stdout.write(summarise(folders) + "\n")
-
-    def _entries(self) -> list[dict[str, str]]:
-        assert self.journal is not None
-        return [json.loads(line) for line in self.journal.read_text(encoding="utf-8").splitlines()]
-
-
-def summarise(folders: list[Path]) -> str:
-    """A small table of the runs in `folders`."""
-    from qs3.report.aggregate import summarise as table
-
-    return table(folders)

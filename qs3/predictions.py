@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from qs3.errors import DataError
 from qs3.files import write_text
 
 FILE = "predictions.csv"
+OF_FILES = "predictions_of_files.csv"
 _FIRST = ("id", "mesh", "label", "predicted")
 
 
@@ -54,6 +56,31 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
     for id_, mesh, label, predicted, row in rows:
         name = "" if label < 0 else p.classes[label]
         writer.writerow([id_, mesh, name, p.classes[predicted], *map(repr, row.tolist())])
+    write_text(path, text.getvalue())
+
+
+def write_predictions_of_files(
+    path: Path, files: Sequence[str], reasons: Sequence[str], predictions: Predictions
+) -> None:
+    """A table for whoever owns the files: one row each, in the order of their names.
+
+    Columns: file; class; confidence; unlike_source (yes or no), reason (in what); and a probability
+    per class, to four digits.
+
+    Args:
+        path: to write.
+        files: name of each cloud's file.
+        reasons: in what a cloud is unlike the source's; "" if in nothing.
+        predictions: of the clouds.
+    """
+    p, text = predictions, io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    first = ("file", "class", "confidence", "unlike_source", "reason")
+    writer.writerow([*first, *(f"p_{name}" for name in p.classes)])
+    rows = zip(files, p.predicted, reasons, p.probabilities, strict=True)
+    for file, predicted, reason, row in sorted(rows, key=lambda r: r[0]):
+        flag, digits = "yes" if reason else "no", [f"{value:.4f}" for value in row]
+        writer.writerow([file, p.classes[predicted], digits[predicted], flag, reason, *digits])
     write_text(path, text.getvalue())
 
 

@@ -9,16 +9,18 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from qs3 import runs
 from qs3.data.domain import check_all
 from qs3.data.store import is_finished
 from qs3.errors import ConfigError
 from qs3.hydra_glue import build, in_multirun
+from qs3.predictions import OF_FILES
+from qs3.quality_words import in_words
 from qs3.runs import Run
 from qs3.selftraining.scheme import Phases, Scheme
-from qs3.selftraining.student_rules import LAST, STUDENT_RULES
+from qs3.selftraining.student_rules import LAST, STUDENT_RULES, check_objective
 from qs3.settings import number, one_of, whole
 
 log = logging.getLogger(__name__)
@@ -46,6 +48,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     )
     _refuse_rounds_of_upper_bound(run)
     _refuse_choice_without_rounds(run)
+    check_objective(cfg.objective, cfg.selection.student)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
         with _wandb_forgotten():
@@ -67,8 +70,27 @@ def train(cfg: DictConfig) -> dict[str, Any]:
             _refuse_other_data(run, metrics["data"])
             log.info("already finished (force=true repeats it)")
     log.info("%s", headline(metrics))
+    if (run.folder / OF_FILES).is_file():
+        log.info("the class of each file: %s", run.folder / OF_FILES)
     log.info("see %s", run.folder / runs.METRICS)
     return metrics
+
+
+def objective_of(cfg: DictConfig, metrics: dict[str, Any]) -> float | None:
+    """What a search over hyper-parameters looks at; None if there is no search.
+
+    Raises:
+        ConfigError: the finished run has no such figure.
+    """
+    if cfg.objective is None:
+        return None
+    value = metrics.get("validators", {}).get(cfg.objective)
+    if value is None:
+        raise ConfigError(
+            f"the run's metrics.json has no {cfg.objective} under validators: it diverged, or was "
+            "finished by an earlier version; force=true repeats it"
+        )
+    return float(value)
 
 
 def headline(metrics: dict[str, Any]) -> str:
@@ -77,7 +99,11 @@ def headline(metrics: dict[str, Any]) -> str:
     target = f"{metrics['target']}{' (simulated)' if metrics['simulated'] else ''}"
     if final["accuracy"] is None:
         counts = ", ".join(f"{name} {count}" for name, count in final["predicted"].items() if count)
-        return f"{run}: no labels to judge {target} by; predicted {counts}{_chosen(metrics)}"
+        estimate = in_words(metrics.get("quality", {}))
+        return (
+            f"{run}: no labels to judge {target} by; predicted {counts}"
+            f"{f'; {estimate}' if estimate else ''}{_chosen(metrics)}"
+        )
     return (
         f"{run}: accuracy {final['accuracy']:.1%}, balanced {final['balanced_accuracy']:.1%} "
         f"on {target}, majority rate {final['majority_rate']:.1%}{_chosen(metrics)}"
@@ -122,6 +148,10 @@ def _check_settings(cfg: DictConfig) -> None:
     one_of("selection.student", cfg.selection.student, STUDENT_RULES)
     whole("data.points", cfg.data.points, 1)
     whole("data.fps_starts", cfg.data.fps_starts, 1)
+    if cfg.data.clouds_a_class is not None:
+        whole("data.clouds_a_class", cfg.data.clouds_a_class, 1)
+    if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
+        raise ConfigError(f"ckpt_path must be last or a path, got {cfg.ckpt_path!r}")
     whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
     one_of("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
     whole("evaluation.rotations", cfg.evaluation.rotations, 0)
@@ -183,9 +213,9 @@ def _refuse_other_data(run: Run, hashes: dict[str, str]) -> None:
 
 def _refuse_ddp_in_multirun(cfg: DictConfig) -> None:
     """Lightning would start each further process with the whole sweep's command line."""
-    several = str(cfg.trainer.get("devices", 1)) not in ("1", "[0]") or (
-        cfg.trainer.get("num_nodes", 1) > 1
-    )
+    devices = cfg.trainer.get("devices", 1)
+    one = len(devices) == 1 if isinstance(devices, ListConfig) else str(devices) == "1"
+    several = not one or cfg.trainer.get("num_nodes", 1) > 1
     if several and in_multirun():
         raise ConfigError(
             "trainer uses several processes (DDP), which cannot be swept with -m; run each seed by "

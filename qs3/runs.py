@@ -54,6 +54,8 @@ _UNHASHED = (
     "force",
     "callbacks.progress",
     "report",
+    "ckpt_path",
+    "objective",
     "data.cache_dir",
     *(
         f"data.{domain}.{key}"
@@ -103,6 +105,13 @@ def config_sha256(cfg: DictConfig) -> str:
         selection.pop("student")  # a younger key: runs from before it are still found
     if plain.get("compile") is False:  # likewise
         plain.pop("compile")
+    data, trainer = plain.get("data"), plain.get("trainer")
+    if isinstance(data, dict) and data.get("clouds_a_class", 0) is None:  # likewise
+        data.pop("clouds_a_class")
+    if isinstance(trainer, dict):  # which of several GPUs trains a run does not matter
+        trainer.pop("gpus", None)
+        if isinstance(trainer.get("devices"), list) and len(trainer["devices"]) == 1:
+            trainer["devices"] = 1
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -110,6 +119,11 @@ def config_sha256(cfg: DictConfig) -> str:
 def config_hash(cfg: DictConfig) -> str:
     """The first 8 digits of `config_sha256`, for names (`check_config` compares all 64)."""
     return config_sha256(cfg)[:8]
+
+
+def has_rounds(cfg: DictConfig) -> bool:
+    """Whether the config has self-training that does something."""
+    return not _without_rounds(OmegaConf.to_container(cfg.selftraining, resolve=False))
 
 
 def run_name(cfg: DictConfig) -> str:

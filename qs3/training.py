@@ -15,7 +15,6 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
@@ -25,23 +24,40 @@ import qs3
 from qs3 import oracle, runs
 from qs3.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
 from qs3.classifier import Classifier
-from qs3.data.datamodule import UdaData, labels_of, load_clouds, with_labels
+from qs3.clock import Clock
+from qs3.data.datamodule import (
+    Labelled,
+    UdaData,
+    Unlabelled,
+    first_of_each_class,
+    labels_of,
+    load_clouds,
+    with_labels,
+)
 from qs3.data.manifest import read_manifest
 from qs3.data.prepare import remove_old_leftovers
 from qs3.data.store import PointSet
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation import Evaluation, adapt_norms
-from qs3.familiar import limits
+from qs3.familiar import limits, strange_clouds
 from qs3.files import remove_leftovers
-from qs3.hydra_glue import build
+from qs3.hydra_glue import build, called
 from qs3.loggers import CsvHistory, EpochRows
 from qs3.methods.base import Method
 from qs3.methods.student import Student
 from qs3.predictions import FILE as PREDICTIONS
-from qs3.predictions import write_predictions
+from qs3.predictions import (
+    OF_FILES,
+    Predictions,
+    write_predictions,
+    write_predictions_of_files,
+)
+from qs3.quality import quality_of, usual_of
 from qs3.randomness import derive
+from qs3.reported import learnt_by_heart, without_labels
 from qs3.result import FILE as RESULT
 from qs3.result import Result, write_result
+from qs3.resuming import take_checkpoint
 from qs3.runs import Run
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, SelfTraining, WarmupSelection
 from qs3.selftraining.scheme import Phases
@@ -81,6 +97,8 @@ def fit(run: Run) -> dict[str, Any]:
     else:
         clouds = load_split(source_set, "train", starts=cfg.data.fps_starts)
         labelled = with_labels(clouds, source_set, "train", "data.source")
+    if cfg.data.clouds_a_class is not None:
+        labelled = first_of_each_class(labelled, cfg.data.clouds_a_class)
     data = UdaData(
         labelled,
         target,
@@ -96,8 +114,9 @@ def fit(run: Run) -> dict[str, Any]:
         uses_target=method.uses_target,
     )
     split = _evaluated_split(target_set)
+    judged = load_split(target_set, split)
     evaluation = Evaluation(
-        load_split(target_set, split),
+        judged,
         labels_of(target_set, split) if split == "test" else None,
         _labels_by_id(target_set, "train"),
         target_set.classes,
@@ -107,6 +126,8 @@ def fit(run: Run) -> dict[str, Any]:
     )
     if cfg.selection.student == ORACLE:
         oracle.check(evaluation)
+    if not cfg.force:
+        take_checkpoint(run, started)
 
     # 2. Classifier and callbacks.
     classifier = Classifier(
@@ -135,7 +156,8 @@ def fit(run: Run) -> dict[str, Any]:
         run.phases.warmup,
     )
     saving = [SaveLast(run.folder), shared]  # in this order
-    callbacks: list[Callback] = [warmup, rounds, student, EpochRows(run.phases), *saving]
+    clock = Clock(began)
+    callbacks: list[Callback] = [warmup, rounds, student, EpochRows(run.phases), clock, *saving]
 
     # 3. One fit over all phases. A checkpoint lies between two epochs; a resume repeats an epoch.
     trainer = _make_trainer(
@@ -180,17 +202,37 @@ def fit(run: Run) -> dict[str, Any]:
     if choice is not None:
         final, files["chosen"] = "chosen", choice.file
     scores, turned = {}, {}
+    quality: dict[str, Any] = {}
+    extras: dict[str, Any] = {}
     for name, file in files.items():
         net = trained(file)
         scores[name] = evaluation.figures(net, classifier.device)
         if name in (final, "selected"):
             turned[name] = evaluation.turned(net, classifier.device)
+        if name == final:
+            more = data.eval_batch_size, classifier.device
+            extras["validators"] = without_labels(net, target, choice, *more)
+            if cfg.data.clouds_a_class is not None:
+                extras["training"] = learnt_by_heart(net, data.labelled, *more)
+            quality = quality_of(
+                net,
+                judged,
+                data.validation,
+                labelled.clouds,
+                owner=method.labels,
+                classes=target_set.classes,
+                batch_size=cfg.data.eval_batch_size,
+                device=classifier.device,
+                teacher=trained(files["selected"]) if run.scheme.rounds else None,
+                upright=run.target.gravity == "z",
+            )
         if name == final and trainer.is_global_zero:
             usual = limits(labelled.clouds, target.clouds)
             write_result(run.folder / RESULT, _result(run, target_set, net, usual))
-            write_predictions(
-                run.folder / PREDICTIONS, evaluation.predictions(net, classifier.device)
-            )
+            predictions = evaluation.predictions(net, classifier.device)
+            write_predictions(run.folder / PREDICTIONS, predictions)
+            if evaluation.y_target_eval is None:
+                _write_of_files(run, target_set, judged, labelled, predictions)
     validated_on = f"{method.labels}_val"
     teacher = (
         f"{validated_on if warmup.rule == 'source_val' else warmup.rule}, epoch {warmup.epoch}"
@@ -205,7 +247,7 @@ def fit(run: Run) -> dict[str, Any]:
         "source": run.target.name if supervised else run.source.name,
         "target": run.target.name,
         "simulated": bool(run.target.simulated),
-        **_names(run),
+        **called(cfg),
         "selection": {
             "teacher": teacher,
             "student": reported,
@@ -239,8 +281,10 @@ def fit(run: Run) -> dict[str, Any]:
             for record in rounds.records
         ],
         **_students(choice, run.phases, scores),
+        **extras,
+        "quality": quality,
         "data": started["data"],
-        "times": {"seconds_since_last_start": round(time.time() - began, 1)},
+        "times": {"seconds": round(clock.seconds(), 1)},
         "versions": started["versions"],
     }
 
@@ -347,17 +391,19 @@ def _students(choice: Choice | None, phases: Phases, scores: Mapping[str, Any]) 
     return {"student": {**choice.record(), "selected": scores["chosen"], "last": last}}
 
 
-def _names(run: Run) -> dict[str, str]:
-    """How method, self-training and model were called on the command line (or their classes)."""
-    cfg = run.cfg
-    choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
-    selector = cfg.selftraining.get("selector") or {"_target_": "none"}
-    names = {"method": cfg.method, "selftraining": selector, "model": cfg.model}
-    called = {
-        group: str(choices.get(group) or node.get("_target_", "none").rsplit(".", 1)[-1].lower())
-        for group, node in names.items()
-    }
-    return called if run.scheme.rounds else {**called, "selftraining": "none"}
+def _write_of_files(
+    run: Run, target: PointSet, judged: Unlabelled, labelled: Labelled, predictions: Predictions
+) -> None:
+    """The predictions by the names of the user's files, with what is odd about each cloud."""
+    rows = read_manifest(run.target.folder, target.classes)
+    origins = {row.id: row.origin for row in rows if row.origin}
+    strange = strange_clouds(judged.clouds, usual_of(labelled.clouds))
+    write_predictions_of_files(
+        run.folder / OF_FILES,
+        [origins.get(id_, id_) for id_ in judged.ids],
+        ["; ".join(each) for each in strange],
+        predictions,
+    )
 
 
 def _make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
@@ -371,7 +417,11 @@ def _make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
 def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
     settings = OmegaConf.to_container(cfg.trainer, resolve=True)
     assert isinstance(settings, dict)
-    return {str(key): value for key, value in settings.items() if key != "threads"} | {
+    ours = ("threads", "gpus")
+    given = {str(key): value for key, value in settings.items() if key not in ours}
+    if isinstance(given.get("profiler"), dict):
+        given["profiler"] = build(cfg.trainer.profiler)
+    return given | {
         "reload_dataloaders_every_n_epochs": 1,  # each epoch has its own order; rounds, their set
         "use_distributed_sampler": False,  # `Batches` shares the clouds out itself
         "num_sanity_val_steps": 0,

@@ -1,17 +1,14 @@
-"""Errors while building from the config, and what a multirun says at its end."""
+"""Errors while building from the config, and what loggers are told of a run."""
 
 from __future__ import annotations
-
-import logging
-from types import SimpleNamespace
 
 import pytest
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from qs3.errors import ConfigError
-from qs3.hydra_glue import SummaryOfSeeds, build
-from tests.report.runs import write_run
+from qs3.hydra_glue import build
+from tests.training.toy import toy_config
 
 
 def refuses(value: int) -> int:
@@ -46,36 +43,10 @@ def test_other_errors_keep_their_traceback():
         build(node(_target_="tests.test_hydra_glue.fails"))
 
 
-def ended(summary: SummaryOfSeeds, folder, error: Exception | None = None) -> None:
-    config = OmegaConf.create({"hydra": {"runtime": {"output_dir": str(folder)}}})
-    summary.on_job_end(config, SimpleNamespace(_return_value=error, overrides=["seed=0"]))
-
-
-@pytest.fixture
-def summary():
-    summary = SummaryOfSeeds()
-    summary.on_multirun_start(OmegaConf.create())
-    yield summary
-    summary.on_multirun_end(OmegaConf.create())
-
-
-def test_an_error_of_all_jobs_is_said_once(summary, tmp_path, caplog):
-    with caplog.at_level(logging.ERROR):
-        for seed, text in enumerate(["no data\nLooked for", "no data\nLooked for", "other", ""]):
-            ended(summary, tmp_path / f"seed{seed}-ab", ValueError(text))
-    assert [record.getMessage() for record in caplog.records] == [
-        "seed=0 failed: no data", "seed=0 failed: other", "seed=0 failed: ValueError",
+def test_tags(tmp_path):
+    """By class, where no command line has named the choices."""
+    assert toy_config(tmp_path, "logger=wandb").logger.wandb.tags == [
+        "specklenet10 -> kinectsim10", "pcm", "qbst", "tinynet", "simulated",
     ]  # fmt: skip
-
-
-def test_no_table_without_a_finished_run(summary, tmp_path, capsys):
-    ended(summary, tmp_path / "seed0-ab", ValueError("no data"))
-    summary.on_multirun_end(OmegaConf.create())
-    assert capsys.readouterr().out == ""
-
-
-def test_finished_runs_make_a_table(summary, tmp_path, capsys):
-    ended(summary, write_run(tmp_path, seed=0))
-    ended(summary, tmp_path / "exp" / "seed1-0123abcd", ValueError("broken"))
-    summary.on_multirun_end(OmegaConf.create())
-    assert "seed 1: no result" in capsys.readouterr().out
+    cfg = toy_config(tmp_path, "logger=wandb", "selftraining=none", "domain@data.target=scannet10")
+    assert cfg.logger.wandb.tags == ["specklenet10 -> scannet10", "pcm", "tinynet"]

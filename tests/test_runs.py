@@ -4,10 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+import qs3.hydra_glue  # noqa: F401 (registers the resolvers)
 from qs3 import runs
 from qs3.errors import ConfigError, DataError, Qs3Error
+
+CONF = Path(__file__).parents[1] / "conf"
 
 BASE = {
     "experiment_name": "x",
@@ -157,3 +161,22 @@ def test_clear_keeps_what_hydra_wrote(tmp_path):
         (tmp_path / name).write_text(json.dumps({}))
     runs.clear(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hydra", "train.log"]
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["experiment=cad10"], "cad10/seed0-f23ad346"),
+        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-03f7f66a"),
+        (["experiment=qs3_s2d"], "qs3_s2d/seed0-64cbc123"),
+        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-5a5c6274"),
+        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-5a5c6274"),
+        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-5a5c6274"),
+        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-41a8ab39"),
+        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-64cbc123"),
+    ],
+)
+def test_runs_from_before_are_found(words, name):
+    """A new key with its default must not give old runs another name: leave it out of the hash."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert runs.run_name(compose("train", words)) == name

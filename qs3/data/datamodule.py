@@ -94,6 +94,14 @@ def with_labels(clouds: Unlabelled, dataset: PointSet, split: str, what: str) ->
     return Labelled(clouds.clouds, clouds.ids, labels)
 
 
+def first_of_each_class(labelled: Labelled, count: int) -> Labelled:
+    """The first `count` clouds of each class, in their order; for `debug=overfit`."""
+    chosen = np.zeros(len(labelled.ids), dtype=bool)
+    for k in labelled.labels.unique().tolist():
+        chosen[np.flatnonzero(labelled.labels.numpy() == k)[:count]] = True
+    return labelled.at(np.flatnonzero(chosen))
+
+
 class UdaData(LightningDataModule):
     """Batches of each phase: labelled ones in the warm-up, pseudo-labelled ones in the rounds.
 

@@ -2,7 +2,7 @@
 
     python -m qs3.predict ckpt=RUN input=PATH [out=predictions.csv] [up=z] [batch_size=16]
                           [threads=N] [device=cpu]
-    python -m qs3.predict export ckpt=RUN out=model.pt2 [batch_size=1]
+    python -m qs3.predict export ckpt=RUN out=model.onnx [check=PATH] [threads=N]
 
   ckpt=     the folder of a finished run, or its result.pt alone
   input=    a file of clouds, or a folder with any depth of folders: .xyz .txt .npy .npz .ply .pcd
@@ -22,8 +22,10 @@ an object of no known class also gets a class, often with high confidence.
 
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.
 
-export writes the net for torch.export.load, without qs3, and compares its logits with the net's.
-It takes prepared clouds [batch_size, points, 3]: qs3.load(RUN).prepare(cloud).points.
+export writes the net for use without qs3: out=model.onnx for onnxruntime and others, out=model.pt2
+for torch.export.load. It takes prepared clouds [clouds, points, 3] and gives logits; how a cloud is
+prepared, and the names of the classes, stand in the .onnx file's metadata. The written net is run
+and its logits compared with the net's, on made-up clouds, or on yours (check=, z up).
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from collections.abc import Sequence
 from qs3.errors import ConfigError, Qs3Error
 
 _PREDICT = ("ckpt", "input", "out", "up", "batch_size", "threads", "device")
-_EXPORT = ("ckpt", "out", "batch_size", "threads")
+_EXPORT = ("ckpt", "out", "check", "threads")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -77,9 +79,8 @@ def _predict(options: dict[str, str]) -> int:
 def _export(options: dict[str, str]) -> int:
     from qs3.predict.export import export_command
 
-    ckpt, out = _needed(options, "ckpt"), options.get("out", "model.pt2")
-    batch_size = _whole("batch_size", options.get("batch_size", "1"))
-    print(export_command(ckpt, out, batch_size, _threads(options)))
+    ckpt, out = _needed(options, "ckpt"), options.get("out", "model.onnx")
+    print(export_command(ckpt, out, options.get("check"), _threads(options)))
     return 0
 
 

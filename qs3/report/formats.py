@@ -10,7 +10,6 @@ from typing import Any
 from qs3.report.aggregate import FEW_SEEDS, Group, task
 from qs3.report.table_cells import INCOMPLETE, METRICS, Cell, Table
 
-_TIME = "seconds_since_last_start"
 _RULES = {"source_val": "source validation", "last": "last epoch"}
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -117,8 +116,8 @@ def details(table: Table) -> list[list[str]]:
 
 
 def seconds(group: Group) -> list[float]:
-    """Wall time of each finished run since its last start, where it is known."""
-    found = (run.metrics.get("times", {}).get(_TIME) for run in group.finished)
+    """Wall time of each finished run over all of its starts, where it is known."""
+    found = (run.metrics.get("times", {}).get("seconds") for run in group.finished)
     return [float(value) for value in found if isinstance(value, int | float)]
 
 
@@ -173,8 +172,8 @@ def remarks(table: Table) -> list[str]:
         seeds = f"{' or '.join(map(str, counts))} seed{'s' * (counts[-1] > 1)}"
         lines.append(f"mean ± standard error over {seeds}; (n=...) marks fewer than {FEW_SEEDS}")
         lines.append(
-            "time: wall time of each run since its last start, the least and the most; work before "
-            "an interruption, and a warm-up taken from another run, are not in it"
+            "time: wall time of each run, the least and the most; all of its starts together, also "
+            "the warm-up that was taken from another run"
         )
     for source in dict.fromkeys(c.paper.source for c in table.cells if c.paper and c.paper.source):
         rows = dict.fromkeys(c.row for c in table.cells if c.paper and c.paper.source == source)
@@ -253,7 +252,7 @@ def csv_text(table: Table) -> str:
     writer.writerow(
         ["row", "column", "metric", "mean", "sem", "n", "seeds", "paper_mean", "paper_sem",
          "paper_selected", "paper_source", "task", "target", "simulated", "teacher_selected",
-         "student_selected", "seconds_since_last_start", "problems", "hash", "command"]
+         "student_selected", "seconds", "problems", "hash", "command"]
     )  # fmt: skip
     for cell in table.cells:
         known = cell.group.first if cell.group else {}

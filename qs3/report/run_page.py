@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
+from qs3.quality_words import table as quality_table
 from qs3.report.run_data import RunFiles, settings_of
 from qs3.report.run_figures import EVALUATION_ONLY
 
@@ -48,6 +49,7 @@ def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]
         *(f'<p class="note">Note: {escape(note)}.</p>' for note in run.notes),
         _table(key_figures(run)),
     ]
+    parts += _quality(run)
     if run.command:
         parts += ["<h2>Command</h2>", f"<pre>{escape(run.command)}</pre>"]
     for name, path in pictures.items():
@@ -69,6 +71,18 @@ def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]
             f"<pre>{escape(settings)}</pre></details>"
         )
     return "\n".join([*parts, "</body></html>", ""])
+
+
+def _quality(run: RunFiles) -> list[str]:
+    """What can be said without the target's labels; nothing for runs of older versions."""
+    rows = quality_table((run.metrics or {}).get("quality") or {})
+    if not rows:
+        return []
+    cells = (
+        f"<tr><th>{escape(name)}</th><td>{escape(value)}</td><td>{escape(meaning)}</td></tr>"
+        for name, value, meaning in rows
+    )
+    return ["<h2>Quality without labels</h2>", f"<table>{''.join(cells)}</table>"]
 
 
 def key_figures(run: RunFiles) -> dict[str, str]:
@@ -102,9 +116,9 @@ def key_figures(run: RunFiles) -> dict[str, str]:
     found["teacher selected by"] = str(chosen.get("teacher", ""))
     if run.rounds:
         found["student selected by"] = str(chosen.get("student", ""))
-    seconds = m.get("times", {}).get("seconds_since_last_start")
+    seconds = m.get("times", {}).get("seconds")
     if seconds is not None:
-        found["time since the last start"] = f"{seconds:.0f} s"
+        found["time"] = f"{seconds:.0f} s"
     found["hash of the settings"] = str(m.get("hash", ""))
     found["versions"] = ", ".join(f"{k} {v}" for k, v in m.get("versions", {}).items())
     return {key: value for key, value in found.items() if value}

@@ -1,4 +1,4 @@
-"""Run what a table lacks: each missing seed of each cell, one process each, some at a time.
+"""Run what a table lacks: each missing seed of each cell, by processes of ours or a launcher.
 
 A run that was finished before is not started; one that was interrupted goes on. A failure is told
 at once, stops nothing, and is listed again at the end.
@@ -6,19 +6,28 @@ at once, stops nothing, and is listed again at the end.
 
 from __future__ import annotations
 
+import json
 import shlex
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.errors import ConfigError
-from qs3.report.tables import Cell, Table
+from qs3.report.tables import Table
 
 ROOT = Path(__file__).parents[2]
+LAUNCHERS: Mapping[str, str] = {
+    "joblib": "hydra.launcher.n_jobs",
+    "submitit_local": "hydra.sweeper.at_once",
+    "submitit_slurm": "hydra.launcher.array_parallelism",
+    "slurm": "hydra.launcher.array_parallelism",
+}
+"""Of Hydra, and the setting of each that says how many jobs run at the same time."""
+
 _POLL_S = 0.2
 _TAIL = 12  # lines of a failed run's output that are shown
 
@@ -49,23 +58,29 @@ class _Running:
     began: float
 
 
-def missing(table: Table, seeds: Sequence[int], rows: Sequence[str] = ()) -> list[Job]:
+def missing(
+    table: Table, seeds: Sequence[int], rows: Sequence[str] = (), columns: Sequence[str] = ()
+) -> list[Job]:
     """What is to be run: row by row, in each row seed by seed; what cells share, once.
 
     Args:
         table: with the runs that there are.
         seeds: that each cell should have.
         rows: only rows whose name contains one of these words; all if empty.
+        columns: likewise.
 
     Raises:
-        ConfigError: `rows` fit no row.
+        ConfigError: `rows` fit no row, `columns` no column, or both together no cell.
     """
-    cells = [c for c in table.cells if c.runnable and not c.missing and _chosen(c, rows)]
-    if rows and not cells:
-        raise ConfigError(
-            f"no row of table {table.name} has {' or '.join(map(repr, rows))} in its name; rows "
-            f"to run are {', '.join(dict.fromkeys(c.row for c in table.cells if c.runnable))}"
-        )
+    cells = [c for c in table.cells if c.runnable and not c.missing]
+    for kind, words in (("row", rows), ("column", columns)):
+        names = dict.fromkeys(getattr(c, kind) for c in cells)
+        cells = [c for c in cells if _chosen(getattr(c, kind), words)]
+        if words and not cells:
+            raise ConfigError(
+                f"no {kind} of table {table.name} has {' or '.join(map(repr, words))} in its name; "
+                f"{kind}s to run are {', '.join(names)}"
+            )
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in cells:
         done = set(cell.group.seeds) if cell.group else set()
@@ -77,8 +92,47 @@ def missing(table: Table, seeds: Sequence[int], rows: Sequence[str] = ()) -> lis
     return list(jobs.values())
 
 
-def _chosen(cell: Cell, rows: Sequence[str]) -> bool:
-    return not rows or any(word.lower() in cell.row.lower() for word in rows)
+def _chosen(name: str, words: Sequence[str]) -> bool:
+    name = name.lower().replace("→", "->")  # as one can type it
+    return not words or any(word.lower().replace("→", "->") in name for word in words)
+
+
+def launch(
+    jobs: Sequence[Job],
+    launcher: str,
+    at_once: int | None,
+    log_dir: str,
+    settings: Sequence[str] = (),
+) -> int:
+    """Run jobs as one multirun of `train.py`; returns its exit status.
+
+    What becomes of them is written to the terminal by the multirun itself; with submitit, what a
+    job says lies in `<log_dir>/.submitit`.
+
+    Args:
+        jobs: in the order of their numbers.
+        launcher: one of `LAUNCHERS`.
+        at_once: how many run at the same time; None: what the launcher does by itself.
+        log_dir: of the runs.
+        settings: further overrides of the launcher, such as "hydra.launcher.partition=gpu".
+    """
+    if not jobs:
+        return 0
+    limit = [] if at_once is None else [f"{LAUNCHERS[launcher]}={at_once}"]
+    with tempfile.TemporaryDirectory(prefix="qs3-table-") as folder:
+        file = Path(folder) / "jobs.json"
+        file.write_text(json.dumps([list(job.overrides) for job in jobs]), encoding="utf-8")
+        words = [
+            f"paths.log_dir={log_dir}",
+            "hydra/sweeper=listed",
+            f"hydra.sweeper.file={file}",
+            f"hydra/launcher={launcher}",
+            *limit,
+            *settings,
+            "--multirun",
+        ]
+        command = [sys.executable, str(ROOT / "train.py"), *words]
+        return subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode
 
 
 def run_all(

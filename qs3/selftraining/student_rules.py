@@ -18,11 +18,45 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from qs3.errors import ConfigError
+
 LAST = "last"
 PSEUDO_VAL = "pseudo_val"
 ORACLE = "oracle"
 ORACLE_IN_WORDS = "oracle (target test labels: diagnostic only)"
 STUDENT_RULES = (LAST, PSEUDO_VAL, "entropy", "infomax", "snd", ORACLE)
+OBJECTIVES = ("entropy", "infomax", "snd", PSEUDO_VAL)
+"""What a search may ask for: none of them looks at a label of the target."""
+
+
+def check_objective(objective: Any, student: Any) -> None:
+    """Refuse what a search must not or cannot look at.
+
+    Args:
+        objective: of the search; None: there is none.
+        student: `selection.student`.
+
+    Raises:
+        ConfigError: it is no label-free score, or one that no run of this config has.
+    """
+    if objective is None:
+        return
+    if objective not in OBJECTIVES:
+        raise ConfigError(
+            f"objective={objective} is refused: a search chooses hyper-parameters, and on a new "
+            "target there are no labels to choose them by (accuracy and oracle look at those of "
+            f"the test set); set objective={'|'.join(OBJECTIVES)}"
+        )
+    if student == ORACLE:
+        raise ConfigError(
+            f"selection.student={ORACLE} looks at the target's test labels: no search may use it; "
+            f"set selection.student={LAST}"
+        )
+    if objective == PSEUDO_VAL != student:
+        raise ConfigError(
+            f"objective={PSEUDO_VAL} needs clouds that were held out of the last round; set "
+            f"selection.student={PSEUDO_VAL} as well, or objective=infomax"
+        )
 
 
 def took_target_labels(metrics: Mapping[str, Any]) -> bool:

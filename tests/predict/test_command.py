@@ -182,7 +182,7 @@ def test_up_and_flags(run, clouds, tmp_path):
         (["ckpt={run}", "input={run}/nothing"], "is not there"),
         (["ckpt={run}", "input={empty}"], "holds no file of"),
         (["ckpt={run}/nothing", "input={clouds}"], "is not there"),
-        (["export", "ckpt={run}", "out=model.onnx"], "must end in .pt2"),
+        (["export", "ckpt={run}", "out=model.h5"], "must end in .onnx or .pt2"),
         (["export"], "ckpt= is missing"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,

@@ -369,6 +369,10 @@ def test_offline_wandb_holds_config_curves_pictures_and_table(toy):  # noqa: F81
     folder = runs.run_folder(cfg)
     config, rows, summary, record = read(folder)
     assert (record.run_group, record.job_type) == ("quickstart", "train")
+    assert (record.project, record.display_name) == ("qs3", "quickstart-seed0")
+    assert record.run_id == runs.run_name(cfg).replace("/", "-")
+    assert list(record.tags) == list(cfg.logger.wandb.tags)
+    assert {"specklenet10 -> kinectsim10", "qbst", "simulated"} <= set(record.tags)
     assert config["protocol"]["epochs"] == 4
     history = table(folder / "history.csv")
     losses = [row["train/loss"] for row in rows if "train/loss" in row]

@@ -13,8 +13,9 @@ import pytest
 
 from qs3.errors import ConfigError
 from qs3.predictions import FILE, Predictions, write_predictions
+from qs3.report.__main__ import main
 from qs3.report.comparison import against, text
-from qs3.report.running import Job, missing, run_all
+from qs3.report.running import Job, _chosen, launch, missing, run_all
 from qs3.report.tables import build_table
 from tests.report.test_tables import run_cell
 from tests.training.toy import overrides, write_toy
@@ -48,6 +49,36 @@ def test_runs_that_cells_share_are_run_once(tmp_path):
 def test_unknown_row(tmp_path):
     with pytest.raises(ConfigError, match="no row of table cad10 has 'danm' in its name"):
         jobs_of(tmp_path, "danm")
+
+
+def test_one_cell(tmp_path):
+    table = build_table("factorial", tmp_path)
+    every = missing(table, [0])
+    row, column = next((c.row, c.column) for c in table.cells if c.runnable)
+    (job,) = missing(table, [0], [row], [column])
+    assert job.name == f"{row}, {column}, seed 0"
+    assert len(missing(table, [0], columns=[column])) < len(every)
+    cells = [cell for cell in build_table("self_training", tmp_path).cells if cell.runnable]
+    assert len([cell for cell in cells if _chosen(cell.column, ["s -> d"])]) == len(cells) / 2
+    with pytest.raises(ConfigError, match=r"no column of table .* has 'x' in its name; columns to"):
+        missing(table, [0], columns=["x"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["launcher=ray"], "launcher=ray; set launcher=joblib|submitit_local|submitit_slurm|slurm"),
+        (["hydra.launcher.partition=gpu"], "partition=gpu needs a launcher; set launcher=joblib|"),
+        (["jobs=0", "launcher=joblib"], "jobs must be at least 1"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(words, message, tmp_path, capsys):
+    assert main(["run", "table=cad10", f"log_dir={tmp_path}", *words]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_nothing_to_launch():
+    assert launch([], "joblib", 2, "logs") == 0
 
 
 def start(job: Job, output: Path) -> subprocess.Popen[bytes]:
@@ -149,6 +180,14 @@ def test_a_table_of_real_trainings(tmp_path):
     assert "4 runs to do" in first.stdout
     assert "[4/4]" in first.stdout
     again = report("run", "rows=speckle", "seeds=0,1")
+    assert "0 runs to do" in again.stdout
+    more = ["rows=(S)", "seeds=0,1,2,3", "hydra.launcher.verbose=1"]
+    launched = report("run", *more, "launcher=joblib", "jobs=2")
+    assert launched.returncode == 0, launched.stdout + launched.stderr
+    assert "n_jobs=2" in launched.stdout
+    assert " 2 (!)" in launched.stdout  # the summary of the two that were missing
+    again = report("run", "rows=(S)", "seeds=0,1,2,3", "launcher=submitit_local")
+    assert again.returncode == 0
     assert "0 runs to do" in again.stdout
     compared = report("compare", "base=source only, speckle scans (S)")
     assert compared.returncode == 0, compared.stderr

@@ -1,0 +1,53 @@
+"""More about the net that a run reports: scores without labels, and whether it learnt by heart."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any
+
+from torch import nn
+
+from qs3.data.datamodule import Labelled, Unlabelled
+from qs3.evaluation import predict
+from qs3.selftraining.student_rules import PSEUDO_VAL
+from qs3.selftraining.student_selection import Choice
+from qs3.selftraining.validators import LABEL_FREE
+
+log = logging.getLogger(__name__)
+
+
+def without_labels(
+    net: nn.Module, target: Unlabelled, choice: Choice | None, batch_size: int, device: Any
+) -> dict[str, float | None]:
+    """What the net is worth by `selftraining.validators`, on the target's training clouds.
+
+    Args:
+        net: as it is reported.
+        target: its training clouds; SND needs two.
+        choice: how the reported student was chosen, if it was: by `pseudo_val`, its score is here.
+        batch_size: of the predictions.
+        device: of the net.
+
+    Returns:
+        By name; None for a score that is no number, of a net that has diverged.
+    """
+    table = predict(net, target.points, batch_size, device)
+    scores = {
+        name: one.score(table)
+        for name, one in LABEL_FREE.items()
+        if name != "snd" or len(table) > 1
+    }
+    if choice is not None and choice.rule == PSEUDO_VAL:
+        scores[PSEUDO_VAL] = choice.score
+    return {name: score if math.isfinite(score) else None for name, score in scores.items()}
+
+
+def learnt_by_heart(
+    net: nn.Module, labelled: Labelled, batch_size: int, device: Any
+) -> dict[str, Any]:
+    """How many there are of the clouds that the net was trained on, and the share that is right."""
+    table = predict(net, labelled.clouds.all(), batch_size, device)
+    right = float((table.argmax(axis=1) == labelled.labels.numpy()).mean())
+    log.info("%.1f %% of the %d training clouds are right", 100 * right, len(table))
+    return {"n": len(table), "accuracy": right}

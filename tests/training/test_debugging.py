@@ -1,0 +1,128 @@
+"""debug=overfit and debug=profiler, and `ckpt_path`."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from qs3 import runs
+from qs3.classifier import Classifier
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.run import train
+from tests.training.conftest import result_of
+from tests.training.toy import CONF, write_domain
+from tests.training.watching import Stop
+
+
+def stop_in(epoch: int) -> str:
+    """An override, which no hash covers."""
+    return f"callbacks.progress={{_target_:tests.training.watching.StopIn,epoch:{epoch}}}"
+
+
+def test_overfit_learns_a_few_clouds_by_heart(toy):
+    cfg = toy("debug=overfit", "protocol.epochs=100", "selftraining.rounds=0")
+    metrics = train(cfg)
+    assert metrics["training"] == {"n": 10, "accuracy": 1.0}  # 12 clouds less 2 for validation
+    assert metrics["selftraining"] == "none"
+    lr = "protocol.optimizer.lr=1e-9"
+    cannot = train(toy("debug=overfit", "protocol.epochs=3", "selftraining.rounds=0", lr))
+    assert cannot["training"]["accuracy"] < 1
+    assert "training" not in train(toy("selftraining=none"))
+    with pytest.raises(ConfigError, match=r"data\.clouds_a_class"):
+        train(toy("data.clouds_a_class=0"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["dgcnn", "pointnet", "pointnet2"])
+def test_overfit_works_for_real_nets(model, toy_data, tmp_path):
+    """As typed, but for the size of the data."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("train", [
+            "experiment=quickstart", "debug=overfit", f"model={model}", "num_classes=3",
+            f"paths.data_dir={toy_data}", f"paths.log_dir={tmp_path}", "data.points=64",
+            "trainer.threads=1", "callbacks=none", "logger=csv",
+        ])  # fmt: skip
+    assert train(cfg)["training"]["accuracy"] == 1.0
+
+
+@pytest.mark.parametrize("profiler", ["SimpleProfiler", "PyTorchProfiler"])
+@pytest.mark.filterwarnings("ignore:The PyTorch Profiler default schedule:UserWarning")
+def test_profiler_writes_into_the_run(profiler, toy):
+    cfg = toy(
+        "debug=profiler", "selftraining.rounds=0", "protocol.epochs=2",
+        f"trainer.profiler._target_=lightning.pytorch.profilers.{profiler}",
+    )  # fmt: skip
+    train(cfg)
+    text = (runs.run_folder(cfg) / "fit-profile.txt").read_text()
+    assert {"SimpleProfiler": "run_training_epoch", "PyTorchProfiler": "aten::"}[profiler] in text
+
+
+def test_ckpt_path_last_insists_on_a_checkpoint(toy, finished):
+    cfg = toy("ckpt_path=last")
+    with pytest.raises(MissingDataError, match=r"ckpt_path=last, but .*last\.ckpt is not there"):
+        train(cfg)
+    with pytest.raises(Stop):
+        train(toy(stop_in(5)))
+    train(cfg)
+    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert train(toy("ckpt_path=last"))["status"] == "finished"  # nothing is left to do
+
+
+@pytest.fixture
+def begun(toy) -> Path:
+    """A run that was interrupted, moved to another place."""
+    with pytest.raises(Stop):
+        train(toy(stop_in(6)))
+    folder = runs.run_folder(toy())
+    moved = folder.parents[1] / "elsewhere" / folder.name
+    moved.parent.mkdir()
+    shutil.move(folder, moved)
+    (moved / ".hydra").mkdir()
+    (moved / ".hydra" / "config.yaml").touch()
+    return moved
+
+
+@pytest.mark.parametrize("file", ["", "/last.ckpt"])
+def test_ckpt_path_brings_a_run_from_elsewhere(file, toy, begun, finished, monkeypatch):
+    began: list[int] = []
+
+    def watch(self, real=Classifier.on_train_epoch_start):
+        began.append(self.current_epoch)
+        real(self)
+
+    monkeypatch.setattr(Classifier, "on_train_epoch_start", watch)
+    cfg = toy(f"ckpt_path={begun}{file}", "paths.warmup_dir=null")
+    train(cfg)
+    assert began[0] == 6  # the one that was not finished there
+    assert not (runs.run_folder(cfg) / ".hydra").exists()
+    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert begun.joinpath("last.ckpt").is_file()
+
+
+def test_ckpt_path_of_another_run(toy, toy_data, begun, tmp_path):
+    for other in ("seed=1", "selftraining.theta=0.3"):
+        with pytest.raises(ConfigError, match=r"belongs to another run: its folder is seed0-"):
+            train(toy(f"ckpt_path={begun}", other))
+    with pytest.raises(MissingDataError, match=r"no last\.ckpt of a run is there"):
+        train(toy(f"ckpt_path={tmp_path}"))
+    with pytest.raises(MissingDataError, match=r"no last\.ckpt of a run is there"):
+        train(toy(f"ckpt_path={begun}/warmup_last.pt"))
+    data = tmp_path / "other_data"
+    shutil.copytree(toy_data, data)
+    shutil.rmtree(data / "kinectsim10")
+    write_domain(data, "kinectsim10", noise=0.2)
+    with pytest.raises(DataError, match=r"another version of data\.target"):
+        train(toy(f"ckpt_path={begun}", f"paths.data_dir={data}", f"paths.log_dir={tmp_path}/new"))
+    (begun / "started.json").unlink()
+    with pytest.raises(ConfigError, match="belongs to another run"):
+        train(toy(f"ckpt_path={begun}"))
+
+
+def test_neither_changes_the_name_of_a_run(toy):
+    plain = runs.run_name(toy())
+    for word in ("ckpt_path=last", "objective=snd", "data.clouds_a_class=null"):
+        assert runs.run_name(toy(word)) == plain
+    assert runs.run_name(toy("data.clouds_a_class=4")) != plain
