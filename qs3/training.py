@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
-import platform
 import time
-import warnings
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import lightning
-import numpy as np
 import torch
-from lightning.pytorch import Callback, Trainer
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
-import qs3
 from qs3 import oracle, runs
 from qs3.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
 from qs3.classifier import Classifier
@@ -35,12 +29,10 @@ from qs3.data.datamodule import (
     with_labels,
 )
 from qs3.data.manifest import read_manifest
-from qs3.data.prepare import remove_old_leftovers
 from qs3.data.store import PointSet
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation import Evaluation, adapt_norms
 from qs3.familiar import limits, strange_clouds
-from qs3.files import remove_leftovers
 from qs3.hydra_glue import build, called
 from qs3.loggers import CsvHistory, EpochRows
 from qs3.methods.base import Method
@@ -63,8 +55,10 @@ from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, SelfTraining
 from qs3.selftraining.scheme import Phases
 from qs3.selftraining.student_rules import LAST as LAST_EPOCH
 from qs3.selftraining.student_rules import ORACLE
-from qs3.selftraining.student_selection import CANDIDATES, Choice, StudentSelection
+from qs3.selftraining.student_selection import Choice, StudentSelection
 from qs3.selftraining.table import path_of
+from qs3.starting import note_start
+from qs3.trainer import build_each, make_trainer, quieten
 from qs3.warmups import SharedWarmup, warmup_sha256
 
 log = logging.getLogger(__name__)
@@ -80,11 +74,11 @@ def fit(run: Run) -> dict[str, Any]:
         interrupted or not, except what stands under "times".
     """
     began, cfg = time.time(), run.cfg
-    _quieten()
+    quieten()
     torch.set_num_threads(cfg.trainer.threads or os.cpu_count() or 1)
     source_set, target_set = run.source.open(), run.target.open()
     _check_classes(source_set, target_set, cfg.num_classes)
-    started = _note_start(run, source_set, target_set)
+    started = note_start(run, source_set, target_set)
 
     # 1. Data. Target labels go to the method that asks for them by name, and to the evaluation.
     method: Method = build(cfg.method)
@@ -160,11 +154,11 @@ def fit(run: Run) -> dict[str, Any]:
     callbacks: list[Callback] = [warmup, rounds, student, EpochRows(run.phases), clock, *saving]
 
     # 3. One fit over all phases. A checkpoint lies between two epochs; a resume repeats an epoch.
-    trainer = _make_trainer(
+    trainer = make_trainer(
         cfg,
         max_epochs=run.phases.total,
-        callbacks=[*_build_each(cfg.callbacks), *callbacks],
-        logger=[CsvHistory(run.folder), *_build_each(cfg.logger)],
+        callbacks=[*build_each(cfg.callbacks), *callbacks],
+        logger=[CsvHistory(run.folder), *build_each(cfg.logger)],
         plugins=[AtomicCheckpointIO()],
         default_root_dir=run.folder,
     )
@@ -342,47 +336,6 @@ def _meshes_by_id(dataset: PointSet, folder: Path) -> dict[str, str]:
     return {row.id: row.mesh_sha256 for row in rows if row.mesh_sha256}
 
 
-def _note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
-    """Read `started.json` and compare it with today's data, or write it."""
-    now: dict[str, Any] = {
-        "data": {"source": source.sha256, "target": target.sha256},
-        "versions": {
-            "qs3": qs3.__version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "lightning": lightning.__version__,
-            "numpy": np.__version__,
-        },
-        "config_sha256": runs.config_sha256(run.cfg),
-    }
-    if int(os.environ.get("LOCAL_RANK", 0)) > 0:
-        first = runs.read_started(run.folder) or {}
-        if first.get("config_sha256") != now["config_sha256"]:
-            raise ConfigError(
-                "the processes of this run have different settings (was a file of conf/ changed "
-                "while they started?); start it again"
-            )
-        return now
-    for folder in (run.folder, run.folder / CANDIDATES, *run.folder.glob("round_*")):
-        remove_leftovers(folder)
-    if run.cfg.data.cache_dir:
-        remove_old_leftovers(Path(run.cfg.data.cache_dir))
-    started = runs.read_started(run.folder)
-    if started is None:
-        runs.write_started(run.folder, now)
-        return now
-    runs.check_config(run.folder, started.get("config_sha256"), now["config_sha256"])
-    for role, dataset in (("source", source), ("target", target)):
-        runs.check_data(run.folder, dataset.name, started["data"][role], dataset.sha256)
-    if started["versions"] != now["versions"]:
-        log.warning(
-            "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
-            started["versions"],
-            now["versions"],
-        )
-    return started
-
-
 def _students(choice: Choice | None, phases: Phases, scores: Mapping[str, Any]) -> dict[str, Any]:
     """How the reported student was chosen, beside the last epoch's; {} if it is the last one."""
     if choice is None:
@@ -406,47 +359,7 @@ def _write_of_files(
     )
 
 
-def _make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
-    try:
-        return Trainer(**_trainer_settings(cfg), **more)
-    except (MisconfigurationException, TypeError, ValueError) as error:
-        hint = "" if cfg.trainer.accelerator == "cpu" else "; without a GPU use trainer=cpu"
-        raise ConfigError(f"trainer: {error}{hint}") from error
-
-
-def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
-    settings = OmegaConf.to_container(cfg.trainer, resolve=True)
-    assert isinstance(settings, dict)
-    ours = ("threads", "gpus")
-    given = {str(key): value for key, value in settings.items() if key not in ours}
-    if isinstance(given.get("profiler"), dict):
-        given["profiler"] = build(cfg.trainer.profiler)
-    return given | {
-        "reload_dataloaders_every_n_epochs": 1,  # each epoch has its own order; rounds, their set
-        "use_distributed_sampler": False,  # `Batches` shares the clouds out itself
-        "num_sanity_val_steps": 0,
-        "log_every_n_steps": 1,
-        "enable_progress_bar": False,  # `qs3.progress` shows all epochs in one bar
-        "enable_model_summary": False,
-    }
-
-
 def _settings(cfg: DictConfig) -> dict[str, Any]:
     """The composed config, for loggers that show it."""
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     return settings
-
-
-def _build_each(group: DictConfig | None) -> list[Any]:
-    return [build(node) for node in (group or {}).values() if node is not None]
-
-
-def _quieten() -> None:
-    """Leave Lightning's warnings and errors to Hydra's log; drop its tips and adverts."""
-    # Lightning 2.6.6 asks torch 2.13 in an old way; not ours to mend.
-    warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
-    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
-        logger = logging.getLogger(name)
-        logger.handlers.clear()
-        logger.setLevel(logging.WARNING)
-        logger.propagate = True
