@@ -7,6 +7,7 @@
                                  [launcher=joblib|submitit_local|slurm]
                                  [hydra.launcher.partition=... and other settings of the launcher]
     python -m qs3.report compare table=cad10 base="source only" [log_dir=logs] [out=...] [...]
+    python -m qs3.report effects table=factorial [log_dir=logs] [out=...] [...]
     python -m qs3.report pictures run=PATH [data_dir=data] [out=PATH/pictures]
     python -m qs3.report pictures domains=[modelnet10,specklenet10,kinectsim10]
                                   [data_dir=data] [split=train] [out=data/pictures]
@@ -17,7 +18,7 @@
 A table is printed as Markdown and saved as .md, .csv, .tex and .html. `overrides` are those that
 the runs had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time;
 called again it goes on. `compare` prints the difference of each row to the row `base`, with its
-interval.
+interval; `effects` those between columns averaged over rows, and between rows over columns.
 Pictures of a run, the folder that training names: curves, confusion, pseudo-labels, classes,
 calibration, features of both domains (if its data are there), and a page of all, index.html.
 Pictures of domains: a contact sheet of each domain, one that compares them, and classes.png, how
@@ -61,6 +62,8 @@ def main(argv: Sequence[str]) -> int:
             return _run(_options(argv[1:], _RUN))
         elif argv[0] == "compare":
             _compare(_options(argv[1:], _COMPARE))
+        elif argv[0] == "effects":
+            _effects(_options(argv[1:], _TABLE))
         else:
             _table(_options(argv, _TABLE))
     except Qs3Error as error:
@@ -157,6 +160,19 @@ def _compare(options: dict[str, str]) -> None:
     write_text(f"{at}-compared.md", text(found, options["base"], markdown=True))
     print(text(found, options["base"]))
     print(f"saved {at}-compared.md")
+
+
+def _effects(options: dict[str, str]) -> None:
+    from qs3.files import write_text
+    from qs3.report.comparison import effects, text
+
+    table = _built(options)
+    found, at = effects(table), _saved_at(table, options)
+    if not found:
+        raise ConfigError(f"table {table.name} has no two columns or rows with runs of ours")
+    write_text(f"{at}-effects.md", text(found, markdown=True))
+    print(text(found))
+    print(f"saved {at}-effects.md")
 
 
 def _table(options: dict[str, str]) -> None:

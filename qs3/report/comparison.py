@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from qs3.errors import ConfigError, DataError
 from qs3.predictions import FILE, Predictions, read_predictions
 from qs3.report.aggregate import align
-from qs3.report.paired import LEVEL, Difference, compare
+from qs3.report.paired import LEVEL, Difference, compare, compare_on_average
 from qs3.report.tables import Cell, Table
 
 
@@ -69,9 +69,74 @@ def _both(a: Sequence[Predictions], b: Sequence[Predictions]) -> tuple[Differenc
     return compare(a, b), compare(a, b, balanced=True)
 
 
-def text(found: Sequence[Compared], base: str, markdown: bool = False) -> str:
-    """A line a row: differences in percentage points, and how many seeds would tell them apart."""
-    header = ["minus " + base, "accuracy", "balanced accuracy", "seeds", "to tell apart"]
+def effects(table: Table) -> list[Compared]:
+    """Main effects: each column minus the first over the rows that have both, then rows likewise.
+
+    Rows whose two cells are one run (a teacher that no column changes) are left out.
+    """
+    columns = {
+        name: [cells[i] for cells in table.rows.values()] for i, name in enumerate(table.columns)
+    }
+    by_row = {name: list(cells) for name, cells in table.rows.items()}
+    return [
+        *_main_effects(columns, list(table.rows)),
+        *_main_effects(by_row, list(table.columns)),
+    ]
+
+
+def _main_effects(
+    lines: Mapping[str, Sequence[Cell | None]], others: Sequence[str]
+) -> list[Compared]:
+    """Each line of cells minus the first one, over the others that both have."""
+    (base, base_cells), *rest = lines.items()
+    found = []
+    for name, cells in rest:
+        both = {
+            other: (one, two)
+            for other, one, two in zip(others, cells, base_cells, strict=True)
+            if one and two and one.runnable and two.runnable and one.overrides != two.overrides
+        }
+        if both:
+            title = f"{name} minus {base}, over {', '.join(both)}"
+            found.append(_on_average(title, list(both.values())))
+    return found
+
+
+def _on_average(name: str, cells: Sequence[tuple[Cell, Cell]]) -> Compared:
+    if any(cell.take != "final" for pair in cells for cell in pair):
+        return Compared(name, None, "a warm-up's predictions are not kept")
+    finished = [
+        {run.seed: run for run in cell.group.finished} if cell.group else {}
+        for pair in cells
+        for cell in pair
+    ]
+    seeds = sorted(seed for seed in set.intersection(*map(set, finished)) if seed is not None)
+    if len(seeds) < 2:
+        return Compared(name, None, f"fewer than two seeds in common ({seeds})")
+    try:
+        said = [[read_predictions(runs[seed].folder / FILE) for seed in seeds] for runs in finished]
+        pairs = list(zip(said[::2], said[1::2], strict=True))
+        plain = compare_on_average(pairs)
+        return Compared(name, (plain, compare_on_average(pairs, balanced=True)))
+    except DataError as error:
+        return Compared(name, None, str(error))
+
+
+def text(found: Sequence[Compared], base: str = "", markdown: bool = False) -> str:
+    """A line a row: differences in percentage points, and how many seeds would tell them apart.
+
+    Args:
+        found: of `against` or `effects`.
+        base: the row that all are compared with, if it is one.
+        markdown: instead of columns for the terminal.
+    """
+    header = [
+        f"minus {base}" if base else "difference",
+        "accuracy",
+        "balanced accuracy",
+        "seeds",
+        "to tell apart",
+    ]
     lines, notes = [header], []
     for one in found:
         if one.differences is None:

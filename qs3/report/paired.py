@@ -66,19 +66,42 @@ def compare(
     Raises:
         DataError: the clouds differ, have no labels, or there are fewer than two seeds or meshes.
     """
-    first = a[0] if a else None
-    if first is None or len(a) != len(b) or len(a) < 2:
-        raise DataError(f"a comparison needs two seeds that both have, got {len(a)} and {len(b)}")
-    for one in (*a, *b):
+    return compare_on_average([(a, b)], balanced=balanced)
+
+
+def compare_on_average(
+    pairs: Sequence[tuple[Sequence[Predictions], Sequence[Predictions]]],
+    *,
+    balanced: bool = False,
+) -> Difference:
+    """The mean of several differences, such as those of two columns of a table over its rows.
+
+    The rows themselves are taken as given: the interval is over seeds and meshes, as for one.
+
+    Args:
+        pairs: of one or several rows, each as in `compare`, all of the same seeds.
+        balanced: compare balanced accuracy instead.
+
+    Raises:
+        DataError: as `compare`.
+    """
+    first = next((one for pair in pairs for one in pair[0]), None)
+    counts = {len(row) for pair in pairs for row in pair}
+    if first is None or len(counts) > 1 or min(counts) < 2:
+        got = " and ".join(map(str, sorted(counts)))
+        raise DataError(f"a comparison needs two seeds that both have, got {got}")
+    for one in (one for pair in pairs for row in pair for one in row):
         if one.ids != first.ids or not np.array_equal(one.labels, first.labels):
             raise DataError("the runs were evaluated on different clouds; they cannot be paired")
     if (first.labels < 0).any():
         raise DataError("the clouds have no labels")
-    right_a = np.stack([p.predicted == p.labels for p in a]).astype(float)
-    right_b = np.stack([p.predicted == p.labels for p in b]).astype(float)
+    differences = np.mean([_right(a) - _right(b) for a, b in pairs], axis=0)
     _, mesh = np.unique(first.meshes, return_inverse=True)
-    weights = _weights(first.labels, balanced)
-    return interval(right_a - right_b, weights, mesh)
+    return interval(differences, _weights(first.labels, balanced), mesh)
+
+
+def _right(row: Sequence[Predictions]) -> Float[np.ndarray, "s n"]:
+    return np.stack([one.predicted == one.labels for one in row]).astype(float)
 
 
 def _weights(labels: Int[np.ndarray, " n"], balanced: bool) -> Float[np.ndarray, " n"]:

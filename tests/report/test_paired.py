@@ -6,7 +6,7 @@ from scipy.stats import t as student_t
 
 from qs3.errors import DataError
 from qs3.predictions import Predictions
-from qs3.report.paired import compare, interval
+from qs3.report.paired import compare, compare_on_average, interval
 
 
 def predictions(labels, predicted, meshes, ids=None) -> Predictions:
@@ -45,6 +45,21 @@ def test_balanced_weighs_classes_alike():
     b = [predictions(labels, [0, 0, 0, 0], meshes)] * 2
     assert compare(a, b).mean == 1 / 4
     assert compare(a, b, balanced=True).mean == 1 / 2
+
+
+def test_several_differences_on_average():
+    """Those of one row and their opposite cancel; beside an equal pair a difference halves."""
+    labels, meshes = [0, 0, 0, 0], ["m", "m", "n", "n"]
+    b = [predictions(labels, [1, 1, 0, 0], meshes)] * 2
+    a = [predictions(labels, [0, 0, 0, 0], meshes), predictions(labels, [0, 1, 0, 0], meshes)]
+    one, half = compare(a, b), compare_on_average([(a, b), (b, b)])
+    np.testing.assert_allclose(
+        [half.mean, half.low, half.high], [one.mean / 2, one.low / 2, one.high / 2]
+    )
+    both = compare_on_average([(a, b), (b, a)])
+    assert (both.mean, both.low, both.high) == (0, 0, 0)
+    with pytest.raises(DataError, match="got 1 and 2"):
+        compare_on_average([(a, b), (a[:1], b[:1])])
 
 
 def test_equal_rows_do_not_differ():

@@ -14,9 +14,9 @@ import pytest
 from qs3.errors import ConfigError
 from qs3.predictions import FILE, Predictions, write_predictions
 from qs3.report.__main__ import main
-from qs3.report.comparison import against, text
+from qs3.report.comparison import against, effects, text
 from qs3.report.running import Job, _chosen, launch, missing, run_all
-from qs3.report.tables import build_table
+from qs3.report.tables import Table, build_table
 from tests.report.test_tables import run_cell
 from tests.training.toy import overrides, write_toy
 
@@ -120,24 +120,26 @@ def test_processes_do_not_outlive_an_interruption():
     last.wait()
 
 
-def test_compare_by_hand(tmp_path):
-    table = build_table("cad10", tmp_path)
-    right_of = {"source only": 10, "DANN": 14, "PCM": 10}  # of 20 clouds, all seeds alike
-    for row, right in right_of.items():
-        (cell,) = (cell for cell in table.cells if cell.row == row)
-        run_cell(tmp_path, cell)
-        filled = build_table("cad10", tmp_path)
-        (cell,) = (cell for cell in filled.cells if cell.row == row)
+def fill(log_dir: Path, name: str, right_of: dict[tuple[str, str], int]) -> Table:
+    """A table whose runs are right about so many of 20 clouds, the same for all seeds."""
+    cells = {(cell.row, cell.column): cell for cell in build_table(name, log_dir).cells}
+    for place in right_of:
+        run_cell(log_dir, cells[place])
+    for cell in build_table(name, log_dir).cells:
+        if (cell.row, cell.column) not in right_of:
+            continue
         assert cell.group is not None
+        predicted = (np.arange(20) >= right_of[cell.row, cell.column]).astype(int)
+        names, labels = tuple(map(str, range(20))), np.zeros(20, dtype=int)
+        said = Predictions(("a", "b"), names, names, labels, np.eye(2)[predicted])
         for run in cell.group.finished:
-            labels = np.zeros(20, dtype=int)
-            predicted = (np.arange(20) >= right).astype(int)
-            names = tuple(map(str, range(20)))
-            write_predictions(
-                run.folder / FILE,
-                Predictions(("a", "b"), names, names, labels, np.eye(2)[predicted]),
-            )
-    table = build_table("cad10", tmp_path)
+            write_predictions(run.folder / FILE, said)
+    return build_table(name, log_dir)
+
+
+def test_compare_by_hand(tmp_path):
+    rows = {"source only": 10, "DANN": 14, "PCM": 10}
+    table = fill(tmp_path, "cad10", {(row, "target test"): n for row, n in rows.items()})
     found = {one.name: one for one in against(table, "source only")}
     assert len(found) == len(table.rows) - 1
     dann, pcm = found["DANN"].differences, found["PCM"].differences
@@ -155,6 +157,31 @@ def test_compare_by_hand(tmp_path):
     assert "GAST: fewer than two seeds" in shown
     with pytest.raises(ConfigError, match="no row 'x'"):
         against(table, "x")
+
+
+def test_effects_by_hand(tmp_path):
+    scratch, source = "from scratch on the target", "continued, with source"
+    half = {
+        ("QBST", scratch): 8,
+        ("QBST", source): 14,
+        ("SPST", scratch): 10,
+        ("SPST", source): 12,
+    }
+    scheme = f"{source} minus {scratch}, over QBST, SPST, CBST, all confident"
+    found = {one.name: one for one in effects(fill(tmp_path / "half", "factorial", half))}
+    assert found[scheme].why.startswith("fewer than two seeds")  # two rows were not run
+    spst = found[f"SPST minus QBST, over {scratch}, {source}"].differences
+    assert spst is not None
+    assert spst[0].mean == pytest.approx(0)  # (10 - 8 + 12 - 14) / 40
+    # no column changes the teacher of all, so it says nothing of columns
+    assert not any("none" in name.split(", over ")[1] for name in found)
+
+    rest = {(row, column): 9 for row in ("CBST", "all confident") for column in (scratch, source)}
+    table = fill(tmp_path / "all", "factorial", {**half, **rest})
+    (one,) = (one for one in effects(table) if one.name == scheme)
+    assert one.differences is not None
+    assert one.differences[0].mean == pytest.approx((6 + 2 + 0 + 0) / 4 / 20)
+    assert "+10.0 [" in text([one])
 
 
 @pytest.mark.slow
