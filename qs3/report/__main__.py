@@ -8,7 +8,7 @@
                                  [hydra.launcher.partition=... and other settings of the launcher]
     python -m qs3.report compare table=cad10 base="source only" [log_dir=logs] [out=...] [...]
     python -m qs3.report effects table=factorial [log_dir=logs] [out=...] [...]
-    python -m qs3.report pictures run=PATH [data_dir=data] [out=PATH/pictures]
+    python -m qs3.report run=PATH [data_dir=data] [out=PATH/pictures]
     python -m qs3.report pictures domains=[modelnet10,specklenet10,kinectsim10]
                                   [data_dir=data] [split=train] [out=data/pictures]
     python -m qs3.report pipeline domain=specklenet10 [object=ID | mesh=FILE] [view=0]
@@ -56,6 +56,8 @@ def main(argv: Sequence[str]) -> int:
     try:
         if argv[0] == "pictures":
             _pictures(_options(argv[1:], _PICTURES))
+        elif "=" in argv[0] and any(word.startswith("run=") for word in argv):
+            _pictures(_options(argv, _PICTURES))
         elif argv[0] == "pipeline":
             _pipeline(argv[1:])
         elif argv[0] == "run":

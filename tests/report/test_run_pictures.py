@@ -312,7 +312,7 @@ def test_embedding_needs_data_and_a_net(run, tmp_path):
 def test_command_line(run, toy_data, tmp_path, capsys):  # noqa: F811
     use_real_net(run)
     out = tmp_path / "out"
-    assert main(["pictures", f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
+    assert main([f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
     shown = [str(out / f"{name}.png") for name in [*ALL, "embedding"]] + [str(out / "index.html")]
     assert capsys.readouterr().out.splitlines() == shown
     assert not_blank(out / "embedding.png")
