@@ -48,7 +48,8 @@ def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray,
 
     def loss(log_t: float) -> float:
         right = scaled(probabilities, math.exp(log_t))[rows, labels]
-        return float(-np.log(np.maximum(right, _TINY)).mean())
+        # Exactly rounded, so that the order of clouds does not matter where the valley is flat.
+        return -math.fsum(np.log(np.maximum(right, _TINY))) / len(right)
 
     # The loss is convex in 1 / T, so it has one valley in log T.
     found = minimize_scalar(loss, bounds=(math.log(_LEAST_T), math.log(_MOST_T)), method="bounded")
