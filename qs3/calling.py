@@ -2,8 +2,8 @@
 
 from qs3.calling import generate, train
 
-generate("domain=modelnet10", "limit=5", "paths.data_dir=/tmp/data")
-folder = train("experiment=quickstart", "seed=1", "paths.data_dir=/tmp/data")
+generate("domain=modelnet10", "limit=5", "paths.data_dir=data")
+folder = train("experiment=quickstart", "seed=1", "paths.data_dir=data")
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 For the notebooks and for trying things out. Its numbers say nothing about scans.
 
-    write_toy("/tmp/toy")
-    train(*toy_overrides("/tmp/toy"), "seed=1")  # qs3.calling
+    write_toy("toy")
+    train(*toy_overrides("toy"), "seed=1")  # qs3.calling
 """
 
 from __future__ import annotations
