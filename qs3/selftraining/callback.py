@@ -31,7 +31,7 @@ from qs3.classifier import Classifier
 from qs3.data.datamodule import UdaData
 from qs3.evaluation import predict
 from qs3.selftraining.scheme import Phases, Scheme
-from qs3.selftraining.selectors import Predictions, check_selection, keep_all
+from qs3.selftraining.selectors import TeacherPredictions, check_selection, keep_all
 from qs3.selftraining.table import path_of, write_pseudo_labels
 
 log = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ class SelfTraining(Callback):
         probabilities = trainer.strategy.broadcast(
             predict(teacher, data.target.points, data.eval_batch_size, pl_module.device)
         )
-        said = Predictions.of(probabilities, data.target.ids)
+        said = TeacherPredictions.of(probabilities, data.target.ids)
         selection = self.scheme.selector.select(said, self.scheme.theta_of(round_), round_)
         if selection.labels is not None:  # a selector may name another class than the likeliest
             said = said.relabelled(selection.labels)

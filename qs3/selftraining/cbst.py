@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.errors import ConfigError
-from qs3.selftraining.selectors import Predictions, Selection
+from qs3.selftraining.selectors import Selection, TeacherPredictions
 from qs3.settings import number, one_of
 
 _KEY = "selftraining.selector"
@@ -90,7 +90,7 @@ class Cbst:
         grown = Decimal(repr(self.portion)) + round_ * Decimal(repr(self.step))
         return float(min(grown, Decimal(repr(self.most))))
 
-    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; the figure "confident" counts predictions above theta."""
         if teacher.probabilities is None:
             raise ConfigError("CBST needs the probabilities of all classes")

@@ -8,7 +8,7 @@ import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.randomness import derive
-from qs3.selftraining.selectors import Predictions, Selection, Selector
+from qs3.selftraining.selectors import Selection, Selector, TeacherPredictions
 from qs3.settings import one_of, whole
 
 
@@ -40,7 +40,7 @@ class Random:
         """Whether the other selector has thresholds of its own."""
         return bool(getattr(self.of, "own_thresholds", False))
 
-    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; figures are those of the other selector."""
         given = self.of.select(teacher, theta, round_)
         if given.labels is not None:

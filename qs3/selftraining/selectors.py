@@ -19,7 +19,7 @@ from qs3.settings import one_of
 
 
 @dataclass(frozen=True, eq=False)
-class Predictions:
+class TeacherPredictions:
     """What a teacher says of each target sample.
 
     Attributes:
@@ -37,13 +37,13 @@ class Predictions:
     probabilities: Float[np.ndarray, "n k"] | None = None
 
     @classmethod
-    def of(cls, probabilities: Float[np.ndarray, "n k"], ids: Sequence[str]) -> Predictions:
+    def of(cls, probabilities: Float[np.ndarray, "n k"], ids: Sequence[str]) -> TeacherPredictions:
         """Those of the likeliest classes; the lowest on ties."""
         predicted = probabilities.argmax(axis=1)
         confidence = probabilities.max(axis=1).astype(np.float64)
         return cls(ids, confidence, predicted, probabilities.shape[1], probabilities)
 
-    def relabelled(self, labels: Int[np.ndarray, " n"]) -> Predictions:
+    def relabelled(self, labels: Int[np.ndarray, " n"]) -> TeacherPredictions:
         """The same with other classes named, and the probabilities of those."""
         assert self.probabilities is not None
         chosen = np.take_along_axis(self.probabilities, labels[:, None], axis=1)[:, 0]
@@ -78,7 +78,7 @@ class Selection:
 class Selector(Protocol):
     """Chooses among predictions; an object built from config group `selftraining`."""
 
-    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """Choose the samples to train on; may choose none (the caller decides what that means).
 
         Args:
@@ -114,7 +114,7 @@ class Qbst:
         one_of("selftraining.selector.order", self.order, ("descending", "ascending"))
         one_of("selftraining.selector.counts", self.counts, ("confident", "all"))
 
-    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes alone."""
         confidence, predicted = teacher.confidence, teacher.predicted
         classes = teacher.classes
@@ -149,7 +149,7 @@ class Spst:
     `Qbst(mu="one")` chooses.
     """
 
-    def select(self, teacher: Predictions, theta: float, round_: int = 0) -> Selection:
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes alone."""
         selected = teacher.confidence > theta
         kept = np.bincount(teacher.predicted[selected], minlength=teacher.classes)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from qs3.methods.student import Student
 from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.controls import Random
-from qs3.selftraining.selectors import Predictions, Qbst, Selector, Spst
+from qs3.selftraining.selectors import Qbst, Selector, Spst, TeacherPredictions
 
 CLASSES = 3
 SEEDS = 4
@@ -82,7 +82,7 @@ class Problem:
         ids = [f"{i:04d}" for i in range(len(self.target))]
         for round_ in range(rounds):
             p = probabilities(teacher, self.target)
-            selection = selector.select(Predictions.of(p, ids), theta, round_)
+            selection = selector.select(TeacherPredictions.of(p, ids), theta, round_)
             labels = p.argmax(1) if selection.labels is None else selection.labels
             y = torch.from_numpy(labels)
             if selection.soft is not None:

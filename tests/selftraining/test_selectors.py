@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.errors import ConfigError, SelectionError
-from qs3.selftraining.selectors import Predictions, Qbst, check_selection
+from qs3.selftraining.selectors import Qbst, TeacherPredictions, check_selection
 
 # Worked by hand for theta = 0.8. Confident: class 0: a b c d e (5), class 1: g h (2),
 # class 2: j (1); n = 8, mu = 3/8, 6/8, 7/8; quotas ceil(15/8) = 2, ceil(12/8) = 2, ceil(7/8) = 1.
@@ -30,7 +30,7 @@ TABLE = [
 
 def select(table, theta=0.8, classes=3, **settings):
     ids, predicted, confidence = zip(*table, strict=True)
-    teacher = Predictions(ids, np.array(confidence), np.array(predicted), classes)
+    teacher = TeacherPredictions(ids, np.array(confidence), np.array(predicted), classes)
     selection = Qbst(**settings).select(teacher, theta)
     return selection, "".join(sorted(np.array(ids)[selection.selected]))
 
@@ -68,7 +68,7 @@ def test_the_paper_s_example_of_a_perfect_teacher():
     sizes = [80, 270, 388, 517, 2070, 130, 164, 71, 391, 807]
     predicted = np.repeat(np.arange(10), sizes)
     ids = [f"{i:05d}" for i in range(len(predicted))]
-    selection = Qbst().select(Predictions(ids, np.full(len(ids), 0.9), predicted, 10), 0.8)
+    selection = Qbst().select(TeacherPredictions(ids, np.full(len(ids), 0.9), predicted, 10), 0.8)
     assert selection.kept[4] == 1194
     assert abs(int(selection.kept.sum()) - 3740) <= 10
     exact = [math.ceil((1 - Fraction(n, 4888)) * n) for n in sizes]

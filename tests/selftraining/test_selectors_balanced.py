@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from qs3.errors import ConfigError
 from qs3.selftraining.cbst import Cbst, class_thresholds
 from qs3.selftraining.controls import Random
-from qs3.selftraining.selectors import Predictions, Qbst, Spst
+from qs3.selftraining.selectors import Qbst, Spst, TeacherPredictions
 
 
 def select(selector, probabilities, theta=0.0, ids=None, round_=0):
     """A selection, and the ids kept with their pseudo-labels, e.g. "a0 b1"."""
     p = np.asarray(probabilities, dtype=float)
     ids = ids if ids is not None else [chr(ord("a") + i) for i in range(len(p))]
-    selection = selector.select(Predictions.of(p, ids), theta, round_)
+    selection = selector.select(TeacherPredictions.of(p, ids), theta, round_)
     labels = p.argmax(axis=1) if selection.labels is None else selection.labels
     kept = sorted(f"{i}{k}" for i, k, s in zip(ids, labels, selection.selected, strict=True) if s)
     return selection, " ".join(kept)

@@ -23,7 +23,7 @@ from qs3.data.store import open_pointset
 from qs3.evaluation import predict
 from qs3.hydra_glue import build
 from qs3.run import train
-from qs3.selftraining.selectors import Predictions, Qbst
+from qs3.selftraining.selectors import Qbst, TeacherPredictions
 from qs3.selftraining.table import write_pseudo_labels
 from tests.training.conftest import result_of
 from tests.training.test_resume import interrupt
@@ -120,7 +120,7 @@ def test_the_table_of_a_later_round_is_what_one_process_makes_of_the_weights(
     net.load_state_dict(seen_by(both.watched, end)[0]["weights"])
     target = load_clouds(open_pointset(root / "data/kinectsim10"), "train", points=64)
     probabilities = predict(net, target.points, 64)
-    said = Predictions.of(probabilities, target.ids)
+    said = TeacherPredictions.of(probabilities, target.ids)
     selected = Qbst().select(said, 0.405).selected
     table = tmp_path / "table.csv"
     write_pseudo_labels(table, target.ids, said.predicted, said.confidence, selected, CLASSES)
