@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3 import runs
 from qs3.data.domain import check_all
@@ -128,7 +128,8 @@ def _fit(run: Run) -> dict[str, Any]:
 def _draw(run: Run) -> None:
     from qs3.report.run_pictures import after_training  # matplotlib from here on
 
-    after_training(run.folder)
+    config: Any = OmegaConf.to_container(run.cfg, resolve=False)
+    after_training(run.folder, config)
 
 
 @contextlib.contextmanager

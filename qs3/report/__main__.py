@@ -20,7 +20,8 @@ the runs had beyond the table's. `run` trains what a table lacks, seed by seed, 
 called again it goes on. `compare` prints the difference of each row to the row `base`, with its
 interval; `effects` those between columns averaged over rows, and between rows over columns.
 Pictures of a run, the folder that training names: curves, confusion, pseudo-labels, classes,
-calibration, features of both domains (if its data are there), and a page of all, index.html.
+calibration; if its data are there, features and clouds of both domains, their class balance and
+the surest mistakes; if they kept their views, the pipeline; and a page of all, index.html.
 Pictures of domains: a contact sheet of each domain, one that compares them, and classes.png, how
 many clouds each class has; with out=NAME.png the comparison alone.
 `pipeline` draws one object on its way from images to residuals. It scans it now (any override of
@@ -232,7 +233,7 @@ def _pictures(options: dict[str, str]) -> None:
     from hydra.utils import instantiate
 
     from qs3.report.class_balance import class_picture
-    from qs3.report.pictures import contact_sheet, scan_picture
+    from qs3.report.pictures import class_sheet, scan_picture
     from qs3.report.tables import composing
 
     names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]
@@ -255,19 +256,8 @@ def _pictures(options: dict[str, str]) -> None:
             counts[domain.label] = data
             if alone:
                 continue
-            part = data.split(split)
-            few = max(1, min(6, *data.counts()[split].values()))  # a row a class
-            of_class = [(part.labels == k).nonzero()[0][:few] for k in range(len(data.classes))]
-            first = [i for members in of_class for i in members]
-            print(
-                contact_sheet(
-                    [part.points[i] for i in first],
-                    [part.ids[i].split("/")[-1] for i in first],
-                    out / f"{name}.png",
-                    columns=few,
-                    heading=f"{domain.label}, {split}",
-                )
-            )
+            heading = f"{domain.label}, {split}"
+            print(class_sheet(data, out / f"{name}.png", split=split, heading=heading))
     if not alone:
         print(class_picture(counts, out / "classes.png"))
     note = f"simulated: {', '.join(simulated)}" if simulated else ""

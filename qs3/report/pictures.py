@@ -24,21 +24,23 @@ _INK, _SOFT, _PAPER = "#1d2430", "#6b7482", "#ffffff"
 
 
 def contact_sheet(
-    points: Sequence[np.ndarray],
+    points: Sequence[np.ndarray | None],
     titles: Sequence[str],
     path: str | Path,
     *,
     columns: int = 6,
     heading: str = "",
+    rows: Sequence[str] = (),
 ) -> Path:
     """Save a sheet of clouds, row by row.
 
     Args:
-        points: clouds [P, 3], z up.
+        points: clouds [P, 3], z up; None leaves a place empty.
         titles: one a cloud, drawn below it.
         path: of the PNG.
         columns: panels in a row.
         heading: a line above all.
+        rows: what stands before each row; none: nothing does.
 
     Raises:
         DataError: there is nothing to draw.
@@ -46,17 +48,73 @@ def contact_sheet(
     if not points or len(points) != len(titles):
         raise DataError(f"a contact sheet of {len(points)} clouds with {len(titles)} titles")
     columns = min(columns, len(points))
-    rows = -(-len(points) // columns)
-    top = 0.45 if heading else 0.1
-    figure = _Figure(columns * _PANEL, rows * (_PANEL + 0.22) + top)
+    lines = -(-len(points) // columns)
+    top, left = (0.45 if heading else 0.1), (0.95 if rows else 0.0)
+    figure = _Figure(left + columns * _PANEL, lines * (_PANEL + 0.22) + top)
     for i, (cloud, title) in enumerate(zip(points, titles, strict=True)):
         row, column = divmod(i, columns)
-        y = figure.height - top - (row + 1) * (_PANEL + 0.22) + 0.22
-        figure.panel(column * _PANEL, y, cloud)
-        figure.text((column + 0.5) * _PANEL, y - 0.06, title, size=7, color=_SOFT)
+        x, y = left + column * _PANEL, figure.height - top - (row + 1) * (_PANEL + 0.22) + 0.22
+        if column == 0 and row < len(rows):
+            figure.text(left - 0.1, y + _PANEL / 2, rows[row], size=9, align="right")
+        if cloud is not None:
+            figure.panel(x, y, cloud)
+            figure.text(x + _PANEL / 2, y - 0.06, title, size=7, color=_SOFT)
     if heading:
         figure.text(figure.width / 2, figure.height - 0.24, heading, size=11, weight="bold")
     return figure.save(path)
+
+
+def class_sheet(
+    data: PointSet, path: str | Path, *, split: str = "train", heading: str = "", most: int = 60
+) -> Path:
+    """Save a sheet of a split's clouds: a row a class, or, without labels, from first to last.
+
+    Args:
+        data: the domain's.
+        path: of the PNG.
+        split: which split.
+        heading: a line above all.
+        most: clouds on the sheet, as long as two of a class fit; six a row. They are taken at
+            even steps: scans of one mesh stand side by side in a dataset.
+
+    Raises:
+        DataError: the split is empty.
+    """
+    part, columns = data.split(split), 6
+    rows: tuple[str, ...] = ()
+    shown: Sequence[int | None]
+    if data.labelled:
+        columns = max(2, min(columns, most // len(part.classes)))
+        members = {cls: _members(part, cls) for cls in part.classes}
+        rows = tuple(cls for cls, own in members.items() if len(own))
+        shown = [i for cls in rows for i in padded(_evenly(members[cls], columns), columns)]
+    else:
+        shown = _evenly(np.arange(len(part)), most)
+    return contact_sheet(
+        [None if i is None else np.asarray(part.points[i]) for i in shown],
+        ["" if i is None else short(part.ids[i]) for i in shown],
+        path,
+        columns=columns,
+        heading=heading,
+        rows=rows,
+    )
+
+
+def padded(row: Sequence[int], columns: int) -> list[int | None]:
+    """A row of a sheet, with empty places at its end."""
+    return [*row, *[None] * (columns - len(row))]
+
+
+def _evenly(members: np.ndarray, most: int) -> list[int]:
+    """At most so many of them, at even steps from the first on."""
+    few = min(most, len(members))
+    return [int(members[i * len(members) // few]) for i in range(few)]
+
+
+def short(id_: str, letters: int = 22) -> str:
+    """The end of an id, as a panel has room for."""
+    name = id_.rsplit("/", 1)[-1]
+    return name if len(name) <= letters else f"…{name[1 - letters :]}"
 
 
 def scan_picture(
@@ -170,7 +228,15 @@ class _Figure:
         )  # fmt: skip
 
     def save(self, path: str | Path) -> Path:
-        """Write the PNG, atomically and without a date in it."""
+        """Write the PNG, atomically and without a date in it.
+
+        In 256 colours: that cannot be seen, and a third of the bytes is left. A sheet of 60 clouds
+        lies in the folder of each run.
+        """
+        from PIL import Image
+
+        self._figure.canvas.draw()
+        seen = np.asarray(self._figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
         with atomic_path(path) as temporary:
-            self._figure.savefig(temporary, format="png", metadata={"Software": None})
+            Image.fromarray(seen).quantize(256).save(temporary, format="png", optimize=True)
         return Path(path)

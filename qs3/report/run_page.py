@@ -8,6 +8,7 @@ from html import escape
 from pathlib import Path
 
 from qs3.quality_words import table as quality_table
+from qs3.report.html_page import html
 from qs3.report.run_data import RunFiles, settings_of
 from qs3.report.run_figures import EVALUATION_ONLY
 
@@ -18,15 +19,18 @@ _TITLES = {
     "classes": "Balance of classes",
     "calibration": "Calibration",
     "embedding": "Features of both domains",
+    "domains": "One object of each class",
+    "source_clouds": "Clouds of the source",
+    "target_clouds": "Clouds of the target",
+    "class_balance": "Classes of both domains",
+    "mistakes": "Surest mistakes",
+    "named": "Surest of each class",
+    "pipeline": "From mesh to cloud",
 }
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; max-width: 62rem; margin: 2rem auto;
-       padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+body { max-width: 62rem; }
 img { max-width: 100%; height: auto; }
-table { border-collapse: collapse; } th, td { padding: .2rem .9rem .2rem 0; text-align: left;
-  vertical-align: top; border-bottom: 1px solid #e3e6eb; } th { font-weight: 500; color: #6b7482; }
-pre { background: #f7f8fa; padding: .8rem; overflow-x: auto; font-size: 13px; }
+th, td { padding: .2rem .9rem .2rem 0; border-bottom: 1px solid #e3e6eb; }
 .note { color: #8a5a12; }
 """
 
@@ -39,13 +43,7 @@ def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]
         pictures: PNG by name.
         skipped: why one is not there, by name.
     """
-    title = escape(run.title)
     parts = [
-        "<!doctype html>",
-        '<html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
-        f"<h1>{title}</h1>",
         *(f'<p class="note">Note: {escape(note)}.</p>' for note in run.notes),
         _table(key_figures(run)),
     ]
@@ -70,7 +68,7 @@ def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]
             f"<h2>Settings</h2><details><summary>all of them</summary>"
             f"<pre>{escape(settings)}</pre></details>"
         )
-    return "\n".join([*parts, "</body></html>", ""])
+    return html(run.title, parts, _STYLE)
 
 
 def _quality(run: RunFiles) -> list[str]:

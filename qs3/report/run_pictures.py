@@ -5,9 +5,11 @@ A picture that has nothing to show is left out, and the reason is said.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,7 @@ from qs3.errors import Qs3Error
 from qs3.files import atomic_path, write_text
 from qs3.report import run_figures
 from qs3.report.canvas import NothingToDrawError
+from qs3.report.run_clouds import cloud_pictures
 from qs3.report.run_data import RunFiles, read_run
 from qs3.report.run_page import page
 
@@ -53,6 +56,7 @@ def draw(
     *,
     data_dir: str | Path | None = None,
     embed: bool = True,
+    config: Mapping[str, Any] | None = None,
 ) -> Drawn:
     """Draw a run's pictures; those of an earlier call are replaced.
 
@@ -61,17 +65,21 @@ def draw(
         out: folder for the files; None: `pictures` in the run's.
         data_dir: where the datasets lie; None: where the run's config says.
         embed: also lay out the features of both domains; takes a minute.
+        config: of the run; None: what Hydra wrote into its folder.
 
     Raises:
         MissingDataError, DataError: see `qs3.report.run_data.read_run`.
     """
     run = read_run(folder)
+    if config is not None:
+        run = dataclasses.replace(run, config=config)
     out = run.folder / FOLDER if out is None else Path(out)
     pictures, skipped = {}, {}
-    for name, make in _figures(run, data_dir, embed).items():
+    for name, make in _makers(run, data_dir, embed).items():
         path = out / f"{name}.png"
         try:
-            pictures[name] = _save(make(), path)
+            make(path)
+            pictures[name] = path
         except NothingToDrawError as reason:
             skipped[name] = str(reason)
             path.unlink(missing_ok=True)
@@ -79,13 +87,20 @@ def draw(
     return Drawn(pictures, skipped, run.notes, out / PAGE)
 
 
-def _figures(
+def _makers(
     run: RunFiles, data_dir: str | Path | None, embed: bool
-) -> dict[str, Callable[[], Figure]]:
+) -> dict[str, Callable[[Path], object]]:
+    """What writes each picture, in the order of the page."""
+
     def classes() -> Figure:
         return run_figures.classes(run, _train_labels(run, data_dir))
 
-    makers: dict[str, Callable[[], Figure]] = {
+    def embedding() -> Figure:
+        from qs3.report.embedding import draw_embedding  # torch
+
+        return draw_embedding(run, data_dir)
+
+    figures: dict[str, Callable[[], Figure]] = {
         "curves": lambda: run_figures.curves(run),
         "confusion": lambda: run_figures.confusion(run),
         "pseudo_labels": lambda: run_figures.pseudo_labels(run),
@@ -93,14 +108,9 @@ def _figures(
         "calibration": lambda: run_figures.calibration(run),
     }
     if embed:
-
-        def embedding() -> Figure:
-            from qs3.report.embedding import draw_embedding  # torch
-
-            return draw_embedding(run, data_dir)
-
-        makers["embedding"] = embedding
-    return makers
+        figures["embedding"] = embedding
+    saving = {name: partial(_save, make) for name, make in figures.items()}
+    return {**saving, **cloud_pictures(run, data_dir)}
 
 
 def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | None:
@@ -114,25 +124,29 @@ def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | No
     return np.array(data.labels[data.indices("train")]) if data.labelled else None
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def _save(make: Callable[[], Figure], path: Path) -> None:
     """Write the PNG, atomically and without a date in it."""
+    figure = make()
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": None})
-    return path
 
 
-def after_training(folder: Path) -> None:
+def after_training(folder: Path, config: Mapping[str, Any] | None = None) -> None:
     """Draw a finished run's pictures, and log them to wandb's active run, if there is one.
 
     A picture that cannot be made is a warning: the result is saved already.
+
+    Args:
+        folder: of the run.
+        config: as composed; None: what Hydra wrote into the folder.
     """
     try:
-        drawn = draw(folder, embed=False)
+        drawn = draw(folder, embed=False, config=config)
         _log_to_wandb(drawn, runs.read_metrics(folder) or {})
         log.info("pictures: %s", drawn.page)
     except Exception as error:
         log.warning(
-            "the run is finished, but its pictures failed (%s: %s); python -m qs3.report pictures "
+            "the run is finished, but its pictures failed (%s: %s); python -m qs3.report "
             "run=%s draws them again",
             type(error).__name__,
             error,

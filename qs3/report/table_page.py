@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from html import escape
 
 from qs3.report.formats import details, grid, marks, remarks, to_run
+from qs3.report.html_page import html
 from qs3.report.table_cells import INCOMPLETE, Table
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; max-width: 76rem; margin: 2rem auto;
-       padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+body { max-width: 76rem; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .9rem .25rem 0; text-align: left; vertical-align: top; }
-td { white-space: nowrap; } th { font-weight: 500; color: #6b7482; }
+table { font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .9rem .25rem 0; }
+td { white-space: nowrap; }
 tr { border-bottom: 1px solid #e3e6eb; }
 tr > :first-child { position: sticky; left: 0; background: #fff; white-space: normal;
   min-width: 8rem; }
@@ -23,20 +22,14 @@ li { overflow-wrap: anywhere; }
 .mark { background: #fdf3dc; border-left: 4px solid #c98a1b; padding: .4rem .8rem; }
 .warn { color: #a4441a; }
 .published { color: #6b7482; }
-pre { background: #f7f8fa; padding: .8rem; overflow-x: auto; font-size: 13px; user-select: all; }
+pre { user-select: all; }
 """
 
 
 def page(table: Table) -> str:
     """Title, what must not be overlooked, table, remarks, each number, commands to copy."""
-    title = escape(table.title)
     notes = [remark for remark in remarks(table) if remark not in marks(table)]
     parts = [
-        "<!doctype html>",
-        '<html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
-        f"<h1>{title}</h1>",
         *(f'<p class="mark">{escape(mark)}</p>' for mark in marks(table)),
         _table(grid(table)),
         "<h2>Remarks</h2><ul>",
@@ -48,7 +41,7 @@ def page(table: Table) -> str:
     if commands := to_run(table):
         parts.append("<h2>Not run yet</h2>")
         parts += [f"<pre>{escape(command)}</pre>" for command in commands]
-    return "\n".join([*parts, "</body></html>", ""])
+    return html(table.title, parts, _STYLE)
 
 
 def _table(lines: Sequence[Sequence[str]]) -> str:

@@ -1,8 +1,13 @@
 """What several tests of the report share."""
 
+import shutil
+
 import pytest
+from omegaconf import OmegaConf
 
 from qs3.report.tables import build_table, table_names
+from tests.training.conftest import finished, toy, toy_data  # noqa: F401
+from tests.training.toy import toy_config
 
 
 @pytest.fixture(scope="session")
@@ -10,3 +15,16 @@ def empty(tmp_path_factory):
     """All tables without any runs, by name."""
     log_dir = tmp_path_factory.mktemp("logs")
     return {name: build_table(name, log_dir) for name in table_names()}
+
+
+@pytest.fixture
+def run(finished, toy_data, tmp_path):  # noqa: F811
+    """A copy of the finished toy run (two rounds) with the files that the command line adds."""
+    folder = tmp_path / "exp" / "seed0-0123abcd"
+    shutil.copytree(finished, folder)
+    (folder / ".hydra").mkdir(exist_ok=True)
+    cfg = toy_config(tmp_path, f"paths.data_dir={toy_data}")
+    OmegaConf.save(cfg, folder / ".hydra" / "config.yaml")
+    words = ["experiment=quickstart", "hydra.job.name='a b'"]
+    OmegaConf.save(OmegaConf.create(words), folder / ".hydra" / "overrides.yaml")
+    return folder

@@ -1,6 +1,9 @@
 """Runs as training leaves them, for the tests of the report."""
 
+import csv
 import json
+
+import matplotlib.image
 
 
 def metrics(seed=0, accuracy=0.5, **changes):
@@ -38,3 +41,22 @@ def write_run(log_dir, **changes):
     folder.mkdir(parents=True)
     (folder / "metrics.json").write_text(json.dumps(content))
     return folder
+
+
+def table(path):
+    """Rows of a CSV file."""
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def change(folder, **changes):
+    """Put other values into a run's metrics.json."""
+    path = folder / "metrics.json"
+    metrics = json.loads(path.read_text())
+    metrics.update(changes)
+    path.write_text(json.dumps(metrics))
+
+
+def not_blank(path):
+    """Whether a PNG has a size, and is neither white nor black."""
+    image = matplotlib.image.imread(path)[..., :3]
+    return image.shape[0] > 200 and 0.005 < (image.min(axis=2) < 0.9).mean() < 0.8
