@@ -3,7 +3,6 @@
 import multiprocessing
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +47,8 @@ def test_fixtures_cover_every_domain():
 @pytest.mark.parametrize("name", NAMES)
 def test_missing_data_is_explained(tmp_path, name):
     found = domain(name, tmp_path)
-    started = time.perf_counter()
     with pytest.raises(MissingDataError) as caught:
         found.check()
-    assert time.perf_counter() - started < 0.5
     message = str(caught.value)
     assert str(found.folder / "meta.yaml") in message
     assert "Where to get it: " in message
