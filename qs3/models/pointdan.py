@@ -16,7 +16,7 @@ from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.base import Backbone, Features, PointClassifier
 from qs3.models.norms import head_norm, make_norm
-from qs3.models.pointnet import PointMLP
+from qs3.models.pointnet import PointMLP, TNet
 
 
 class Nodes(NamedTuple):
@@ -86,27 +86,6 @@ class NodeModule(nn.Module):
         return Nodes(torch.cat([f, back.to(f.dtype)], dim=2), nodes, place)
 
 
-class _Turn(nn.Module):
-    """T-Net as PointDAN has it: LeakyReLU 0.01 in its second half, ReLU in the first."""
-
-    def __init__(self, channels: int, norm: str) -> None:
-        super().__init__()
-        self.channels = channels
-        self.points = PointMLP(channels, 64, 128, 1024, norm=norm)
-        kind = head_norm(norm)
-        self.cloud = nn.Sequential(
-            *(nn.Linear(1024, 512), make_norm(kind, 512), nn.LeakyReLU()),
-            *(nn.Linear(512, 256), make_norm(kind, 256), nn.LeakyReLU()),
-            nn.Linear(256, channels**2),
-        )
-
-    def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b c c"]:
-        """The matrix that multiplies row vectors from the right."""
-        flat = self.cloud(self.points.maximum(x))  # [b, c * c]
-        identity = torch.eye(self.channels, dtype=x.dtype, device=x.device)
-        return flat.view(-1, self.channels, self.channels) + identity
-
-
 class PointDanBackbone(Backbone):
     """T-Net 3, 64, 64, T-Net 64, nodes (64 to 128), 128, 1024, maximum, norm.
 
@@ -121,9 +100,9 @@ class PointDanBackbone(Backbone):
         self, *, nodes: int = 64, neighbours: int = 64, radius: float = 0.3, norm: str = "batch"
     ) -> None:
         super().__init__()
-        self.input_transform = _Turn(3, norm)
+        self.input_transform = TNet(3, norm, nn.LeakyReLU)
         self.first = PointMLP(3, 64, 64, norm=norm)
-        self.feature_transform = _Turn(64, norm)
+        self.feature_transform = TNet(64, norm, nn.LeakyReLU)
         self.node_module = NodeModule(64, nodes, neighbours, radius, norm)
         self.last = PointMLP(128, 128, 1024, norm=norm)
         self.norm = make_norm(head_norm(norm), 1024)

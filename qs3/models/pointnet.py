@@ -71,16 +71,24 @@ class PointMLP(nn.Module):
 
 
 class TNet(nn.Module):
-    """A matrix for each cloud, the identity plus what the cloud asks for: [B, C, C]."""
+    """A matrix for each cloud, the identity plus what the cloud asks for: [B, C, C].
 
-    def __init__(self, channels: int, norm: str = "batch") -> None:
+    Args:
+        channels: C.
+        norm: see `qs3.models.norms`.
+        activation: after the maximum; PointDAN has LeakyReLU 0.01 there, the others ReLU.
+    """
+
+    def __init__(
+        self, channels: int, norm: str = "batch", activation: type[nn.Module] = nn.ReLU
+    ) -> None:
         super().__init__()
         self.channels = channels
         self.points = PointMLP(channels, 64, 128, 1024, norm=norm)
         kind = head_norm(norm)
         self.cloud = nn.Sequential(
-            *(nn.Linear(1024, 512), make_norm(kind, 512), nn.ReLU()),
-            *(nn.Linear(512, 256), make_norm(kind, 256), nn.ReLU()),
+            *(nn.Linear(1024, 512), make_norm(kind, 512), activation()),
+            *(nn.Linear(512, 256), make_norm(kind, 256), activation()),
             nn.Linear(256, channels**2),
         )
 
