@@ -34,22 +34,29 @@ _ESTIMATES = ("temperature", "mean_confidence", "calibrated", "thresholded", "di
 
 
 def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray, " v"]) -> float:
-    """The T in [0.05, 20] for which softmax(log p / T) has the least mean -log p_label.
+    """The T in [0.05, 20] for which softmax(log p / T) has the least cross-entropy to the labels.
 
     Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, section 4.2. log p equals
     the logits but for a constant of each row, which the softmax does not see. T > 1 makes less
     sure. No class changes. 20 (the least sure that can be) if the net is no better than chance.
 
+    A label counts (v + 1) / (v + 2), the other classes share the rest (Laplace's rule of
+    succession, as in Platt, "Probabilistic Outputs for Support Vector Machines", 1999, section
+    2.2). Without that a net that makes no error on v clouds would be taken to make none at all.
+
     Args:
         probabilities: of held-out clouds, v >= 1.
         labels: theirs.
     """
-    rows = np.arange(len(labels))
+    classes = probabilities.shape[1]
+    rest = 1 / (len(labels) + 2)
+    weights = np.full(probabilities.shape, rest / max(1, classes - 1))
+    weights[np.arange(len(labels)), labels] = 1 - rest
 
     def loss(log_t: float) -> float:
-        right = scaled(probabilities, math.exp(log_t))[rows, labels]
+        logs = np.log(np.maximum(scaled(probabilities, math.exp(log_t)), _TINY))
         # Exactly rounded, so that the order of clouds does not matter where the valley is flat.
-        return -math.fsum(np.log(np.maximum(right, _TINY))) / len(right)
+        return -math.fsum((weights * logs).sum(axis=1)) / len(labels)
 
     # The loss is convex in 1 / T, so it has one valley in log T.
     found = minimize_scalar(loss, bounds=(math.log(_LEAST_T), math.log(_MOST_T)), method="bounded")
@@ -159,6 +166,7 @@ def quality_of(
     batch_size: int,
     device: Any = "cpu",
     teacher: nn.Module | None = None,
+    unadapted: tuple[nn.Module, nn.Module | None] | None = None,
     upright: bool = True,
 ) -> dict[str, Any]:
     """What `metrics.json` has under `quality`, in words in `qs3.quality_words`.
@@ -174,6 +182,8 @@ def quality_of(
         classes: names in label order.
         batch_size, device: of the predictions.
         teacher: the net before self-training; None if there was none.
+        unadapted: net and teacher with the norms that they were trained with, for the labelled
+            clouds of the source, where `net` and `teacher` have the target's (AdaBN).
         upright: z points up in the target's clouds.
 
     Returns:
@@ -182,7 +192,8 @@ def quality_of(
     """
     points, labels = target.points, validation.labels.numpy()
     domain = "source" if owner == "source" else "target"
-    known = predict(net, validation.clouds.all(), batch_size, device, domain=domain)
+    as_trained, taught = unadapted if unadapted and owner == "source" else (net, teacher)
+    known = predict(as_trained, validation.clouds.all(), batch_size, device, domain=domain)
     judged = predict(net, points, batch_size, device)
     counts = np.bincount(judged.argmax(axis=1), minlength=len(classes))
     found: dict[str, Any] = {
@@ -203,9 +214,10 @@ def quality_of(
     if upright:
         found["turns_agree"] = turns_agree(judged, _turned(net, points, batch_size, device))
     if teacher is not None:
+        assert taught is not None
         theirs = predict(teacher, points, batch_size, device)
         found["teacher_agrees"] = agreement(judged, theirs)
-        known = predict(teacher, validation.clouds.all(), batch_size, device, domain=domain)
+        known = predict(taught, validation.clouds.all(), batch_size, device, domain=domain)
         if np.isfinite(known).all() and np.isfinite(theirs).all():
             accuracy = agreement(known, np.eye(len(classes))[labels])
             found["teacher"] = {"validation_accuracy": accuracy, **estimates(known, labels, theirs)}

@@ -6,21 +6,21 @@ from collections.abc import Mapping
 from typing import Any
 
 MEANINGS: Mapping[str, str] = {
-    "validation_accuracy": "accuracy on held-out source clouds. On your clouds it will be lower",
+    "validation_accuracy": "accuracy on held-out labelled clouds. On others it will be lower",
     "mean_confidence": "mean largest probability, as the net gives it. Nets are too sure of "
     "themselves, on clouds of another domain most of all",
     "calibrated": "expected accuracy if confidences meant on your clouds what they mean on "
-    "held-out source clouds (AC). Too high as a rule, because your clouds differ from these",
-    "thresholded": "share of your clouds above the certainty that as many held-out source clouds "
-    "miss as are wrong (ATC). Too high as a rule; can be off either way",
-    "difference": "accuracy on held-out source clouds, less what is lost in confidence (DoC). "
+    "held-out labelled clouds (AC). Too high as a rule, because your clouds differ from these",
+    "thresholded": "share of your clouds above the certainty that as many held-out labelled "
+    "clouds miss as are wrong (ATC). Too high as a rule; can be off either way",
+    "difference": "accuracy on held-out labelled clouds, less what is lost in confidence (DoC). "
     "Too high as a rule",
     "turns_agree": "share of clouds with the same class after turns about gravity, which change "
     "no class. What changes is unreliable; what stays can be wrong all the same",
     "teacher_agrees": "share of clouds on which the net before self-training says the same. "
     "The student learnt from it, so both can be wrong together",
-    "unlike_source": "share of clouds outside the range of the source's in spacing, flatness or "
-    "height, so unlike all that came with a label. Few say nothing: a new object can look usual",
+    "unlike_source": "share of clouds outside the range of the labelled ones in spacing, flatness "
+    "or height, so unlike all that came with a label. Few say nothing: a new object can look usual",
     "never_predicted": "classes that no cloud got. Either there are none of them, or they are "
     "all taken for something else",
 }

@@ -44,10 +44,18 @@ def without_labels(
 
 
 def learnt_by_heart(
-    net: nn.Module, labelled: Labelled, batch_size: int, device: Any
+    net: nn.Module, labelled: Labelled, owner: str, batch_size: int, device: Any
 ) -> dict[str, Any]:
-    """How many there are of the clouds that the net was trained on, and the share that is right."""
-    table = predict(net, labelled.clouds.all(), batch_size, device)
+    """How many there are of the clouds that the net was trained on, and the share that is right.
+
+    Args:
+        net: as it is reported.
+        labelled: those clouds.
+        owner: of their labels, "source" or "target_train": whose norms the net takes for them.
+        batch_size, device: of the predictions.
+    """
+    domain = "source" if owner == "source" else "target"
+    table = predict(net, labelled.clouds.all(), batch_size, device, domain=domain)
     right = float((table.argmax(axis=1) == labelled.labels.numpy()).mean())
     log.info("%.1f %% of the %d training clouds are right", 100 * right, len(table))
     return {"n": len(table), "accuracy": right}

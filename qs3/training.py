@@ -177,10 +177,10 @@ def fit(run: Run) -> dict[str, Any]:
         save(copy_weights(classifier.net), run.folder / STUDENT)
     trainer.strategy.barrier("student saved")
 
-    def trained(file: Path) -> nn.Module:
+    def trained(file: Path, norms: str = cfg.evaluation.norms) -> nn.Module:
         net = classifier.fresh_net(phase=0).to(classifier.device)
         net.load_state_dict(load(file, classifier.device))
-        if cfg.evaluation.norms == "adabn":
+        if norms == "adabn":
             seed = derive(run.seed, "adabn")
             adapt_norms(net, target.points, cfg.protocol.batch_size, seed, classifier.device)
         return net
@@ -207,7 +207,11 @@ def fit(run: Run) -> dict[str, Any]:
             more = data.eval_batch_size, classifier.device
             extras["validators"] = without_labels(net, target, choice, *more)
             if cfg.data.clouds_a_class is not None:
-                extras["training"] = learnt_by_heart(net, data.labelled, *more)
+                extras["training"] = learnt_by_heart(net, data.labelled, method.labels, *more)
+            taught = files["selected"] if run.scheme.rounds else None
+            as_trained = None
+            if cfg.evaluation.norms == "adabn":
+                as_trained = trained(file, ""), trained(taught, "") if taught else None
             quality = quality_of(
                 net,
                 judged,
@@ -217,7 +221,8 @@ def fit(run: Run) -> dict[str, Any]:
                 classes=target_set.classes,
                 batch_size=cfg.data.eval_batch_size,
                 device=classifier.device,
-                teacher=trained(files["selected"]) if run.scheme.rounds else None,
+                teacher=trained(taught) if taught else None,
+                unadapted=as_trained,
                 upright=run.target.gravity == "z",
             )
         if name == final and trainer.is_global_zero:

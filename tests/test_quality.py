@@ -53,9 +53,26 @@ def test_the_temperature_is_found_that_the_logits_were_multiplied_by(t):
     assert quality.temperature(spoilt, labels) == pytest.approx(t, rel=0.03)
 
 
-def test_a_net_that_is_always_right_is_made_surer_and_a_blind_one_unsure():
+@pytest.mark.parametrize("v", [1, 3, 60])
+def test_a_net_that_is_always_right_is_as_sure_as_so_few_clouds_allow(v):
+    """Right on v of v clouds: (v + 1) / (v + 2), Laplace's rule, whatever it said itself."""
+    always = np.zeros(v, dtype=int)
+    t = quality.temperature(two(*[0.7] * v), always)
+    assert quality.scaled(two(0.7), t)[0, 0] == pytest.approx((v + 1) / (v + 2), abs=1e-4)
+
+
+def test_a_target_does_not_become_certain_because_validation_held_no_error():
+    """60 clouds, all right, and a target on which the net is as unsure as it is wrong."""
+    source, _ = drawn(60, 3.0)
+    target, truth = drawn(4000, 1.0, seed=1)
+    right = (target.argmax(axis=1) == truth).mean()
+    found = quality.estimates(source, source.argmax(axis=1), target)
+    assert found["temperature"] > 0.3  # without Laplace's rule 0.05, and then all are certain
+    assert right < found["calibrated"] < 0.8
+
+
+def test_a_net_worse_than_chance_is_made_unsure():
     table = two(0.6, 0.7, 0.9)
-    assert quality.temperature(table, np.zeros(3, dtype=int)) < 0.06
     assert quality.temperature(table, np.ones(3, dtype=int)) > 19
     assert quality.scaled(table, 20.0).max() < 0.53
 
