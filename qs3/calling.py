@@ -8,6 +8,8 @@ folder = train("experiment=quickstart", "seed=1", "paths.data_dir=data")
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,9 +36,9 @@ def train(*overrides: str) -> Path:
     from qs3.run import train as run_of
     from qs3.runs import run_folder
 
-    cfg = composed("train", *overrides)
-    folder = run_folder(cfg)
-    run_of(cfg)
+    with _as_hydra("train", overrides) as cfg:
+        folder = run_folder(cfg)
+        run_of(cfg)
     # What Hydra leaves in a run's folder, which pictures and `qs3.report` read.
     write_text(folder / ".hydra" / "config.yaml", OmegaConf.to_yaml(cfg))
     write_text(folder / ".hydra" / "overrides.yaml", OmegaConf.to_yaml(list(overrides)))
@@ -53,6 +55,24 @@ def generate(*overrides: str) -> PointSet:
     return made(composed("generate", *overrides))
 
 
+@contextlib.contextmanager
+def _as_hydra(command: str, overrides: Sequence[str]) -> Iterator[DictConfig]:
+    """A command's config; in the block Hydra's choices are known, which name a run's parts."""
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import open_dict
+
+    whole = _composed(command, overrides, return_hydra_config=True)
+    known, before = HydraConfig.instance(), HydraConfig.instance().cfg
+    known.set_config(whole)
+    cfg = whole.copy()
+    with open_dict(cfg):
+        del cfg["hydra"]
+    try:
+        yield cfg
+    finally:
+        known.cfg = before
+
+
 def composed(command: str, *overrides: str) -> DictConfig:
     """The config that a command would run with.
 
@@ -63,6 +83,10 @@ def composed(command: str, *overrides: str) -> DictConfig:
     Raises:
         ConfigError: no such group, choice or key.
     """
+    return _composed(command, overrides)
+
+
+def _composed(command: str, overrides: Sequence[str], **more: Any) -> Any:
     from hydra.errors import ConfigCompositionException, OverrideParseException
 
     from qs3.errors import ConfigError
@@ -70,8 +94,7 @@ def composed(command: str, *overrides: str) -> DictConfig:
 
     with composing() as compose:
         try:
-            cfg: Any = compose(command, list(overrides))
+            return compose(command, list(overrides), **more)
         except (ConfigCompositionException, OverrideParseException) as error:
             lines = str(error).strip().splitlines()
             raise ConfigError(lines[0] if lines else type(error).__name__) from error
-    return cfg

@@ -14,6 +14,7 @@ from qs3.checkpoints import LAST
 from qs3.errors import ConfigError, MissingDataError
 from qs3.files import atomic_path, make_folder
 from qs3.runs import Run
+from qs3.starting import warn_of_versions
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +27,9 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
 
     null does nothing. "last" insists on a checkpoint of the run. A path, of a run's folder or of
     the `last.ckpt` in it, brings the same run from elsewhere: another machine's logs, a backup. As
-    settings, seed and data must be the same, the result is that of a run that was never moved. A
-    run that has a checkpoint of its own goes on from that.
+    settings, seed and data must be the same, the result is that of a run that was never moved;
+    other versions of torch may change it, which is a warning. A run that has a checkpoint of its
+    own goes on from that.
 
     Args:
         run: whose folder it is.
@@ -63,6 +65,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
             "or leave ckpt_path out"
         )
     runs.check_config(other, begun.get("config_sha256"), started["config_sha256"])
+    warn_of_versions(begun["versions"], started["versions"])
     for role in ("source", "target"):
         runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])
     log.info("going on from %s", path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +57,15 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
     runs.check_config(run.folder, started.get("config_sha256"), now["config_sha256"])
     for role, dataset in (("source", source), ("target", target)):
         runs.check_data(run.folder, dataset.name, started["data"][role], dataset.sha256)
-    if started["versions"] != now["versions"]:
+    warn_of_versions(started["versions"], now["versions"])
+    return started
+
+
+def warn_of_versions(begun: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Say if a run goes on with other versions than it was begun with."""
+    if begun != now:
         log.warning(
             "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
-            started["versions"],
-            now["versions"],
+            begun,
+            now,
         )
-    return started

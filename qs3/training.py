@@ -28,6 +28,7 @@ from qs3.data.datamodule import (
     load_clouds,
     with_labels,
 )
+from qs3.data.domain import Domain
 from qs3.data.manifest import read_manifest
 from qs3.data.store import PointSet
 from qs3.errors import ConfigError, DataError
@@ -116,7 +117,7 @@ def fit(run: Run) -> dict[str, Any]:
         target_set.classes,
         cfg.data.eval_batch_size,
         cfg.evaluation.rotations,
-        _meshes_by_id(target_set, run.target.folder),
+        _objects_by_id(target_set, run.target),
     )
     if cfg.selection.student == ORACLE:
         oracle.check(evaluation)
@@ -336,9 +337,13 @@ def _labels_by_id(dataset: PointSet, split: str) -> dict[str, int] | None:
     return dict(zip(dataset.split(split).ids, labels.tolist(), strict=True))
 
 
-def _meshes_by_id(dataset: PointSet, folder: Path) -> dict[str, str]:
-    rows = read_manifest(folder, dataset.classes)
-    return {row.id: row.mesh_sha256 for row in rows if row.mesh_sha256}
+def _objects_by_id(dataset: PointSet, domain: Domain) -> dict[str, str]:
+    """What each cloud shows: its mesh, or what the publisher's ids tell; where that is known."""
+    importer = domain.importer()
+    of_id = importer.object_of if importer else lambda _: ""
+    rows = read_manifest(domain.folder, dataset.classes)
+    known = {row.id: row.mesh_sha256 or of_id(row.id) for row in rows}
+    return {id_: name for id_, name in known.items() if name}
 
 
 def _students(choice: Choice | None, phases: Phases, scores: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 
 import qs3
 from qs3.calling import composed, generate, train
@@ -37,6 +38,8 @@ def test_train_leaves_what_the_command_leaves(tmp_path):
     folder = train(*toy_overrides(tmp_path), *SHORT, "seed=3")
     metrics = json.loads((folder / "metrics.json").read_text())
     assert (metrics["seed"], metrics["source"], metrics["simulated"]) == (3, "toy_source", True)
+    assert (metrics["method"], metrics["selftraining"]) == ("source_only", "qbst")  # as typed
+    assert not HydraConfig.initialized()
     run = read_run(folder)
     assert run.config["protocol"]["epochs"] == 2
     assert run.command.startswith("python train.py experiment=quickstart")

@@ -143,12 +143,14 @@ def export(
     clouds = made_up(predictor.points) if clouds is None else clouds
     # A copy that nobody trains: some operations of the graph have no gradients.
     net = copy.deepcopy(predictor.net).cpu().requires_grad_(False)
+    # Two, also where there is one: torch takes a size of 1 for one that never changes.
+    example = clouds[:1].repeat(2, 1, 1)
     make_folder(out.parent)
     with _quiet(), torch.no_grad(), use_domain(net, norms_for(net, "target")):
         write: Callable[..., Any] = _write_onnx if out.suffix == ".onnx" else _write_pt2
         with atomic_path(out) as temporary:
             try:
-                run = write(Plain(net).eval(), clouds[:2].clone(), predictor, temporary)
+                run = write(Plain(net).eval(), example, predictor, temporary)
             except Exception as error:  # torch raises dozens of kinds
                 raise _cannot(predictor, error) from error
             ours = np.concatenate([net(part).numpy() for part in clouds.split(16)])

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from qs3.errors import ConfigError, DataError
-from qs3.predictions import FILE, Predictions, read_predictions
+from qs3.predictions import FILE, read_predictions
 from qs3.report.aggregate import align
-from qs3.report.paired import LEVEL, Difference, compare, compare_on_average
+from qs3.report.paired import LEVEL, Difference, compare_on_average
 from qs3.report.tables import Cell, Table
 
 
@@ -20,11 +20,13 @@ class Compared:
         name: of the row, and of the column if there are several.
         differences: accuracy, balanced accuracy; None if `why` says what is missing.
         why: "" or the reason.
+        objects_known: whether it is known which clouds show the same object.
     """
 
     name: str
     differences: tuple[Difference, Difference] | None
     why: str = ""
+    objects_known: bool = True
 
 
 def against(table: Table, base: str) -> list[Compared]:
@@ -45,28 +47,8 @@ def against(table: Table, base: str) -> list[Compared]:
             if cell is None or other is None or not cell.runnable:
                 continue
             name = f"{row}, {column}" if len(table.columns) > 1 else row
-            found.append(_compared(name, cell, other))
+            found.append(_compared(name, [(cell, other)]))
     return found
-
-
-def _compared(name: str, cell: Cell, base: Cell) -> Compared:
-    if cell.take != "final" or base.take != "final":
-        return Compared(name, None, "a warm-up's predictions are not kept")
-    ours = {run.seed: run for run in cell.group.finished} if cell.group else {}
-    theirs = {run.seed: run for run in base.group.finished} if base.group else {}
-    seeds = sorted(seed for seed in ours.keys() & theirs.keys() if seed is not None)
-    if len(seeds) < 2:
-        return Compared(name, None, f"fewer than two seeds in common ({seeds})")
-    try:
-        a = [read_predictions(ours[seed].folder / FILE) for seed in seeds]
-        b = [read_predictions(theirs[seed].folder / FILE) for seed in seeds]
-        return Compared(name, _both(a, b))
-    except DataError as error:
-        return Compared(name, None, str(error))
-
-
-def _both(a: Sequence[Predictions], b: Sequence[Predictions]) -> tuple[Difference, Difference]:
-    return compare(a, b), compare(a, b, balanced=True)
 
 
 def effects(table: Table) -> list[Compared]:
@@ -84,6 +66,13 @@ def effects(table: Table) -> list[Compared]:
     ]
 
 
+def _same(one: Cell, two: Cell) -> bool:
+    """Whether two cells are one experiment, however their overrides are written."""
+    if one.group and two.group:
+        return (one.group.experiment, one.group.hash) == (two.group.experiment, two.group.hash)
+    return one.overrides == two.overrides
+
+
 def _main_effects(
     lines: Mapping[str, Sequence[Cell | None]], others: Sequence[str]
 ) -> list[Compared]:
@@ -94,32 +83,38 @@ def _main_effects(
         both = {
             other: (one, two)
             for other, one, two in zip(others, cells, base_cells, strict=True)
-            if one and two and one.runnable and two.runnable and one.overrides != two.overrides
+            if one and two and one.runnable and two.runnable and not _same(one, two)
         }
         if both:
             title = f"{name} minus {base}, over {', '.join(both)}"
-            found.append(_on_average(title, list(both.values())))
+            found.append(_compared(title, list(both.values())))
     return found
 
 
-def _on_average(name: str, cells: Sequence[tuple[Cell, Cell]]) -> Compared:
-    if any(cell.take != "final" for pair in cells for cell in pair):
+def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
+    """The mean difference of pairs of cells, or why there is none."""
+    cells = [cell for pair in pairs for cell in pair]
+    if any(cell.take != "final" for cell in cells):
         return Compared(name, None, "a warm-up's predictions are not kept")
     finished = [
-        {run.seed: run for run in cell.group.finished} if cell.group else {}
-        for pair in cells
-        for cell in pair
+        {run.seed: run for run in cell.group.finished} if cell.group else {} for cell in cells
     ]
     seeds = sorted(seed for seed in set.intersection(*map(set, finished)) if seed is not None)
     if len(seeds) < 2:
         return Compared(name, None, f"fewer than two seeds in common ({seeds})")
+    for cell in cells:
+        if cell.group and not cell.group.comparable:
+            return Compared(name, None, f"{cell.row}, {cell.column}: not averaged, see the table")
+    targets = {runs[seed].metrics["data"].get("target") for runs in finished for seed in seeds}
+    if len(targets) > 1:
+        return Compared(name, None, "the runs saw different versions of the target")
     try:
         said = [[read_predictions(runs[seed].folder / FILE) for seed in seeds] for runs in finished]
-        pairs = list(zip(said[::2], said[1::2], strict=True))
-        plain = compare_on_average(pairs)
-        return Compared(name, (plain, compare_on_average(pairs, balanced=True)))
+        both = list(zip(said[::2], said[1::2], strict=True))
+        plain, balanced = (compare_on_average(both, balanced=b) for b in (False, True))
     except DataError as error:
         return Compared(name, None, str(error))
+    return Compared(name, (plain, balanced), objects_known=said[0][0].meshes != said[0][0].ids)
 
 
 def text(found: Sequence[Compared], base: str = "", markdown: bool = False) -> str:
@@ -151,8 +146,15 @@ def text(found: Sequence[Compared], base: str = "", markdown: bool = False) -> s
         0,
         f"differences in percentage points with {LEVEL:.0%} intervals over seeds and test meshes"
         + (f" ({', '.join(map(str, sorted(meshes)))} meshes)" if meshes else "")
-        + "; * marks those whose interval does not reach 0",
+        + "; * marks those whose interval does not reach 0, each line by itself: of twenty rows "
+        "that are no better than the other one gets a star",
     )
+    if any(one.differences and not one.objects_known for one in found):
+        notes.insert(
+            1,
+            "which clouds show the same object is not known, so each counts as one of its own: "
+            "where several do, the intervals are too narrow",
+        )
     table: Callable[[Sequence[Sequence[str]]], list[str]] = _markdown if markdown else align
     return "\n".join([*table(lines), "", *(f"- {note}" for note in notes)]) + "\n"
 

@@ -10,6 +10,7 @@ from typing import Any
 from qs3.report.aggregate import FEW_SEEDS, Group, task
 from qs3.report.table_cells import INCOMPLETE, METRICS, Cell, Table
 
+_ACCURACY = "accuracy"  # what papers give
 _RULES = {"source_val": "source validation", "last": "last epoch"}
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -29,7 +30,8 @@ def _plain_grid(table: Table) -> list[list[str]]:
     many = len(table.columns) > 1
     header = ["method"]
     for i in range(len(table.columns)):
-        header += _heads(table, i, many) + (["paper"] if _has_paper(table, i) else [])
+        paper = "paper" if _ACCURACY in table.metrics else f"paper, {METRICS[_ACCURACY]}"
+        header += _heads(table, i, many) + ([paper] if _has_paper(table, i) else [])
     lines = [header if many else [*header, "seeds"]]
     for name, cells in table.rows.items():
         line = [name]
@@ -61,17 +63,16 @@ def _benchmark_grid(table: Table) -> list[list[str]]:
     lines = [[*header, "epoch selected by"]]
     for name, cells in table.rows.items():
         papers = [cell.paper if cell else None for cell in cells]
-        if any(papers):
+        if any(papers) and _ACCURACY in table.metrics:
             line = [name, "published"]
             for paper in [*papers, table.published_average(name)]:
-                line += [paper.text() if paper else ""] + [""] * (len(table.metrics) - 1)
+                line += [paper.text() if paper and m == _ACCURACY else "" for m in table.metrics]
             lines.append([*line, " or ".join(dict.fromkeys(p.selected for p in papers if p))])
         if any(cell and cell.runnable for cell in cells):
             line = [name, "ours"]
             for cell in cells:
                 line += [cell.text(metric) if cell else "" for metric in table.metrics]
-            averages = [table.average(name, metric) for metric in table.metrics]
-            line += [stat.percent() if stat else "" for stat in averages]
+            line += [table.average_text(name, metric) for metric in table.metrics]
             rules = dict.fromkeys(_rule(c, "student") for c in cells if c and c.group)
             lines.append([*line, " or ".join(_RULES.get(rule, rule) for rule in rules if rule)])
     return lines
@@ -258,7 +259,7 @@ def csv_text(table: Table) -> str:
         known = cell.group.first if cell.group else {}
         times = seconds(cell.group) if cell.group else []
         for metric in table.metrics:
-            stat, paper = cell.ours(metric), cell.paper if metric == "accuracy" else None
+            stat, paper = cell.ours(metric), cell.paper if metric == _ACCURACY else None
             values: list[Any] = [cell.row, cell.column, METRICS[metric].removesuffix(" %")]
             values += [100 * stat.mean, _percent(stat.sem), stat.n] if stat else ["", "", 0]
             values.append(" ".join(map(str, cell.group.seeds)) if cell.group else "")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 from qs3.data.domain import Domain
 from qs3.data.store import PointSet, is_finished
+from qs3.errors import Qs3Error
 from qs3.report.canvas import NothingToDrawError
 from qs3.report.run_data import RunFiles
+
+_KEYS = tuple(field.name for field in dataclasses.fields(Domain))
 
 
 def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> Domain:
@@ -19,19 +24,27 @@ def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> D
         data_dir: where the datasets lie; None: where the run's config says.
 
     Raises:
-        NothingToDrawError: there is no config.
+        NothingToDrawError: there is no config, or it describes no domain.
     """
     from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
-    from qs3.hydra_glue import build  # also registers the resolvers of a config
+    import qs3.hydra_glue  # noqa: F401 (registers the resolvers of a config)
 
     if run.config is None:
         raise NothingToDrawError("the run's folder has no .hydra/config.yaml that names its data")
-    cfg = OmegaConf.create(dict(run.config))
-    if data_dir is not None:
-        cfg.paths.data_dir = str(Path(data_dir).absolute())
-    domain: Domain = build(cfg.data[role])
-    return domain
+    try:
+        cfg = OmegaConf.create(dict(run.config))
+        if data_dir is not None:
+            cfg.paths.data_dir = str(Path(data_dir).absolute())
+        found: Any = OmegaConf.to_container(cfg.data[role], resolve=True)
+        # Not instantiated: the folder may be somebody else's, and a config can name any code.
+        about = {key: found[key] for key in _KEYS if key in found}
+        return Domain(**{**about, "published": None, "synthesis": None})
+    except (OmegaConfBaseException, TypeError, ValueError, Qs3Error) as error:
+        raise NothingToDrawError(
+            f"data.{role} of the run's .hydra/config.yaml describes no domain ({error})"
+        ) from error
 
 
 def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) -> PointSet:

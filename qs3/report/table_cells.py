@@ -91,8 +91,7 @@ class Cell:
         """What the table shows: the number, or why there is none."""
         mark = f" {INCOMPLETE}" if self.incomplete else ""
         if (stat := self.ours(metric)) is not None:
-            few = f" (n={stat.n})" if stat.n < FEW_SEEDS else ""
-            return stat.percent() + few + mark
+            return _with_n(stat) + mark
         if not self.runnable:
             return ""
         if self.missing:
@@ -157,6 +156,14 @@ class Table:
             return None
         return Stat.of([sum(v) / len(v) for v in values.values()])
 
+    def average_text(self, row: str, metric: str) -> str:
+        """What the table shows of it; "" if there is none."""
+        stat = self.average(row, metric)
+        if stat is None:
+            return ""
+        incomplete = any(cell.incomplete for cell in self.rows[row] if cell)
+        return _with_n(stat) + f" {INCOMPLETE}" * incomplete
+
     def published_average(self, row: str) -> Published | None:
         """As published, or the mean of the published numbers if every column has one."""
         papers = [cell.paper for cell in self.rows[row] if cell and cell.paper]
@@ -164,3 +171,8 @@ class Table:
             return None
         mean = self.averages.get(row, sum(paper.mean for paper in papers) / len(papers))
         return Published(mean, None, papers[0].selected, papers[0].source)
+
+
+def _with_n(stat: Stat) -> str:
+    """The number; of few seeds with how many they are."""
+    return stat.percent() + (f" (n={stat.n})" if stat.n < FEW_SEEDS else "")

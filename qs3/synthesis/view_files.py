@@ -14,6 +14,7 @@ import contextlib
 import hashlib
 import io
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,6 +143,12 @@ class KeptView:
     believed: np.ndarray
 
 
+_DAMAGED = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+
+
 def load_views(root: Path, object_id: str) -> tuple[KeptView, ...]:
     """The views of an object that `save_view` wrote, by number; none if there are none.
 
@@ -154,7 +161,7 @@ def load_views(root: Path, object_id: str) -> tuple[KeptView, ...]:
             with np.load(io.BytesIO(path.read_bytes())) as file:
                 arrays = dict(file)
             found.append(_kept(int(path.stem.removeprefix("view_")), arrays))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except _DAMAGED as error:
             raise DataError(f"{path} is damaged ({error}); generate the dataset again") from error
     return tuple(sorted(found, key=lambda view: view.number))
 

@@ -131,6 +131,18 @@ def test_torch_export_gives_the_net_s_logits(name, tmp_path):
     assert compared.odd <= 1
 
 
+def test_one_cloud_to_compare_on_does_not_bind_the_file_to_one(tmp_path):
+    make, points = NETS["pointnet"]
+    torch.manual_seed(0)
+    predictor = predictor_of(make(), points)
+    out = tmp_path / "net.pt2"
+    export(predictor, out, made_up(points, 1))
+    clouds = made_up(points, 5)
+    with torch.no_grad():
+        theirs = torch.export.load(out).module()(clouds)
+        assert (theirs - predictor.net(clouds)).abs().max() <= 1e-4
+
+
 def test_the_command_and_the_pt2_file_without_qs3(run, tmp_path, capsys):
     out = tmp_path / "model.pt2"
     assert main(["export", f"ckpt={run}", f"out={out}", "threads=1"]) == 0

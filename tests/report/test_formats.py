@@ -146,6 +146,37 @@ def test_averages(pointda):
     assert replace(pointda, rows={"PCM": (fewer, *cells[1:])}).average("PCM", "accuracy") is None
 
 
+def test_an_average_of_few_or_failed_seeds_says_so(pointda):
+    def of(runs, problems):
+        return tuple(
+            replace(cell, group=replace(cell.group, finished=cell.group.finished[:runs],
+                                        problems=problems))
+            for cell in pointda.rows["PCM"]
+        )  # fmt: skip
+
+    def shown(cells):
+        lines = grid(replace(pointda, rows={"PCM": cells}))
+        return next(line for line in lines if line[1] == "ours")[-2]
+
+    assert shown(of(1, ())) == "50.0 (n=1)"
+    assert shown(of(2, ("seed 2: unfinished",))) == "50.5 ± 0.5 (n=2) †"
+    assert shown((*of(3, ())[:5], *of(3, ("seed 9: unfinished",))[5:])) == "51.0 ± 0.6 †"
+
+
+def test_a_published_accuracy_stands_in_no_other_column(empty):
+    """Papers give accuracy, not balanced accuracy."""
+    for name in ("uda", "pointda10"):
+        only = replace(empty[name], metrics=("balanced_accuracy",))
+        cells = [cell.paper.text() for cell in only.cells if cell.paper]
+        for column in zip(*grid(only), strict=True):
+            if set(column[1:]) & set(cells):
+                assert column[0] == "paper, accuracy %"
+        turned = replace(empty[name], metrics=("balanced_accuracy", "accuracy"))
+        for column in zip(*grid(turned), strict=True):
+            if "balanced" in column[0]:
+                assert not set(column[1:]) & set(cells), column[0]
+
+
 def test_published_averages_agree(empty):
     """As the papers state them; a slip in a number would show here."""
     stated = {

@@ -13,6 +13,7 @@ from qs3.report import pictures, run_clouds
 from qs3.report.canvas import NothingToDrawError
 from qs3.report.run_clouds import cloud_pictures
 from qs3.report.run_data import read_run
+from qs3.report.run_pictures import draw as draw_run
 from tests.report.runs import change, not_blank, table
 from tests.synthesis.generating import config
 from tests.training.toy import CLASSES, write_domain
@@ -130,6 +131,32 @@ def test_other_data_damaged_data_no_data(run, toy_data, tmp_path):
     assert not_blank(draw(run, "source_clouds", tmp_path / "s.png", data_dir))
     change(run, data={"source": "0" * 64, "target": "0" * 64})
     assert "another version" in why_not(run, "mistakes", out)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("data.source._target_", "shutil.rmtree"),
+        ("data.source._recursive_", True),
+        ("data.source.published._target_", "os.remove"),
+    ],
+)
+def test_a_config_runs_nothing(run, tmp_path, place, value):
+    """A run's folder may be somebody else's: whatever it names, a domain's data are opened."""
+    path = run / ".hydra" / "config.yaml"
+    config = OmegaConf.load(path)
+    OmegaConf.update(config, place, value, force_add=True)
+    OmegaConf.save(config, path)
+    assert not_blank(draw(run, "source_clouds", tmp_path / "s.png"))
+
+
+@pytest.mark.parametrize("text", ["a: 1", "data: {source: 3}", "data: {source: {name: x}}"])
+def test_a_config_without_domains_costs_no_other_picture(run, text, tmp_path):
+    (run / ".hydra" / "config.yaml").write_text(text)
+    drawn = draw_run(run, tmp_path, embed=False)
+    assert {"curves", "confusion", "calibration"} <= set(drawn.pictures)
+    assert "describes no domain" in drawn.skipped["source_clouds"]
+    assert drawn.page.is_file()
 
 
 def test_domains_stand_side_by_side_under_their_names(run, tmp_path, monkeypatch):

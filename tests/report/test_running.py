@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import subprocess
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.predictions import FILE, Predictions, write_predictions
+from qs3.predictions import FILE, Predictions, read_predictions, write_predictions
 from qs3.report.__main__ import main
 from qs3.report.comparison import against, effects, text
 from qs3.report.running import Job, _chosen, launch, missing, run_all
@@ -157,6 +158,47 @@ def test_compare_by_hand(tmp_path):
     assert "GAST: fewer than two seeds" in shown
     with pytest.raises(ConfigError, match="no row 'x'"):
         against(table, "x")
+
+
+def test_what_a_table_does_not_average_is_not_compared(tmp_path):
+    place = "target test"
+    table = fill(tmp_path, "cad10", {("source only", place): 10, ("DANN", place): 14})
+    cells = {cell.row: cell for cell in table.cells if cell.group}
+    shown = text(against(table, "source only"), "source only")
+    assert "each counts as one of its own" in shown  # these predictions know no objects
+
+    def compared(path, target):
+        metrics = json.loads(path.read_text())
+        metrics["data"]["target"] = target
+        path.write_text(json.dumps(metrics))
+        again = build_table("cad10", tmp_path)
+        (one,) = (one for one in against(again, "source only") if one.name == "DANN")
+        return one
+
+    paths = [run.folder / "metrics.json" for run in cells["DANN"].group.finished]
+    one = compared(paths[0], "c" * 64)
+    assert one.differences is None
+    assert "not averaged" in one.why
+    compared(paths[1], "c" * 64)
+    one = compared(paths[2], "c" * 64)  # all of its seeds, but not the base's
+    assert one.differences is None
+    assert "different versions of the target" in one.why
+
+
+def test_objects_that_are_known_are_counted(tmp_path):
+    """Twenty clouds of four objects."""
+    place = "target test"
+    table = fill(tmp_path, "cad10", {("source only", place): 10, ("DANN", place): 14})
+    names = tuple(map(str, range(20)))
+    for cell in table.cells:
+        for run in cell.group.finished if cell.group else ():
+            said = read_predictions(run.folder / FILE)
+            meshes = tuple(str(i // 5) for i in range(20))
+            known = Predictions(said.classes, names, meshes, said.labels, said.probabilities)
+            write_predictions(run.folder / FILE, known)
+    (one,) = (one for one in against(table, "source only") if one.differences)
+    assert one.differences[0].meshes == 4
+    assert "each counts as one of its own" not in text([one])
 
 
 def test_effects_by_hand(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -119,6 +120,22 @@ def test_ckpt_path_of_another_run(toy, toy_data, begun, tmp_path):
     (begun / "started.json").unlink()
     with pytest.raises(ConfigError, match="belongs to another run"):
         train(toy(f"ckpt_path={begun}"))
+
+
+def test_ckpt_path_warns_of_other_versions(toy, begun, caplog):
+    started = begun / "started.json"
+    document = json.loads(started.read_text())
+    document["versions"]["torch"] = "1.0"
+    started.write_text(json.dumps(document))
+    train(toy(f"ckpt_path={begun}", "paths.warmup_dir=null"))
+    assert "begun with" in caplog.text
+    assert "'torch': '1.0'" in caplog.text
+
+
+def test_ckpt_path_and_force_contradict_each_other(toy, begun):
+    with pytest.raises(ConfigError, match=r"give one of them"):
+        train(toy(f"ckpt_path={begun}", "force=true"))
+    assert begun.joinpath("last.ckpt").is_file()
 
 
 def test_neither_changes_the_name_of_a_run(toy):

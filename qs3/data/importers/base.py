@@ -86,6 +86,13 @@ class Importer(abc.ABC):
             DataError: names the file or folder that does not fit the format.
         """
 
+    def object_of(self, id_: str) -> str:
+        """Which object a cloud shows, where its id tells; else "".
+
+        Clouds of one object are no independent samples: `qs3.report.paired` takes them together.
+        """
+        return ""
+
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """[P, 3] as published to [P, 3] with z up."""
         return cloud

@@ -79,6 +79,10 @@ class GraspNetPC(Importer):
             found += sorted(of_split, key=lambda item: (classes.index(item.row.cls), item.row.id))
         return found
 
+    def object_of(self, id_: str) -> str:
+        """See `Importer`: each class is one object."""
+        return id_.split("/")[0]
+
     def _folder(self, split: str, sensor: str) -> Path:
         return self.root / split / self.reality / sensor
 

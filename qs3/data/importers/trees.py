@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import functools
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from qs3.data.importers.base import (
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError
 
+_SCANNET = re.compile(r"/(scene\d{4})_\d{2}(?:_|$)")
 _MAX_BYTES = 64 << 20  # of one cloud's file; a published one has under 200 kB
 
 
@@ -103,6 +105,14 @@ class XyzTree(TreeImporter):
     def read_file(self, path: Path) -> np.ndarray:
         """See `TreeImporter`."""
         return read_xyz(path)
+
+    def object_of(self, id_: str) -> str:
+        """See `Importer`: the room, of ScanNet's ids such as "chair/test/scene0011_01_7".
+
+        Rooms were scanned up to a dozen times (_00, _01, ...), with the same objects in them.
+        """
+        room = _SCANNET.search(id_)
+        return room[1] if room else ""
 
 
 @dataclass(frozen=True)
