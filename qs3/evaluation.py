@@ -202,9 +202,10 @@ class Evaluation:
         predicted, labels = probabilities.argmax(axis=1), self.y_target_eval
         if labels is None:
             return figures_without_labels(predicted, self.classes)
+        confident = bool(np.isfinite(probabilities).all())  # of anything: else it has diverged
         return {
             **figures(predicted, labels, self.classes),
-            "calibration_error": calibration_error(probabilities, labels),
+            "calibration_error": calibration_error(probabilities, labels) if confident else None,
         }
 
     def pseudo_labels(self, path: Path) -> dict[str, float] | None:

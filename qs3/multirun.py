@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import json
 import logging
 import os
@@ -60,7 +61,7 @@ class SummaryOfSeeds(Callback):
             return
         error = getattr(job_return, "_return_value", None)
         text = in_words(error) if isinstance(error, Exception) else ""
-        if text and text not in (entry.get("error") for entry in self._entries()):
+        if text and text not in (entry.get("error") for entry in self._read()[0]):
             log.error("%s failed: %s", " ".join(job_return.overrides), text)
         self._note(config, overrides=list(job_return.overrides), error=text)
 
@@ -72,24 +73,45 @@ class SummaryOfSeeds(Callback):
         if self.journal is None:
             return
         entry = {"folder": str(config.hydra.runtime.output_dir), **more}
-        with open(self.journal, "a", encoding="utf-8") as file:  # one short write: atomic
-            file.write(json.dumps(entry) + "\n")
+        try:  # never made here: a job that ends after the summary leaves nothing behind
+            handle = os.open(self.journal, os.O_WRONLY | os.O_APPEND)
+        except FileNotFoundError:
+            return
+        with open(handle, "wb") as file:  # one short write: atomic, save on a network's disk
+            file.write((json.dumps(entry) + "\n").encode())
 
     def _summarise(self) -> None:
         if self.journal is None or os.getpid() != self._main:
             return
-        jobs = last_words(self._entries())
+        entries, unreadable = self._read()
+        jobs = last_words(entries)
         self.journal.unlink(missing_ok=True)
         self.journal = None
         folders = sorted({Path(job["folder"]) for job in jobs})
         if self.table and any((folder / runs.METRICS).is_file() for folder in folders):
             sys.stdout.write(summarise(folders) + "\n")
         sys.stdout.write(failures(jobs))
+        if unreadable:
+            sys.stdout.write(
+                f"{unreadable} of the notes of the jobs could not be read: the list may lack some, "
+                "or say of a job that went well that it did not end\n"
+            )
         sys.stdout.flush()
 
-    def _entries(self) -> list[dict[str, Any]]:
+    def _read(self) -> tuple[list[dict[str, Any]], int]:
+        """What was noted, and how many lines are damaged: two machines may write at one place."""
         assert self.journal is not None
-        return [json.loads(line) for line in self.journal.read_text(encoding="utf-8").splitlines()]
+        try:
+            lines = self.journal.read_bytes().splitlines()
+        except FileNotFoundError:  # by a job that ends after the summary
+            lines = []
+        entries = []
+        for line in lines:
+            with contextlib.suppress(ValueError):
+                entry = json.loads(line)
+                if isinstance(entry, dict) and {"folder", "overrides"} <= set(entry):
+                    entries.append(entry)
+        return entries, len(lines) - len(entries)
 
 
 def in_words(error: BaseException) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -69,7 +70,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
             runs.check_config(run.folder, metrics.get("config_sha256"), runs.config_sha256(cfg))
             _refuse_other_data(run, metrics["data"])
             log.info("already finished (force=true repeats it)")
-    log.info("%s", headline(metrics))
+    log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
     if (run.folder / OF_FILES).is_file():
         log.info("the class of each file: %s", run.folder / OF_FILES)
     log.info("see %s", run.folder / runs.METRICS)
@@ -79,18 +80,28 @@ def train(cfg: DictConfig) -> dict[str, Any]:
 def objective_of(cfg: DictConfig, metrics: dict[str, Any]) -> float | None:
     """What a search over hyper-parameters looks at; None if there is no search.
 
+    NaN for a run that has diverged: it is finished, and would diverge again.
+
     Raises:
         ConfigError: the finished run has no such figure.
     """
     if cfg.objective is None:
         return None
-    value = metrics.get("validators", {}).get(cfg.objective)
-    if value is None:
+    validators = metrics.get("validators", {})
+    if cfg.objective not in validators:
         raise ConfigError(
-            f"the run's metrics.json has no {cfg.objective} under validators: it diverged, or was "
-            "finished by an earlier version; force=true repeats it"
+            f"the run's metrics.json has no {cfg.objective} under validators: it was finished by "
+            "an earlier version, which force=true repeats, or (snd) its target has a single cloud"
         )
-    return float(value)
+    value = validators[cfg.objective]
+    return math.nan if value is None else float(value)
+
+
+def judged(cfg: DictConfig, metrics: dict[str, Any]) -> str:
+    """The result of a search's trial in one line: no accuracy, it would be nothing to choose by."""
+    value = metrics.get("validators", {}).get(cfg.objective)
+    text = "none: the net has diverged" if value is None else f"{value:.4f}"
+    return f"{metrics['experiment']}, seed {metrics['seed']}: objective={cfg.objective} {text}"
 
 
 def headline(metrics: dict[str, Any]) -> str:
@@ -153,6 +164,10 @@ def _check_settings(cfg: DictConfig) -> None:
         whole("data.clouds_a_class", cfg.data.clouds_a_class, 1)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
         raise ConfigError(f"ckpt_path must be last or a path, got {cfg.ckpt_path!r}")
+    if cfg.ckpt_path is not None and cfg.force:
+        raise ConfigError(
+            "force=true begins the run anew and ckpt_path goes on with one; give one of them"
+        )
     whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
     one_of("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
     whole("evaluation.rotations", cfg.evaluation.rotations, 0)

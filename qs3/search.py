@@ -1,37 +1,33 @@
-"""A search over hyper-parameters that never looks at a label of the target (Optuna's TPE).
+"""Searches over hyper-parameters that never look at a label of the target: TPE, and a grid.
 
     ask Optuna for settings -> launch runs -> read the objective that each returns -> tell Optuna
 
 The objective is a validator of `qs3.selftraining.validators`: accuracy is refused. The study lies
 in a file beside the runs, so that the same command goes on with it: trials that have finished are
-not repeated, those that failed or were interrupted are tried again. What Optuna draws for a trial
-follows from (seed, number of the trial): an interrupted search proposes what an uninterrupted one
-would have.
+not repeated, those that failed or were interrupted are tried again. One that diverged is a bad
+trial, not a failed one. What Optuna draws for a trial follows from (seed, number of the trial): an
+interrupted search proposes what an uninterrupted one would have.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
-import logging
-import shlex
 import sys
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import (
-    ChoiceSweep,
-    IntervalSweep,
-    Override,
-    QuotedString,
-    RangeSweep,
-)
+from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus
+from omegaconf import DictConfig
 
 from qs3 import runs
 from qs3.errors import ConfigError
+from qs3.search_report import FAILED, Tried, report
+from qs3.search_space import distribution, overrides, split, words
 from qs3.selftraining.student_rules import check_objective
 from qs3.settings import whole
 from qs3.sweepers import OverLauncher
@@ -41,17 +37,97 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import FrozenTrial, Trial
 
-log = logging.getLogger(__name__)
-
 _AGAIN = "again"  # of a trial: the number of the one that it repeats
 
 
-class LabelFreeSearch(OverLauncher):
+class Judged(OverLauncher):
+    """What both searches have in common: what they may vary, and what they may look at.
+
+    Args:
+        params: by key what to search, in Hydra's grammar for sweeps, or a value.
+    """
+
+    def __init__(self, params: Mapping[str, Any]) -> None:
+        self.params = dict(params)
+
+    def run(self, arguments: list[str]) -> list[JobReturn]:
+        """Search; print all trials, the best, and the command that repeats it with more seeds."""
+        loader = self.hydra_context.config_loader
+        fixed, searched = split(arguments, self.params, loader)
+        cfg = loader.load_sweep_config(self.config, list(fixed))
+        check_objective(cfg.objective, cfg.selection.student)
+        if cfg.objective is None:
+            raise ConfigError("a search needs an objective; set objective=infomax, say")
+        done = self.search(cfg, fixed, searched)
+        for result in done:
+            _ = result.return_value  # raises if the job failed
+        return done
+
+    @abstractmethod
+    def search(
+        self, cfg: DictConfig, fixed: list[str], searched: Mapping[str, Override]
+    ) -> list[JobReturn]:
+        """Launch runs and print the report.
+
+        Args:
+            cfg: what all trials share.
+            fixed: the overrides that made it.
+            searched: the others, by key.
+        """
+
+    def say(
+        self, kind: str, more: str, cfg: DictConfig, tried: Sequence[Tried], fixed: Sequence[str]
+    ) -> None:
+        """Print the report."""
+        headline = f"{kind} by {cfg.objective}, which needs no labels{more}"
+        text = report(headline, cfg.objective, _lower_is_better(cfg), tried, fixed)
+        sys.stdout.write(text + "\n")
+
+
+class LabelFreeGrid(Judged):
+    """Hydra's sweeper for `hparams_search=qbst_grid`: every combination.
+
+    Args:
+        params: by key the values: `0.6,0.7,0.8`, `range(5, 16, 5)` or `choice(a, b)`.
+        at_once: so many are handed to the launcher, and waited for, before the next; None: all.
+    """
+
+    def __init__(self, params: Mapping[str, Any], at_once: int | None = None) -> None:
+        super().__init__(params)
+        self.at_once = None if at_once is None else whole("hydra.sweeper.at_once", at_once, 1)
+
+    def search(
+        self, cfg: DictConfig, fixed: list[str], searched: Mapping[str, Override]
+    ) -> list[JobReturn]:
+        """Of what the command line leaves open, in the order of the keys."""
+        values = {}
+        for key, one in searched.items():
+            if not one.is_discrete_sweep():
+                raise ConfigError(
+                    f"{one.input_line}: a grid needs the values themselves; write {key}=a,b,c, or "
+                    "search with hparams_search=qbst_optuna"
+                )
+            values[key] = list(one.sweep_string_iterator())
+            if not values[key]:
+                raise ConfigError(f"{one.input_line} has no values; write {key}=a,b,c")
+        cells = [
+            dict(zip(values, cell, strict=True)) for cell in itertools.product(*values.values())
+        ]
+        jobs = [[*fixed, *overrides(cell)] for cell in cells]
+        step, done = self.at_once or len(jobs), []
+        for first in range(0, len(jobs), step):
+            done += self.launch(jobs[first : first + step], first)
+        tried = [Tried.of(i, cells[i], result) for i, result in enumerate(done)]
+        self.say("Grid", "", cfg, tried, fixed)
+        return done
+
+
+class LabelFreeSearch(Judged):
     """Hydra's sweeper for `hparams_search=qbst_optuna`.
 
     Args:
-        params: by key what to search, in Hydra's grammar for sweeps: `interval(0.5, 0.9)`,
-            `range(1, 11)`, `choice(a, b)`, and `tag(log, interval(1e-4, 1e-2))`.
+        params: by key what to search: `interval(0.5, 0.9)`, `range(1, 11)`, `choice(a, b)`, and
+            `tag(log, interval(1e-4, 1e-2))`.
         trials: of the whole study, also over several calls.
         at_once: trials that are asked for, and launched, together.
         seed: of the proposals.
@@ -60,79 +136,55 @@ class LabelFreeSearch(OverLauncher):
     """
 
     def __init__(
-        self, params: Mapping[str, str], trials: int, at_once: int, seed: int, random: int,
+        self, params: Mapping[str, Any], trials: int, at_once: int, seed: int, random: int,
         folder: str,
     ) -> None:  # fmt: skip
-        self.params = dict(params)
+        super().__init__(params)
         self.trials = whole("hydra.sweeper.trials", trials, 1)
         self.at_once = whole("hydra.sweeper.at_once", at_once, 1)
         self.seed = whole("hydra.sweeper.seed", seed, 0)
         self.random = whole("hydra.sweeper.random", random, 1)
         self.folder = Path(folder)
 
-    def run(self, arguments: list[str]) -> list[JobReturn]:
-        """Search; print all trials, the best, and the command that repeats it with more seeds."""
-        fixed, space = self._split(arguments)
-        check_objective(self.config.objective, self.config.selection.student)
-        if self.config.objective is None:
-            raise ConfigError("a search needs an objective; set objective=infomax, say")
-        study = self._study(fixed, space)
+    def search(
+        self, cfg: DictConfig, fixed: list[str], searched: Mapping[str, Override]
+    ) -> list[JobReturn]:
+        """Until there are as many trials as were asked for."""
+        try:
+            import optuna
+        except ImportError as error:
+            raise ConfigError("the search needs Optuna: pip install 'qs3[search]'") from error
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        space = {key: distribution(one) for key, one in searched.items()}
+        study = self._study(cfg, space)
         _try_again(study)
         done: list[JobReturn] = []
         while (left := self.trials - _count(study)) > 0 or _waiting(study):
             batch = [self._ask(study, space) for _ in range(min(self.at_once, max(left, 1)))]
-            jobs = [[*fixed, *_overrides(trial.params)] for trial in batch]
+            jobs = [[*fixed, *overrides(words(trial.params))] for trial in batch]
             results = self.launch(jobs, batch[0].number)
             for trial, result in zip(batch, results, strict=True):
                 _tell(study, trial, result)
             done += results
             if not _finished(study) and all(r.status != JobStatus.COMPLETED for r in results):
                 break  # e.g. no data: the next would end like these
-        sys.stdout.write(self._report(study, fixed) + "\n")
-        for result in done:
-            _ = result.return_value  # raises if the job failed
+        self.say("Search", f"; the study is {self.file}", cfg, _tried(study), fixed)
         return done
 
-    def _split(self, arguments: Sequence[str]) -> tuple[list[str], dict[str, BaseDistribution]]:
-        """Overrides that all trials share, and what is searched."""
-        parse = OverridesParser.create(config_loader=self.hydra_context.config_loader)
-        by_key = {o.get_key_element(): o for o in parse.parse_overrides(list(arguments))}
-        for one in parse.parse_overrides([f"{key}={value}" for key, value in self.params.items()]):
-            by_key.setdefault(one.get_key_element(), one)  # what was typed counts
-        space = {k: distribution(o) for k, o in by_key.items() if o.is_sweep_override()}
-        if "seed" in space:
-            raise ConfigError(
-                "a search tries each setting with one seed, because seeds are nothing to choose "
-                "by; give one seed, and repeat the best setting with several afterwards"
-            )
-        if not space:
-            raise ConfigError(
-                "there is nothing to search; set hydra.sweeper.params, or key='interval(low,high)'"
-            )
-        return [str(o.input_line) for o in by_key.values() if not o.is_sweep_override()], space
+    def _study(self, cfg: DictConfig, space: Mapping[str, BaseDistribution]) -> Study:
+        from optuna import create_study
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
 
-    def _study(self, fixed: list[str], space: Mapping[str, BaseDistribution]) -> Study:
-        try:
-            import optuna
-            from optuna.storages import JournalStorage
-            from optuna.storages.journal import JournalFileBackend
-        except ImportError as error:
-            raise ConfigError("the search needs Optuna: pip install 'qs3[search]'") from error
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        cfg = self.hydra_context.config_loader.load_sweep_config(self.config, list(fixed))
         which = [runs.config_sha256(cfg), cfg.seed, cfg.objective, self.seed, self.random]
         text = json.dumps([*which, {key: str(one) for key, one in sorted(space.items())}])
         name = f"{cfg.experiment_name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
         self.file = self.folder / f"{name}.journal"
         self.folder.mkdir(parents=True, exist_ok=True)
-        from qs3.selftraining.validators import LABEL_FREE
-
-        validator = LABEL_FREE.get(cfg.objective)
-        lower = validator is not None and not validator.higher_is_better
-        return optuna.create_study(
+        return create_study(
             storage=JournalStorage(JournalFileBackend(str(self.file))),
             study_name=name,
-            direction="minimize" if lower else "maximize",
+            direction="minimize" if _lower_is_better(cfg) else "maximize",
             load_if_exists=True,
         )
 
@@ -145,85 +197,32 @@ class LabelFreeSearch(OverLauncher):
         )
         return study.ask(dict(space))
 
-    def _report(self, study: Study, fixed: Sequence[str]) -> str:
-        """All trials, the best one, and what to do with it."""
-        from qs3.report.aggregate import align
 
-        objective = self.config.objective
-        shown = [trial for trial in study.trials if trial.number not in _repeated(study)]
-        keys = list(dict.fromkeys(key for trial in shown for key in trial.params))
-        rows = [("trial", objective, *keys, "run")]
-        for trial in shown:
-            value = "-" if trial.value is None else f"{trial.value:.4f}"
-            values = (_text(trial.params.get(key, "-")) for key in keys)
-            rows.append((str(trial.number), value, *values, trial.user_attrs.get("run", "failed")))
-        words = [f"Search by {objective}, which needs no labels; the study is {self.file}"]
-        words += align(rows)
-        if _finished(study):
-            best = study.best_trial
-            search = ("hparams_search=", "objective=", "seed=")
-            kept = [word for word in fixed if not word.startswith(search)]
-            command = shlex.join([*kept, *_overrides(best.params), "seed=0,1,2"])
-            words.append(f"Best: trial {best.number}. With several seeds:")
-            words.append(f"  python train.py -m {command}")
-        return "\n".join(words)
+def _lower_is_better(cfg: DictConfig) -> bool:
+    from qs3.selftraining.validators import LABEL_FREE
 
-
-def distribution(override: Override) -> BaseDistribution:
-    """What Optuna calls a sweep of Hydra's.
-
-    Raises:
-        ConfigError: the sweep is of another kind.
-    """
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
-
-    sweep: Any = override.value()
-    key, log_scale = override.get_key_element(), "log" in getattr(sweep, "tags", ())
-    if isinstance(sweep, ChoiceSweep):
-        plain: list[Any] = [
-            one.text if isinstance(one, QuotedString) else one for one in sweep.list
-        ]
-        return CategoricalDistribution(plain)
-    if isinstance(sweep, IntervalSweep):
-        low, high = sweep.start, sweep.end
-        assert low is not None
-        assert high is not None
-        if isinstance(low, int) and isinstance(high, int):
-            return IntDistribution(low, high, log=log_scale)
-        return FloatDistribution(float(low), float(high), log=log_scale)
-    if isinstance(sweep, RangeSweep) and not log_scale:
-        values = list(sweep.range())  # without its end
-        if all(isinstance(value, int) for value in values):
-            return IntDistribution(int(values[0]), int(values[-1]), step=int(sweep.step))
-        return FloatDistribution(
-            float(values[0]), round(float(values[-1]), 10), step=float(sweep.step)
-        )
-    raise ConfigError(
-        f"cannot search {override.input_line}; write {key}=interval(low,high), "
-        "range(start,end,step) or choice(a,b)"
-    )
-
-
-def _overrides(params: Mapping[str, Any]) -> list[str]:
-    return [f"{key}={_text(value)}" for key, value in params.items()]
-
-
-def _text(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return not LABEL_FREE[cfg.objective].higher_is_better
 
 
 def _tell(study: Study, trial: Trial, result: JobReturn) -> None:
     from optuna.trial import TrialState
 
-    if result.status == JobStatus.COMPLETED:
-        trial.set_user_attr("run", runs.run_name(result.cfg))  # type: ignore[arg-type]
-        study.tell(trial, result.return_value)
-    else:
-        study.tell(trial, state=TrialState.FAIL)
+    one = Tried.of(trial.number, words(trial.params), result)
+    trial.set_user_attr("run", one.run)
+    if one.value is not None:
+        study.tell(trial, one.value)
+    else:  # a pruned trial is a bad one to TPE, and is not tried again: it would diverge again
+        again = one.run == FAILED
+        study.tell(trial, state=TrialState.FAIL if again else TrialState.PRUNED)
+
+
+def _tried(study: Study) -> list[Tried]:
+    """The study's trials; of one that was repeated, the repetition."""
+    return [
+        Tried(trial.number, words(trial.params), trial.value, trial.user_attrs.get("run", FAILED))
+        for trial in study.trials
+        if trial.number not in _repeated(study)
+    ]
 
 
 def _try_again(study: Study) -> None:

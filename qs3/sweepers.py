@@ -1,4 +1,4 @@
-"""Sweepers of our own for Hydra: a list of jobs from a file; the search is `qs3.search`.
+"""Sweepers of our own for Hydra: a list of jobs from a file; searches are in `qs3.search`.
 
 Hydra takes sweepers from its list of plugins only, under names that begin with `hydra_plugins`.
 """
@@ -92,8 +92,9 @@ class ListedJobs(OverLauncher):
 
 def register() -> None:
     """Tell Hydra of our sweepers, before it looks for one."""
-    from qs3.search import LabelFreeSearch
+    from qs3.search import LabelFreeGrid, LabelFreeSearch
 
     known: dict[str, Any] = Plugins.instance().class_name_to_class
     known["hydra_plugins.qs3.ListedJobs"] = ListedJobs
+    known["hydra_plugins.qs3.LabelFreeGrid"] = LabelFreeGrid
     known["hydra_plugins.qs3.LabelFreeSearch"] = LabelFreeSearch

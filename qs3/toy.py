@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.data.store import ManifestRow, PointSet, write_pointset
+from qs3.overrides import override
 
 SHAPES = {
     "ball": (1.0, 1.0, 1.0),
@@ -66,13 +67,13 @@ def toy_overrides(root: str | Path) -> list[str]:
             "name": f"toy_{role}",
             "title": f"toy_{role}",
             "symbol": role[0].upper(),
-            "path": root / "data" / f"toy_{role}",
             "classes": f"[{','.join(SHAPES)}]",
             "published": "null",
             "simulated": "true",
         }
         words.append(f"domain@data.{role}=own")
         words += [f"data.{role}.{key}={value}" for key, value in of_role.items()]
+        words.append(override(f"data.{role}.path", root / "data" / f"toy_{role}"))
     return [
         *words,
         "model=pointnet",
@@ -90,9 +91,9 @@ def toy_overrides(root: str | Path) -> list[str]:
         "callbacks=none",
         "logger=csv",
         "report.pictures=false",
-        f"paths.data_dir={root / 'data'}",
-        f"paths.log_dir={root / 'logs'}",
-        f"paths.warmup_dir={root / 'warmups'}",
+        override("paths.data_dir", root / "data"),
+        override("paths.log_dir", root / "logs"),
+        override("paths.warmup_dir", root / "warmups"),
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -77,6 +78,32 @@ def test_a_job_that_never_ended(summary, tmp_path, capsys):
         "  did not end: killed, interrupted or still running; the same command goes on with it",
     ]
     assert out[-1].startswith("    seed=1  (")
+
+
+def test_a_damaged_line_costs_only_itself(summary, tmp_path, capsys):
+    """Two machines that write at the same place of a network's disk."""
+    ended(summary, write_run(tmp_path, seed=0))
+    with open(summary.journal, "ab") as file:
+        file.write(
+            b'{"folder": "/logs/se{"folder": "/x", "overr\n[1]\n"x"\n\xff{}\n{"folder": "/y"}\n'
+        )
+    ended(summary, tmp_path / "exp" / "seed1-0123abcd", ValueError("broken"), seed=1)
+    summary.on_multirun_end(config(tmp_path))
+    out = capsys.readouterr().out
+    assert "seed 1: no result" in out
+    assert "1 of 2 jobs failed:\n  ValueError: broken" in out
+    assert out.splitlines()[-1].startswith("5 of the notes of the jobs could not be read")
+
+
+def test_a_job_that_ends_after_the_summary_leaves_nothing_behind(summary, tmp_path, caplog):
+    """In a process of its own, on a cluster, when the main process was stopped by Ctrl-C."""
+    late = pickle.loads(pickle.dumps(summary))
+    late.on_job_start(config(tmp_path / "late", "seed=1"))
+    summary.on_multirun_end(config(tmp_path))
+    job = SimpleNamespace(_return_value=ValueError("late"), overrides=["seed=1"])
+    late.on_job_end(config(tmp_path / "late"), job)
+    assert "seed=1 failed: ValueError: late" in caplog.text
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_failures_are_grouped_by_error():

@@ -37,6 +37,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qs3.errors import ConfigError, Qs3Error
+from qs3.overrides import override
 from qs3.report.tables import Table
 
 _TABLE = {"table", "log_dir", "data_dir", "out", "target", "overrides"}
@@ -51,7 +52,7 @@ _PICTURES = {"domains", "run", "data_dir", "out", "split"}
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit status."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
+    if not argv or {"-h", "--help", "help"} & set(argv):
         print(__doc__)
         return 0
     try:
@@ -67,6 +68,9 @@ def main(argv: Sequence[str]) -> int:
             _compare(_options(argv[1:], _COMPARE))
         elif argv[0] == "effects":
             _effects(_options(argv[1:], _TABLE))
+        elif "=" not in argv[0]:
+            words = "table=NAME, run, compare, effects, run=PATH, pictures or pipeline"
+            raise ConfigError(f"unknown command {argv[0]!r}; it begins with {words} (see --help)")
         else:
             _table(_options(argv, _TABLE))
     except Qs3Error as error:
@@ -89,20 +93,23 @@ def _options(argv: Sequence[str], known: set[str]) -> dict[str, str]:
             found[key] = value
             continue
         if not equals or key not in known:
-            raise ConfigError(f"unknown argument {word!r}; known are {', '.join(sorted(known))}=")
+            names = sorted("hydra.launcher.KEY=" if k == _LAUNCHER else f"{k}=" for k in known)
+            raise ConfigError(f"unknown argument {word!r}; known are {', '.join(names)}")
         found[key] = value
     return found
 
 
-def _built(options: dict[str, str]) -> Table:
-    """The table that the options ask for, with our runs."""
+def _built(options: dict[str, str], runs: bool = True) -> Table:
+    """The table that the options ask for, with our runs; `runs`: there are some, one may think."""
     from qs3.report.tables import build_table, table_names
 
     if "table" not in options:
         raise ConfigError(f"which table? table={'|'.join(table_names())}")
     extra = shlex.split(options.get("overrides", ""))
-    extra += [f"paths.data_dir={options['data_dir']}"] if "data_dir" in options else []
+    extra += [override("paths.data_dir", options["data_dir"])] if "data_dir" in options else []
     log_dir = options.get("log_dir", "logs")
+    if runs and "log_dir" in options and not Path(log_dir).is_dir():
+        raise ConfigError(f"log_dir={log_dir} is not there; it is the paths.log_dir of the runs")
     return build_table(options["table"], log_dir, extra, options.get("target"))
 
 
@@ -128,7 +135,7 @@ def _run(options: dict[str, str]) -> int:
     if launcher not in (*LAUNCHERS, None) or (settings and launcher is None):
         what = f"launcher={launcher}" if launcher else f"{settings[0]} needs a launcher"
         raise ConfigError(f"{what}; set launcher={'|'.join(LAUNCHERS)}")
-    table = _built(options)
+    table = _built(options, runs=False)
     jobs = missing(table, seeds, rows, columns)
     print(f"table {table.name}: {len(jobs)} runs to do", flush=True)
     if launcher:
@@ -153,29 +160,31 @@ def _whole(key: str, word: str) -> int:
 
 def _compare(options: dict[str, str]) -> None:
     from qs3.files import write_text
-    from qs3.report.comparison import against, text
+    from qs3.report.comparison import against, csv_text, text
 
     table = _built(options)
     if "base" not in options:
         raise ConfigError(f"against which row? base={'|'.join(table.rows)}")
     found = against(table, options["base"])
     at = _saved_at(table, options)
-    write_text(f"{at}-compared.md", text(found, options["base"], markdown=True))
-    print(text(found, options["base"]))
-    print(f"saved {at}-compared.md")
+    write_text(f"{at}-compared.md", text(found, options["base"], markdown=True, table=table))
+    write_text(f"{at}-compared.csv", csv_text(found, table))
+    print(text(found, options["base"], table=table))
+    print(f"saved {at}-compared.md, .csv")
 
 
 def _effects(options: dict[str, str]) -> None:
     from qs3.files import write_text
-    from qs3.report.comparison import effects, text
+    from qs3.report.comparison import csv_text, effects, text
 
     table = _built(options)
     found, at = effects(table), _saved_at(table, options)
     if not found:
         raise ConfigError(f"table {table.name} has no two columns or rows with runs of ours")
-    write_text(f"{at}-effects.md", text(found, markdown=True))
-    print(text(found))
-    print(f"saved {at}-effects.md")
+    write_text(f"{at}-effects.md", text(found, markdown=True, table=table))
+    write_text(f"{at}-effects.csv", csv_text(found, table))
+    print(text(found, table=table))
+    print(f"saved {at}-effects.md, .csv")
 
 
 def _table(options: dict[str, str]) -> None:
@@ -245,9 +254,8 @@ def _pictures(options: dict[str, str]) -> None:
     sets, simulated, counts = {}, [], {}
     with composing() as compose:
         for name in names:
-            cfg = compose(
-                "train", [f"domain@data.source={name}", f"paths.data_dir={data_dir.absolute()}"]
-            )
+            folder = override("paths.data_dir", data_dir.absolute())
+            cfg = compose("train", [f"domain@data.source={name}", folder])
             domain = instantiate(cfg.data.source)
             data = domain.open()
             words = f"{domain.title}{' (simulated)' if domain.simulated else ''}"

@@ -7,16 +7,18 @@ at once, stops nothing, and is listed again at the end.
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.errors import ConfigError
+from qs3.overrides import override
 from qs3.report.tables import Table
 
 ROOT = Path(__file__).parents[2]
@@ -30,6 +32,7 @@ LAUNCHERS: Mapping[str, str] = {
 
 _POLL_S = 0.2
 _TAIL = 12  # lines of a failed run's output that are shown
+_ERROR = re.compile(r"[A-Z]\w*Error: ")
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,8 @@ def missing(
     Args:
         table: with the runs that there are.
         seeds: that each cell should have.
-        rows: only rows whose name contains one of these words; all if empty.
+        rows: only rows with one of these names, or, where no row has that name, whose name
+            contains the word; all if empty.
         columns: likewise.
 
     Raises:
@@ -75,7 +79,8 @@ def missing(
     cells = [c for c in table.cells if c.runnable and not c.missing]
     for kind, words in (("row", rows), ("column", columns)):
         names = dict.fromkeys(getattr(c, kind) for c in cells)
-        cells = [c for c in cells if _chosen(getattr(c, kind), words)]
+        chosen = _chosen(names, words)
+        cells = [c for c in cells if getattr(c, kind) in chosen]
         if words and not cells:
             raise ConfigError(
                 f"no {kind} of table {table.name} has {' or '.join(map(repr, words))} in its name; "
@@ -92,9 +97,17 @@ def missing(
     return list(jobs.values())
 
 
-def _chosen(name: str, words: Sequence[str]) -> bool:
-    name = name.lower().replace("→", "->")  # as one can type it
-    return not words or any(word.lower().replace("→", "->") in name for word in words)
+def _chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
+    """Names that are meant by the words: the one that is the word, else all that contain it."""
+    typed = {name: name.lower().replace("→", "->") for name in names}
+    if not words:
+        return set(typed)
+    found: set[str] = set()
+    for word in words:
+        word = word.lower().replace("→", "->")
+        exact = {name for name, text in typed.items() if text == word}
+        found |= exact or {name for name, text in typed.items() if word in text}
+    return found
 
 
 def launch(
@@ -123,9 +136,9 @@ def launch(
         file = Path(folder) / "jobs.json"
         file.write_text(json.dumps([list(job.overrides) for job in jobs]), encoding="utf-8")
         words = [
-            f"paths.log_dir={log_dir}",
+            override("paths.log_dir", log_dir),
             "hydra/sweeper=listed",
-            f"hydra.sweeper.file={file}",
+            override("hydra.sweeper.file", file),
             f"hydra/launcher={launcher}",
             *limit,
             *settings,
@@ -189,7 +202,15 @@ def _outcome(one: _Running) -> str:
     seconds = time.monotonic() - one.began
     text = one.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     if one.process.returncode:
-        shown = "\n    ".join(text[-_TAIL:])
+        shown = "\n    ".join(_why(text))
         return f"{one.job.name}: FAILED after {seconds:.0f} s: {one.job.command}\n    {shown}"
     result = next((line.split("] ", 1)[-1] for line in reversed(text) if "accuracy" in line), "")
     return f"{one.job.name}: {result} ({seconds:.0f} s)"
+
+
+def _why(lines: Sequence[str]) -> Sequence[str]:
+    """The end of a failed run's output: from the error for people on, if there is one."""
+    hydra = "Set the environment variable HYDRA_FULL_ERROR"
+    lines = [line for line in lines if line and not line.startswith(hydra)]
+    first = [i for i, line in enumerate(lines) if _ERROR.match(line)]
+    return lines[first[-1] : first[-1] + _TAIL] if first else lines[-_TAIL:]

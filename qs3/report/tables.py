@@ -8,6 +8,7 @@ file and finds the runs; `formats` and `table_page` print.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -17,6 +18,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
 from qs3.errors import ConfigError
+from qs3.overrides import override
 from qs3.report.aggregate import DIAGNOSTIC, Group, group, load_runs
 from qs3.report.formats import csv_text, grid, latex, markdown, remarks, to_run
 from qs3.report.table_cells import METRICS, Cell, Published, Table
@@ -38,6 +40,7 @@ __all__ = [
 ]
 CONF = Path(__file__).parents[2] / "conf"
 BENCHMARK = "benchmark"
+_SUPERVISED = "qs3.methods.supervised.Supervised"
 _KEYS = ("title", "layout", "notes", "metrics", "columns", "rows", "sources")
 
 
@@ -76,11 +79,13 @@ def build_table(
         spec = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {error}") from error
+    if target is not None:
+        _check_target(target)
     runs = load_runs(log_dir)
     groups = {(g.experiment, g.hash): g for g in group(runs)}
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
     if str(log_dir) != "logs":
-        more.append(f"paths.log_dir={log_dir}")
+        more.append(override("paths.log_dir", log_dir))
     try:
         benchmark = _is_benchmark(spec, path)
         if benchmark and target:
@@ -93,7 +98,7 @@ def build_table(
             for i, column in enumerate(spec["columns"])
             if (cell := _cell(spec, row, i, column, more, published=not target))
         ]
-        filled = {(c.row, c.column): c for c in _fill(cells, groups)}
+        filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
         metrics = tuple(spec["metrics"])
         columns = tuple(_column(column, target) for column in spec["columns"])
         rows = {
@@ -109,6 +114,7 @@ def build_table(
     if unknown := sorted(set(metrics) - set(METRICS)):
         raise ConfigError(f"{path}: unknown metrics {unknown}; known are {', '.join(METRICS)}")
     if target:
+        title = f"{title}, on another target: {target}"
         notes = [*notes, f"all cells on the target {target}, which is not the paper's"]
     if left_out := sum(run.status == DIAGNOSTIC for run in runs):
         notes = [*notes, f"runs left out: {left_out}, chosen by the {ORACLE_IN_WORDS}"]
@@ -170,7 +176,17 @@ def _cell(
     return Cell(row["name"], column, overrides, paper, take)
 
 
-def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> list[Cell]:
+def _check_target(name: str) -> None:
+    known = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        meant = f" (did you mean {near[0]}?)" if near else ""
+        raise ConfigError(f"target={name} is no domain{meant}; there are {', '.join(known)}")
+
+
+def _fill(
+    cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group], target: str | None = None
+) -> list[Cell]:
     """The cells with their runs, or with the reason why they cannot be run."""
     from hydra.errors import (
         ConfigCompositionException,
@@ -188,6 +204,10 @@ def _fill(cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group]) -> lis
                 continue
             try:
                 cfg = compose("train", list(cell.overrides))
+                if target and cfg.method.get("_target_") == _SUPERVISED:
+                    # The upper bound has labels of its target: the other target is its source too.
+                    words = (*cell.overrides, f"domain@data.source={target}")
+                    cell, cfg = replace(cell, overrides=words), compose("train", list(words))
             except MissingConfigException as error:
                 filled.append(replace(cell, missing=_first_line(error)))
                 continue
@@ -219,7 +239,7 @@ def _refuse_oracle(cell: Cell, cfg: Any) -> None:
 
 
 @contextlib.contextmanager
-def composing() -> Iterator[Callable[[str, list[str]], Any]]:
+def composing() -> Iterator[Callable[..., Any]]:
     """Hydra's compose on the repository's conf/, also inside a running Hydra application."""
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra

@@ -44,7 +44,8 @@ def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
     it is called IM.
     """
     mean = probabilities.mean(axis=0, keepdims=True)
-    return max(0.0, float(_entropies(mean)[0]) - entropy(probabilities))  # < 0 by rounding alone
+    value = _entropies(mean)[0] - entropy(probabilities)  # < 0 by rounding alone
+    return float(np.maximum(0.0, value))  # max() of Python's would make 0 of NaN
 
 
 def snd(

@@ -56,6 +56,11 @@ def test_entropy_by_hand():
     assert entropy(np.array([[0.25, 0.75]])) == pytest.approx(quarter)
 
 
+@pytest.mark.parametrize("name", LABEL_FREE)
+def test_a_net_that_has_diverged_has_no_score(name):
+    assert math.isnan(LABEL_FREE[name].score(np.full((4, 3), np.nan)))
+
+
 def test_infomax_by_hand():
     assert infomax(CERTAIN) == pytest.approx(math.log(3))
     assert infomax(UNSURE) == 0

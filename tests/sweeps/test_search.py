@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import re
+import shlex
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.utils import create_config_search_path
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
 
 from qs3.errors import ConfigError
 from qs3.hydra_glue import build
-from qs3.run import objective_of, train
-from qs3.search import distribution
+from qs3.run import judged, objective_of, train
+from qs3.search_report import Tried, report
+from qs3.search_space import distribution, split, words
 from qs3.selftraining.student_rules import OBJECTIVES, check_objective
 from qs3.selftraining.validators import LABEL_FREE
 from tests.sweeps.commands import command, light, light_runs
@@ -20,6 +27,8 @@ from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.toy import CONF, overrides
 
 SEARCH = "hparams_search=qbst_optuna"
+GRID = "hparams_search=qbst_grid"
+LOADER = ConfigLoaderImpl(create_config_search_path(str(CONF)))
 
 
 def table(text: str) -> list[list[str]]:
@@ -80,10 +89,12 @@ def test_failures_are_listed_and_tried_again(tmp_path):
         (["objective=accuracy"], "objective=accuracy is refused"),
         (["objective=oracle"], "objective=oracle is refused"),
         (["selection.student=oracle"], "selection.student=oracle looks at the target's"),
-        (["objective=pseudo_val"], "set selection.student=pseudo_val as well"),
+        (["objective=pseudo_val"], "a higher theta selects easier ones"),
         (["objective=null"], "a search needs an objective"),
         (["seed=0,1"], "tries each setting with one seed"),
         (["hydra.sweeper.trials=0"], "hydra.sweeper.trials must be"),
+        (["objective=entropy,infomax"], "objective=entropy,infomax cannot be searched: all trials"),
+        (["selftraining.theta=interval(0.8,0.5)"], "0.8 to 0.5 is no interval"),
     ],
 )  # fmt: skip
 def test_what_is_refused(words, message, tmp_path):
@@ -94,10 +105,67 @@ def test_what_is_refused(words, message, tmp_path):
     assert light_runs(tmp_path) == {}
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["objective=accuracy"], "objective=accuracy is refused"),
+        (["selftraining.theta=interval(0.5,0.8)"], "write selftraining.theta=a,b,c"),
+        (["selftraining.rounds=range(5,1)"], "has no values; write selftraining.rounds=a,b,c"),
+        (["hydra.sweeper.at_once=0"], "hydra.sweeper.at_once must be"),
+    ],
+)  # fmt: skip
+def test_what_a_grid_refuses(words, message, tmp_path):
+    result = light(tmp_path, GRID, *words)
+    assert result.returncode == 1
+    assert message in result.stderr + result.stdout
+    assert "Traceback" not in result.stderr
+    assert light_runs(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    ("word", "why"),
+    [
+        ("objective=entropy,infomax", "judged in the same way"),
+        ("selection.student=last,oracle", "judged in the same way"),
+        ("selection={student:last},{student:oracle}", "judged in the same way"),
+        ("data.points=512,1024", "other data"),
+        ("data.sampler=choice(shuffled,balanced)", "other data"),
+        ("domain@data.target=kinectsim10,depthscannet10", "other data"),
+        ("model@data.target=a,b", "other data"),
+        ("+experiment=qs3_s2d,qbst_m2d", "other data"),
+        ("evaluation.rotations=range(0,4)", "other data"),
+        ("num_classes=10,11", "other data"),
+        ("paths.log_dir=a,b", "changes no result"),
+        ("logger=csv,wandb", "changes no result"),
+        ("hparams_search=qbst_grid,qbst_optuna", "changes no result"),
+        ("experiment_name=a,b", "changes no result"),
+        ("debug=fast,overfit", "single runs"),
+    ],
+)
+def test_keys_that_no_search_varies(word, why):
+    key = word.split("=")[0]
+    with pytest.raises(ConfigError, match=f"{re.escape(word)} cannot be searched.*{why}.*") as told:
+        split([word, "method=dann,pcm"], {}, LOADER)
+    assert f"give {key} one value" in str(told.value)
+    with pytest.raises(ConfigError, match="cannot be searched"):
+        split([], {key: word.split("=", 1)[1]}, LOADER)
+
+
+def test_what_a_search_may_vary():
+    arguments = ["method=dann,pcm", "model=choice(dgcnn,pointnet)", "data.points=512", "a=1"]
+    fixed, searched = split([*arguments, "protocol.batch_size=8,16"], {"a": "1,2", "b": 3}, LOADER)
+    assert fixed == ["data.points=512", "a=1", "b=3"]
+    assert list(searched) == ["method", "model", "protocol.batch_size"]
+    with pytest.raises(ConfigError, match="there is nothing to search"):
+        split(["a=1"], {"a": "1,2"}, LOADER)
+
+
 def test_objectives_are_label_free():
-    assert set(OBJECTIVES) == {*LABEL_FREE, "pseudo_val"}
+    assert set(OBJECTIVES) == set(LABEL_FREE)
     check_objective(None, "oracle")
-    check_objective("pseudo_val", "pseudo_val")
+    check_objective("infomax", "pseudo_val")
+    with pytest.raises(ConfigError, match=r"objective=pseudo_val is refused.*selected itself"):
+        check_objective("pseudo_val", "pseudo_val")
 
 
 def test_a_run_refuses_the_objective_by_itself(toy):  # noqa: F811
@@ -119,9 +187,42 @@ def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
     cfg = toy("selftraining=none", "objective=entropy")
     metrics = train(cfg)
     assert 0 <= objective_of(cfg, metrics) == metrics["validators"]["entropy"] <= 1.0987
+    metrics["validators"]["entropy"] = None  # as `qs3.reported.without_labels` says it
+    assert math.isnan(objective_of(cfg, metrics))
+    assert judged(cfg, metrics).endswith(": objective=entropy none: the net has diverged")
     del metrics["validators"]
     with pytest.raises(ConfigError, match=r"no entropy under validators.*force=true"):
         objective_of(cfg, metrics)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_a_run_that_really_diverges_is_finished_and_has_none(objective, toy):  # noqa: F811
+    cfg = toy(
+        "selftraining=none", "protocol.optimizer.lr=1e30", "protocol.epochs=1",
+        f"objective={objective}",
+    )  # fmt: skip
+    metrics = train(cfg)
+    assert metrics["validators"] == dict.fromkeys(OBJECTIVES)
+    assert metrics["final"]["calibration_error"] is None
+    assert math.isnan(objective_of(cfg, metrics))
+    assert judged(cfg, train(cfg)).endswith("none: the net has diverged")
+
+
+def test_a_trial_says_its_objective_and_no_accuracy(toy, caplog):  # noqa: F811
+    """Nor when it was finished before; metrics.json has all."""
+    words = ["selftraining=none", "protocol.epochs=1"]
+    with caplog.at_level(logging.INFO):
+        metrics = train(toy(*words, "objective=infomax"))
+        train(toy(*words, "objective=entropy"))
+    assert 0 <= metrics["final"]["accuracy"] <= 1
+    assert "accuracy" not in caplog.text.lower()
+    for name in ("infomax", "entropy"):
+        score = metrics["validators"][name]
+        assert f"quickstart, seed 0: objective={name} {score:.4f}" in caplog.messages
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        train(toy(*words))
+    assert "accuracy" in caplog.text
 
 
 def parsed(text: str):
@@ -144,6 +245,31 @@ def test_distributions():
         distribution(parsed("tag(log,range(1,5))"))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "interval(0.8,0.5)", "interval(3,1)", "interval(0,inf)", "range(10,2,-2)", "range(5,1)",
+        "range(1,5,0)", "range(0.5,0.1,0.1)", "tag(log,interval(0,1))", "choice([1,2],[3])",
+        "tag(log,interval(-1.0,1.0))",
+    ],
+)  # fmt: skip
+def test_wrong_ranges_are_errors_for_people(text):
+    with pytest.raises(ConfigError, match=re.escape(f"cannot search a={text}: ")) as told:
+        distribution(parsed(text))
+    assert "write a=" in str(told.value)
+
+
+@pytest.mark.parametrize("text", ["x,y", "a b", "1", "null", "it's", "[x]", "plain", "f(x)"])
+def test_a_choice_reaches_the_run_as_it_was_typed(text):
+    """Also text that Hydra would read as a sweep, a number or a list."""
+    sweep = parsed(f"{QuotedString(text, Quote.single).with_quotes()},2,null,true")
+    choices = distribution(sweep).choices
+    assert choices == (text, 2, None, True)
+    read = [parsed(words({"a": one})["a"]) for one in choices]
+    assert [one.value() for one in read] == list(choices)
+    assert not any(one.is_sweep_override() for one in read)
+
+
 @pytest.mark.parametrize("name", ["qbst_grid", "qbst_optuna"])
 def test_configs_are_within_what_self_training_takes(name):
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -161,12 +287,68 @@ def test_configs_are_within_what_self_training_takes(name):
 
 
 def test_the_grid_is_every_combination(tmp_path):
-    """Of what the command line leaves open."""
+    """Of what the command line leaves open; it ends with the objective of each."""
     fixed = ["selftraining.rounds=6", "selftraining.epsilon=0.0,0.01"]
-    result = light(tmp_path, "hparams_search=qbst_grid", *fixed)
+    result = light(tmp_path, GRID, *fixed, "hydra.sweeper.at_once=4")
     assert result.returncode == 0, result.stderr
     thetas = sorted(run["theta"] for run in light_runs(tmp_path).values())
     assert thetas == [0.6, 0.6, 0.7, 0.7, 0.8, 0.8]
+    rows = table(result.stdout)
+    assert [row[:4] for row in rows] == [
+        ["0", "-0.0100", "0.0", "0.6"], ["1", "-0.0000", "0.0", "0.7"],
+        ["2", "-0.0100", "0.0", "0.8"], ["3", "-0.0100", "0.01", "0.6"],
+        ["4", "-0.0000", "0.01", "0.7"], ["5", "-0.0100", "0.01", "0.8"],
+    ]  # fmt: skip
+    assert {row[4].removeprefix("qs3_s2d/") for row in rows} == set(light_runs(tmp_path))
+    assert "accuracy" not in result.stdout.lower()
+    assert "Grid by infomax, which needs no labels" in result.stdout
+    (typed,) = re.findall(r"Best: trial 1\..*\n  python train.py -m (.*)", result.stdout)
+    words = typed.split()
+    assert set(words) == {
+        "experiment=qs3_s2d", "selftraining.rounds=6", "selftraining.epsilon=0.0",
+        "selftraining.theta=0.7", "seed=0,1,2",
+    }  # fmt: skip
+
+
+def test_a_run_that_diverged_is_a_bad_trial_and_no_failure(tmp_path):
+    """It is listed, is not tried again, and the search goes on."""
+    result = search(tmp_path, 3, "seed=7")
+    assert result.returncode == 0, result.stderr
+    lost = [line.split() for line in result.stdout.splitlines() if "  diverged: qs3_s2d/" in line]
+    rows = [row for row in table(result.stdout) if row[1] != "-"]
+    assert 0 < len(lost) < 3
+    assert len(rows) == 3 - len(lost)
+    assert all(float(row[2]) > 0.695 for row in lost)
+    assert all(float(row[2]) < 0.695 for row in rows)
+    assert "failed" not in result.stdout
+    again = search(tmp_path, 3, "seed=7")
+    assert again.returncode == 0
+    assert table(again.stdout) == table(result.stdout)
+    assert "Launching" not in again.stdout
+
+
+def test_a_grid_lists_what_diverged_and_ends_well(tmp_path):
+    fixed = ["selftraining.rounds=6", "selftraining.epsilon=0.0", "selftraining.theta=0.6,0.7"]
+    result = light(tmp_path, GRID, *fixed, "seed=7")
+    assert result.returncode == 0
+    assert [row[1] for row in table(result.stdout)] == ["-0.0100", "-"]
+    assert "  diverged: qs3_s2d/seed7-" in result.stdout
+
+
+def test_the_best_trial():
+    """The first of the best; none where all diverged."""
+    tried = [Tried(i, {"a": f"'{i},'"}, value, f"r/{i}") for i, value in enumerate([2, 3, 3, 1])]
+    fixed = ["hparams_search=x", "experiment=e", "objective=snd", "seed=4", "b=c d"]
+    text = report("T", "snd", False, tried, fixed).splitlines()
+    assert text[0] == "T"
+    assert text[-2] == "Best: trial 1. With several seeds:"
+    typed = shlex.split(text[-1])[3:]
+    assert typed == ["experiment=e", "b=c d", "a='1,'", "seed=0,1,2"]
+    assert "Best: trial 3." in report("T", "entropy", True, tried, fixed)
+    lost = [Tried(0, {"a": "1"}, None, "diverged: r/0")]
+    assert report("T", "snd", False, lost, fixed).endswith(
+        "No trial has a finite snd, so there is no best one"
+    )
 
 
 @pytest.mark.slow
@@ -179,3 +361,14 @@ def test_a_search_with_trainings(tmp_path, toy_data):  # noqa: F811
     assert result.returncode == 0, result.stderr
     assert len(table(result.stdout)) == 3
     assert "Best: trial" in result.stdout
+    console = (result.stdout + result.stderr).lower()
+    assert "accura" not in console
+    assert "balanced" not in console
+    assert len(re.findall(r"quickstart, seed 0: objective=infomax \d\.\d{4}", console)) == 3
+    grid = [*overrides(tmp_path, f"paths.data_dir={toy_data}"), GRID, "selftraining.theta=0.4"]
+    result = command(
+        tmp_path, *grid, "selftraining.epsilon=0.0", "selftraining.rounds=1,2", "logger=wandb"
+    )
+    assert result.returncode == 0, result.stderr
+    assert len(table(result.stdout)) == 2
+    assert "accura" not in (result.stdout + result.stderr).lower()
