@@ -89,7 +89,7 @@ class SummaryOfSeeds(Callback):
         self.journal = None
         folders = sorted({Path(job["folder"]) for job in jobs})
         if self.table and any((folder / runs.METRICS).is_file() for folder in folders):
-            sys.stdout.write(summarise(folders) + "\n")
+            sys.stdout.write(summarise(folders, differences(jobs)) + "\n")
         sys.stdout.write(failures(jobs))
         if unreadable:
             sys.stdout.write(
@@ -150,11 +150,26 @@ def failures(jobs: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def summarise(folders: list[Path]) -> str:
-    """A small table of the runs in `folders`."""
+def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
+    """By folder the overrides in which jobs differ, without the seed; "" if they do not.
+
+    Args:
+        jobs: with "folder" and "overrides".
+    """
+    words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
+    keys = dict.fromkeys(key for one in words for key in one if key != "seed")
+    several = [key for key in keys if len({one.get(key) for one in words}) > 1]
+    return {
+        Path(job["folder"]): " ".join(f"{key}={one[key]}" for key in several if key in one)
+        for job, one in zip(jobs, words, strict=True)
+    }
+
+
+def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:
+    """A small table of the runs in `folders`; `settings`: in what they differ."""
     from qs3.report.aggregate import summarise as table
 
-    return table(folders)
+    return table(folders, settings)
 
 
 def _new_file(folder: Path) -> Path:

@@ -11,7 +11,7 @@ import pytest
 from hydra.errors import CompactHydraException
 from omegaconf import OmegaConf
 
-from qs3.multirun import SummaryOfSeeds, failures, in_words
+from qs3.multirun import SummaryOfSeeds, differences, failures, in_words
 from tests.report.runs import write_run
 
 
@@ -43,6 +43,40 @@ def test_an_error_of_all_jobs_is_said_once(summary, tmp_path, caplog):
         "seed=0 failed: ValueError: no data", "seed=0 failed: ValueError: other",
         "seed=0 failed: ValueError",
     ]  # fmt: skip
+
+
+def test_the_table_says_in_what_its_lines_differ(tmp_path, capsys):
+    summary = SummaryOfSeeds()
+    summary.on_multirun_start(config(tmp_path))
+    hashes = {"0.5": "aaaaaaaa", "0.45": "bbbbbbbb", "0.4": "cccccccc"}
+    for theta, sha in hashes.items():
+        for seed in (0, 1):
+            words = ["experiment=quickstart", f"selftraining.theta={theta}", f"seed={seed}"]
+            folder = tmp_path / "exp" / f"seed{seed}-{sha}"
+            if theta != "0.4":
+                write_run(tmp_path, seed=seed, hash=sha)
+            else:
+                (folder / ".hydra").mkdir(parents=True)
+            summary.on_job_start(config(folder, *words))
+            summary.on_job_end(config(folder), SimpleNamespace(_return_value=None, overrides=words))
+    summary.on_multirun_end(config(tmp_path))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[:2] == ["experiment", "settings"]
+    assert sorted(line.split()[1] for line in lines[3:6]) == [
+        f"selftraining.theta={theta}" for theta in sorted(hashes)
+    ]  # also the one that is not finished
+    assert "experiment=quickstart" not in "".join(lines)  # what all have in common
+
+
+def test_only_what_differs_and_no_seed():
+    def job(*words):
+        return {"folder": words[-1], "overrides": list(words[:-1])}
+
+    assert set(differences([job("seed=0", "a=1", "/x"), job("seed=1", "a=1", "/y")]).values()) == {
+        ""
+    }
+    found = differences([job("seed=0", "model=dgcnn", "/x"), job("seed=0", "b=2", "/y")])
+    assert found == {Path("/x"): "model=dgcnn", Path("/y"): "b=2"}
 
 
 def test_no_table_without_a_finished_run(summary, tmp_path, capsys):

@@ -217,14 +217,23 @@ def task(metrics: Mapping[str, Any]) -> str:
     return f"{metrics.get('source', '?')} -> {metrics.get('target', '?')}{simulated}"
 
 
-def summarise(folders: list[Path]) -> str:
+def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:
     """An aligned text table of the runs in `folders`, a line a config; percentages.
 
     What could not be averaged follows below the table, with its reason.
+
+    Args:
+        folders: of the runs.
+        settings: by folder in what a config differs from the others of the table.
     """
-    groups = group(load_run(folder) for folder in folders)
-    header = (
-        "experiment", "source -> target", "method", "self-training",
+    settings = settings or {}
+    runs = [load_run(folder) for folder in folders]
+    groups = group(runs)
+    differs = {(run.experiment, run.hash): settings.get(run.folder, "") for run in runs}
+    several = any(differs.values())
+    header: tuple[str, ...] = (
+        "experiment", *(["settings"] if several else []), "source -> target", "method",
+        "self-training",
         "accuracy", "balanced", "seeds", "majority",
     )  # fmt: skip
     lines, notes = [header], []
@@ -239,6 +248,7 @@ def summarise(folders: list[Path]) -> str:
         lines.append(
             (
                 g.experiment,
+                *([differs[g.experiment, g.hash] or "-"] if several else []),
                 task(g.first) if g.first else "?",
                 str(g.first.get("method", "?")),
                 str(g.first.get("selftraining", "?")),
@@ -251,7 +261,7 @@ def summarise(folders: list[Path]) -> str:
         if g.unlabelled:
             notes.append(f"{g.experiment} {g.hash}: no target labels, so no accuracy")
         notes += problems
-    if any("(!)" in line[6] for line in lines):
+    if any("(!)" in line[-2] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
     return "\n".join([caption, *align(lines), *notes])

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from qs3.errors import ConfigError, DataError
 from qs3.predictions import FILE, read_predictions
 from qs3.report.aggregate import align
+from qs3.report.formats import SIMULATED, marks
 from qs3.report.paired import LEVEL, Difference, compare_on_average
 from qs3.report.tables import Cell, Table
+
+_MORE_MESHES = "more meshes"
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,8 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
     ]
     seeds = sorted(seed for seed in set.intersection(*map(set, finished)) if seed is not None)
     if len(seeds) < 2:
+        if not all(finished):
+            return Compared(name, None, "not run")
         return Compared(name, None, f"fewer than two seeds in common ({seeds})")
     for cell in cells:
         if cell.group and not cell.group.comparable:
@@ -117,13 +124,16 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
     return Compared(name, (plain, balanced), objects_known=said[0][0].meshes != said[0][0].ids)
 
 
-def text(found: Sequence[Compared], base: str = "", markdown: bool = False) -> str:
+def text(
+    found: Sequence[Compared], base: str = "", markdown: bool = False, table: Table | None = None
+) -> str:
     """A line a row: differences in percentage points, and how many seeds would tell them apart.
 
     Args:
         found: of `against` or `effects`.
         base: the row that all are compared with, if it is one.
         markdown: instead of columns for the terminal.
+        table: that they are of: its title and what must not be overlooked come first.
     """
     header = [
         f"minus {base}" if base else "difference",
@@ -132,15 +142,17 @@ def text(found: Sequence[Compared], base: str = "", markdown: bool = False) -> s
         "seeds",
         "to tell apart",
     ]
-    lines, notes = [header], []
+    lines = [header]
+    reasons: dict[str, list[str]] = {}
     for one in found:
         if one.differences is None:
-            notes.append(f"{one.name}: {one.why}")
+            reasons.setdefault(one.why, []).append(one.name)
             continue
         accuracy, balanced = one.differences
         lines.append(
             [one.name, _shown(accuracy), _shown(balanced), str(accuracy.seeds), _needed(accuracy)]
         )
+    notes = [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
     meshes = {one.differences[0].meshes for one in found if one.differences}
     notes.insert(
         0,
@@ -149,14 +161,50 @@ def text(found: Sequence[Compared], base: str = "", markdown: bool = False) -> s
         + "; * marks those whose interval does not reach 0, each line by itself: of twenty rows "
         "that are no better than the other one gets a star",
     )
+    if any(_needed(one.differences[0]) == _MORE_MESHES for one in found if one.differences):
+        notes.append(
+            f"{_MORE_MESHES}: no number of seeds would tell them apart, the test split has too few"
+        )
     if any(one.differences and not one.objects_known for one in found):
         notes.insert(
             1,
             "which clouds show the same object is not known, so each counts as one of its own: "
             "where several do, the intervals are too narrow",
         )
-    table: Callable[[Sequence[Sequence[str]]], list[str]] = _markdown if markdown else align
-    return "\n".join([*table(lines), "", *(f"- {note}" for note in notes)]) + "\n"
+    head = []
+    if table:
+        # Whatever else is missing: numbers on a simulated target are never shown without the word.
+        simulated = [mark for mark in marks(table) if mark.startswith(SIMULATED)]
+        head = [f"{'## ' if markdown else ''}{table.title}", "", *simulated, ""]
+    layout: Callable[[Sequence[Sequence[str]]], list[str]] = _markdown if markdown else align
+    body = layout(lines) if len(lines) > 1 else []
+    return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"
+
+
+def csv_text(found: Sequence[Compared], table: Table) -> str:
+    """A line a difference and metric, in percentage points.
+
+    Args:
+        found: of `against` or `effects`.
+        table: that they are of.
+    """
+    file = io.StringIO(newline="")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(
+        ["name", "metric", "difference", "low", "high", "seeds", "meshes", "seeds_needed",
+         "simulated", "why"]
+    )  # fmt: skip
+    simulated = str(any(cell.simulated for cell in table.cells)).lower()
+    for one in found:
+        for i, metric in enumerate(("accuracy", "balanced accuracy")):
+            if one.differences is None:
+                writer.writerow([one.name, metric, *[""] * 6, simulated, one.why])
+                continue
+            d = one.differences[i]
+            points = [f"{100 * value:.4f}" for value in (d.mean, d.low, d.high)]
+            needed = "" if d.seeds_needed is None else d.seeds_needed
+            writer.writerow([one.name, metric, *points, d.seeds, d.meshes, needed, simulated, ""])
+    return file.getvalue()
 
 
 def _shown(d: Difference) -> str:
@@ -167,7 +215,7 @@ def _shown(d: Difference) -> str:
 def _needed(d: Difference) -> str:
     if d.clear:
         return "-"
-    return "more meshes" if d.seeds_needed is None else f"{d.seeds_needed} seeds"
+    return _MORE_MESHES if d.seeds_needed is None else f"{d.seeds_needed} seeds"
 
 
 def _markdown(lines: Sequence[Sequence[str]]) -> list[str]:

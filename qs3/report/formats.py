@@ -11,6 +11,8 @@ from qs3.report.aggregate import FEW_SEEDS, Group, task
 from qs3.report.table_cells import INCOMPLETE, METRICS, Cell, Table
 
 _ACCURACY = "accuracy"  # what papers give
+SIMULATED = "SIMULATED target"
+TO_RUN = "Not run yet, or fewer than three seeds"
 _RULES = {"source_val": "source validation", "last": "last epoch"}
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -138,7 +140,7 @@ def marks(table: Table) -> list[str]:
     lines = []
     found = [name for i in range(len(table.columns)) for name in table.simulated(i)]
     if found:
-        lines.append(f"SIMULATED target: {', '.join(dict.fromkeys(found))}")
+        lines.append(f"{SIMULATED}: {', '.join(dict.fromkeys(found))}")
     if any(cell.incomplete for cell in table.cells):
         lines.append(f"{INCOMPLETE} seeds that failed, are not finished or do not fit: see below")
     return lines
@@ -170,12 +172,14 @@ def remarks(table: Table) -> list[str]:
         lines.append(f"validation split: {', '.join(sorted(splits))}")
     if found:
         counts = sorted({len(g.finished) for g in found})
-        seeds = f"{' or '.join(map(str, counts))} seed{'s' * (counts[-1] > 1)}"
+        few, most = counts[0], counts[-1]
+        seeds = f"{few} seed{'s' * (few > 1)}" if few == most else f"{few} to {most} seeds"
         lines.append(f"mean ± standard error over {seeds}; (n=...) marks fewer than {FEW_SEEDS}")
-        lines.append(
-            "time: wall time of each run, the least and the most; all of its starts together, also "
-            "the warm-up that was taken from another run"
-        )
+        if any(seconds(g) for g in found):
+            lines.append(
+                "time: wall time of each run, the least and the most; all of its starts together, "
+                "also the warm-up that was taken from another run"
+            )
     for source in dict.fromkeys(c.paper.source for c in table.cells if c.paper and c.paper.source):
         rows = dict.fromkeys(c.row for c in table.cells if c.paper and c.paper.source == source)
         lines.append(f"published numbers of {', '.join(rows)}: {source}")
@@ -189,13 +193,13 @@ def remarks(table: Table) -> list[str]:
 
 
 def to_run(table: Table) -> list[str]:
-    """Commands that fill the cells without a number, each once."""
+    """Commands that fill the cells without a number or with few seeds, each once."""
     empty = [
         cell
         for cell in table.cells
         if cell.runnable
         and not cell.missing
-        and cell.ours(table.metrics[0]) is None
+        and ((stat := cell.ours(table.metrics[0])) is None or stat.n < FEW_SEEDS)
         and not (cell.group and cell.group.unlabelled)
     ]
     return list(dict.fromkeys(cell.command for cell in empty))
@@ -208,7 +212,7 @@ def markdown(table: Table) -> str:
     if len(behind := details(table)) > 1:
         lines += ["", "Behind each number:", "", *_markdown_table(behind)]
     if commands := to_run(table):
-        lines += ["", "Not run yet:", "", "```", *commands, "```"]
+        lines += ["", f"{TO_RUN}:", "", "```", *commands, "```"]
     return "\n".join(lines) + "\n"
 
 
@@ -228,7 +232,8 @@ def latex(table: Table) -> str:
     header, *body = grid(table)
     behind = details(table)
     notes = remarks(table) + (["; ".join(line) for line in behind] if len(behind) > 1 else [])
-    lines = [f"% {' '.join(note.split())}" for note in [table.title, *notes]]
+    package = r"\usepackage{booktabs}"
+    lines = [f"% {' '.join(note.split())}" for note in [table.title, package, *notes]]
     lines += [rf"\begin{{tabular}}{{@{{}}l{'c' * (len(header) - 1)}@{{}}}}", r"\toprule"]
     lines += [_latex_row(header), r"\midrule", *map(_latex_row, body), r"\bottomrule"]
     for mark in marks(table):

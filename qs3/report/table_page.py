@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from qs3.report.formats import details, grid, marks, remarks, to_run
+from qs3.report.formats import TO_RUN, details, grid, marks, remarks, to_run
 from qs3.report.html_page import html
 from qs3.report.table_cells import INCOMPLETE, Table
 
@@ -39,7 +39,7 @@ def page(table: Table) -> str:
     if len(behind := details(table)) > 1:
         parts += ["<h2>Behind each number</h2>", _table(behind)]
     if commands := to_run(table):
-        parts.append("<h2>Not run yet</h2>")
+        parts.append(f"<h2>{TO_RUN}</h2>")
         parts += [f"<pre>{escape(command)}</pre>" for command in commands]
     return html(table.title, parts, _STYLE)
 

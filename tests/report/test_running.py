@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 import shlex
@@ -15,8 +17,8 @@ import pytest
 from qs3.errors import ConfigError
 from qs3.predictions import FILE, Predictions, read_predictions, write_predictions
 from qs3.report.__main__ import main
-from qs3.report.comparison import against, effects, text
-from qs3.report.running import Job, _chosen, launch, missing, run_all
+from qs3.report.comparison import against, csv_text, effects, text
+from qs3.report.running import Job, _chosen, _why, launch, missing, run_all
 from qs3.report.tables import Table, build_table
 from tests.report.test_tables import run_cell
 from tests.training.toy import overrides, write_toy
@@ -60,7 +62,13 @@ def test_one_cell(tmp_path):
     assert job.name == f"{row}, {column}, seed 0"
     assert len(missing(table, [0], columns=[column])) < len(every)
     cells = [cell for cell in build_table("self_training", tmp_path).cells if cell.runnable]
-    assert len([cell for cell in cells if _chosen(cell.column, ["s -> d"])]) == len(cells) / 2
+    chosen = _chosen((cell.column for cell in cells), ["s -> d"])
+    assert len([cell for cell in cells if cell.column in chosen]) == len(cells) / 2
+    names = ["PCM", "DefRec+PCM", "DANN", "PCM + QBST"]
+    assert _chosen(names, ["pcm"]) == {"PCM"}  # the row of that name, not all that contain it
+    assert _chosen(names, ["qbst", "dann"]) == {"PCM + QBST", "DANN"}
+    assert _chosen(names, ["rec+p"]) == {"DefRec+PCM"}
+    assert _chosen(names, []) == set(names)
     with pytest.raises(ConfigError, match=r"no column of table .* has 'x' in its name; columns to"):
         missing(table, [0], columns=["x"])
 
@@ -102,6 +110,14 @@ def test_a_failure_stops_nothing_and_is_told():
     assert "python train.py bad" in told
     assert "accuracy ['bad']" in told  # the end of its output
     assert sum("accuracy ['one']" in line for line in lines) == 1
+
+
+def test_a_failed_run_shows_its_error_from_the_first_line():
+    lines = [*(f"epoch {i}" for i in range(20)), "MissingDataError: domain x is not there"]
+    lines += [*(f"    looked for {i}" for i in range(5)), ""]
+    lines += ["Set the environment variable HYDRA_FULL_ERROR=1 for a complete stack trace."]
+    assert list(_why(lines)) == [lines[20], *lines[21:26]]
+    assert list(_why(["a", "b"])) == ["a", "b"]
 
 
 def test_processes_do_not_outlive_an_interruption():
@@ -149,13 +165,23 @@ def test_compare_by_hand(tmp_path):
     assert dann[0].mean == pytest.approx(0.2)
     assert (dann[0].seeds, dann[0].meshes) == (3, 20)
     assert pcm[0].mean == 0
-    assert found["GAST"].why == "fewer than two seeds in common ([])"
+    assert found["GAST"].why == "not run"
     shown = text(list(found.values()), "source only")
     assert "minus source only" in shown
     assert "DANN" in shown
     assert "+20.0 [" in shown
     assert "(20 meshes)" in shown
-    assert "GAST: fewer than two seeds" in shown
+    assert "GAST" in next(line for line in shown.splitlines() if line.endswith(": not run"))
+    assert "simulated" not in shown
+    for markdown in (False, True):
+        shown = text(list(found.values()), "source only", markdown, table)
+        assert shown.splitlines()[0].removeprefix("## ") == table.title
+        assert "SIMULATED target: kinectsim10" in shown.splitlines()
+    rows = list(csv.DictReader(io.StringIO(csv_text(list(found.values()), table))))
+    assert len(rows) == 2 * len(found)
+    (row,) = (r for r in rows if (r["name"], r["metric"]) == ("DANN", "accuracy"))
+    assert float(row["difference"]) == pytest.approx(20)
+    assert (row["seeds"], row["meshes"], row["simulated"]) == ("3", "20", "true")
     with pytest.raises(ConfigError, match="no row 'x'"):
         against(table, "x")
 
@@ -211,7 +237,7 @@ def test_effects_by_hand(tmp_path):
     }
     scheme = f"{source} minus {scratch}, over QBST, SPST, CBST, all confident"
     found = {one.name: one for one in effects(fill(tmp_path / "half", "factorial", half))}
-    assert found[scheme].why.startswith("fewer than two seeds")  # two rows were not run
+    assert found[scheme].why == "not run"  # two rows of four
     spst = found[f"SPST minus QBST, over {scratch}, {source}"].differences
     assert spst is not None
     assert spst[0].mean == pytest.approx(0)  # (10 - 8 + 12 - 14) / 40

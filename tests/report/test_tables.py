@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from qs3.errors import ConfigError
 from qs3.report import tables
 from qs3.report.__main__ import main
-from qs3.report.formats import csv_text, latex, markdown
+from qs3.report.formats import TO_RUN, csv_text, latex, markdown
 from qs3.report.table_cells import Published
 from qs3.report.tables import build_table, composing
 from qs3.runs import config_hash, run_folder
@@ -81,7 +81,12 @@ def test_quickstart_filled(tmp_path):
     assert "not the paper's protocol" in text
     assert "majority rate of the simulated target kinectsim10: 45.0 %" in text
     assert "teacher selected by: source_val\n" in text
-    assert "Not run yet" not in text
+    # What has one seed: both rows are filled by the same command.
+    shown = [line for line in lines if line.startswith("python train.py")]
+    assert shown == [build_table("quickstart", tmp_path).cells[3].command]
+    assert f"{TO_RUN}:" in lines
+    run_cell(tmp_path, empty.cells[3], seeds=(1, 2), accuracy=0.7, warmup=warmup)
+    assert TO_RUN not in markdown(build_table("quickstart", tmp_path))
 
 
 def test_paper_beside_ours(tmp_path, empty):
@@ -114,6 +119,13 @@ def test_another_target(tmp_path):
     assert all("domain@data.target=kinectsim10" in c.overrides for c in table.cells)
     assert all(c.paper is None for c in table.cells)
     assert "which is not the paper's" in markdown(table)
+    assert "on another target: kinectsim10" in markdown(table)
+    upper = [c for c in table.cells if "experiment=supervised_d" in c.overrides]
+    assert upper
+    for cell in table.cells:  # the upper bound is trained on the other target, too
+        assert ("domain@data.source=kinectsim10" in cell.overrides) == (cell in upper)
+    with pytest.raises(ConfigError, match=r"no domain \(did you mean kinectsim10\?\)"):
+        build_table("uda", tmp_path, target="kinectsim1")
 
 
 def test_extra_overrides_are_part_of_the_command(tmp_path):
