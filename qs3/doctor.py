@@ -13,6 +13,10 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
+_ABOUT = (
+    "Says what works on this machine, and which Debian package would help where something is "
+    "missing."
+)
 BLENDER_PACKAGES = (
     "libxi6",
     "libxxf86vm1",
@@ -63,7 +67,7 @@ CHECKS = (
 
 def main() -> None:
     """Run the checks; with --install, install missing Debian packages where that is possible."""
-    parser = argparse.ArgumentParser(prog="python -m qs3.doctor", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m qs3.doctor", description=_ABOUT)
     parser.add_argument(
         "--install", action="store_true", help="install missing Debian packages if this is root"
     )

@@ -60,7 +60,7 @@ def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
     From 0.1 % to 99.9 % of the clouds of each domain, and of these ranges the lowest and highest
     end. Of fewer than a thousand clouds this is about the range of all. At most `most` of a domain
     are measured, evenly spaced. Having many points is no fault: `points` has no upper end
-    (infinity).
+    (infinity). Its lower end is that of the clouds on disk, see `enough`.
     """
     ranges = []
     for clouds in domains:
@@ -72,6 +72,18 @@ def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
     low[0], high[0] = np.floor(low[0]), np.inf  # points: of many, none is too many
     names = tuple(MEASURES)
     return {name: [float(low[i]), float(high[i])] for i, name in enumerate(names)}
+
+
+def enough(usual: Mapping[str, list[float]], seen: int) -> dict[str, list[float]]:
+    """The same ranges for a net that sees `seen` points of a cloud.
+
+    A cloud that has as many points as the net sees does not lack any, however many the clouds of
+    training have on disk.
+    """
+    changed = {name: list(ends) for name, ends in usual.items()}
+    if "points" in changed:
+        changed["points"][0] = min(changed["points"][0], float(seen))
+    return changed
 
 
 def strange(measured: Mapping[str, float], usual: Mapping[str, list[float]]) -> list[str]:

@@ -28,7 +28,7 @@ from qs3.data.importers.folders import CloudFolder
 from qs3.data.samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation import predict
-from qs3.familiar import measure, strange
+from qs3.familiar import enough, measure, strange
 from qs3.result import PACKAGES, Result, build_net, read_result
 
 BATCH = 32  # clouds: more are no faster on a CPU
@@ -83,7 +83,7 @@ class Predictor:
         Raises:
             DataError: no points, or NaN or infinite coordinates; says which.
         """
-        cloud = np.asarray(cloud)
+        cloud = _array(cloud, name)
         if cloud.ndim != 2 or cloud.shape[1] < 3:
             raise DataError(f"{name}: the array has shape {cloud.shape}, expected [n, 3]")
         cloud = checked(cloud[:, :3], name)
@@ -94,7 +94,8 @@ class Predictor:
         whole = stored[None]  # [1, P, 3]
         some = self.points < rules.points
         ready = Clouds.of(whole, sample(whole, self.points, 1) if some else None).all()[0]
-        found = strange(measure(stored, ready.numpy()), self.result.usual)
+        usual = enough(self.result.usual, self.points)
+        found = strange(measure(stored, ready.numpy()), usual)
         return Prepared(ready, len(cloud), tuple(found))
 
     def probabilities(
@@ -125,9 +126,16 @@ class Predictor:
             batch_size: clouds that the net sees at a time.
 
         Raises:
-            DataError: names the cloud that is empty or not finite.
+            DataError: no list of clouds; or names the cloud that is empty or not finite.
         """
-        arrays = [np.asarray(cloud) for cloud in clouds]
+        if clouds is None or isinstance(clouds, str | bytes) or not hasattr(clouds, "__iter__"):
+            raise DataError(f"got {clouds!r:.60}; give a list of clouds, [n, 3] arrays")
+        if getattr(clouds, "ndim", 3) == 2:
+            raise DataError(
+                f"got one array of shape {tuple(clouds.shape)}; give a list of clouds, "  # type: ignore[union-attr]
+                "predictor([cloud])"
+            )
+        arrays = list(clouds)
         names = [f"cloud {i}" for i in range(len(arrays))] if names is None else names
         if not arrays:
             return np.empty((0, len(self.classes)))
@@ -154,6 +162,23 @@ def load(
     result = read_result(run)
     place = device_of(device)
     return Predictor(build_net(result, packages).to(place), result, place)
+
+
+def _array(cloud: Any, name: str) -> np.ndarray:
+    """An array, tensor or nested list of numbers as an array.
+
+    Raises:
+        DataError: something else.
+    """
+    if isinstance(cloud, Tensor):
+        cloud = cloud.detach().cpu()
+    try:
+        found = np.asarray(cloud)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise DataError(f"{name}: no array of numbers [n, 3] ({error})") from error
+    if found.dtype.kind not in "fiu":
+        raise DataError(f"{name}: {type(cloud).__name__} of {found.dtype}, no numbers [n, 3]")
+    return found
 
 
 def device_of(device: Any) -> torch.device:

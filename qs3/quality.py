@@ -23,7 +23,7 @@ from qs3.data.augment import rotate_z
 from qs3.data.clouds import Clouds
 from qs3.data.datamodule import Labelled, Unlabelled
 from qs3.evaluation import predict
-from qs3.familiar import limits, strange_clouds
+from qs3.familiar import enough, limits, strange_clouds
 
 TURNS = 3
 """Turns about gravity besides none: by 90, 180 and 270 degrees."""
@@ -242,15 +242,9 @@ def unlike(clouds: Clouds, source: Clouds) -> float:
 
 
 def usual_of(source: Clouds, most: int = 1000) -> dict[str, list[float]]:
-    """Of each measure the range in at most `most` clouds.
-
-    A cloud that has as many points as the net sees does not lack any, however many the source's
-    clouds have on disk.
-    """
-    usual = limits(source, most=most)
+    """Of each measure the range in at most `most` clouds; of points no more than the net sees."""
     seen = source.stored.shape[1] if source.order is None else source.order.shape[2]
-    usual["points"][0] = min(usual["points"][0], float(seen))
-    return usual
+    return enough(limits(source, most=most), seen)
 
 
 def _certainty(probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " n"]:

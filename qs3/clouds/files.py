@@ -5,10 +5,11 @@
     .npy        [n, >= 3], or [m, n, >= 3]: m clouds
     .npz        the array `points` (or the only one) as in .npy; perhaps `label` or `cls`
     .ply        the vertices, text or binary; faces are passed over
-    .pcd        x y z; pixels without a measurement (NaN) are left out, as the format means them
+    .pcd        x y z
     .h5 .hdf5   the dataset `data` or `points` as in .npy; perhaps `label`
 
-Only x y z are read. Pickled arrays are refused unopened, sizes are checked before memory is taken.
+Only x y z are read. Points that are NaN or infinite, as depth cameras write them, are left out and
+counted. Pickled arrays are refused unopened, sizes are checked before memory is taken.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class CloudFile:
         clouds: [n, 3] each; float32 and finite from `read_clouds`, as in the file from
             `parse_clouds`.
         labels: of each cloud as the file has them, a number or a word; None if it has none.
-        dropped: pixels without a measurement that were left out.
+        dropped: points that are NaN or infinite and that `read_clouds` left out, of all clouds.
         many: whether the file is made for several clouds (then each has a number in its name).
     """
 
@@ -61,15 +62,35 @@ def read_cloud(path: str | Path) -> np.ndarray:
 
 
 def read_clouds(path: str | Path) -> CloudFile:
-    """All clouds of a file, checked.
+    """All clouds of a file, without points that are not finite, and checked.
 
     Raises:
         DataError: names the file, and the line or cloud.
     """
     found = parse_clouds(path)
-    places = [f"{path}, cloud {i}" if found.many else str(path) for i in range(len(found.clouds))]
-    clouds = tuple(checked(c, where) for c, where in zip(found.clouds, places, strict=True))
-    return dataclasses.replace(found, clouds=clouds)
+    clouds, dropped = [], 0
+    for i, whole in enumerate(found.clouds):
+        where = f"{path}, cloud {i}" if found.many else str(path)
+        cloud, lost = measured(whole, where)
+        clouds.append(checked(cloud, where))
+        dropped += lost
+    return dataclasses.replace(found, clouds=tuple(clouds), dropped=dropped)
+
+
+def measured(cloud: np.ndarray, where: str) -> tuple[np.ndarray, int]:
+    """[n, 3] without the points that are NaN or infinite, and how many these were.
+
+    Numbers too large for float32 are no such points: `checked` names them.
+
+    Raises:
+        DataError: no point is left.
+    """
+    finite = np.isfinite(cloud).all(axis=1)
+    if finite.all():
+        return cloud, 0
+    if not finite.any():
+        raise DataError(f"{where}: all {len(cloud)} points are not finite (NaN or infinite)")
+    return cloud[finite], int((~finite).sum())
 
 
 def checked(cloud: np.ndarray, where: str) -> np.ndarray:
@@ -84,7 +105,10 @@ def checked(cloud: np.ndarray, where: str) -> np.ndarray:
         small = np.asarray(cloud, dtype=np.float32)
     if not (finite := np.isfinite(small).all(axis=1)).all():
         row = int(np.flatnonzero(~finite)[0])
-        raise DataError(f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite in float32")
+        raise DataError(
+            f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite in float32; "
+            "leave such points out"
+        )
     return small
 
 
@@ -136,15 +160,22 @@ def _bad_line(path: Path, lines: list[bytes]) -> str:
         words = line.split(b"#")[0].split()
         if not words:
             continue
-        shown = line[:60].decode(errors="replace").strip()
+        shown = printable(line[:60].decode(errors="backslashreplace").strip())[:60]
         try:
             [float(word) for word in words]
         except ValueError:
-            return f"{path}, line {number}: {shown!r} is not a row of numbers"
+            return f"{path}, line {number}: '{shown}' is not a row of numbers"
         if len(words) < 3 or (width is not None and len(words) != width):
-            return f"{path}, line {number}: {shown!r} has {len(words)} numbers, not {width or 3}"
+            return f"{path}, line {number}: '{shown}' has {len(words)} numbers, not {width or 3}"
         width = len(words)
     return f"{path}: not a text file of rows with numbers"
+
+
+def printable(text: str) -> str:
+    """One line that a terminal and a table can show: what is not printable becomes escapes."""
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+    )
 
 
 def npy_clouds(path: Path) -> int | None:
@@ -237,10 +268,7 @@ def _pcd(path: Path) -> CloudFile:
         points = read_pcd(path).xyz()
     except DataError as error:
         raise error if str(path) in str(error) else DataError(f"{path}: {error}") from error
-    measured = np.isfinite(points).all(axis=1)
-    if not measured.any():
-        raise DataError(f"{path}: no pixel has a measurement")
-    return CloudFile((points[measured],), dropped=int((~measured).sum()))
+    return CloudFile((points,))
 
 
 def _hdf5(path: Path) -> CloudFile:

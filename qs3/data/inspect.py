@@ -28,7 +28,7 @@ from qs3.errors import Qs3Error
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit status."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
+    if not argv or argv[0] == "help" or {"-h", "--help"} & set(argv):
         sys.stdout.write(__doc__ or "")
         return 0
     try:

@@ -9,15 +9,17 @@
             .h5 .hdf5. Any number of points, any unit, any place; other files are passed over
   up=       the axis that points up in your files: x y z -x -y -z. Which way is up is not guessed,
             and the wrong axis costs most of the accuracy
-  out=      .csv or .json, replaced if it is there
+  out=      .csv or .json; the line at the end says so if it replaced a file
   threads=  batches at the same time, each on one thread; as many as processors if not given
   device=   cpu | cuda | cuda:1
 
 A row for each cloud: file (name[3] is cloud 3 of a file that holds several), status, class,
-confidence, points, out_of_range, reason, and p_<class>, a probability for each class.
+confidence, points, dropped, out_of_range, reason, and p_<class>, a probability for each class.
+Points that are NaN or infinite are left out: dropped counts them, points the others.
 
-out_of_range=yes: a cloud unlike all those of training (too few points; spacing, flatness, height
-or stray points outside what 99.8 % of them had); the reason says in what. It guarantees nothing:
+out_of_range=yes: a cloud unlike all those of training (fewer points than the net samples and than
+training had; spacing, flatness, height or stray points outside what 99.8 % of them had); the reason
+says in what. It guarantees nothing:
 an object of no known class also gets a class, often with high confidence.
 
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.
@@ -25,7 +27,8 @@ A damaged file gets status=failed and its reason, and the others go on. The exit
 export writes the net for use without qs3: out=model.onnx for onnxruntime and others, out=model.pt2
 for torch.export.load. It takes prepared clouds [clouds, points, 3] and gives logits; how a cloud is
 prepared, and the names of the classes, stand in the .onnx file's metadata. The written net is run
-and its logits compared with the net's, on made-up clouds, or on yours (check=, z up).
+and its logits compared with the net's, on made-up clouds, or on yours (check=, z up; damaged ones
+are left out).
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ _EXPORT = ("ckpt", "out", "check", "threads")
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit status."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
+    if not argv or argv[0] == "help" or {"-h", "--help"} & set(argv):
         print(__doc__)
         return 0
     logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 import qs3
-from qs3.clouds.files import SUFFIXES, parse_clouds
+from qs3.clouds.files import SUFFIXES, measured, parse_clouds, printable
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.files import make_folder, write_text
@@ -66,13 +66,15 @@ class Row(NamedTuple):
 
     Attributes:
         file: relative to the input; name[3] is cloud 3 of a file that holds several.
-        points: in the file; None if it could not be read.
+        points: in the file, without those dropped; None if it could not be read.
+        dropped: points of the file that are NaN or infinite; None if it could not be read.
         reason: in what it is out of range, or why it failed; "" otherwise.
         probabilities: [C] float64; None if it failed.
     """
 
     file: str
     points: int | None
+    dropped: int | None
     reason: str
     probabilities: np.ndarray | None
 
@@ -92,30 +94,44 @@ def predict_command(
     predictor = load(settings.ckpt, device=settings.device, packages=packages)
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
+    replaces = out.exists()
     began = time.monotonic()
-    with progress_bar("predicting", total=len(files)) as advance:
+    with progress_bar("files read", total=len(files)) as advance:
         rows = list(predict_files(predictor, files, root, settings, advance))
     seconds = time.monotonic() - began
     written = _json if out.suffix.lower() == ".json" else _csv
     write_text(out, written(rows, predictor))
     failed = [row for row in rows if row.probabilities is None]
-    return _told(rows, failed, others, predictor, seconds, out), failed
+    lines = _told(rows, failed, len(files), others, predictor, seconds)
+    return "\n".join([*lines, saved(out, replaces)]), failed
 
 
-def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
+def saved(out: str | Path, replaces: bool) -> str:
+    """Says where a file lies now, and that another one lay there."""
+    return f"saved {out}" + " (replaced what was there)" * replaces
+
+
+def find_files(place: str | Path, key: str = "input") -> tuple[list[Path], Path, int]:
     """The files to read, what their names are relative to, and how many files are passed over.
 
     In a folder: all files of known formats at any depth, in order of their names; hidden ones and
     links to folders are left out.
 
+    Args:
+        place: a file or folder.
+        key: of the command line that names it, for messages.
+
     Raises:
         MissingDataError: nothing there.
+        DataError: one file, of an unknown format.
     """
     place = Path(place).expanduser()
     if place.is_file():
+        if place.suffix.lower() not in SUFFIXES:
+            raise DataError(f"{key}={place}: unknown format; known are {', '.join(SUFFIXES)}")
         return [place], place.parent, 0
     if not place.is_dir():
-        raise MissingDataError(f"input={place} is not there")
+        raise MissingDataError(f"{key}={place} is not there")
     found, others = [], 0
     for folder, folders, names in os.walk(place):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
@@ -127,7 +143,7 @@ def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
             else:
                 others += 1
     if not found:
-        raise MissingDataError(f"input={place} holds no file of {' '.join(SUFFIXES)}")
+        raise MissingDataError(f"{key}={place} holds no file of {' '.join(SUFFIXES)}")
     return sorted(found), place, others
 
 
@@ -169,11 +185,11 @@ def predict_files(
 
 
 class _Raw(NamedTuple):
-    """A cloud as read: what it is called in the table and in messages."""
+    """A cloud as read: its name in the table, its points, and how many were not finite."""
 
     name: str
-    where: str
     cloud: np.ndarray
+    dropped: int
 
 
 def _batches(
@@ -197,38 +213,52 @@ def _read(path: Path, root: Path) -> Iterator[Row | _Raw]:
     try:
         found = parse_clouds(path)
     except DataError as error:
-        yield Row(name, None, str(error), None)
+        yield Row(name, None, None, _reason(error, str(path)), None)
         return
-    for i, cloud in enumerate(found.clouds):
-        own, where = (f"{name}[{i}]", f"{path}, cloud {i}") if found.many else (name, str(path))
-        yield _Raw(own, where, cloud)
+    for i, given in enumerate(found.clouds):
+        own = f"{name}[{i}]" if found.many else name
+        try:
+            cloud, dropped = measured(given, own)
+        except DataError as error:
+            yield Row(own, 0, len(given), _reason(error, own), None)
+            continue
+        yield _Raw(own, cloud, dropped)
+
+
+def _reason(error: DataError, name: str) -> str:
+    """What is wrong, without the name before it: that has a column of its own."""
+    return printable(str(error).removeprefix(name).lstrip(" :,"))
 
 
 def _judged(predictor: Predictor, batch: Sequence[Row | _Raw], up: str) -> list[Row]:
     """The rows of a batch: each cloud prepared, and one pass of the net."""
-    prepared: dict[int, Prepared] = {}
+    prepared: dict[int, tuple[_Raw, Prepared]] = {}
     rows: dict[int, Row] = {}
     for i, item in enumerate(batch):
         if isinstance(item, Row):
             rows[i] = item
             continue
         try:
-            prepared[i] = predictor.prepare(item.cloud, item.where, up)
+            prepared[i] = item, predictor.prepare(item.cloud, item.name, up)
         except DataError as error:
-            rows[i] = Row(item.name, len(item.cloud), str(error), None)
+            why = _reason(error, item.name)
+            rows[i] = Row(item.name, len(item.cloud), item.dropped, why, None)
     if prepared:
-        points = torch.stack([each.points for each in prepared.values()])
+        points = torch.stack([each.points for _, each in prepared.values()])
         found = predictor.probabilities(points, len(points))
-        for (i, each), probabilities in zip(prepared.items(), found, strict=True):
-            rows[i] = Row(batch[i][0], each.given, "; ".join(each.strange), probabilities)
+        for (i, (item, each)), probabilities in zip(prepared.items(), found, strict=True):
+            why = "; ".join(each.strange)
+            rows[i] = Row(item.name, each.given, item.dropped, why, probabilities)
     return [rows[i] for i in range(len(batch))]
 
 
 def _csv(rows: list[Row], predictor: Predictor) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    header = ("file", "status", "class", "confidence", "points", "out_of_range", "reason")
-    writer.writerow([*header, *(f"p_{name}" for name in predictor.classes)])
+    first = ("file", "status", "class", "confidence", "points", "dropped")
+    writer.writerow(
+        [*first, "out_of_range", "reason", *(f"p_{name}" for name in predictor.classes)]
+    )
     for row in rows:
         values = _record(row, predictor)
         each = values.pop("probabilities") or dict.fromkeys(predictor.classes)
@@ -252,7 +282,8 @@ def _record(row: Row, predictor: Predictor) -> dict[str, Any]:
     if row.probabilities is None:
         nothing = dict.fromkeys(("class", "confidence"))
         return {
-            **{"file": row.file, "status": "failed", **nothing, "points": row.points},
+            **{"file": row.file, "status": "failed", **nothing},
+            **{"points": row.points, "dropped": row.dropped},
             **{"out_of_range": None, "reason": row.reason, "probabilities": None},
         }
     each = row.probabilities.tolist()
@@ -263,6 +294,7 @@ def _record(row: Row, predictor: Predictor) -> dict[str, Any]:
         "class": predictor.classes[best],
         "confidence": each[best],
         "points": row.points,
+        "dropped": row.dropped,
         "out_of_range": bool(row.reason),
         "reason": row.reason,
         "probabilities": dict(zip(predictor.classes, each, strict=True)),
@@ -272,11 +304,11 @@ def _record(row: Row, predictor: Predictor) -> dict[str, Any]:
 def _told(
     rows: list[Row],
     failed: list[Row],
+    files: int,
     others: int,
     predictor: Predictor,
     seconds: float,
-    out: Path,
-) -> str:
+) -> list[str]:
     """What was done, for the terminal."""
     good = [row for row in rows if row.probabilities is not None]
     strange = sum(bool(row.reason) for row in good)
@@ -285,10 +317,17 @@ def _told(
         for row in good
         if row.probabilities is not None
     )
-    lines = [f"{len(good)} clouds, {len(good) / max(seconds, 1e-9):.1f} a second"]
+    rate = len(good) / max(seconds, 1e-9)
+    lines = [f"{len(good)} clouds, {rate:.1f} clouds a second, from {files} files"]
     if good:
         lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
         lines.append(f"{strange} of them out of range (column out_of_range)")
+    if holed := [row for row in good if row.dropped]:
+        dropped = sum(row.dropped or 0 for row in holed)
+        lines.append(
+            f"{dropped} points of {len(holed)} clouds are NaN or infinite and were left out "
+            "(column dropped)"
+        )
     if predictor.result.gravity == "none":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
     if others:
@@ -297,7 +336,7 @@ def _told(
         lines.append(f"{len(failed)} failed:")
         lines += [f"  {row.file}: {row.reason}" for row in failed[:_SHOWN]]
         lines += [f"  and {len(failed) - _SHOWN} more, see the table"] * (len(failed) > _SHOWN)
-    return "\n".join([*lines, f"saved {out}"])
+    return lines
 
 
 def _printable(name: str) -> str:

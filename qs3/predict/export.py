@@ -19,14 +19,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 import qs3
-from qs3.clouds.files import parse_clouds
-from qs3.errors import ConfigError, Qs3Error
+from qs3.clouds.files import measured, parse_clouds
+from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.files import atomic_path, make_folder
 from qs3.inference import Predictor, load
 from qs3.models.base import PointClassifier
 from qs3.models.norms import norms_for, use_domain
 from qs3.predict.plain import Plain, least_points
 from qs3.settings import whole
+
+log = logging.getLogger(__name__)
 
 ALLOWED = 1e-4  # difference of logits
 ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
@@ -103,9 +105,12 @@ def export_command(
         check: a file or folder of clouds, z up, to compare on; clouds made up if None.
         threads: of torch.
     """
+    from qs3.predict.command import saved
+
     torch.set_num_threads(whole("threads", threads, 1))
     predictor = load(ckpt)
     clouds = None if check is None else clouds_of(predictor, check)
+    replaces = Path(out).expanduser().exists()
     compared = export(predictor, out, clouds)
     how = f"onnxruntime.InferenceSession({str(out)!r})"
     if Path(out).suffix == ".pt2":
@@ -115,9 +120,9 @@ def export_command(
     )
     return (
         f"{compared}\n"
-        f"saved {out}: {how} takes {INPUT!r}, float32 [clouds, points, 3], any number of prepared\n"
-        f"clouds of {points} points, and gives {OUTPUT!r} of {', '.join(predictor.classes)};\n"
-        "NaN is not noticed"
+        f"{saved(out, replaces)}: {how} takes {INPUT!r}, float32 [clouds, points, 3],\n"
+        f"any number of prepared clouds of {points} points, and gives {OUTPUT!r} of\n"
+        f"{', '.join(predictor.classes)}; NaN is not noticed"
     )
 
 
@@ -146,6 +151,8 @@ def export(
     # Two, also where there is one: torch takes a size of 1 for one that never changes.
     example = clouds[:1].repeat(2, 1, 1)
     make_folder(out.parent)
+    # What torch compiled for another net's loops, whose sizes would become limits of this one's.
+    torch.compiler.reset()
     with _quiet(), torch.no_grad(), use_domain(net, norms_for(net, "target")):
         write: Callable[..., Any] = _write_onnx if out.suffix == ".onnx" else _write_pt2
         with atomic_path(out) as temporary:
@@ -169,19 +176,31 @@ def any_points(predictor: Predictor) -> bool:
 
 
 def clouds_of(predictor: Predictor, place: str | Path) -> Float[Tensor, "n m 3"]:
-    """The first clouds of a file or folder, prepared; z up.
+    """The first clouds of a file or folder, prepared; z up. Damaged ones are left out and told.
 
     Raises:
-        MissingDataError, DataError: there are none, or one is damaged.
+        MissingDataError: there are no files.
+        DataError: all are damaged.
     """
     from qs3.predict.command import find_files
 
     found: list[Tensor] = []
-    for path in find_files(place)[0]:
-        for i, cloud in enumerate(parse_clouds(path).clouds):
-            found.append(predictor.prepare(cloud, f"{path}, cloud {i}").points)
+    for path in find_files(place, "check")[0]:
+        try:
+            clouds = parse_clouds(path).clouds
+        except DataError as error:
+            log.warning("left out: %s", error)
+            continue
+        for i, given in enumerate(clouds):
+            where = f"{path}, cloud {i}"
+            try:
+                found.append(predictor.prepare(measured(given, where)[0], where).points)
+            except DataError as error:
+                log.warning("left out: %s", error)
             if len(found) == 8 * _CHECKED:
                 return torch.stack(found)
+    if not found:
+        raise DataError(f"check={place} holds no cloud that can be read; see the lines above")
     return torch.stack(found)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import struct
 import tracemalloc
 from pathlib import Path
@@ -86,7 +87,8 @@ def test_truncated_files_never_give_other_points(tmp_path: Path, suffix: str) ->
         ("a.xyz", "1 2 3\n1 2\n", "line 2: '1 2' has 2 numbers, not 3"),
         ("a.xyz", "1 2\n", "line 1: '1 2' has 2 numbers, not 3"),
         ("a.txt", "1,2,3\na,b,c\n", "line 2: 'a b c' is not a row of numbers"),
-        ("a.xyz", "1 2 3\n4 nan 6\n", r"point 2: .*not finite"),
+        ("a.xyz", "1 2 nan\n4 nan 6\n", r"a\.xyz: all 2 points are not finite"),
+        ("a.xyz", "1 2 3\n4 1e39 6\n", r"point 2: .*not finite in float32; leave such"),
         ("a.xyz", "# only a comment\n", "there are no points"),
         ("a.xyz", "", "0 bytes"),
         ("a.pcd", "nonsense", r"a\.pcd"),
@@ -412,6 +414,22 @@ def test_clouds_come_as_finite_float32(tmp_path: Path, suffix: str) -> None:
         path = write(tmp_path / f"b{suffix}", CLOUD * 1e300)
         with pytest.raises(DataError, match=rf"b\{suffix}, point 1: .*not finite in float32"):
             read_cloud(path)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_points_that_are_not_finite_are_left_out(
+    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(0)
+    cloud = rng.standard_normal((12, 3)).astype(np.float32)
+    left = np.delete(cloud, [0, 5], axis=0)
+    cloud[0], cloud[5, 1] = np.nan, np.inf
+    write(tmp_path / "bed" / f"a{suffix}", cloud)
+    with caplog.at_level("INFO"):
+        (read,), (row,) = CloudFolder(tmp_path, points=10, test_every=0).read(("bed",))
+    np.testing.assert_array_equal(read, left)
+    assert row.valid_points == 10
+    assert re.search(rf"a{suffix}\S*: \d points that are NaN or infinite left out", caplog.text)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])

@@ -111,9 +111,7 @@ def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, ca
     write(folder / "a.xyz", clouds[0])
     (folder / "b.xyz").write_text("1 2 3\n4 five 6\n")
     (folder / "c.ply").write_text("ply\nformat ascii 1.0\nelement vertex 9\nend_header\n")
-    nan = clouds[1].copy()
-    nan[5] = np.nan
-    np.save(folder / "d.npy", np.stack([clouds[1], nan, clouds[2]]))
+    np.save(folder / "d.npy", np.stack([clouds[1], clouds[1] * np.nan, clouds[2]]))
     np.save(folder / "e.npy", np.array([{}], dtype=object), allow_pickle=True)
     (folder / "f.txt").write_text("")
     write(folder / "g.pcd", clouds[3])
@@ -129,8 +127,9 @@ def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, ca
     assert list(status) == sorted(status)
     reasons = {row["file"]: row["reason"] for row in rows}
     assert "line 2" in reasons["b.xyz"]
-    assert "cloud 1, point 6" in reasons["d.npy[1]"]
-    assert "pickled" in reasons["e.npy"]
+    assert reasons["d.npy[1]"] == "all 64 points are not finite (NaN or infinite)"
+    assert reasons["e.npy"] == "a pickled array, refused; save it as plain numbers"
+    assert not any(str(tmp_path) in reason for reason in reasons.values())  # that is `file`
     failed = next(row for row in rows if row["file"] == "b.xyz")
     assert {failed[key] for key in ("class", "confidence", "out_of_range", "p_ball")} == {""}
     expected = qs3.load(run)(clouds[:4])
@@ -145,6 +144,59 @@ def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, ca
     assert "4 clouds, " in said
     assert "5 failed:" in said
     assert "e.npy" in said
+
+
+@pytest.mark.parametrize("suffix", [*ONE, "many.npy"])
+def test_points_that_are_not_finite_are_left_out_and_counted(run, clouds, tmp_path, suffix, capsys):
+    rows = clouds[:2].astype("f8").repeat(2, axis=1)  # each point twice: the rest is all of it
+    rows[0, 5], rows[0, 8, 1], rows[0, 9, 2] = np.nan, np.inf, -np.inf
+    source = tmp_path / "in" / f"a{suffix}"
+    write(source, rows if "many" in suffix else rows[0])
+    assert predict(run, source.parent, tmp_path / "said.csv") == 0
+    assert predict(run, source.parent, tmp_path / "said.json") == 0
+    first, *others = table(tmp_path / "said.csv")
+    assert (first["status"], first["points"], first["dropped"]) == ("ok", "125", "3")
+    left = rows[0][np.isfinite(rows[0]).all(1)]
+    np.testing.assert_allclose(probabilities(first), qs3.load(run)([left])[0], atol=1e-6)
+    assert "finite" not in first["reason"]
+    assert [row["dropped"] for row in others] == ["0"] * ("many" in suffix)
+    assert json.loads((tmp_path / "said.json").read_text())["clouds"][0]["dropped"] == 3
+    assert "3 points of 1 clouds are NaN or infinite and were left out" in capsys.readouterr().out
+
+
+def test_numbers_too_large_are_no_missing_points(run, clouds, tmp_path):
+    large = clouds[0].astype("f8")
+    large[4] = 1e300
+    np.save(tmp_path / "a.npy", large)
+    assert predict(run, tmp_path / "a.npy", tmp_path / "said.csv") == 1
+    (row,) = table(tmp_path / "said.csv")
+    assert row["reason"].startswith("point 5: [1e+300, ")
+
+
+def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):
+    (tmp_path / "a.xyz").write_bytes(b"\x1b[31m\x00\xff\xfe\x07 binary\r more\n" * 9)
+    assert predict(run, tmp_path / "a.xyz", tmp_path / "said.csv") == 1
+    said = capsys.readouterr().out
+    assert all(c.isprintable() for c in said.replace("\n", ""))
+    assert said.isascii()
+    (row,) = table(tmp_path / "said.csv")
+    assert row["reason"].startswith(r"line 1: '\x1b[31m\x00\xff\xfe\x07 binary")
+    assert row["reason"].isascii()
+    assert row["reason"].isprintable()
+
+
+def test_words_for_files_clouds_and_what_is_replaced(run, clouds, tmp_path, capsys, caplog):
+    np.save(tmp_path / "a.npy", clouds[:3])
+    out = tmp_path / "out" / "said.csv"
+    with caplog.at_level("INFO"):
+        assert predict(run, tmp_path, out) == 0
+    assert "files read: 1 of 1" in caplog.text
+    said = capsys.readouterr().out
+    assert "3 clouds, " in said
+    assert "clouds a second, from 1 files" in said
+    assert said.endswith(f"saved {out}\n")
+    assert predict(run, tmp_path / "a.npy", out) == 0
+    assert capsys.readouterr().out.endswith(f"saved {out} (replaced what was there)\n")
 
 
 def test_nothing_but_damage_still_gives_a_table(run, tmp_path):
@@ -162,7 +214,7 @@ def test_up_and_flags(run, clouds, tmp_path):
     rows = table(tmp_path / "said.csv")
     np.testing.assert_allclose(probabilities(rows[0]), qs3.load(run)(clouds[:1])[0], atol=1e-6)
     assert [row["out_of_range"] for row in rows] == ["no", "yes", "yes"]
-    assert "points 9 is under 64" in rows[1]["reason"]
+    assert "points 9 is under 32" in rows[1]["reason"]
     assert "height" in rows[2]["reason"]
     assert [row["points"] for row in rows] == ["64", "9", "64"]
 
@@ -181,6 +233,9 @@ def test_up_and_flags(run, clouds, tmp_path):
         (["ckpt={run}", "input={clouds}", "device=quantum"], "device=quantum"),
         (["ckpt={run}", "input={run}/nothing"], "is not there"),
         (["ckpt={run}", "input={empty}"], "holds no file of"),
+        (["ckpt={run}", "input={run}/metrics.json"], "metrics.json: unknown format; known are"),
+        (["export", "ckpt={run}", "check={run}/nothing"], "check={run}/nothing is not there"),
+        (["export", "ckpt={run}", "check={empty}"], "check={empty} holds no file of"),
         (["ckpt={run}/nothing", "input={clouds}"], "is not there"),
         (["export", "ckpt={run}", "out=model.h5"], "must end in .onnx or .pt2"),
         (["export"], "ckpt= is missing"),
@@ -193,7 +248,8 @@ def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, 
     write(tmp_path / "a.xyz", clouds[0])
     places = {"run": run, "clouds": tmp_path / "a.xyz", "empty": tmp_path / "empty"}
     assert main([word.format(**places) for word in words]) == 1
-    assert message in capsys.readouterr().err
+    assert message.format(**places) in capsys.readouterr().err
+    assert not (tmp_path / "model.onnx").exists()
     assert not (tmp_path / "predictions.csv").exists()
 
 
@@ -218,6 +274,14 @@ def test_help_is_short_and_light(tmp_path):
     assert len(lines) < 40
     assert max(map(len, lines)) <= 100
     assert "up=" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "words", [["export", "--help"], ["export", "ckpt=x", "-h"], ["ckpt=x", "--help"], ["help"]]
+)
+def test_help_anywhere_is_the_page(words, capsys):
+    assert main(words) == 0
+    assert "export writes the net" in capsys.readouterr().out
 
 
 def test_as_a_command(run, clouds, tmp_path):

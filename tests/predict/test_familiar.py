@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from qs3.data.clouds import Clouds
 from qs3.data.prepare import prepare
-from qs3.familiar import MEASURES, limits, measure, strange
+from qs3.familiar import MEASURES, enough, limits, measure, strange
 from qs3.geometry.sampling import unit_ball
 
 
@@ -75,6 +75,14 @@ def test_limits_take_the_wider_end_of_each_domain():
     assert both["height"][1] > 2.5
     # a subset of the clouds has the limits of the subset
     assert limits(low.at(np.arange(5)))["height"] != one["height"]
+
+
+def test_a_cloud_with_as_many_points_as_the_net_sees_lacks_none():
+    usual = {"points": [2048.0, np.inf], "height": [0.5, 1.5]}
+    assert enough(usual, 1024) == {"points": [1024, np.inf], "height": [0.5, 1.5]}
+    assert enough(usual, 4096) == usual  # training had fewer than that
+    assert usual["points"] == [2048, np.inf]  # not changed in place
+    assert enough({"height": [0.5, 1.5]}, 64) == {"height": [0.5, 1.5]}
 
 
 def test_the_tails_are_a_thousandth():

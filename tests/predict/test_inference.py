@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import pickle
 import subprocess
@@ -113,6 +114,49 @@ def test_bad_clouds_are_named(predictor):
     with pytest.raises(ConfigError, match="up"):
         predictor([good], up="w")
     assert predictor([]).shape == (0, 3)
+
+
+def test_too_few_points_are_fewer_than_the_net_sees(run, tmp_path, predictor):
+    """Also where result.pt says how many the files of training had: 64; the net sees 32."""
+    assert predictor.result.usual["points"][0] == 64
+    cloud = np.random.default_rng(0).normal(size=(64, 3))
+
+    def said(points: int, which=predictor) -> str:
+        return "; ".join(which.prepare(cloud[:points]).strange)
+
+    assert "points" not in said(32)
+    assert "points 31 is under 32" in said(31)
+    usual = {**plain(run)["usual"], "points": [20.0, float("inf")]}
+    seen_less = qs3.load(changed(run, tmp_path, usual=usual))
+    assert "points" not in said(20, seen_less)
+    assert "points 19 is under 20" in said(19, seen_less)
+
+
+def test_what_is_no_list_of_clouds_is_told(predictor, test_clouds):
+    cloud = test_clouds[0]
+    for one in (cloud, torch.from_numpy(cloud)):
+        with pytest.raises(DataError, match=r"shape \(64, 3\); give a list of clouds"):
+            predictor(one)
+    for wrong in (None, 7, "scan.xyz"):
+        with pytest.raises(DataError, match="give a list of clouds"):
+            predictor(wrong)
+    for wrong in (None, "scan.xyz", [[1, 2, 3], [4, 5]]):
+        with pytest.raises(DataError, match=r"cloud 1: .*no .*numbers"):
+            predictor([cloud, wrong])
+    with pytest.raises(DataError, match=r"point 3: .*leave such points out"):
+        predictor([np.where(np.arange(64)[:, None] == 2, np.nan, cloud)])
+    expected = predictor([cloud])
+    tensor = torch.from_numpy(cloud).requires_grad_()
+    np.testing.assert_array_equal(predictor([tensor]), expected)
+    np.testing.assert_array_equal(predictor([cloud.tolist()]), expected)
+
+
+def test_the_front_door_says_what_it_takes():
+    own, real = (inspect.signature(f).parameters for f in (qs3.load, load))
+    assert list(own) == list(real)
+    for name in own:
+        assert (own[name].kind, own[name].default) == (real[name].kind, real[name].default)
+        assert f"{name}:" in qs3.load.__doc__
 
 
 def test_random_numbers_of_the_caller_are_left_alone(run):

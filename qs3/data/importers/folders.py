@@ -28,6 +28,7 @@ from qs3.clouds.files import (
     SUFFIXES,
     CloudFile,
     checked,
+    measured,
     npy_clouds,
     parse_clouds,
     read_clouds,
@@ -65,8 +66,8 @@ class CloudFolder(Importer):
     """See the module. Clouds may have any number of points.
 
     A cloud with more than P points is thinned to its P farthest (farthest point sampling from the
-    first on); one with fewer repeats its points. The manifest's `valid_points` says how many there
-    were.
+    first on); one with fewer repeats its points. Points that are NaN or infinite are left out
+    before. The manifest's `valid_points` says how many there were of the others.
 
     Attributes:
         layout: one of those above; "auto" looks at the names of the folders.
@@ -259,11 +260,13 @@ class _LastFile:
         return self._file
 
     def cloud(self, path: Path, number: int, of: int, where: str) -> np.ndarray:
-        """[n, 3] float32, checked."""
+        """[n, 3] float32, without points that are not finite, and checked."""
         clouds = self.read(path).clouds
         if len(clouds) != of:
             raise DataError(f"{path} has {len(clouds)} clouds, a moment ago it had {of}")
-        return checked(clouds[number], where)
+        cloud, dropped = measured(clouds[number], where)
+        _tell(where, dropped)
+        return checked(cloud, where)
 
 
 def _with_tests(rows: dict[str, Item], every: int) -> dict[str, Item]:
@@ -346,9 +349,13 @@ def _digest(root: Path) -> str:
 
 def _only(path: Path) -> np.ndarray:
     file = read_clouds(path)
-    if file.dropped:
-        log.info("%s: %d pixels without a measurement left out", path, file.dropped)
+    _tell(str(path), file.dropped)
     return file.clouds[0]
+
+
+def _tell(where: str, dropped: int) -> None:
+    if dropped:
+        log.info("%s: %d points that are NaN or infinite left out", where, dropped)
 
 
 def _raise(error: DataError) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,7 +33,7 @@ def inspect_command(argv: Sequence[str]) -> str:
     names, values, (overrides,) = parse(argv, _OWN)
     names = [*names, *([str(values["domain"])] if "domain" in values else [])]
     if len(names) != 1:
-        raise ConfigError(f"which domain? domain=NAME or domain=FOLDER, one of them; got {names}")
+        raise ConfigError(f"which domain? domain=NAME or domain=FOLDER, one of them; {_got(argv)}")
     opened = open_named(names[0], overrides)
     bounds = _bounds(values)
     steps = min(bounds.sample, len(opened.data))
@@ -50,7 +51,7 @@ def compare_command(argv: Sequence[str]) -> str:
     """Compare two domains and save what was found; text for the terminal."""
     names, values, overrides = parse(argv, _OWN, sides=("a", "b"))
     if len(names) != 2 or "domain" in values:
-        raise ConfigError(f"compare takes two domains, names or folders: compare A B; got {names}")
+        raise ConfigError(f"compare takes two domains, names or folders: compare A B; {_got(argv)}")
     a, b = (open_named(name, of) for name, of in zip(names, overrides, strict=True))
     bounds = _bounds(values)
     with _bar(f"comparing {a.name} and {b.name}", COMPARE_STEPS) as advance:
@@ -62,6 +63,14 @@ def compare_command(argv: Sequence[str]) -> str:
     _side_by_side(a, b, out / "clouds.png", bounds.seed)
     text = of_pair(facts, markdown=False)
     return f"{text}\nsaved comparison.json, comparison.md and clouds.png in {out}"
+
+
+def _got(argv: Sequence[str]) -> str:
+    """What was given instead, and which key of it may be a typing error of domain=."""
+    given = dict(word.split("=", 1) for word in argv if "=" in word and word[:7] != "domain=")
+    near = difflib.get_close_matches("domain", given, n=1)
+    hint = f"; did you mean domain={given[near[0]]}?" if near else ""
+    return f"got {' '.join(argv) or 'nothing'}{hint}"
 
 
 def _bounds(values: dict[str, Any]) -> Bounds:

@@ -260,6 +260,7 @@ def test_one_domain_against_itself_has_no_gap(data_dir):
         (["domain=modelnet10", "paths.data_dir=/nowhere"], "is not there"),
         (["domain=modelnet10", "sample=many"], "whole number"),
         (["out=x"], "which domain"),
+        (["domian=modelnet10"], "got domian=modelnet10; did you mean domain=modelnet10?"),
         (["compare", "modelnet10"], "two domains"),
         (["domain=/nowhere/at/all"], "no dataset folder"),
     ],
@@ -267,6 +268,12 @@ def test_one_domain_against_itself_has_no_gap(data_dir):
 def test_mistakes_are_told(words, message, capsys):
     assert command.main(words) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["compare", "--help"], ["domain=x", "-h"], ["help"], []])
+def test_help_anywhere_is_the_page(words, capsys):
+    assert command.main(words) == 0
+    assert "What the words mean" in capsys.readouterr().out
 
 
 def test_unknown_keys_of_a_folder(data_dir):
