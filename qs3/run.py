@@ -160,8 +160,9 @@ def _check_settings(cfg: DictConfig) -> None:
     one_of("selection.student", cfg.selection.student, STUDENT_RULES)
     whole("data.points", cfg.data.points, 1)
     whole("data.fps_starts", cfg.data.fps_starts, 1)
-    if cfg.data.clouds_a_class is not None:
-        whole("data.clouds_a_class", cfg.data.clouds_a_class, 1)
+    for key in ("clouds_a_class", "clouds_a_split"):
+        if cfg.data[key] is not None:
+            whole(f"data.{key}", cfg.data[key], 1)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
         raise ConfigError(f"ckpt_path must be last or a path, got {cfg.ckpt_path!r}")
     if cfg.ckpt_path is not None and cfg.force:

@@ -106,8 +106,9 @@ def config_sha256(cfg: DictConfig) -> str:
     if plain.get("compile") is False:  # likewise
         plain.pop("compile")
     data, trainer = plain.get("data"), plain.get("trainer")
-    if isinstance(data, dict) and data.get("clouds_a_class", 0) is None:  # likewise
-        data.pop("clouds_a_class")
+    for key in ("clouds_a_class", "clouds_a_split"):  # likewise
+        if isinstance(data, dict) and data.get(key, 0) is None:
+            data.pop(key)
     if isinstance(trainer, dict):  # which of several GPUs trains a run does not matter
         trainer.pop("gpus", None)
         if isinstance(trainer.get("devices"), list) and len(trainer["devices"]) == 1:

@@ -23,6 +23,7 @@ from qs3.data.datamodule import (
     Labelled,
     UdaData,
     Unlabelled,
+    few_of_each_split,
     first_of_each_class,
     labels_of,
     load_clouds,
@@ -80,10 +81,16 @@ def fit(run: Run) -> dict[str, Any]:
     source_set, target_set = run.source.open(), run.target.open()
     _check_classes(source_set, target_set, cfg.num_classes)
     started = note_start(run, source_set, target_set)
+    cache = Path(cfg.data.cache_dir) if cfg.data.cache_dir else None
+    if (few := cfg.data.clouds_a_split) is not None:
+        source_set, target_set = (
+            few_of_each_split(source_set, few),
+            few_of_each_split(target_set, few),
+        )
+        cache = None  # which is of whole splits
 
     # 1. Data. Target labels go to the method that asks for them by name, and to the evaluation.
     method: Method = build(cfg.method)
-    cache = Path(cfg.data.cache_dir) if cfg.data.cache_dir else None
     load_split = partial(load_clouds, points=cfg.data.points, cache_dir=cache)
     target = load_split(target_set, "train", starts=cfg.data.fps_starts)
     supervised = method.labels == "target_train"

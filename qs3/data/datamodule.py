@@ -6,6 +6,7 @@ The target's test clouds do not come here at all: only `qs3.evaluation` holds th
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,6 +93,26 @@ def with_labels(clouds: Unlabelled, dataset: PointSet, split: str, what: str) ->
             "choose another dataset or method"
         )
     return Labelled(clouds.clouds, clouds.ids, labels)
+
+
+def few_of_each_split(dataset: PointSet, count: int) -> PointSet:
+    """At most `count` clouds of each split, at even steps; for `debug=fast`.
+
+    They keep their order and ids, and the hash is still that of the whole dataset.
+    """
+    chosen: list[int] = []
+    for split in dataset.counts():
+        members = dataset.indices(split)
+        few = min(count, len(members))
+        chosen += [int(members[i * len(members) // few]) for i in range(few)]
+    rows = np.sort(chosen)
+    return dataclasses.replace(
+        dataset,
+        points=dataset.points[rows],
+        labels=dataset.labels[rows],
+        splits=dataset.splits[rows],
+        ids=tuple(dataset.ids[i] for i in rows),
+    )
 
 
 def first_of_each_class(labelled: Labelled, count: int) -> Labelled:

@@ -6,11 +6,14 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
 from qs3 import runs
 from qs3.classifier import Classifier
+from qs3.data.datamodule import few_of_each_split
+from qs3.data.store import open_pointset
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.run import train
 from tests.training.conftest import result_of
@@ -59,6 +62,33 @@ def test_profiler_writes_into_the_run(profiler, toy):
     train(cfg)
     text = (runs.run_folder(cfg) / "fit-profile.txt").read_text()
     assert {"SimpleProfiler": "run_training_epoch", "PyTorchProfiler": "aten::"}[profiler] in text
+
+
+def test_few_of_each_split(tmp_path):
+    write_domain(tmp_path, "x", noise=0.1, train=24, test=2)  # of each of three classes
+    whole = open_pointset(tmp_path / "x")
+    few = few_of_each_split(whole, 9)
+    assert (few.splits == "train").sum() == 9
+    assert (few.splits == "test").sum() == 6  # there are no more
+    assert few.sha256 == whole.sha256
+    assert list(few.counts()["train"].values()) == [3, 3, 3]
+    for i, name in enumerate(few.ids):
+        at = whole.ids.index(name)
+        np.testing.assert_array_equal(few.points[i], whole.points[at])
+        assert (few.labels[i], few.splits[i]) == (whole.labels[at], whole.splits[at])
+    assert sorted(few.ids, key=whole.ids.index) == list(few.ids)
+
+
+def test_a_run_of_few_clouds_leaves_no_cache(toy, tmp_path):
+    cfg = toy("data.clouds_a_split=12", "selftraining=none", f"data.cache_dir={tmp_path / 'cache'}")
+    metrics = train(cfg)
+    assert metrics["final"]["n"] == 12
+    assert metrics["hash"] != runs.config_hash(toy("selftraining=none"))
+    assert not list((tmp_path / "cache").rglob("*.npy"))
+    train(toy("selftraining=none", f"data.cache_dir={tmp_path / 'cache'}"))
+    assert list((tmp_path / "cache").rglob("*.npy"))
+    with pytest.raises(ConfigError, match=r"data\.clouds_a_split"):
+        train(toy("data.clouds_a_split=0"))
 
 
 def test_ckpt_path_last_insists_on_a_checkpoint(toy, finished):
@@ -140,6 +170,7 @@ def test_ckpt_path_and_force_contradict_each_other(toy, begun):
 
 def test_neither_changes_the_name_of_a_run(toy):
     plain = runs.run_name(toy())
-    for word in ("ckpt_path=last", "objective=snd", "data.clouds_a_class=null"):
+    nulls = ("data.clouds_a_class=null", "data.clouds_a_split=null")
+    for word in ("ckpt_path=last", "objective=snd", *nulls):
         assert runs.run_name(toy(word)) == plain
     assert runs.run_name(toy("data.clouds_a_class=4")) != plain
