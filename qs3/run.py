@@ -17,6 +17,7 @@ from qs3.data.domain import check_all
 from qs3.data.store import is_finished
 from qs3.errors import ConfigError
 from qs3.hydra_glue import build, in_multirun
+from qs3.making import make_if_missing
 from qs3.predictions import OF_FILES
 from qs3.quality_words import in_words
 from qs3.runs import Run
@@ -130,6 +131,9 @@ def _chosen(metrics: dict[str, Any]) -> str:
 
 
 def _fit(run: Run) -> dict[str, Any]:
+    if run.cfg.data.make_source:
+        run.target.check()  # before minutes are spent on the source
+        make_if_missing(run.source)
     check_all(run.source, run.target)
     from qs3.training import fit  # torch and Lightning from here on
 
@@ -183,6 +187,8 @@ def _check_settings(cfg: DictConfig) -> None:
         raise ConfigError(f"protocol.regulariser must be >= 0, got {cfg.protocol.regulariser}")
     if "lr" in cfg.protocol.optimizer:
         number("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
+    if not isinstance(cfg.data.make_source, bool):
+        raise ConfigError(f"data.make_source must be true or false, got {cfg.data.make_source!r}")
     if not isinstance(cfg.report.pictures, bool):
         raise ConfigError(f"report.pictures must be true or false, got {cfg.report.pictures!r}")
     if cfg.trainer.threads is not None:

@@ -57,6 +57,7 @@ _UNHASHED = (
     "ckpt_path",
     "objective",
     "data.cache_dir",
+    "data.make_source",
     *(
         f"data.{domain}.{key}"
         for domain in ("source", "target")
