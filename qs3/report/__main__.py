@@ -243,11 +243,13 @@ def _pictures(options: dict[str, str]) -> None:
 
     from qs3.report.class_balance import class_picture
     from qs3.report.pictures import class_sheet, scan_picture
-    from qs3.report.tables import composing
+    from qs3.report.tables import check_domain, composing
 
     names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]
     if not names:
         raise ConfigError("of what? run=PATH, or domains=[modelnet10,specklenet10,kinectsim10]")
+    for name in names:
+        check_domain("domains: ", name)
     data_dir = Path(options.get("data_dir", "data"))
     out, split = Path(options.get("out", data_dir / "pictures")), options.get("split", "train")
     alone = out.suffix == ".png"

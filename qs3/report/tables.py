@@ -80,7 +80,7 @@ def build_table(
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {error}") from error
     if target is not None:
-        _check_target(target)
+        check_domain("target=", target)
     runs = load_runs(log_dir)
     groups = {(g.experiment, g.hash): g for g in group(runs)}
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
@@ -176,12 +176,13 @@ def _cell(
     return Cell(row["name"], column, overrides, paper, take)
 
 
-def _check_target(name: str) -> None:
+def check_domain(key: str, name: str) -> None:
+    """Raise ConfigError, with the names there are, if `name` after `key` is no domain's."""
     known = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         meant = f" (did you mean {near[0]}?)" if near else ""
-        raise ConfigError(f"target={name} is no domain{meant}; there are {', '.join(known)}")
+        raise ConfigError(f"{key}{name} is no domain{meant}; there are {', '.join(known)}")
 
 
 def _fill(

@@ -93,4 +93,8 @@ def test_command_line(tmp_path, capsys):
     assert list(alone.parent.iterdir()) == [alone]
     assert main(["pictures", "domains=[scannet10]", f"data_dir={tmp_path}"]) == 1
     assert "MissingDataError: domain scannet10" in capsys.readouterr().err
+    assert main(["pictures", "domains=[specklenet1]", f"data_dir={tmp_path}"]) == 1
+    assert "domains: specklenet1 is no domain (did you mean specklenet10?)" in (
+        capsys.readouterr().err
+    )
     assert main(["pictures"]) == 1
