@@ -39,6 +39,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
         MissingDataError: there is no such checkpoint.
         ConfigError: it is another run's.
         DataError: it was trained on other data.
+        Qs3Error: it is still being trained.
     """
     where = run.cfg.ckpt_path
     own = run.folder / LAST
@@ -65,6 +66,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
             "or leave ckpt_path out"
         )
     runs.check_config(other, begun.get("config_sha256"), started["config_sha256"])
+    runs.check_idle(other)
     warn_of_versions(begun["versions"], started["versions"])
     for role in ("source", "target"):
         runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])

@@ -26,6 +26,7 @@ import contextlib
 import fcntl
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -232,6 +233,20 @@ def locked(
         except OSError as error:
             raise Qs3Error(f"another process is {doing} {folder}; {advice}") from error
         yield
+
+
+def check_idle(folder: Path) -> None:
+    """Raise Qs3Error if another process trains in the folder, which need not be writable."""
+    path = folder / ".lock"
+    if not os.access(path, os.R_OK):
+        return  # a copy, which nobody locks
+    with open(path, "rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError as error:
+            raise Qs3Error(
+                f"another process is training in {folder}; wait for it or stop it"
+            ) from error
 
 
 def _open_lock(path: Path) -> BinaryIO:

@@ -14,7 +14,7 @@ from qs3 import runs
 from qs3.classifier import Classifier
 from qs3.data.datamodule import few_of_each_split
 from qs3.data.store import open_pointset
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.run import train
 from tests.training.conftest import result_of
 from tests.training.toy import CONF, write_domain
@@ -150,6 +150,11 @@ def test_ckpt_path_of_another_run(toy, toy_data, begun, tmp_path):
     (begun / "started.json").unlink()
     with pytest.raises(ConfigError, match="belongs to another run"):
         train(toy(f"ckpt_path={begun}"))
+
+
+def test_ckpt_path_of_a_run_that_is_being_trained(toy, begun):
+    with runs.locked(begun), pytest.raises(Qs3Error, match="another process is training in"):
+        train(toy(f"ckpt_path={begun}", "paths.warmup_dir=null"))
 
 
 def test_ckpt_path_warns_of_other_versions(toy, begun, caplog):
