@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from qs3.calling import composed
+from qs3.errors import ConfigError
 from qs3.overrides import override, quoted
 from qs3.report.__main__ import _built
 from qs3.report.running import Job, launch
@@ -63,7 +64,12 @@ def test_every_path_of_ours_reaches_the_config(name, tmp_path):
     assert paths == [str(folder / part) for part in ("data", "logs", "warmups")]
     assert cfg.data.target.path == str(folder / "data" / "toy_target")
     assert list(cfg.data.source.classes) == ["ball", "rod", "slab", "plank"]
-    table = _built({"table": "quickstart", "log_dir": str(folder), "data_dir": f"{folder}/data"})
+    options = {"table": "quickstart", "log_dir": str(folder), "data_dir": f"{folder}/data"}
+    with pytest.raises(ConfigError, match="is not there; it is the paths"):
+        _built(options)
+    assert not folder.exists()
+    folder.mkdir()
+    table = _built(options)
     (cell, *_) = [cell for cell in table.cells if cell.runnable]
     paths = composed("train", *cell.overrides).paths
     assert (paths.log_dir, paths.data_dir) == (str(folder), f"{folder}/data")
