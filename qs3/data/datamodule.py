@@ -6,7 +6,6 @@ The target's test clouds do not come here at all: only `qs3.evaluation` holds th
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,14 +104,7 @@ def few_of_each_split(dataset: PointSet, count: int) -> PointSet:
         members = dataset.indices(split)
         few = min(count, len(members))
         chosen += [int(members[i * len(members) // few]) for i in range(few)]
-    rows = np.sort(chosen)
-    return dataclasses.replace(
-        dataset,
-        points=dataset.points[rows],
-        labels=dataset.labels[rows],
-        splits=dataset.splits[rows],
-        ids=tuple(dataset.ids[i] for i in rows),
-    )
+    return dataset.at(np.sort(chosen))
 
 
 def first_of_each_class(labelled: Labelled, count: int) -> Labelled:

@@ -109,13 +109,16 @@ class PointSet:
                 f"dataset {self.name!r} has no split {split!r}; it has {sorted(self.counts())}"
             )
         adjacent = chosen[-1] - chosen[0] + 1 == len(chosen)
-        rows: Any = slice(int(chosen[0]), int(chosen[-1]) + 1) if adjacent else chosen
+        return self.at(slice(int(chosen[0]), int(chosen[-1]) + 1) if adjacent else chosen)
+
+    def at(self, rows: slice | np.ndarray) -> PointSet:
+        """Some clouds, by their positions; the hash is still that of the whole dataset."""
         return dataclasses.replace(
             self,
             points=self.points[rows],
             labels=self.labels[rows],
             splits=self.splits[rows],
-            ids=tuple(self.ids[i] for i in chosen),
+            ids=tuple(self.ids[i] for i in np.arange(len(self))[rows]),
         )
 
     def counts(self) -> dict[str, dict[str, int]]:
