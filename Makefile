@@ -21,13 +21,13 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	  || { echo "The venv module is missing. On Debian and Ubuntu: apt-get install python3.11-venv"; exit 1; }
 	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c constraints.txt -e '.[dev]'
 	@touch $@
-	@$(RUN) -m qs3.doctor --install
+	@$(RUN) -m qs3.tools.doctor --install
 
 doctor: install ## what works here, and which system package would help
-	@$(RUN) -m qs3.doctor
+	@$(RUN) -m qs3.tools.doctor
 
 quickstart: install ## the main job on embedded data, about a quarter of an hour on 2 cores
-	@$(RUN) -m qs3.quickstart --out $(OUT)
+	@$(RUN) -m qs3.tools.quickstart --out $(OUT)
 
 test: install ## lint, types and all tests that are not slow
 	$(VENV)/bin/ruff check .

@@ -3,13 +3,13 @@
 import hydra
 from omegaconf import DictConfig
 
-from qs3.hydra_glue import speak_plainly
+from qs3.config.hydra import speak_plainly
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="generate")
 def main(cfg: DictConfig) -> None:
     """Make the dataset that the config describes, or continue it."""
-    from qs3.generation import generate
+    from qs3.generation.command import generate
 
     speak_plainly(generate, cfg)
 

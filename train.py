@@ -3,13 +3,13 @@
 import hydra
 from omegaconf import DictConfig
 
-from qs3.hydra_glue import speak_plainly
+from qs3.config.hydra import speak_plainly
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 def main(cfg: DictConfig) -> float | None:
     """Run, continue or skip the run that the config describes; returns what a search asks for."""
-    from qs3.run import objective_of, train
+    from qs3.training.command import objective_of, train
 
     return speak_plainly(lambda cfg: objective_of(cfg, train(cfg)), cfg)
 

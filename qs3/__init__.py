@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     import torch
 
-    from qs3.inference import Predictor
+    from qs3.inference.predictor import Predictor
 
 __version__ = "0.1.0"
 
@@ -40,7 +40,7 @@ def load(
             package, if you trust it to be built with any arguments.
 
     Returns:
-        See `qs3.inference.Predictor`.
+        See `qs3.inference.predictor.Predictor`.
 
     Raises:
         qs3.errors.MissingDataError: no finished run there.
@@ -48,6 +48,6 @@ def load(
             `packages`.
         qs3.errors.ConfigError: no such device.
     """
-    from qs3.inference import load as load_result  # imports torch: only when it is needed
+    from qs3.inference.predictor import load as load_result  # imports torch: only when it is needed
 
     return load_result(run, device=device, packages=packages)

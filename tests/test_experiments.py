@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
-from qs3 import runs
-from qs3.hydra_glue import build
-from qs3.run import train
+from qs3.config.hydra import build
+from qs3.runs import folder as runs
+from qs3.training.command import train
 from tests.fixtures.published import write_all
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -38,7 +38,7 @@ from qs3.data.manifest import (
     to_csv,
 )
 from qs3.errors import DataError, MissingDataError
-from qs3.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
+from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
 
 __all__ = [
     "SPLITS",
@@ -276,7 +276,7 @@ def open_table(
 
     Returns:
         [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names
-        of the columns. For "provenance" see `qs3.synthesis.keeping.provenance_of`.
+        of the columns. For "provenance" see `qs3.generation.provenance.provenance_of`.
 
     Raises:
         MissingDataError: there is no such folder, or it was not finished.

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from qs3.geometry.exporting import takes_numpy
-from qs3.geometry.products import times
+from qs3.geometry.matmul import times
 from qs3.geometry.sampling import farthest_point_sampling_np
 
 _BLOCK = 1 << 26  # distances held at once: 256 MB in float32

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from qs3.classes import ALIASES, CLASSES, known_as
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.meshes.files import SUFFIXES, load_mesh
+from qs3.meshes.io import SUFFIXES, load_mesh
 from qs3.meshes.source import MeshItem
 
 SPLITS = ("train", "test")

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from qs3.config.checks import number
 from qs3.errors import ConfigError
-from qs3.settings import number
 
 
 class Method(nn.Module):

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from qs3.config.checks import one_of
 from qs3.methods.base import Method, class_loss, feature_dims, weight
 from qs3.methods.reversal import dann_alpha, reverse_gradient
 from qs3.models.base import ClassHead
 from qs3.models.norms import use_domain
-from qs3.settings import one_of
 
 
 class Dann(Method):

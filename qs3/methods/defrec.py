@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.config.checks import number, whole
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.chamfer import masked_chamfer
@@ -19,7 +20,6 @@ from qs3.methods.deform import deform
 from qs3.methods.mixup import source_loss
 from qs3.models.base import Features
 from qs3.models.norms import use_domain
-from qs3.settings import number, whole
 
 
 class DefRec(Method):

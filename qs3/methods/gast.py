@@ -13,12 +13,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from qs3.config.checks import whole
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.deform import VOXELS, deform
 from qs3.methods.mixup import join, source_loss
 from qs3.models.norms import use_domain
-from qs3.settings import whole
 
 _QUARTERS = 4
 

@@ -20,10 +20,10 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
+from qs3.geometry.matmul import linear, times
 from qs3.geometry.neighbours import gather, knn
-from qs3.geometry.products import linear, times
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.edgeconv import EdgeConv, max_over_rows
+from qs3.models.fast.edgeconv import EdgeConv, max_over_rows
 from qs3.models.norms import head_norm, make_norm
 
 VARIANTS = ("uda", "simpleview", "defrec")

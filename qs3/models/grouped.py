@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.models.grouped_maximum import grouped_maximum
+from qs3.models.fast.grouped_mlp_max import grouped_maximum
 from qs3.models.norms import active, make_norm, track, uses_batch
 
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.largest import normed_maximum
+from qs3.models.fast.pointwise_max import normed_maximum
 from qs3.models.norms import head_norm, make_norm
 
 VARIANTS = ("simpleview", "uda", "basic")

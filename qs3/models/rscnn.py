@@ -23,8 +23,8 @@ from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.fast.rsconv import RSConv, relations
 from qs3.models.norms import make_norm, norm_rows
-from qs3.models.rsconv import RSConv, relations
 
 # centres, radius (of a cloud in the unit ball), slots of a ball, of each layer
 LEVELS = ((512, 0.23, 48), (128, 0.32, 64))

@@ -14,10 +14,10 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError
 from qs3.models.base import Backbone, Features, PointClassifier
+from qs3.models.fast.resnet_cpu import can_step, step
 from qs3.models.norms import head_norm, make_norm
 from qs3.models.projection import VIEWS, depth_images
 from qs3.models.resnet import ResNet18
-from qs3.models.resnet_cpu import can_step, step
 
 
 class SimpleView(Backbone):

@@ -36,9 +36,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from qs3.config.quoting import override
 from qs3.errors import ConfigError, Qs3Error
-from qs3.overrides import override
-from qs3.report.tables import Table
+from qs3.report.tables.table import Table
 
 _TABLE = {"table", "log_dir", "data_dir", "out", "target", "overrides"}
 _LAUNCHER = "hydra.launcher."
@@ -101,7 +101,7 @@ def _options(argv: Sequence[str], known: set[str]) -> dict[str, str]:
 
 def _built(options: dict[str, str], runs: bool = True) -> Table:
     """The table that the options ask for, with our runs; `runs`: there are some, one may think."""
-    from qs3.report.tables import build_table, table_names
+    from qs3.report.tables.table import build_table, table_names
 
     if "table" not in options:
         raise ConfigError(f"which table? table={'|'.join(table_names())}")
@@ -120,7 +120,7 @@ def _saved_at(table: Table, options: dict[str, str]) -> Path:
 
 
 def _run(options: dict[str, str]) -> int:
-    from qs3.report.running import LAUNCHERS, launch, missing, run_all
+    from qs3.report.tables.running import LAUNCHERS, launch, missing, run_all
 
     seeds = [_whole("seeds", word) for word in options.get("seeds", "0,1,2").split(",")]
     rows, columns = (
@@ -159,8 +159,8 @@ def _whole(key: str, word: str) -> int:
 
 
 def _compare(options: dict[str, str]) -> None:
-    from qs3.files import write_text
-    from qs3.report.comparison import against, csv_text, text
+    from qs3.report.tables.comparison import against, csv_text, text
+    from qs3.utils.files import write_text
 
     table = _built(options)
     if "base" not in options:
@@ -174,8 +174,8 @@ def _compare(options: dict[str, str]) -> None:
 
 
 def _effects(options: dict[str, str]) -> None:
-    from qs3.files import write_text
-    from qs3.report.comparison import csv_text, effects, text
+    from qs3.report.tables.comparison import csv_text, effects, text
+    from qs3.utils.files import write_text
 
     table = _built(options)
     found, at = effects(table), _saved_at(table, options)
@@ -188,9 +188,9 @@ def _effects(options: dict[str, str]) -> None:
 
 
 def _table(options: dict[str, str]) -> None:
-    from qs3.files import write_text
-    from qs3.report.formats import csv_text, latex, markdown
-    from qs3.report.table_page import page
+    from qs3.report.tables.formats import csv_text, latex, markdown
+    from qs3.report.tables.page import page
+    from qs3.utils.files import write_text
 
     table = _built(options)
     text, at = markdown(table), _saved_at(table, options)
@@ -202,7 +202,7 @@ def _table(options: dict[str, str]) -> None:
 
 
 def _pictures_of_run(options: dict[str, str]) -> None:
-    from qs3.report.run_pictures import draw
+    from qs3.report.runs.pictures import draw
 
     for other in ("domains", "split"):
         if other in options:
@@ -217,8 +217,8 @@ def _pictures_of_run(options: dict[str, str]) -> None:
 
 
 def _pipeline(words: Sequence[str]) -> None:
-    from qs3.report.pipeline import kept_object, scan_object
-    from qs3.report.pipeline_figure import save_pipeline
+    from qs3.report.figures.pipeline import kept_object, scan_object
+    from qs3.report.figures.pipeline_figure import save_pipeline
 
     if odd := [word for word in words if "=" not in word]:
         raise ConfigError(f"unknown argument {odd[0]!r}; arguments are key=value")
@@ -241,9 +241,9 @@ def _pictures(options: dict[str, str]) -> None:
         return _pictures_of_run(options)
     from hydra.utils import instantiate
 
-    from qs3.report.class_balance import class_picture
-    from qs3.report.pictures import class_sheet, scan_picture
-    from qs3.report.tables import check_domain, composing
+    from qs3.report.figures.class_balance import class_picture
+    from qs3.report.figures.contact_sheets import class_sheet, scan_picture
+    from qs3.report.tables.table import check_domain, composing
 
     names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]
     if not names:

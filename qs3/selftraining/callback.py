@@ -26,13 +26,13 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from qs3.checkpoints import copy_weights, load, save
-from qs3.classifier import Classifier
-from qs3.data.datamodule import UdaData
-from qs3.evaluation import predict
-from qs3.selftraining.scheme import Phases, Scheme
+from qs3.datamodules.adaptation import UdaData
+from qs3.datamodules.phases import Phases, Scheme
+from qs3.engine.classifier import Classifier
+from qs3.evaluation.metrics import predict
+from qs3.runs.checkpoints import copy_weights, load, save
+from qs3.runs.pseudo_labels import path_of, write_pseudo_labels
 from qs3.selftraining.selectors import TeacherPredictions, check_selection, keep_all
-from qs3.selftraining.table import path_of, write_pseudo_labels
 
 log = logging.getLogger(__name__)
 

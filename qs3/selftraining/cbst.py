@@ -15,9 +15,9 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.config.checks import number, one_of
 from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, TeacherPredictions
-from qs3.settings import number, one_of
 
 _KEY = "selftraining.selector"
 

@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from qs3.config.checks import one_of
 from qs3.errors import SelectionError
-from qs3.settings import one_of
 
 
 @dataclass(frozen=True, eq=False)

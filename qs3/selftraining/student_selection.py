@@ -7,7 +7,7 @@
 
 It only looks: with every rule but `pseudo_val` the run trains as with `last`, to the bit, and with
 `pseudo_val` as far as the last round. Target labels cannot be reached from here. For `oracle` the
-weights of all these epochs are kept, and `qs3.oracle` chooses when training is over.
+weights of all these epochs are kept, and `qs3.selftraining.oracle` chooses when training is over.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor, nn
 
-from qs3.checkpoints import copy_weights, save
-from qs3.classifier import Classifier
-from qs3.data.datamodule import UdaData
+from qs3.datamodules.adaptation import UdaData
+from qs3.datamodules.phases import Phases
+from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
-from qs3.evaluation import predict
-from qs3.randomness import derive
-from qs3.selftraining.scheme import Phases
-from qs3.selftraining.student_rules import LAST, ORACLE, ORACLE_IN_WORDS, PSEUDO_VAL
-from qs3.selftraining.validators import LABEL_FREE, hold_out, is_better
+from qs3.evaluation.metrics import predict
+from qs3.evaluation.selection_rules import LAST, ORACLE, ORACLE_IN_WORDS, PSEUDO_VAL
+from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
+from qs3.runs.checkpoints import copy_weights, save
+from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
 

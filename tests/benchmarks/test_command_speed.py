@@ -27,7 +27,7 @@ def _run(folder: Path, *words: str) -> None:
         (str(ROOT / "train.py"), "--help"),
         (str(ROOT / "train.py"), "experiment=qs3_s2d"),  # its data are not there
         (str(ROOT / "generate.py"), "--help"),
-        ("-m", "qs3.predict", "--help"),
+        ("-m", "qs3.inference", "--help"),
         ("-m", "qs3.report", "--help"),
     ],
     ids=["train --help", "train without data", "generate --help", "predict --help", "report"],

@@ -14,9 +14,9 @@ from torch_geometric.nn import EdgeConv as PygEdgeConv
 
 from qs3.geometry.neighbours import knn
 from qs3.models.dgcnn import dgcnn
-from qs3.models.edgeconv import EdgeConv
+from qs3.models.fast.edgeconv import EdgeConv
+from tests.models.fast.test_edgeconv_pyg import edges
 from tests.models.reference import NaiveDGCNN
-from tests.models.test_edgeconv_pyg import edges
 
 
 def _step(model: nn.Module, points: torch.Tensor, labels: torch.Tensor) -> Callable[[], None]:

@@ -16,11 +16,11 @@ import torch
 from lightning.pytorch import Trainer
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.data.augment import Augment
-from qs3.data.clouds import Clouds
-from qs3.data.datamodule import Labelled, UdaData, Unlabelled
-from qs3.data.prepare import prepare
-from qs3.selftraining.scheme import Phases, Scheme
+from qs3.datamodules.adaptation import Labelled, UdaData, Unlabelled
+from qs3.datamodules.augment import Augment
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.fps_cache import prepare
+from qs3.datamodules.phases import Phases, Scheme
 
 CLOUDS, STORED, POINTS, BATCH = 4183, 2048, 1024, 16  # PointDA-10's ModelNet, QS3's warm-up
 TEXT_FILES = 32

@@ -1,4 +1,4 @@
-"""Clouds a second of `qs3.predict`, files to probabilities, against the straight way."""
+"""Clouds a second of `qs3.inference`, files to probabilities, against the straight way."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.inference import Predictor
+from qs3.inference.command import Settings, predict_files
+from qs3.inference.model_file import Result
+from qs3.inference.predictor import Predictor
 from qs3.models.dgcnn import dgcnn
-from qs3.predict.command import Settings, predict_files
-from qs3.result import Result
 from tests.models.reference import NaiveDGCNN
 
 CLASSES = tuple("abcdefghij")

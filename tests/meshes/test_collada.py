@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from qs3.meshes.files import load_mesh
+from qs3.meshes.io import load_mesh
 from tests.meshes.written import PRIMITIVES, TRIANGLES, dae, refused, save
 
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import MeshError
-from qs3.meshes import files
-from qs3.meshes.files import load_mesh
+from qs3.meshes import io as files
+from qs3.meshes.io import load_mesh
 from tests.meshes.written import EXPORTS, dae, export, gltf, mixed_ply, save
 
 

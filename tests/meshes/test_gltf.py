@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.meshes.files import load_mesh
 from qs3.meshes.formats import arrays
+from qs3.meshes.io import load_mesh
 from tests.meshes.written import PYRAMID, corners, gltf, refused, save, z_up
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import MeshError
-from qs3.meshes.files import load_mesh
+from qs3.meshes.io import load_mesh
 from tests.meshes.written import SQUARE_OFF, refused, save
 
 

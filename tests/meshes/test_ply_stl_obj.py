@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.meshes.files import load_mesh
+from qs3.meshes.io import load_mesh
 from tests.meshes.written import PYRAMID, export, mixed_ply, refused, save
 
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from qs3.errors import MeshError
-from qs3.meshes.files import load_mesh
+from qs3.meshes.io import load_mesh
 
 SQUARE_OFF = "OFF\n4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
 PYRAMID = trimesh.Trimesh(

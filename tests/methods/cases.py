@@ -16,8 +16,8 @@ from qs3.methods.gast import Gast
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
 from qs3.methods.source_only import SourceOnly
-from qs3.methods.student import Student
 from qs3.methods.supervised import Supervised
+from qs3.selftraining.student_loss import Student
 
 
 @dataclass(frozen=True)

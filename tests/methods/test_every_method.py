@@ -17,10 +17,10 @@ from qs3.methods.gast import Gast
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
 from qs3.methods.source_only import SourceOnly
-from qs3.methods.student import Student
 from qs3.models.base import ClassHead, PointClassifier
 from qs3.models.dgcnn import DGCNN
 from qs3.models.pointdan import pointdan
+from qs3.selftraining.student_loss import Student
 
 METHODS: dict[str, Any] = {
     "source_only": SourceOnly,

@@ -21,7 +21,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from qs3.data.augment import Augment
+from qs3.datamodules.augment import Augment
 from qs3.methods.base import Method
 from tests.methods.cases import CASES, batch_of, total
 from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan

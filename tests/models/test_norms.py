@@ -6,7 +6,7 @@ import torch
 from torch import nn
 
 from qs3.errors import ConfigError, DataError
-from qs3.evaluation import predict
+from qs3.evaluation.metrics import predict
 from qs3.models.dgcnn import dgcnn
 from qs3.models.norms import (
     DomainNorm,

@@ -9,10 +9,10 @@ from torch import nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError, DataError
-from qs3.models import rsconv
 from qs3.models.base import PointClassifier
+from qs3.models.fast import rsconv
+from qs3.models.fast.rsconv import relations
 from qs3.models.rscnn import RSCNN, group, rscnn
-from qs3.models.rsconv import relations
 from tests.models.golden import clouds, gradient_norm, set_weights
 from tests.models.reference_rscnn import NaiveRSCNN
 

@@ -11,8 +11,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError, DataError
-from qs3.models import resnet_cpu, windows
 from qs3.models.base import PointClassifier
+from qs3.models.fast import active_windows as windows
+from qs3.models.fast import resnet_cpu
 from qs3.models.projection import depth_images
 from qs3.models.resnet import ResNet18
 from qs3.models.simpleview import SimpleView, simpleview

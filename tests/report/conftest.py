@@ -5,7 +5,7 @@ import shutil
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.report.tables import build_table, table_names
+from qs3.report.tables.table import build_table, table_names
 from tests.training.conftest import finished, toy, toy_data  # noqa: F401
 from tests.training.toy import toy_config
 

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from qs3.methods.student import Student
+from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
-from qs3.selftraining.controls import Random
 from qs3.selftraining.selectors import Qbst, Selector, Spst, TeacherPredictions
+from qs3.selftraining.student_loss import Student
 
 CLASSES = 3
 SEEDS = 4

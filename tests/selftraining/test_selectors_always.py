@@ -11,10 +11,10 @@ from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
-import qs3.hydra_glue  # noqa: F401 (registers the resolvers)
-from qs3.hydra_glue import build
+import qs3.config.hydra  # noqa: F401 (registers the resolvers)
+from qs3.config.hydra import build
+from qs3.datamodules.phases import Scheme
 from qs3.selftraining.cbst import Cbst
-from qs3.selftraining.scheme import Scheme
 from qs3.selftraining.selectors import Qbst, Spst
 from tests.selftraining.test_selectors_balanced import select
 from tests.training.toy import CONF

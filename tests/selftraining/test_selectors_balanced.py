@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.errors import ConfigError
+from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst, class_thresholds
-from qs3.selftraining.controls import Random
 from qs3.selftraining.selectors import Qbst, Spst, TeacherPredictions
 
 

@@ -13,9 +13,9 @@ import os
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from qs3 import runs
+from qs3.config.hydra import speak_plainly
 from qs3.errors import SelectionError
-from qs3.hydra_glue import speak_plainly
+from qs3.runs import folder as runs
 
 
 def work(cfg: DictConfig) -> float:
@@ -37,7 +37,7 @@ def work(cfg: DictConfig) -> float:
         found["times"] += json.loads(path.read_text())["times"]
     path.write_text(json.dumps(found))
     if cfg.seed == 7 and cfg.selftraining.theta > 0.695:
-        return math.nan  # as `qs3.run.objective_of` says it
+        return math.nan  # as `qs3.training.command.objective_of` says it
     return -((cfg.selftraining.theta - 0.7) ** 2) - (cfg.selftraining.rounds - 6) ** 2 / 100
 
 

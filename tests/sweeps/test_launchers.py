@@ -8,9 +8,9 @@ import re
 import pytest
 from hydra import compose, initialize_config_dir
 
-from qs3 import runs
+from qs3.config.hydra import _gpu_in_turn
 from qs3.errors import ConfigError
-from qs3.hydra_glue import _gpu_in_turn
+from qs3.runs import folder as runs
 from tests.sweeps.commands import command, light, light_runs
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
 from tests.training.toy import CONF, overrides

@@ -15,13 +15,13 @@ from hydra._internal.utils import create_config_search_path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 
+from qs3.config.hydra import build
 from qs3.errors import ConfigError
-from qs3.hydra_glue import build
-from qs3.run import judged, objective_of, train
-from qs3.search_report import Tried, report
-from qs3.search_space import distribution, split, words
-from qs3.selftraining.student_rules import OBJECTIVES, check_objective
-from qs3.selftraining.validators import LABEL_FREE
+from qs3.evaluation.selection_rules import OBJECTIVES, check_objective
+from qs3.evaluation.validators import LABEL_FREE
+from qs3.sweeps.search_report import Tried, report
+from qs3.sweeps.search_space import distribution, split, words
+from qs3.training.command import judged, objective_of, train
 from tests.sweeps.commands import command, light, light_runs
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.toy import CONF, overrides
@@ -187,7 +187,7 @@ def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
     cfg = toy("selftraining=none", "objective=entropy")
     metrics = train(cfg)
     assert 0 <= objective_of(cfg, metrics) == metrics["validators"]["entropy"] <= 1.0987
-    metrics["validators"]["entropy"] = None  # as `qs3.reported.without_labels` says it
+    metrics["validators"]["entropy"] = None  # as `qs3.training.final_scores.without_labels` says it
     assert math.isnan(objective_of(cfg, metrics))
     assert judged(cfg, metrics).endswith(": objective=entropy none: the net has diverged")
     del metrics["validators"]

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-import qs3.hydra_glue  # noqa: F401 (registers the resolvers)
-from qs3 import runs
-from qs3.run import train
+import qs3.config.hydra  # noqa: F401 (registers the resolvers)
+from qs3.runs import folder as runs
+from qs3.training.command import train
 from tests.training.toy import toy_config, write_toy
 
 

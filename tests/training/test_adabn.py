@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from qs3 import runs
-from qs3.checkpoints import load
-from qs3.data.datamodule import load_clouds
 from qs3.data.store import open_pointset
-from qs3.evaluation import adapt_norms, predict
-from qs3.predictions import read_predictions
-from qs3.run import train
+from qs3.datamodules.adaptation import load_clouds
+from qs3.evaluation.metrics import adapt_norms, predict
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.runs.predictions import read_predictions
+from qs3.training.command import train
 from tests.training.toy import TinyNet
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from omegaconf import open_dict
 
-from qs3 import runs
-from qs3.checkpoints import load
-from qs3.run import train
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.training.command import train
 
 
 @pytest.mark.slow

@@ -16,15 +16,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from qs3 import runs
-from qs3.checkpoints import load
-from qs3.data.datamodule import load_clouds
+from qs3.config.hydra import build
 from qs3.data.store import open_pointset
-from qs3.evaluation import predict
-from qs3.hydra_glue import build
-from qs3.run import train
+from qs3.datamodules.adaptation import load_clouds
+from qs3.evaluation.metrics import predict
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.runs.pseudo_labels import write_pseudo_labels
 from qs3.selftraining.selectors import Qbst, TeacherPredictions
-from qs3.selftraining.table import write_pseudo_labels
+from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.test_resume import interrupt
 from tests.training.toy import CLASSES, overrides, toy_config, write_domain

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
-from qs3 import runs
-from qs3.classifier import Classifier
-from qs3.data.datamodule import few_of_each_split
 from qs3.data.store import open_pointset
+from qs3.datamodules.adaptation import few_of_each_split
+from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
-from qs3.run import train
+from qs3.runs import folder as runs
+from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.toy import CONF, write_domain
 from tests.training.watching import Stop

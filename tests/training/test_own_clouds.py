@@ -10,9 +10,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from qs3 import runs
 from qs3.errors import ConfigError
-from qs3.run import train
+from qs3.runs import folder as runs
+from qs3.training.command import train
 from tests.training.toy import _SHAPES, CONF, overrides
 
 

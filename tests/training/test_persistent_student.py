@@ -6,12 +6,12 @@ import contextlib
 
 import torch
 
-from qs3 import runs
-from qs3.checkpoints import LAST, copy_weights
-from qs3.classifier import Classifier
-from qs3.hydra_glue import build
-from qs3.randomness import derive
-from qs3.run import train
+from qs3.config.hydra import build
+from qs3.engine.classifier import Classifier
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import LAST, copy_weights
+from qs3.training.command import train
+from qs3.utils.seeding import derive
 from tests.training.conftest import result_of
 
 

@@ -10,15 +10,15 @@ import pytest
 import torch
 from omegaconf import open_dict
 
-from qs3 import runs
-from qs3.checkpoints import load
-from qs3.data.datamodule import Unlabelled, load_clouds
+from qs3.config.hydra import build
 from qs3.data.store import open_pointset
-from qs3.evaluation import predict
-from qs3.hydra_glue import build
-from qs3.run import train
+from qs3.datamodules.adaptation import Unlabelled, load_clouds
+from qs3.evaluation.metrics import predict
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
-from qs3.selftraining.table import read_pseudo_labels
+from qs3.training.command import train
 from tests.training.toy import CLASSES, toy_config
 
 # 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1

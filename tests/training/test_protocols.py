@@ -11,16 +11,16 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from qs3 import runs
-from qs3.classifier import Classifier
+from qs3.datamodules.phases import Phases
+from qs3.engine.classifier import Classifier
+from qs3.engine.schedules import Plateau
 from qs3.errors import ConfigError
 from qs3.methods.base import class_loss
 from qs3.methods.source_only import SourceOnly
-from qs3.methods.student import Student
 from qs3.models.pointnet import pointnet, transform_regulariser
-from qs3.run import train
-from qs3.schedules import Plateau
-from qs3.selftraining.scheme import Phases
+from qs3.runs import folder as runs
+from qs3.selftraining.student_loss import Student
+from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.test_resume import interrupt
 

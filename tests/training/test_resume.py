@@ -15,12 +15,12 @@ import torch
 from lightning.pytorch import Callback
 from omegaconf import open_dict
 
-import qs3.checkpoints
-import qs3.runs
+import qs3.runs.checkpoints
+import qs3.runs.folder
 import qs3.selftraining.callback
-from qs3 import runs
-from qs3.checkpoints import load
-from qs3.run import train
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.toy import overrides
 
@@ -121,7 +121,7 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
 
     real = torch.save
     with monkeypatch.context() as patch:
-        patch.setattr(qs3.checkpoints.torch, "save", half_a_file)
+        patch.setattr(qs3.runs.checkpoints.torch, "save", half_a_file)
         with pytest.raises(Stop):
             train(cfg)
     train(cfg)
@@ -135,7 +135,7 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
         (qs3.selftraining.callback, "predict", 2),
         (qs3.selftraining.callback, "write_pseudo_labels", 1),
         (qs3.selftraining.callback, "check_selection", 2),
-        (qs3.runs, "write_metrics", 1),
+        (qs3.runs.folder, "write_metrics", 1),
     ],
 )
 def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, call):

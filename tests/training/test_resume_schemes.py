@@ -12,9 +12,9 @@ import pytest
 import torch
 from omegaconf import open_dict
 
-from qs3 import runs
-from qs3.checkpoints import load
-from qs3.run import train
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.toy import CONF
 from tests.training.watching import Stop

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from qs3 import runs
-from qs3.checkpoints import load
-from qs3.run import train
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.training.command import train
 from tests.training.conftest import result_of
 
 

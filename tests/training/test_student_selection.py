@@ -16,30 +16,30 @@ import pytest
 import torch
 from omegaconf import open_dict
 
-import qs3.oracle
+import qs3.selftraining.oracle
 import qs3.selftraining.student_selection
-from qs3 import runs
-from qs3.checkpoints import copy_weights, load
-from qs3.classifier import Classifier
+from qs3.config.hydra import build
 from qs3.data.store import open_pointset
+from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, SelectionError
-from qs3.evaluation import predict
-from qs3.hydra_glue import build
-from qs3.report.aggregate import group, load_runs, summarise
-from qs3.report.tables import build_table, markdown
-from qs3.run import headline, train
-from qs3.selftraining.student_rules import ORACLE_IN_WORDS, STUDENT_RULES
+from qs3.evaluation.metrics import predict
+from qs3.evaluation.selection_rules import ORACLE_IN_WORDS, STUDENT_RULES
+from qs3.evaluation.validators import LABEL_FREE, hold_out
+from qs3.report.tables.aggregate import group, load_runs, summarise
+from qs3.report.tables.table import build_table, markdown
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import copy_weights, load
+from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.student_selection import StudentSelection, candidate_path
-from qs3.selftraining.table import read_pseudo_labels
-from qs3.selftraining.validators import LABEL_FREE, hold_out
+from qs3.training.command import headline, train
 from tests.training.conftest import result_of
+from tests.training.test_fit import copy_with_other_labels
 from tests.training.test_resume import interrupt
 from tests.training.test_target_labels import (  # noqa: F401 (watch is a fixture)
     truth_of,
     watch,
     write_shuffled_target,
 )
-from tests.training.test_training import copy_with_other_labels
 from tests.training.toy import CLASSES, overrides, toy_config, write_domain
 
 RULES = STUDENT_RULES[1:]
@@ -149,7 +149,7 @@ def test_scores_are_those_of_each_epoch_on_the_targets_training_clouds(
     by_rule, toy, toy_data, rule
 ):
     """Again from the weights of each epoch, which the run with the oracle has kept."""
-    from qs3.data.datamodule import load_clouds
+    from qs3.datamodules.adaptation import load_clouds
 
     kept, cfg = by_rule("oracle"), toy()
     points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
@@ -226,8 +226,8 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
 
 def test_held_out_accuracy(by_rule, toy, toy_data):
     """Of the epoch that was chosen, again from its weights, the seed and the round's table."""
-    from qs3.data.datamodule import load_clouds
-    from qs3.randomness import derive
+    from qs3.datamodules.adaptation import load_clouds
+    from qs3.utils.seeding import derive
 
     folder = by_rule("pseudo_val")
     student = metrics_of(folder)["student"]
@@ -281,7 +281,7 @@ def test_too_few_to_hold_out(toy, monkeypatch):
 
 
 def test_the_oracle_is_the_best_epoch_on_the_test_set(by_rule, toy, toy_data):
-    from qs3.data.datamodule import load_clouds
+    from qs3.datamodules.adaptation import load_clouds
 
     folder, cfg = by_rule("oracle"), toy()
     target = open_pointset(toy_data / "kinectsim10")
@@ -399,7 +399,7 @@ def test_interrupted_in_a_hook(by_rule, toy, rule, hook, count):
     [
         ("pseudo_val", qs3.selftraining.student_selection, "hold_out", 1),
         ("oracle", qs3.selftraining.student_selection, "save", 2),
-        ("oracle", qs3.oracle, "is_better", 2),  # training is over
+        ("oracle", qs3.selftraining.oracle, "is_better", 2),  # training is over
     ],
 )
 def test_interrupted_in_a_function(by_rule, toy, monkeypatch, rule, module, name, call):
@@ -443,7 +443,7 @@ def test_two_processes_choose_one_student(toy_data, tmp_path, rule):
     folder = runs.run_folder(cfg)
     student = metrics_of(folder)["student"]
     if rule in LABEL_FREE:
-        from qs3.data.datamodule import load_clouds
+        from qs3.datamodules.adaptation import load_clouds
 
         points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
         table = table_of(cfg, folder / "student_selected.pt", points)

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3 import runs
 from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.errors import ConfigError
-from qs3.report.aggregate import summarise
-from qs3.run import headline, train
+from qs3.report.tables.aggregate import summarise
+from qs3.runs import folder as runs
+from qs3.training.command import headline, train
 from tests.training.toy import CLASSES
 
 
@@ -92,7 +92,7 @@ def test_reports_of_such_runs(toy, unlabelled):
 
 
 def test_table_of_such_runs(tmp_path):
-    from tests.report.test_tables import build_table, markdown, run_cell
+    from tests.report.tables.test_tables import build_table, markdown, run_cell
 
     table = build_table("quickstart", tmp_path)
     for cell in table.cells:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback
 
-from qs3.checkpoints import copy_weights, save
+from qs3.runs.checkpoints import copy_weights, save
 
 
 class Watch(Callback):

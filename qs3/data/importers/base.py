@@ -18,7 +18,7 @@ from qs3.classes import ALIASES, known_as
 from qs3.data.manifest import ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
 from qs3.errors import ConfigError, DataError
-from qs3.files import locked
+from qs3.utils.files import locked
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,8 @@ class Importer(abc.ABC):
     def object_of(self, id_: str) -> str:
         """Which object a cloud shows, where its id tells; else "".
 
-        Clouds of one object are no independent samples: `qs3.report.paired` takes them together.
+        Clouds of one object are no independent samples: `qs3.report.tables.paired` takes them
+        together.
         """
         return ""
 

@@ -34,11 +34,11 @@ from qs3.clouds.files import (
     read_clouds,
     split_prefix,
 )
+from qs3.config.checks import one_of, whole
 from qs3.data.importers.base import Importer, Item, class_of, split_of
 from qs3.data.importers.trees import _visible
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError
-from qs3.settings import one_of, whole
 
 log = logging.getLogger(__name__)
 

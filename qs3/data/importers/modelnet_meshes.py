@@ -28,7 +28,7 @@ from qs3.classes import ALIASES
 from qs3.data.importers.base import Importer, Item, inside, split_of
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError, MeshError
-from qs3.randomness import derive
+from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
 
@@ -117,7 +117,7 @@ def sample_file(path: Path, points: int, seed: int) -> np.ndarray:
         MeshError: the file is damaged or has no surface; names the file.
     """
     from qs3.geometry.sampling import surface_sample
-    from qs3.meshes.files import load_mesh
+    from qs3.meshes.io import load_mesh
 
     mesh = load_mesh(path)
     try:

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from qs3.data.inspection.facts import COMPARE_STEPS, Bounds, compare, inspect
-from qs3.data.inspection.opening import Opened, open_named, parse
-from qs3.data.inspection.words import of_domain, of_pair
+from qs3.data.inspection.measure import COMPARE_STEPS, Bounds, compare, inspect
+from qs3.data.inspection.open_dataset import Opened, open_named, parse
+from qs3.data.inspection.text import of_domain, of_pair
 from qs3.errors import ConfigError
-from qs3.files import make_folder, write_json, write_text
+from qs3.utils.files import make_folder, write_json, write_text
 
 OUT = Path("out/inspection")
 _OWN = {"domain": str, "out": str, "sample": int, "seed": int, "meshes": str}
@@ -88,7 +88,7 @@ def _file_name(opened: Opened) -> str:
 
 @contextmanager
 def _bar(label: str, total: int) -> Any:
-    from qs3.synthesis.progress import progress_bar
+    from qs3.utils.progress import progress_bar
 
     with progress_bar(label, total=total) as advance:
         yield advance

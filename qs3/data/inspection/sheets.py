@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from qs3.files import atomic_path
 from qs3.geometry.orthographic import project
+from qs3.utils.files import atomic_path
 
 _PANEL, _LABEL, _GAP = 1.25, 1.0, 0.2  # inches
 _INK, _SOFT = "#1d2430", "#6b7482"

@@ -21,6 +21,7 @@ import numpy as np
 
 import qs3
 from qs3.classes import CLASSES
+from qs3.config.checks import whole
 from qs3.data.manifest import ManifestRow
 from qs3.data.scannet.files import Found, SceneFiles, find_scenes
 from qs3.data.scannet.labels import read_label_map, read_scene_list
@@ -31,10 +32,9 @@ from qs3.data.scannet.scene_parts import RECIPE, SceneParts
 from qs3.data.scannet.settings import Extraction
 from qs3.data.store import PointSet, is_finished, open_pointset, read_meta, write_pointset
 from qs3.errors import DataError
-from qs3.files import locked, make_folder, sha256_file, write_text
-from qs3.settings import whole
-from qs3.synthesis.parts import forget
-from qs3.synthesis.progress import progress_bar
+from qs3.generation.shards import forget
+from qs3.utils.files import locked, make_folder, sha256_file, write_text
+from qs3.utils.progress import progress_bar
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from qs3.data.scannet.labels import Labelled
 from qs3.data.scannet.objects import ObjectCloud
 from qs3.data.scannet.scene import SceneResult
 from qs3.errors import ConfigError, DataError
-from qs3.files import make_folder, remove_leftovers, write_bytes, write_json
+from qs3.utils.files import make_folder, remove_leftovers, write_bytes, write_json
 
 RECIPE, PARTS = "recipe.json", "parts"
 _COUNTS = ("frames", "frames_used", "frames_lost", "frames_unmasked")

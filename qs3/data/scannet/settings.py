@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from qs3.config.checks import number, one_of, whole
 from qs3.data.scannet.labels import COLUMNS
 from qs3.errors import ConfigError
-from qs3.settings import number, one_of, whole
 
 
 @dataclass(frozen=True)

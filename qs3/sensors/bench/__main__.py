@@ -75,9 +75,9 @@ def _bench(words: Sequence[str], quick: bool) -> int:
             )
 
     # Only now: `--help` needs none of it.
-    from qs3.files import make_folder, write_json, write_text
     from qs3.sensors.bench import bands, comparison, figures, page, runner
     from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+    from qs3.utils.files import make_folder, write_json, write_text
 
     plan = runner.Plan.quick() if quick else runner.Plan()
     subjects = [runner.load(name, overrides) for name in names or runner.DEFAULT_SENSORS]

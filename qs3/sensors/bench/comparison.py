@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from qs3.config.location import ROOT
 from qs3.errors import MissingDataError
-from qs3.files import write_json
 from qs3.sensors.bench import real
 from qs3.sensors.bench.figures import draw_real
-from qs3.sensors.bench.runner import ROOT, _read, fingerprint
+from qs3.sensors.bench.runner import _read, fingerprint
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.tabletop import Tabletop
 from qs3.sensors.renderers.base import Renderer
+from qs3.utils.files import write_json
 
 log = logging.getLogger(__name__)
 

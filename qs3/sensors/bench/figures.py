@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from qs3.files import atomic_path
 from qs3.sensors.bench import bands, laws
 from qs3.sensors.bench.runner import SensorResult
+from qs3.utils.files import atomic_path
 
 _COLOURS = (
     "#1f6fb2",

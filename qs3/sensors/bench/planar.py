@@ -10,8 +10,8 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.bench import metrics
-from qs3.sensors.bench.own_laws import stated_sigma_m
-from qs3.sensors.bench.still import StillRenderer
+from qs3.sensors.bench.cached_renderer import StillRenderer
+from qs3.sensors.bench.preset_laws import stated_sigma_m
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.targets import POSE, TiltedPlane
 from qs3.sensors.renderers.base import Renderer

@@ -15,17 +15,16 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
+from qs3.config.hydra import build
+from qs3.config.location import CONF
 from qs3.errors import ConfigError
-from qs3.files import write_json
-from qs3.hydra_glue import build
 from qs3.sensors.bench import edges, planar
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.renderers.base import Renderer
+from qs3.utils.files import write_json
 
 log = logging.getLogger(__name__)
 
-ROOT = Path(__file__).resolve().parents[3]
-CONF = ROOT / "conf"
 DEFAULT_SENSORS = (
     "kinect_v1",
     "structure_sensor",
@@ -192,8 +191,8 @@ def _code() -> str:
         "planar",
         "edges",
         "subject",
-        "still",
-        "own_laws",
+        "cached_renderer",
+        "preset_laws",
         "tabletop",
     )
     files = [path for path in sensors.rglob("*.py") if path.parent.name != "bench"]

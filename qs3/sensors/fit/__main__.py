@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from qs3.config.location import CONF
 from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.cameras import Intrinsics
 from qs3.sensors.fit.frames import read_frame, read_pinhole
@@ -29,7 +30,7 @@ Take three or more depth frames of a flat, matt wall: from distances that differ
 What is found: noise against distance (before the quantiser; growing with Z^2 as for cameras that
 triangulate, or with Z, whichever fits better), its smoothness, steps of 1/Z or of Z, fill rate
 against the angle of incidence, and, with --distances, the bias. A preset adds these to the true
-depth; see qs3.sensors.fitted.FittedDepth. The plot shows data and model: look at it."""
+depth; see qs3.sensors.devices.fitted.FittedDepth. The plot shows data and model: look at it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -63,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for line in preset.summary():
         sys.stdout.write(line + "\n")
     sys.stdout.write(f"wrote {given.out} and {picture}\n")
-    if given.out.resolve().parent == (Path(__file__).parents[3] / "conf" / "sensor"):
+    if given.out.resolve().parent == (CONF / "sensor"):
         sys.stdout.write(f"use it: python generate.py sensor={given.out.stem} renderer=mitsuba\n")
     else:
         sys.stdout.write(

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from qs3.errors import DataError
+from qs3.sensors.devices.fitted import FittedDepth, neighbour_correlation
 from qs3.sensors.fit.planes import Wall
 from qs3.sensors.fit.rounded import TRIMMED_NORMAL, smooth_wall, spread_between
 from qs3.sensors.fit.steps import Steps
 from qs3.sensors.fit.texture import noise_size_px
-from qs3.sensors.fitted import FittedDepth, neighbour_correlation
 
 _BIN = 1.08  # ratio of the ends of a bin of distances
 _LEAST_IN_BIN = 400

@@ -12,11 +12,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from qs3.files import write_text
 from qs3.geometry.cameras import Intrinsics
 from qs3.sensors.fit.laws import Fill, Noise
 from qs3.sensors.fit.planes import Wall
 from qs3.sensors.fit.steps import Steps
+from qs3.utils.files import write_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class FittedPreset:
         lines = [
             "# Fitted to depth frames of a flat wall; noise is added to the true depth.",
             f"# {command}",
-            "_target_: qs3.sensors.fitted.FittedDepth",
+            "_target_: qs3.sensors.devices.fitted.FittedDepth",
             f"width_px: {k.width_px}",
             f"height_px: {k.height_px}",
             f"focal_px: {k.focal_px:.8g}",

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.fit.planes import Wall
-from qs3.sensors.fitted import FittedDepth
 
 _WALLS = 3  # so many of the least slanted are used
 _HEIGHT_PX, _WIDTH_PX = 180, 240  # and so much of each

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from qs3.sensors.reasons import Reason
+from qs3.sensors.pixel_status import Reason
 
 
 @dataclass(frozen=True, eq=False)

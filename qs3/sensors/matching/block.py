@@ -9,7 +9,7 @@ import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.sensors.matching.base import Match, side_by_side
-from qs3.sensors.reasons import Reason
+from qs3.sensors.pixel_status import Reason
 
 STEREOBM_BIAS_PX = 7.5 / 256
 """OpenCV's StereoBM computes 1/256 px, adds 15 and shifts by 4 bits: it rounds up to the

@@ -13,11 +13,11 @@ from qs3.sensors.matching.base import Match
 from qs3.sensors.matching.hamming import census, count_ones
 from qs3.sensors.matching.semiglobal import aggregate
 from qs3.sensors.matching.subpixel import Fit, linearised, offset
-from qs3.sensors.reasons import Reason
+from qs3.sensors.pixel_status import Reason
 
 A_FACTORS = {Fit.V: 0.03, Fit.PARABOLA: 0.57}
 """What `linearised` needs for Hamming distances over blocks, without grey values: measured on
-synthetic dots over 16 phases (tests/sensors/test_matching_census.py)."""
+synthetic dots over 16 phases (tests/sensors/matching/test_census.py)."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.sensors.matching.base import Match
 from qs3.sensors.matching.subpixel import linearised
-from qs3.sensors.reasons import Reason
+from qs3.sensors.pixel_status import Reason
 
 
 @dataclass(frozen=True)

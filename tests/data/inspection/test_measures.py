@@ -7,16 +7,16 @@ import pytest
 
 from qs3.data import inspect as command
 from qs3.data.inspection import gap, measures
-from qs3.data.inspection.facts import WITHIN, Bounds, compare
-from qs3.data.inspection.opening import open_named
+from qs3.data.inspection.measure import WITHIN, Bounds, compare
+from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.errors import ConfigError
+from qs3.generation.recipes import SurfaceSamples
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh
-from qs3.synthesis.placing import UnitCube
-from qs3.synthesis.randomness import object_rng
-from qs3.synthesis.recipes import SurfaceSamples
+from qs3.meshes.placement import UnitCube
+from qs3.utils.object_rng import object_rng
 from tests.fixtures import published as fixtures
 
 
@@ -138,7 +138,7 @@ def generated(tmp_path_factory):
         for mesh, item in zip(meshes, items, strict=True)
     ]
     folder = tmp_path_factory.mktemp("generated")
-    placing = {"_target_": "qs3.synthesis.placing.UnitCube"}
+    placing = {"_target_": "qs3.meshes.placement.UnitCube"}
     write_pointset(
         folder,
         name="generated",

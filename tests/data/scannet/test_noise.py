@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from qs3.data.scannet.extraction import extract
-from qs3.sensors.reference_speckle import ReferenceSpeckle
+from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.data.scannet.rooms import (
     COLOUR,

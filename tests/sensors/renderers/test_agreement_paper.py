@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3.generation.camera_poses import AnchoredViews
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh
+from qs3.meshes.placement import UnitCube
 from qs3.sensors.base import window_of
-from qs3.sensors.infrared import InfraredCamera
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.matching import ReferenceMatcher
+from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.renderers.base import Body, Projector, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from qs3.sensors.speckle_stereo import SpeckleStereo
-from qs3.synthesis.placing import UnitCube
-from qs3.synthesis.views import AnchoredViews
 
 SENSOR = SpeckleStereo()
 PX_M = SENSOR.focal_px * SENSOR.baseline_m

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from qs3.config.hydra import build
 from qs3.errors import ConfigError, RenderError
 from qs3.geometry.cameras import Camera, Intrinsics, Window, project
-from qs3.hydra_glue import build
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.base import Body, Projector, RendererSettings, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer

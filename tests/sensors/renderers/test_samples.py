@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from qs3.meshes.mesh import Mesh
-from qs3.sensors.infrared import InfraredCamera
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.renderers.base import Body
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from qs3.sensors.speckle_stereo import SpeckleStereo
 
 PHASES = 6  # planes at evenly spaced sub-pixel disparities, or pixel locking decides
 

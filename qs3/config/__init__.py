@@ -1,0 +1,1 @@
+"""Hydra: resolvers, composing, hashing and checking of configs; knows where `conf/` is."""

@@ -1,0 +1,152 @@
+"""What Hydra needs from us: resolvers, instantiation, plain errors.
+
+Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
+`${qs3.tags:}` and `${qs3.gpu_in_turn:N}`, and for help texts `${qs3.choices:GROUP}` and
+`${qs3.described:GROUP}`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import CompactHydraException, InstantiationException
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from qs3.config.location import CONF
+from qs3.errors import ConfigError, Qs3Error
+from qs3.runs import folder as runs
+
+
+def _run_name(*, _root_: DictConfig) -> str:
+    return runs.run_name(_root_)
+
+
+def _wandb_id(*, _root_: DictConfig) -> str:
+    return runs.run_name(_root_).replace("/", "-")
+
+
+def _tags(*, _root_: DictConfig) -> list[str]:
+    """For loggers: method, self-training, net and domains, and whether the target is simulated."""
+    names, data = called(_root_), _root_.data
+    tags = [f"{data.source.name} -> {data.target.name}", *dict.fromkeys(names.values())]
+    return [tag for tag in tags if tag != "none"] + ["simulated"] * bool(
+        data.target.get("simulated")
+    )
+
+
+def _gpu_in_turn(gpus: int | None = None) -> int:
+    """The GPU for this job: its number in the sweep, modulo `gpus`; 0 outside of a sweep.
+
+    Whatever process a job runs in: a variable such as CUDA_VISIBLE_DEVICES would come too late in
+    a process that has run a job before.
+
+    Args:
+        gpus: how many there are; None: as many as CUDA finds.
+    """
+    if gpus is None:
+        import torch  # counts without occupying a GPU
+
+        gpus = max(1, torch.cuda.device_count())
+    if isinstance(gpus, bool) or not isinstance(gpus, int) or gpus < 1:
+        raise ConfigError(f"trainer.gpus must be a whole number of at least 1, got {gpus!r}")
+    return int(HydraConfig.get().job.num) % gpus if in_multirun() else 0
+
+
+def called(cfg: DictConfig) -> dict[str, str]:
+    """How method, self-training and model were called on the command line (or their classes)."""
+    choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
+    selector = cfg.selftraining.get("selector") or {"_target_": "none"}
+    nodes = {"method": cfg.method, "selftraining": selector, "model": cfg.model}
+    names = {
+        group: str(choices.get(group) or node.get("_target_", "none").rsplit(".", 1)[-1].lower())
+        for group, node in nodes.items()
+    }
+    return names if runs.has_rounds(cfg) else {**names, "selftraining": "none"}
+
+
+def _choices(group: str, indent: int = 0) -> str:
+    """The choices of a config group, as `a | b`; `none` goes without saying.
+
+    With `indent`, in lines of 100 characters that all begin in that column.
+    """
+    text = " | ".join(path.stem for path in _files(group))
+    return ("\n" + " " * indent).join(textwrap.wrap(text, 100 - indent)) if indent else text
+
+
+def _described(group: str, also: str = "") -> str:
+    """A line for each choice of a config group: its name and the first sentence of its file.
+
+    With `also` only the choices that another group has, too.
+    """
+    files = _files(group)
+    if also:
+        files = [path for path in files if path.name in {other.name for other in _files(also)}]
+    width = max((len(path.stem) for path in files), default=0)
+    lines = []
+    for path in files:
+        head = itertools.takewhile(
+            lambda line: line.startswith("#"), path.read_text("utf-8").splitlines()
+        )
+        words = " ".join(line[1:].strip() for line in head if not line.startswith("# @package"))
+        sentence = re.split(r"(?<=[.;])\s", words, maxsplit=1)[0].rstrip(";.")
+        short = textwrap.shorten(sentence, 100 - width, placeholder=" ...")
+        lines.append(f"  {path.stem:<{width}}  {short}".rstrip())
+    return "\n".join(lines)
+
+
+def _files(group: str) -> list[Path]:
+    return sorted(path for path in (CONF / group).glob("*.yaml") if path.stem != "none")
+
+
+OmegaConf.register_new_resolver("qs3.choices", _choices, replace=True)
+OmegaConf.register_new_resolver("qs3.described", _described, replace=True)
+OmegaConf.register_new_resolver("qs3.gpu_in_turn", _gpu_in_turn, replace=True)
+OmegaConf.register_new_resolver("qs3.tags", _tags, replace=True)
+OmegaConf.register_new_resolver("qs3.run_name", _run_name, replace=True)
+OmegaConf.register_new_resolver("qs3.wandb_id", _wandb_id, replace=True)
+
+
+def build(node: Any, **more: Any) -> Any:
+    """`instantiate` with plain containers, and with our own errors as they were raised.
+
+    Raises:
+        ConfigError: the target does not take what stands in the config (a TypeError or ValueError
+            of its own); names the place in the config.
+    """
+    try:
+        return instantiate(node, _convert_="all", **more)
+    except InstantiationException as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            if isinstance(cause, Qs3Error):
+                raise cause from None
+            cause = cause.__cause__ or cause.__context__
+        if isinstance(error.__cause__, TypeError | ValueError):
+            place = re.search(r"^full_key: (.+)$", str(error), re.MULTILINE)
+            where = place[1] if place else str(error).splitlines()[0]
+            raise ConfigError(f"{where}: {error.__cause__}") from error
+        raise
+
+
+def speak_plainly(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
+    """Run `task`; an error meant for the user becomes a message without a traceback.
+
+    HYDRA_FULL_ERROR=1 shows the traceback nevertheless.
+    """
+    try:
+        return task(cfg)
+    except Qs3Error as error:
+        raise CompactHydraException(f"{type(error).__name__}: {error}") from error
+
+
+def in_multirun() -> bool:
+    """Whether this job is one of a sweep."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

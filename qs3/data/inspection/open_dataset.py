@@ -1,0 +1,163 @@
+"""From the words of a command line to a dataset: a domain's config, or the folder of a store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from qs3.config.location import CONF
+from qs3.data.domain import Domain
+from qs3.data.manifest import ManifestRow, read_manifest
+from qs3.data.store import PointSet, is_finished, open_pointset
+from qs3.errors import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A dataset and what to call it.
+
+    Attributes:
+        name: short, for file names.
+        label: title and symbol.
+        folder: of the store.
+        variant: array of the store.
+        data: the clouds.
+        rows: the manifest, failed objects included.
+    """
+
+    name: str
+    label: str
+    folder: Path
+    variant: str
+    data: PointSet
+    rows: tuple[ManifestRow, ...]
+
+    @property
+    def kept(self) -> list[ManifestRow]:
+        """The rows of the clouds, in order."""
+        return [row for row in self.rows if row.status == "ok"]
+
+    @property
+    def twin(self) -> PointSet | None:
+        """The clean twins of these clouds, if the store has them."""
+        if self.variant == "points_clean" or "points_clean" not in self.data.meta["sha256"]:
+            return None
+        return open_pointset(self.folder, "points_clean", verify=False)
+
+
+def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
+    """Open a domain by the name of its config, or a store by its folder.
+
+    Args:
+        name: of conf/domain/NAME.yaml, or a folder with a finished dataset.
+        overrides: keys of the domain's config (`variant`, `published.folder`) or `paths.data_dir`;
+            for a folder only `variant`.
+
+    Raises:
+        ConfigError: there is no such domain, or no such key.
+        MissingDataError: the domain's files are not there.
+        DataError: they are damaged.
+    """
+    if is_finished(name) or "/" in name or name.startswith((".", "~")):
+        if unknown := sorted(set(overrides) - {"variant", "paths.data_dir"}):
+            raise ConfigError(f"{', '.join(unknown)}: a folder of a dataset takes variant= only")
+        folder, variant = Path(name).expanduser(), overrides.get("variant", "points")
+        data = open_pointset(folder, variant)
+        more = [variant] * (variant != "points") + ["simulated"] * bool(data.meta.get("simulated"))
+        label = f"{data.name} ({', '.join(more)})" if more else data.name
+        return _opened(data.name, label, folder, variant, data)
+    domain = compose_domain(name, overrides)
+    data = domain.open()
+    return _opened(domain.name, domain.label, domain.folder, domain.variant, data)
+
+
+def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
+    """conf/domain/NAME.yaml with changes, instantiated.
+
+    Raises:
+        ConfigError: there is no such domain, or no such key.
+    """
+    from hydra.errors import HydraException
+
+    known = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
+    if name not in known:
+        raise ConfigError(
+            f"domain={name} is unknown; there are {', '.join(known)}, or give the folder of a "
+            "dataset (with a / in it)"
+        )
+    words = [
+        f"{key if key.startswith('paths.') else f'domain.{key}'}={value}"
+        for key, value in overrides.items()
+    ]
+    with _composing() as compose:
+        from qs3.config.hydra import build
+
+        try:
+            cfg = compose(overrides=[f"+domain={name}", "+paths=default", *words])
+        except HydraException as error:
+            first = next(iter(str(error).strip().splitlines()), type(error).__name__)
+            raise ConfigError(f"domain={name}: {first}") from error
+        domain: Domain = build(cfg.domain)
+    return domain
+
+
+def parse(
+    argv: Sequence[str], own: Mapping[str, type], sides: Sequence[str] = ()
+) -> tuple[list[str], dict[str, object], list[dict[str, str]]]:
+    """The words of the command.
+
+    Args:
+        argv: names and key=value words.
+        own: keys that are not the domain's, with their types.
+        sides: prefixes of keys that are meant for one of several domains.
+
+    Returns:
+        Words without "=", the values of `own` that were given, and the overrides of each side
+        (of the one domain, without sides).
+
+    Raises:
+        ConfigError: a value of the wrong kind.
+    """
+    names: list[str] = []
+    values: dict[str, object] = {}
+    overrides: list[dict[str, str]] = [{} for _ in sides or ("",)]
+    for word in argv:
+        key, equals, value = word.partition("=")
+        if not equals:
+            names.append(word)
+        elif key in own:
+            try:
+                values[key] = own[key](value)
+            except ValueError as error:
+                raise ConfigError(f"{key} must be a whole number, got {value!r}") from error
+            if own[key] is int and int(value) < (key != "seed"):
+                raise ConfigError(f"{key} must be at least {int(key != 'seed')}, got {value}")
+        else:
+            side, _, rest = key.partition(".")
+            for number, place in enumerate(overrides):
+                if side not in sides or sides[number] == side:
+                    place[rest if side in sides else key] = value
+    return names, values, overrides
+
+
+def _opened(name: str, label: str, folder: Path, variant: str, data: PointSet) -> Opened:
+    rows = tuple(read_manifest(folder, data.classes))
+    return Opened(name, label, folder, variant, data, rows)
+
+
+@contextmanager
+def _composing() -> Iterator:
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    import qs3.config.hydra  # noqa: F401  registers the resolvers that configs use
+
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            yield compose
+    finally:
+        GlobalHydra.instance().hydra = running

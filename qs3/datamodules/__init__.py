@@ -1,0 +1,1 @@
+"""LightningDataModules: clouds of one or two domains, sampled, batched and augmented."""

@@ -1,0 +1,158 @@
+"""Batches drawn from tables, in an order that is a function of (seed, epoch).
+
+There are no worker processes: a batch is one indexing into mapped files, and augmentation happens
+on the device. So there is nothing that the number of workers could change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from qs3.datamodules.clouds import Clouds
+from qs3.utils.seeding import derive
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Clouds of one domain, with labels under the name of their owner, or without any.
+
+    Attributes:
+        clouds: n clouds.
+        labels: by owner ("y_source", "y_pseudo", "y_target_train"): [n] int64; often none at all.
+        balance: the owner whose classes are drawn equally often; None draws each cloud once.
+    """
+
+    clouds: Clouds
+    labels: Mapping[str, Tensor]
+    balance: str | None = None
+
+    def __len__(self) -> int:
+        return len(self.clouds)
+
+    def rows(self, index: Tensor, start: Tensor | None = None) -> dict[str, Tensor]:
+        """The clouds (key "points") and labels at `index`, each cloud in its sample `start`."""
+        labels = {key: y[index] for key, y in self.labels.items()}
+        return {"points": self.clouds.take(index, start), **labels}
+
+    def order(self, generator: torch.Generator) -> Int[Tensor, " n"]:
+        """As many positions as clouds: all of them, shuffled; or `balanced`."""
+        if self.balance is None:
+            return torch.randperm(len(self), generator=generator)
+        return balanced(self.labels[self.balance], generator)
+
+
+def balanced(classes: Int[Tensor, " n"], generator: torch.Generator) -> Int[Tensor, " n"]:
+    """As many positions, each of a class drawn at random: all that occur are equally likely.
+
+    A class's clouds come in a shuffled order, again and again: none comes twice before all have
+    come once. So a rare class repeats its clouds, and some of a common one do not come at all.
+    """
+    present, of = classes.unique(return_inverse=True)
+    drawn = torch.randint(len(present), (len(classes),), generator=generator)
+    order = torch.empty_like(drawn)
+    for k in range(len(present)):
+        places, members = (drawn == k).nonzero()[:, 0], (of == k).nonzero()[:, 0]
+        while len(places):
+            members = members[torch.randperm(len(members), generator=generator)]
+            order[places[: len(members)]] = members[: len(places)]
+            places = places[len(members) :]
+    return order
+
+
+class Batches:
+    """One epoch: `{"source": {"points", "y_source"}, ..., "index": i, "epoch": e}` per step.
+
+    Each cloud is seen in one of its samples, drawn anew each epoch.
+
+    Args:
+        tables: by domain; the first decides the number of batches, the others are drawn from
+            again and again, each time in a new order.
+        batch_size: clouds of each domain in a batch. A last batch of one cloud (batch
+            normalisation cannot use it) joins the one before.
+        seed: of the run.
+        epoch: counted from 0.
+        shuffle: False keeps the tables' order, and each cloud's sample 0 (evaluation).
+        rank: of this process; each takes every `world`-th cloud, and as many as the others.
+        world: number of processes.
+    """
+
+    def __init__(
+        self,
+        tables: Mapping[str, Table],
+        batch_size: int,
+        *,
+        seed: int,
+        epoch: int,
+        shuffle: bool = True,
+        rank: int = 0,
+        world: int = 1,
+    ) -> None:
+        self.tables = dict(tables)
+        self.seed, self.epoch, self.shuffle = seed, epoch, shuffle
+        self.rank, self.world = rank, world
+        first = next(iter(self.tables.values()))
+        self.sizes = _sizes(-(-len(first) // world), batch_size)
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        parts = {name: self._parts(name, table) for name, table in self.tables.items()}
+        for i in range(len(self)):
+            batch: dict[str, Any] = {"index": i, "epoch": self.epoch}
+            for name, table in self.tables.items():
+                batch[name] = table.rows(*(part[i] for part in parts[name]))
+            yield batch
+
+    def _parts(self, name: str, table: Table) -> list[tuple[Tensor, ...]]:
+        """Of each batch the positions [size], and while training the samples [size]."""
+        index = self._order(name, table)
+        parts = [index.split(self.sizes)]
+        if self.shuffle and table.clouds.starts > 1:
+            generator = self._generator("sample", name, self.epoch)
+            start = torch.randint(table.clouds.starts, (len(table),), generator=generator)
+            parts.append(start[index].split(self.sizes))
+        return parts
+
+    def _order(self, name: str, table: Table) -> Tensor:
+        """This process's positions of the epoch: its share of one order after another."""
+        n, needed = len(table), sum(self.sizes)
+        each = -(-n // self.world)  # all processes take equally many: some clouds come twice
+        shares = []
+        for passed in range(-(-needed // each)):
+            if self.shuffle:
+                order = table.order(self._generator("shuffle", name, self.epoch, passed))
+            else:
+                order = torch.arange(n)
+            shares.append(
+                order.repeat(1 + self.world)[: each * self.world][self.rank :: self.world]
+            )
+        return torch.cat(shares)[:needed]
+
+    def _generator(self, *names: int | str) -> torch.Generator:
+        return torch.Generator().manual_seed(derive(self.seed, *names))
+
+
+def generator_of(
+    batch: Mapping[str, Any], use: str, seed: int, rank: int, device: Any
+) -> torch.Generator:
+    """Randomness of one use in one step: a function of (seed, use, epoch, step, process)."""
+    names = (use, batch["epoch"], batch["index"], rank)
+    return torch.Generator(device=device).manual_seed(derive(seed, *names))
+
+
+def _sizes(n: int, batch_size: int) -> list[int]:
+    """Sizes of the batches that n clouds are cut into."""
+    sizes = [batch_size] * (n // batch_size)
+    if rest := n % batch_size:
+        if rest == 1 and sizes:
+            sizes[-1] += 1
+        else:
+            sizes.append(rest)
+    return sizes

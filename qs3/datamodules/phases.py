@@ -1,0 +1,139 @@
+"""How self-training is run: which epochs belong to which phase, and the settings of its rounds.
+
+Light (no torch), so that a wrong setting is an error within a second of starting.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+from qs3.config.checks import number, one_of, whole
+from qs3.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Phases:
+    """The epochs of one `Trainer.fit`: a warm-up, then rounds of equal length.
+
+    Phase 0 is the warm-up, phase r + 1 is round r. All epochs count from 0.
+    """
+
+    warmup: int
+    rounds: int = 0
+    epochs: int = 0
+
+    def __post_init__(self) -> None:
+        whole("protocol.epochs", self.warmup, 1)
+
+    @property
+    def total(self) -> int:
+        """Number of epochs in all."""
+        return self.warmup + self.rounds * self.epochs
+
+    def phase(self, epoch: int) -> int:
+        """0 in the warm-up, r + 1 in round r (an epoch past the end is in the last phase)."""
+        if epoch < self.warmup or self.rounds == 0:
+            return 0
+        return 1 + min((epoch - self.warmup) // self.epochs, self.rounds - 1)
+
+    def span(self, phase: int) -> tuple[int, int]:
+        """First epoch of a phase, and the first one after it."""
+        if phase == 0:
+            return 0, self.warmup
+        start = self.warmup + (phase - 1) * self.epochs
+        return start, start + self.epochs
+
+    def starts(self, epoch: int) -> bool:
+        """Whether `epoch` is the first of its phase."""
+        return self.span(self.phase(epoch))[0] == epoch
+
+    def ends(self, epoch: int) -> bool:
+        """Whether `epoch` is the last of its phase."""
+        return self.span(self.phase(epoch))[1] == epoch + 1
+
+    def cosine(self, epoch: int) -> float:
+        """Factor on the learning rate: from 1 towards 0 along a half cosine, in each phase anew."""
+        start, stop = self.span(self.phase(epoch))
+        return 0.5 * (1.0 + math.cos(math.pi * (epoch - start) / (stop - start)))
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """The settings of config group `selftraining`.
+
+    Attributes:
+        selector: a `qs3.selftraining.selectors.Selector`.
+        rounds: number of rounds; 0 is no self-training.
+        epochs: of each round.
+        batch_size: of each round.
+        theta: confidence that a pseudo-label must exceed, in round 0; 0 is for selectors that have
+            thresholds of their own (CBST), and for them alone.
+        epsilon: added to theta in each further round.
+        init: "scratch" draws new weights each round; "continue" begins round 0 with the weights of
+            the teacher that labelled it, and each further round with the student before;
+            "persistent" draws new weights in round 0 alone, and keeps them and the optimiser's
+            moments from then on, as in QS3's released code.
+        use_source: whether labelled source clouds are trained on in the rounds, too.
+        pcm: whether the student's clouds are mixed (see `qs3.methods.pcm`).
+        weight_step: by how much the weight of both losses falls each epoch of the rounds, from 1
+            (GAST's code: 0.005; both fall alike, so it matters beside the weight decay alone).
+        mrkld: weight of CRST's regulariser (see `qs3.selftraining.student_loss`); 0 is none.
+        missing_class: what to do if a class has no pseudo-label: "warn" or "error".
+        rehearsal: train on all target samples, whatever the selector keeps (`debug=fast`).
+    """
+
+    selector: Any = None
+    rounds: int = 0
+    epochs: int = 10
+    batch_size: int = 32
+    theta: float = 0.8
+    epsilon: float = 0.0
+    init: str = "scratch"
+    use_source: bool = False
+    pcm: bool = False
+    weight_step: float = 0.0
+    mrkld: float = 0.0
+    missing_class: str = "warn"
+    rehearsal: bool = False
+
+    def __post_init__(self) -> None:
+        whole("selftraining.rounds", self.rounds, 0)
+        if self.rounds == 0:
+            return
+        if not hasattr(self.selector, "select"):
+            raise ConfigError("selftraining.rounds > 0 needs a selector, e.g. selftraining=qbst")
+        whole("selftraining.epochs", self.epochs, 1)
+        whole("selftraining.batch_size", self.batch_size, 2)  # batch norm needs two clouds
+        one_of("selftraining.init", self.init, ("scratch", "continue", "persistent"))
+        one_of("selftraining.missing_class", self.missing_class, ("warn", "error"))
+        number("selftraining.theta", self.theta)
+        number("selftraining.epsilon", self.epsilon)
+        free = bool(getattr(self.selector, "own_thresholds", False)) and self.theta == 0
+        if not (0.0 < self.theta < 1.0 or free):
+            raise ConfigError(f"selftraining.theta must lie in (0, 1), got {self.theta}")
+        if number("selftraining.mrkld", self.mrkld) < 0:
+            raise ConfigError(f"selftraining.mrkld must be >= 0, got {self.mrkld}")
+        epochs = self.rounds * self.epochs
+        if not 0.0 <= number("selftraining.weight_step", self.weight_step) * (epochs - 1) < 1.0:
+            raise ConfigError(
+                f"selftraining.weight_step must be >= 0, and below 1 after {epochs - 1} epochs, "
+                f"got {self.weight_step}"
+            )
+        last = self.theta_of(self.rounds - 1)
+        if not (0.0 < last < 1.0 or (free and last == 0)):
+            raise ConfigError(
+                f"selftraining.theta + epsilon * (rounds - 1) must lie in (0, 1), got {last} "
+                f"(theta={self.theta}, epsilon={self.epsilon}, rounds={self.rounds})"
+            )
+
+    def theta_of(self, round_: int) -> float:
+        """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly."""
+        return float(Decimal(repr(self.theta)) + round_ * Decimal(repr(self.epsilon)))
+
+
+def no_rounds(**ignored: Any) -> Scheme:
+    """No self-training, whatever an experiment file has set for the rounds it would have had."""
+    return Scheme(rounds=0)

@@ -1,0 +1,86 @@
+"""Which labelled training clouds validate. Rules are functions of ids and labels, not of chance.
+
+Further scans of an object (`generate.py scans=N` calls them id~1, id~2, ...) go where it goes:
+else training would see the validation shapes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Int
+
+from qs3.errors import DataError
+from qs3.utils.seeding import derive
+
+STRATIFIED_SEED = 0
+STRATIFIED_SHARE = 0.2  # of each class's objects, as large as the lineage's part
+
+Rule = Callable[[Sequence[str], np.ndarray], tuple[np.ndarray, np.ndarray]]
+_FURTHER_SCAN = re.compile(r"~\d+$")
+
+
+def lineage(
+    ids: Sequence[str], labels: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " v"]]:
+    """(train, validation): of the objects sorted by id, positions with i % 10 >= 8 validate.
+
+    The rule of DefRec, GAST and QS3. Ids begin with the class, so each class is split about 4 : 1.
+
+    Raises:
+        DataError: fewer than nine objects, so that there is nothing to validate on.
+    """
+    objects, place = _objects(ids)
+    order = np.argsort(np.array(ids), kind="stable")
+    validates = place[order] % 10 >= 8
+    if not validates.any():
+        raise DataError(
+            f"only {len(objects)} labelled training objects; at least 9 are needed, so that every "
+            "ninth and tenth can validate"
+        )
+    return order[~validates], order[validates]
+
+
+def stratified(
+    ids: Sequence[str], labels: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " v"]]:
+    """(train, validation): of each class a fifth of its objects validates, rounded, at least one.
+
+    A class's objects are sorted by a hash of (`STRATIFIED_SEED`, id) and the first ones taken, so
+    the split is the same for every run and in whatever order the clouds are stored. The only
+    object of a class stays in training. Both parts are sorted by id.
+
+    Raises:
+        DataError: no class has two objects, or an object has scans of two classes.
+    """
+    objects, place = _objects(ids)
+    cls = np.full(len(objects), -1)
+    cls[place] = labels
+    if (mixed := np.flatnonzero(cls[place] != labels)).size:
+        raise DataError(f"the scans of {objects[place[mixed[0]]]!r} have labels of two classes")
+    rank = np.array([derive(STRATIFIED_SEED, "validation", str(name)) for name in objects])
+    validates = np.zeros(len(objects), dtype=bool)
+    for label in np.unique(cls):
+        members = np.flatnonzero(cls == label)
+        if len(members) > 1:
+            count = max(1, round(STRATIFIED_SHARE * len(members)))
+            validates[members[np.argsort(rank[members])][:count]] = True
+    if not validates.any():
+        raise DataError(
+            f"none of the {len(np.unique(cls))} classes has two labelled training objects, so "
+            "that one could validate"
+        )
+    order = np.argsort(np.array(ids), kind="stable")
+    chosen = validates[place[order]]
+    return order[~chosen], order[chosen]
+
+
+def _objects(ids: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The objects' names, sorted, and of each cloud which object it shows."""
+    return np.unique([_FURTHER_SCAN.sub("", name) for name in ids], return_inverse=True)
+
+
+RULES = MappingProxyType({"lineage": lineage, "stratified": stratified})

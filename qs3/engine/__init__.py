@@ -1,0 +1,1 @@
+"""The LightningModule, its schedules and loggers, and the trainer that runs it."""

@@ -1,0 +1,191 @@
+"""The LightningModule: a net, the method's loss in the warm-up, the student's in the rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+
+from qs3.datamodules.batches import generator_of
+from qs3.datamodules.phases import Phases
+from qs3.engine.schedules import Plateau, cosine
+from qs3.errors import ConfigError
+from qs3.methods.base import Method
+from qs3.models.base import Backbone
+from qs3.selftraining.student_loss import Student
+from qs3.utils.seeding import derive
+
+# `qs3.engine.loggers.EpochRows` hands the figures on, before the checkpoint is written.
+_PER_EPOCH: dict[str, Any] = {
+    "on_step": False,
+    "on_epoch": True,
+    "logger": False,
+    "sync_dist": True,
+}
+
+
+class Classifier(LightningModule):
+    """Trains a net over all phases of a run.
+
+    Args:
+        build_net: makes a net, [B, N, 3] to logits [B, C], drawing its weights from torch's
+            global generator.
+        build_optimizer: makes the optimiser of given parameters.
+        method: loss of the warm-up.
+        student: loss of the rounds.
+        phases: which epoch belongs to which phase; each phase has its own schedule.
+        seed: of the run.
+        schedule: of the learning rate, see `qs3.engine.schedules`.
+        smoothing: of class labels, see `qs3.methods.base.class_loss`.
+        regulariser_weight: of what a backbone wants in the loss (`Features.regulariser`).
+    """
+
+    def __init__(
+        self,
+        build_net: Callable[[], nn.Module],
+        build_optimizer: Callable[..., torch.optim.Optimizer],
+        method: Method,
+        student: Student,
+        phases: Phases,
+        seed: int,
+        schedule: str = "cosine",
+        smoothing: float = 0.0,
+        regulariser_weight: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.build_net, self.build_optimizer = build_net, build_optimizer
+        self.phases, self.seed, self.schedule = phases, seed, schedule
+        self.net = self.fresh_net(phase=0)
+        self.method, self.student = method, student
+        method.smoothing = student.smoothing = smoothing
+        self._plateau: Plateau | None = None
+        self._loaded_plateau: dict[str, Any] | None = None
+        self.regulariser_weight = regulariser_weight
+        self._regularisers: list[Tensor] = []  # of the passes of a step
+        if regulariser_weight:
+            for module in self.net.modules():
+                if isinstance(module, Backbone):
+                    module.register_forward_hook(self._keep_regulariser)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive(seed, "heads"))
+            method.prepare(self.net)
+        self._hits: list[Tensor] = []
+
+    def fresh_net(self, phase: int) -> nn.Module:
+        """A net with new weights: a function of (seed, phase), whatever was drawn before."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive(self.seed, "init", phase))
+            return self.build_net()
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
+        """Logits."""
+        return self.net(points)
+
+    def configure_optimizers(self) -> Any:
+        """One optimiser, one schedule."""
+        try:
+            optimizer = self._optimizer()
+        except (TypeError, ValueError) as error:  # e.g. a negative learning rate
+            raise ConfigError(f"protocol.optimizer: {error}") from error
+        if self.schedule == "plateau":
+            self._plateau = Plateau(optimizer)
+            return optimizer
+        return {"optimizer": optimizer, "lr_scheduler": cosine(optimizer, self.phases)}
+
+    def learning_rate(self) -> float:
+        """Of the epoch that is ending, before the hook below."""
+        optimizer = self.optimizers()
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        if self._plateau is not None:
+            return float(optimizer.param_groups[0]["lr"])
+        return float(optimizer.defaults["lr"] * self.phases.cosine(self.current_epoch))
+
+    def on_train_epoch_end(self) -> None:
+        """The plateau's step, before the epoch's checkpoint."""
+        if self._plateau is not None:
+            self._plateau.step(float(self.trainer.callback_metrics["train/loss"]))
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the plateau's memory."""
+        if self._plateau is not None:
+            checkpoint["plateau"] = self._plateau.state_dict()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep it until there is a plateau."""
+        self._loaded_plateau = checkpoint.get("plateau")
+
+    def on_train_start(self) -> None:
+        """Give the plateau its memory back."""
+        if self._plateau is not None and self._loaded_plateau is not None:
+            self._plateau.load_state_dict(self._loaded_plateau)
+            self._loaded_plateau = None
+
+    def _optimizer(self) -> torch.optim.Optimizer:
+        own = self.method.learning_rates(self.net)
+        if not own:
+            return self.build_optimizer(self.parameters())
+        groups = [list(module.parameters()) for module, _ in own]
+        taken = {id(p) for group in groups for p in group}
+        rest = [p for p in self.parameters() if id(p) not in taken]
+        optimizer = self.build_optimizer([{"params": group} for group in (rest, *groups)])
+        for group, (_, factor) in zip(optimizer.param_groups[1:], own, strict=True):
+            group["lr"] *= factor
+        return optimizer
+
+    def start_phase(
+        self, weights: Mapping[str, Tensor] | None, *, keep_moments: bool = False
+    ) -> None:
+        """Go on with `weights`, or with the net's if None; forget the optimiser's moments."""
+        if weights is not None:
+            self.net.load_state_dict(weights)
+        optimizer = self.optimizers()
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        if not keep_moments:
+            optimizer.state.clear()
+        if self._plateau is not None:
+            self._plateau.start_phase()
+
+    def on_train_epoch_start(self) -> None:
+        """Reseed torch (dropout draws from it): an epoch is a function of (seed, epoch)."""
+        torch.manual_seed(derive(self.seed, "dropout", self.current_epoch, self.global_rank))
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
+        """The loss of the current phase."""
+        warmup = self.phases.phase(self.current_epoch) == 0
+        method = self.method if warmup else self.student
+        generator = generator_of(batch, "method", self.seed, self.global_rank, self.device)
+        self._regularisers.clear()
+        terms = method.loss(self.net, {**batch, "progress": self._progress(batch_idx)}, generator)
+        total = torch.stack(list(terms.values())).sum()
+        if self._regularisers:
+            total = total + self.regulariser_weight * torch.stack(self._regularisers).sum()
+        if not warmup and self.trainer.world_size > 1:  # DDP waits for the gradient of all
+            total = total + sum(0.0 * p.sum() for p in self.method.parameters())
+        size = max(len(part["points"]) for part in batch.values() if isinstance(part, dict))
+        self.log("train/loss", total, batch_size=size, **_PER_EPOCH)
+        return total
+
+    def _keep_regulariser(self, _: nn.Module, __: Any, features: Any) -> None:
+        if features.regulariser is not None and torch.is_grad_enabled():
+            self._regularisers.append(features.regulariser)
+
+    def _progress(self, batch_idx: int) -> float:
+        """Part of the warm-up that is done after this step, in (0, 1]; 1 in the rounds."""
+        done = self.current_epoch + (batch_idx + 1) / int(self.trainer.num_training_batches)
+        return min(done / self.phases.warmup, 1.0)
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        """Count the hits on held-out labelled clouds."""
+        labels = batch["source"][f"y_{self.method.labels}"]
+        self._hits.append(self(batch["source"]["points"]).argmax(dim=1) == labels)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the accuracy as `<owner>_val/acc`; one process decides for all."""
+        accuracy = float(torch.cat(self._hits).double().mean())
+        self._hits.clear()
+        accuracy = float(self.trainer.strategy.broadcast(accuracy))
+        self.log(f"{self.method.labels}_val/acc", accuracy, **_PER_EPOCH)

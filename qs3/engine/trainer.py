@@ -1,0 +1,64 @@
+"""Lightning's trainer as this project uses it."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from typing import Any
+
+from lightning.pytorch import Trainer
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from omegaconf import DictConfig, OmegaConf
+
+from qs3.config.hydra import build
+from qs3.errors import ConfigError
+
+
+def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
+    """Lightning's trainer by config group `trainer`.
+
+    Args:
+        cfg: the composed config.
+        **more: arguments that follow from the run.
+
+    Raises:
+        ConfigError: Lightning does not take the settings.
+    """
+    try:
+        return Trainer(**_trainer_settings(cfg), **more)
+    except (MisconfigurationException, TypeError, ValueError) as error:
+        hint = "" if cfg.trainer.accelerator == "cpu" else "; without a GPU use trainer=cpu"
+        raise ConfigError(f"trainer: {error}{hint}") from error
+
+
+def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
+    settings = OmegaConf.to_container(cfg.trainer, resolve=True)
+    assert isinstance(settings, dict)
+    ours = ("threads", "gpus")
+    given = {str(key): value for key, value in settings.items() if key not in ours}
+    if isinstance(given.get("profiler"), dict):
+        given["profiler"] = build(cfg.trainer.profiler)
+    return given | {
+        "reload_dataloaders_every_n_epochs": 1,  # each epoch has its own order; rounds, their set
+        "use_distributed_sampler": False,  # `Batches` shares the clouds out itself
+        "num_sanity_val_steps": 0,
+        "log_every_n_steps": 1,
+        "enable_progress_bar": False,  # `qs3.engine.progress` shows all epochs in one bar
+        "enable_model_summary": False,
+    }
+
+
+def build_each(group: DictConfig | None) -> list[Any]:
+    """The objects of a config group that has several, such as `callbacks`."""
+    return [build(node) for node in (group or {}).values() if node is not None]
+
+
+def quieten() -> None:
+    """Leave Lightning's warnings and errors to Hydra's log; drop its tips and adverts."""
+    # Lightning 2.6.6 asks torch 2.13 in an old way; not ours to mend.
+    warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
+    for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.setLevel(logging.WARNING)
+        logger.propagate = True

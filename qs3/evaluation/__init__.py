@@ -1,0 +1,1 @@
+"""Metrics, validators without labels, accuracy estimates, and what is unlike the source."""

@@ -1,0 +1,252 @@
+"""What can be said about predictions whose labels nobody knows.
+
+Three estimates of their accuracy, made from confidences alone, and what else hints at trouble.
+All of them learn what a confidence means on labelled validation clouds of the source, and carry it
+over to the target. That carries over only in part: clouds of another domain, or of no known class,
+get high confidences too, so the estimates are too high as a rule. By how much was measured on
+simulated targets: docs/predictions.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.optimize import minimize_scalar
+from torch import Tensor, nn
+
+from qs3.datamodules.adaptation import Labelled, Unlabelled
+from qs3.datamodules.augment import rotate_z
+from qs3.datamodules.clouds import Clouds
+from qs3.evaluation.metrics import predict
+from qs3.evaluation.ood import enough, limits, strange_clouds
+
+TURNS = 3
+"""Turns about gravity besides none: by 90, 180 and 270 degrees."""
+
+_LEAST_T, _MOST_T, _TINY = 0.05, 20.0, 1e-300
+_LOOKED_AT = 300  # clouds of a domain, 3 ms each
+_ESTIMATES = ("temperature", "mean_confidence", "calibrated", "thresholded", "difference")
+
+
+def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray, " v"]) -> float:
+    """The T in [0.05, 20] for which softmax(log p / T) has the least cross-entropy to the labels.
+
+    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, section 4.2. log p equals
+    the logits but for a constant of each row, which the softmax does not see. T > 1 makes less
+    sure. No class changes. 20 (the least sure that can be) if the net is no better than chance.
+
+    A label counts (v + 1) / (v + 2), the other classes share the rest (Laplace's rule of
+    succession, as in Platt, "Probabilistic Outputs for Support Vector Machines", 1999, section
+    2.2). Without that a net that makes no error on v clouds would be taken to make none at all.
+
+    Args:
+        probabilities: of held-out clouds, v >= 1.
+        labels: theirs.
+    """
+    classes = probabilities.shape[1]
+    rest = 1 / (len(labels) + 2)
+    weights = np.full(probabilities.shape, rest / max(1, classes - 1))
+    weights[np.arange(len(labels)), labels] = 1 - rest
+
+    def loss(log_t: float) -> float:
+        logs = np.log(np.maximum(scaled(probabilities, math.exp(log_t)), _TINY))
+        # Exactly rounded, so that the order of clouds does not matter where the valley is flat.
+        return -math.fsum((weights * logs).sum(axis=1)) / len(labels)
+
+    # The loss is convex in 1 / T, so it has one valley in log T.
+    found = minimize_scalar(loss, bounds=(math.log(_LEAST_T), math.log(_MOST_T)), method="bounded")
+    return math.exp(found.x)
+
+
+def scaled(probabilities: Float[np.ndarray, "n c"], t: float) -> Float[np.ndarray, "n c"]:
+    """softmax(log p / t)."""
+    logits = np.log(np.maximum(probabilities, _TINY)) / t
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def average_confidence(probabilities: Float[np.ndarray, "n c"]) -> float:
+    """AC: the mean largest probability, an estimate of accuracy if these are calibrated.
+
+    Called so in Garg et al., "Leveraging Unlabeled Data to Predict Out-of-Distribution
+    Performance", ICLR 2022, section 4.1; Hendrycks and Gimpel, ICLR 2017.
+    """
+    return float(probabilities.max(axis=1).mean())
+
+
+def thresholded_confidence(
+    source: Float[np.ndarray, "v c"],
+    labels: Int[np.ndarray, " v"],
+    target: Float[np.ndarray, "n c"],
+) -> float:
+    """ATC: the share of target clouds whose score is at least t.
+
+    The score is minus the entropy, Σ_k p_k ln p_k. t leaves as many source clouds below it as the
+    net gets wrong (Garg et al., ICLR 2022, eq. 1 and 2, the variant with negative entropy). Of k
+    errors in v clouds t is the (k + 1)-th smallest score, so with no error it is the smallest one.
+
+    Args:
+        source: probabilities of held-out source clouds.
+        labels: theirs.
+        target: probabilities of clouds without labels.
+    """
+    scores = np.sort(_certainty(source))
+    wrong = int((source.argmax(axis=1) != labels).sum())
+    if wrong == len(scores):
+        return 0.0
+    return float((_certainty(target) >= scores[wrong]).mean())
+
+
+def difference_of_confidences(
+    source: Float[np.ndarray, "v c"],
+    labels: Int[np.ndarray, " v"],
+    target: Float[np.ndarray, "n c"],
+) -> float:
+    """DoC: the source's accuracy, less what the mean confidence loses on the target; in [0, 1].
+
+    acc_S - (AC_S - AC_T): Guillory et al., "Predicting with Confidence on Unseen Distributions",
+    ICCV 2021, section 3, with the difference taken as it is and not through a regression.
+    """
+    accuracy = float((source.argmax(axis=1) == labels).mean())
+    lost = average_confidence(source) - average_confidence(target)
+    return min(1.0, max(0.0, accuracy - lost))
+
+
+def turns_agree(
+    first: Float[np.ndarray, "n c"], turned: Sequence[Float[np.ndarray, "n c"]]
+) -> float:
+    """The share of pairs (cloud, turn) with the class of the cloud as it is.
+
+    How invariant a net is to what cannot change a class goes with its accuracy on shifted data:
+    Deng, Gould and Zheng, "On the Strong Correlation Between Model Invariance and Generalization",
+    NeurIPS 2022.
+    """
+    return float(np.mean([agreement(first, other) for other in turned]))
+
+
+def agreement(a: Float[np.ndarray, "n c"], b: Float[np.ndarray, "n c"]) -> float:
+    """The share of clouds for which both name one class.
+
+    Two nets that were trained apart agree about as often as they are right (Jiang et al.,
+    "Assessing Generalization of SGD via Disagreement", ICLR 2022); teacher and student were not.
+    """
+    return float((a.argmax(axis=1) == b.argmax(axis=1)).mean())
+
+
+def estimates(
+    source: Float[np.ndarray, "v c"],
+    labels: Int[np.ndarray, " v"],
+    target: Float[np.ndarray, "n c"],
+) -> dict[str, float]:
+    """The temperature of the source's clouds, and the three estimates after scaling by it."""
+    t = temperature(source, labels)
+    source, raw, target = scaled(source, t), target, scaled(target, t)
+    return {
+        "temperature": t,
+        "mean_confidence": average_confidence(raw),
+        "calibrated": average_confidence(target),
+        "thresholded": thresholded_confidence(source, labels, target),
+        "difference": difference_of_confidences(source, labels, target),
+    }
+
+
+def quality_of(
+    net: nn.Module,
+    target: Unlabelled,
+    validation: Labelled,
+    source: Clouds,
+    *,
+    owner: str,
+    classes: Sequence[str],
+    batch_size: int,
+    device: Any = "cpu",
+    teacher: nn.Module | None = None,
+    unadapted: tuple[nn.Module, nn.Module | None] | None = None,
+    upright: bool = True,
+) -> dict[str, Any]:
+    """What `metrics.json` has under `quality`, in words in `qs3.evaluation.estimates_text`.
+
+    Looks at no label of the target.
+
+    Args:
+        net: the reported one.
+        target: the clouds that are judged.
+        validation: labelled clouds that no warm-up was trained on.
+        source: all labelled clouds.
+        owner: of their labels, "source" or "target_train".
+        classes: names in label order.
+        batch_size, device: of the predictions.
+        teacher: the net before self-training; None if there was none.
+        unadapted: net and teacher with the norms that they were trained with, for the labelled
+            clouds of the source, where `net` and `teacher` have the target's (AdaBN).
+        upright: z points up in the target's clouds.
+
+    Returns:
+        Plain values. None where a figure does not exist (no teacher, no gravity), or is no number
+        because the net has diverged.
+    """
+    points, labels = target.points, validation.labels.numpy()
+    domain = "source" if owner == "source" else "target"
+    as_trained, taught = unadapted if unadapted and owner == "source" else (net, teacher)
+    known = predict(as_trained, validation.clouds.all(), batch_size, device, domain=domain)
+    judged = predict(net, points, batch_size, device)
+    counts = np.bincount(judged.argmax(axis=1), minlength=len(classes))
+    found: dict[str, Any] = {
+        "clouds": len(judged),
+        "validated_on": f"{owner}_val",
+        "validation_clouds": len(labels),
+        "validation_accuracy": agreement(known, np.eye(len(classes))[labels]),
+        **dict.fromkeys(_ESTIMATES),
+        "turns_agree": None,
+        "teacher_agrees": None,
+        "teacher": None,
+        "unlike_source": unlike(target.clouds, source),
+        "never_predicted": [name for name, n in zip(classes, counts, strict=True) if not n],
+    }
+    if not (np.isfinite(known).all() and np.isfinite(judged).all()):
+        return found
+    found |= estimates(known, labels, judged)
+    if upright:
+        found["turns_agree"] = turns_agree(judged, _turned(net, points, batch_size, device))
+    if teacher is not None:
+        assert taught is not None
+        theirs = predict(teacher, points, batch_size, device)
+        found["teacher_agrees"] = agreement(judged, theirs)
+        known = predict(taught, validation.clouds.all(), batch_size, device, domain=domain)
+        if np.isfinite(known).all() and np.isfinite(theirs).all():
+            accuracy = agreement(known, np.eye(len(classes))[labels])
+            found["teacher"] = {"validation_accuracy": accuracy, **estimates(known, labels, theirs)}
+    return found
+
+
+def _turned(net: nn.Module, points: Tensor, batch_size: int, device: Any) -> list[np.ndarray]:
+    tables = []
+    for i in range(1, TURNS + 1):
+        angle = torch.full((len(points),), 2 * math.pi * i / (TURNS + 1), dtype=points.dtype)
+        tables.append(predict(net, rotate_z(points, angle), batch_size, device))
+    return tables
+
+
+def unlike(clouds: Clouds, source: Clouds) -> float:
+    """The share of clouds outside the usual range of the source's.
+
+    At most 300 of each are looked at, evenly spaced.
+    """
+    found = strange_clouds(clouds, usual_of(source, _LOOKED_AT), most=_LOOKED_AT)
+    return sum(map(bool, found)) / len(found)
+
+
+def usual_of(source: Clouds, most: int = 1000) -> dict[str, list[float]]:
+    """Of each measure the range in at most `most` clouds; of points no more than the net sees."""
+    seen = source.stored.shape[1] if source.order is None else source.order.shape[2]
+    return enough(limits(source, most=most), seen)
+
+
+def _certainty(probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " n"]:
+    logs = np.log(np.where(probabilities > 0, probabilities, 1.0))
+    return (probabilities * logs).sum(axis=1)

@@ -1,0 +1,57 @@
+"""`quality` of `metrics.json` in words; `qs3.evaluation.accuracy_estimates` computes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+MEANINGS: Mapping[str, str] = {
+    "validation_accuracy": "accuracy on held-out labelled clouds. On others it will be lower",
+    "mean_confidence": "mean largest probability, as the net gives it. Nets are too sure of "
+    "themselves, on clouds of another domain most of all",
+    "calibrated": "expected accuracy if confidences meant on your clouds what they mean on "
+    "held-out labelled clouds (AC). Too high as a rule, because your clouds differ from these",
+    "thresholded": "share of your clouds above the certainty that as many held-out labelled "
+    "clouds miss as are wrong (ATC). Too high as a rule; can be off either way",
+    "difference": "accuracy on held-out labelled clouds, less what is lost in confidence (DoC). "
+    "Too high as a rule",
+    "turns_agree": "share of clouds with the same class after turns about gravity, which change "
+    "no class. What changes is unreliable; what stays can be wrong all the same",
+    "teacher_agrees": "share of clouds on which the net before self-training says the same. "
+    "The student learnt from it, so both can be wrong together",
+    "unlike_source": "share of clouds outside the range of the labelled ones in spacing, flatness "
+    "or height, so unlike all that came with a label. Few say nothing: a new object can look usual",
+    "never_predicted": "classes that no cloud got. Either there are none of them, or they are "
+    "all taken for something else",
+}
+"""What each figure tells, and what it does not."""
+
+
+def in_words(quality: Mapping[str, Any]) -> str:
+    """The estimates in a few words, for the end of a headline; "" without any."""
+    if quality.get("calibrated") is None:
+        return ""
+    teacher = quality.get("teacher")
+    before = f" (before self-training {_range(teacher)})" if teacher else ""
+    return f"accuracy estimated from confidences {_range(quality)}{before}, too high as a rule"
+
+
+def _range(quality: Mapping[str, Any]) -> str:
+    found = [quality[name] for name in ("calibrated", "thresholded", "difference")]
+    low, high = f"{min(found):.0%}", f"{max(found):.0%}"
+    return low if low == high else f"{low} to {high}"
+
+
+def table(quality: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Name, value and meaning of each figure that there is, for people."""
+    rows = []
+    for key, meaning in MEANINGS.items():
+        value = quality.get(key)
+        if value is None:
+            continue
+        shown = f"{value:.1%}" if isinstance(value, float) else ", ".join(value) or "none"
+        before = (quality.get("teacher") or {}).get(key)
+        if before is not None:
+            shown += f" (before self-training {before:.1%})"
+        rows.append((key.replace("_", " "), shown, f"{meaning}."))
+    return rows

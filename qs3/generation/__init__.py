@@ -1,0 +1,1 @@
+"""The generate command, Mesh2Point: place, view, scan, fuse and sample meshes; workers, resume."""

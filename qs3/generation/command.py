@@ -1,0 +1,257 @@
+"""The story of generate.py: meshes in, a checked dataset out.
+
+Light to import: renderers live in worker processes only.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from qs3.config.hydra import build
+from qs3.data.domain import Domain
+from qs3.data.store import ManifestRow, PointSet, is_finished, open_pointset, write_pointset
+from qs3.errors import DataError
+from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
+from qs3.generation.disk import check_folder, disk_errors_told
+from qs3.generation.plan import (
+    benchmark,
+    check,
+    check_recipe,
+    describe,
+    keep,
+    mesh_items,
+    mesh_root,
+    stated_hash,
+    stored_config,
+)
+from qs3.generation.provenance import PROVENANCE
+from qs3.generation.shards import CLOUDS, CONFIG, INFRARED, Parts, check_same_recipe, forget
+from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
+from qs3.meshes.source import MeshItem
+from qs3.runs.folder import locked
+from qs3.utils.files import write_text
+from qs3.utils.progress import progress_bar
+
+log = logging.getLogger(__name__)
+
+_FAILURES_SHOWN = 5
+
+
+def generate(cfg: DictConfig) -> PointSet:
+    """Make the dataset that `cfg` describes, or continue it, or find it finished.
+
+    Args:
+        cfg: conf/generate.yaml, composed.
+
+    Returns:
+        The dataset.
+
+    Raises:
+        ConfigError: a setting is wrong, or the folder holds another dataset.
+        MissingDataError: the mesh folder or one of its classes is not there.
+        RenderError: the renderer cannot be used on this machine.
+        DataError: every object failed (or, with strict=true, any), or the disk is full.
+    """
+    check(cfg)
+    domain: Domain = build(cfg.domain)
+    folder = domain.folder
+    items = mesh_items(cfg)
+    parts = Parts(folder)
+    job = Job(
+        recipe=build(cfg.recipe),
+        make_renderer=partial(_make_renderer, OmegaConf.to_container(cfg.renderer, resolve=True)),
+        seed=cfg.seed,
+        keep=keep(cfg, items, folder),
+        save=parts.save,
+    )
+    check_recipe(job.recipe, cfg)
+    check_folder(folder, cfg.paths.data_dir)
+    with (
+        locked(
+            folder,
+            doing="making the dataset in",
+            advice="wait for it, or give another paths.data_dir",
+        ),
+        disk_errors_told(folder, lambda: parts.state(len(items))),
+    ):
+        if cfg.force:
+            forget(folder)
+        recipe = describe(cfg, items, renderer_provenance(job))
+        if is_finished(folder):
+            check_same_recipe(folder, recipe)
+            parts.clear()  # a kill after the last write leaves them
+            log.info("%s is already there: %s", domain.label, folder)
+            pointset = open_pointset(folder, domain.variant)
+            _check_strict(cfg, pointset, items, folder)
+            return pointset
+        start = time.perf_counter()
+        parts.begin(recipe)
+        passing = _scan_missing(job, items, parts, cfg.workers, domain.label)
+        outcomes = _collect(items, parts, passing, folder)
+        # The dataset last: with meta.yaml it counts as finished, and the parts can go.
+        _draw(domain, items, outcomes, folder)
+        write_text(folder / CONFIG, OmegaConf.to_yaml(cfg, resolve=True))
+        pointset = _write(domain, items, outcomes, recipe, cfg)
+        parts.clear()
+    _report(pointset, items, outcomes, folder, time.perf_counter() - start)
+    stated = stated_hash(cfg, recipe)
+    if stated and stated != pointset.sha256:
+        log.warning(
+            "the stated content hash is %s: another processor or library version made other bytes",
+            stated[:16],
+        )
+    _check_strict(cfg, pointset, items, folder)
+    return pointset
+
+
+def _check_strict(cfg: DictConfig, pointset: PointSet, items: list[MeshItem], folder: Path) -> None:
+    failed = len(items) - len(pointset.ids)
+    if cfg.strict and failed:
+        raise DataError(f"{failed} of {len(items)} objects failed; see {folder / 'manifest.csv'}")
+
+
+def _make_renderer(settings: Any) -> Any:
+    return build(settings)
+
+
+def _scan_missing(
+    job: Job, items: list[MeshItem], parts: Parts, workers: int, label: str
+) -> dict[str, Outcome]:
+    """Scan what has no part yet; the failures that are not the objects' fault, by id.
+
+    Those get no part: should this run be interrupted, the next one tries them again.
+    """
+    missing = [item for item in items if not parts.done(item.id)]
+    passing = {}
+    if len(missing) < len(items):
+        log.info("continuing: %d of %d objects are done", len(items) - len(missing), len(items))
+    with progress_bar(label, total=len(items), done=len(items) - len(missing)) as advance:
+        for outcome in scan_all(job, missing, workers):
+            if not outcome.lasting:
+                passing[outcome.item_id] = outcome
+            elif not outcome.saved:
+                parts.save(outcome)
+            advance()
+            if outcome.reason:
+                log.warning("%s: %s", outcome.item_id, outcome.reason)
+    return passing
+
+
+def _collect(
+    items: list[MeshItem], parts: Parts, passing: dict[str, Outcome], folder: Path
+) -> list[Outcome]:
+    """One outcome an item; DataError if no object gave a cloud."""
+    outcomes: list[Outcome] = []
+    for item in items:
+        outcome = passing.get(item.id) or parts.load(item.id)
+        if outcome is None:
+            raise DataError(f"the part of {item.id} is gone: run the same command again")
+        outcomes.append(outcome)
+    if all(outcome.cloud is None for outcome in outcomes):
+        forget(folder)  # nothing is lost, and mended settings are not refused
+        raise DataError(
+            f"all {len(items)} objects failed; the first: {items[0].id}: {outcomes[0].reason}"
+        )
+    return outcomes
+
+
+def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome], folder: Path) -> None:
+    """clouds.png and, where something was looked at, infrared.png: for people only."""
+    clouds: dict[str, list[Any]] = {item.cls: [] for item in items}
+    previews = {}
+    for item, outcome in zip(items, outcomes, strict=True):
+        if outcome.cloud is None:
+            continue
+        if len(clouds[item.cls]) < OBJECTS:
+            clouds[item.cls].append(outcome.cloud.arrays)
+        if outcome.cloud.preview and item.cls not in previews:
+            previews[item.cls] = (item.id, outcome.cloud.preview)
+    twin = any("points_clean" in arrays for some in clouds.values() for arrays in some)
+    clouds_picture(folder / CLOUDS, clouds, domain.label, twin)
+    if previews:
+        infrared_picture(folder / INFRARED, previews, domain.label)
+
+
+def _write(
+    domain: Domain,
+    items: list[MeshItem],
+    outcomes: list[Outcome],
+    recipe: dict[str, Any],
+    cfg: DictConfig,
+) -> PointSet:
+    good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
+    rows = [
+        ManifestRow(
+            id=item.id,
+            cls=item.cls,
+            split=item.split,
+            seed=cfg.seed,
+            mesh_sha256=outcome.mesh_sha256,
+            origin=item.origin,
+            views=outcome.cloud.views if outcome.cloud else None,
+            valid_points=outcome.cloud.valid_points if outcome.cloud else None,
+            status="ok" if outcome.cloud else "failed",
+            reason=_without_root(outcome.reason, cfg),
+        )
+        for item, outcome in zip(items, outcomes, strict=True)
+    ]
+    return write_pointset(
+        domain.folder,
+        name=domain.folder.name,
+        classes=domain.names,
+        arrays={name: [cloud.arrays[name] for cloud in good] for name in good[0].arrays},
+        rows=rows,
+        meta={
+            "simulated": domain.simulated,
+            "benchmark": benchmark(cfg, recipe),
+            "settings": recipe["settings"],
+            "versions": recipe["versions"],
+            "config": stored_config(cfg),
+        },
+        tables={"provenance": PROVENANCE} if cfg.provenance else None,
+    )
+
+
+def _without_root(reason: str, cfg: DictConfig) -> str:
+    """The reason with paths relative to the mesh folder: a manifest is the same anywhere."""
+    if cfg.meshes is None:
+        return reason
+    root = mesh_root(cfg)
+    return reason.replace(f"{root.resolve()}/", "").replace(f"{root}/", "")
+
+
+def _report(
+    pointset: PointSet,
+    items: list[MeshItem],
+    outcomes: list[Outcome],
+    folder: Path,
+    seconds: float,
+) -> None:
+    """Counts a class, failures with their reasons, where things are, and the content hash."""
+    failures = [o for o in outcomes if o.cloud is None]
+    failed = Counter(item.cls for item, o in zip(items, outcomes, strict=True) if o.cloud is None)
+    counts = pointset.counts()
+    log.info("%-10s %s %7s", "clouds", " ".join(f"{split:>7}" for split in counts), "failed")
+    for name in pointset.classes:
+        row = [counts[split][name] for split in counts]
+        if any(row) or failed[name]:
+            log.info("%-10s %s %7d", name, " ".join(f"{n:>7d}" for n in row), failed[name])
+    total = [sum(counts[split].values()) for split in counts]
+    log.info("%-10s %s %7d", "all", " ".join(f"{n:>7d}" for n in total), len(failures))
+    for outcome in failures[:_FAILURES_SHOWN]:
+        log.warning("failed: %s: %s", outcome.item_id, outcome.reason)
+    if len(failures) > _FAILURES_SHOWN:
+        more = len(failures) - _FAILURES_SHOWN
+        log.warning("and %d more: %s says why", more, folder / "manifest.csv")
+    if kind := pointset.meta.get("benchmark"):
+        log.info("this is %s", kind)
+    pictures = " and ".join(n for n in (CLOUDS, INFRARED) if (folder / n).is_file())
+    log.info("in %s: look at %s", folder, pictures)
+    log.info("content hash %s, %.0f s", pointset.sha256[:16], seconds)

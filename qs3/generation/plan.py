@@ -1,0 +1,248 @@
+"""What generate.py is about to do: settings checked, objects listed, everything written down."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+import qs3
+from qs3.classes import CLASSES, class_list
+from qs3.config.checks import whole
+from qs3.config.hydra import build
+from qs3.errors import ConfigError
+from qs3.generation.provenance import Keep
+from qs3.generation.released.poses import read_poses
+from qs3.generation.shards import VIEWS
+from qs3.meshes.folder import MeshFolder
+from qs3.meshes.source import MeshItem
+from qs3.utils.files import sha256_file
+
+_WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
+_NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
+_SWITCHES = ("provenance", "keep_views", "force", "strict")
+# Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
+_OF_LOOKING = ("scene", "tracking", "crop")
+_PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
+# Of a config: where things lie, and what never changes a byte.
+_UNSTORED = ("paths", "workers", "force", "strict")
+
+
+def check(cfg: DictConfig) -> None:
+    """Raise ConfigError for settings that no later step would explain as well."""
+    for key, least in _WHOLE.items():
+        if cfg[key] is not None or key != "limit":
+            whole(key, cfg[key], least)
+    if not isinstance(cfg.fraction, int | float) or not 0 < cfg.fraction <= 1:
+        raise ConfigError(f"fraction must be in (0, 1], got {cfg.fraction!r}")
+    if cfg.classes is not None:
+        if not isinstance(cfg.classes, ListConfig):
+            raise ConfigError(f"classes is a list: classes=[{cfg.classes}]")
+        known = known_classes(cfg)
+        if unknown := sorted(set(cfg.classes) - set(known)):
+            raise ConfigError(f"classes: {unknown} are not among the known {', '.join(known)}")
+    for key in _SWITCHES:
+        if not isinstance(cfg[key], bool):
+            raise ConfigError(f"{key} must be true or false, got {cfg[key]!r}")
+    if cfg.paths.data_dir is None or not str(cfg.paths.data_dir).strip():
+        raise ConfigError(f"paths.data_dir must name a folder, got {cfg.paths.data_dir!r}")
+    if cfg.meshes is None and cfg.half != "all":
+        raise ConfigError("half= divides a folder of meshes: give one with meshes=PATH")
+    for key in ("released", "poses"):
+        if cfg.get(key) and "poses" not in cfg.recipe:
+            raise ConfigError(
+                f"{key}= is for domain=specklenet10, and where it fits for blensor10, as the "
+                f"authors made them; leave it out for domain={cfg.domain.name}"
+            )
+
+
+def known_classes(cfg: DictConfig) -> tuple[str, ...]:
+    """The classes of the domain, in label order."""
+    return class_list(cfg.domain.get("classes"))
+
+
+def check_recipe(recipe: Any, cfg: DictConfig) -> None:
+    """Raise ConfigError if sensor or renderer are missing where the recipe needs them.
+
+    And if something is asked for that a domain without views cannot give.
+    """
+    if not recipe.needs_renderer:
+        for key in (*_OF_LOOKING, "provenance", "keep_views"):
+            if cfg.get(key):
+                raise ConfigError(
+                    f"domain {cfg.domain.name} looks at nothing, so {key}= says nothing to it: "
+                    "leave it out"
+                )
+        return
+    parts = {"sensor": recipe.sensor, "renderer": cfg.renderer}
+    for key, part in (*parts.items(), *((key, cfg[key]) for key in _OF_LOOKING if key in cfg)):
+        if not part:
+            raise ConfigError(
+                f"domain {cfg.domain.name} looks at meshes: {key}=none does not do, choose another"
+            )
+
+
+def mesh_items(cfg: DictConfig) -> list[MeshItem]:
+    """The objects to scan, from the user's folder or the embedded catalogue."""
+    classes = tuple(cfg.classes) if cfg.classes else None
+    if cfg.meshes is None:
+        if missing := sorted(set(classes or known_classes(cfg)) - set(CLASSES)):
+            raise ConfigError(
+                f"the embedded catalogue has no {', '.join(missing)}: give a folder of meshes with "
+                "meshes=PATH, or only classes that it has, classes=[chair,table]"
+            )
+        items = build(cfg.catalogue, classes=classes or CLASSES).items()
+    else:
+        items = MeshFolder(
+            path=mesh_root(cfg),
+            classes=classes,
+            test_fraction=cfg.test_fraction,
+            half=cfg.half,
+            known=known_classes(cfg),
+        ).items()
+    kept = _first_of_each(items, cfg.limit, cfg.fraction)
+    return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]
+
+
+def mesh_root(cfg: DictConfig) -> Path:
+    """The user's folder of meshes."""
+    return Path(cfg.meshes).expanduser()
+
+
+def keep(cfg: DictConfig, items: Sequence[MeshItem], folder: Path) -> Keep:
+    """What is wanted besides the clouds: provenance, views, and previews of some objects."""
+    seen: Counter[str] = Counter()
+    previews = []
+    for item in items:
+        if seen[item.cls] < _PREVIEWS:
+            previews.append(item.id)
+        seen[item.cls] += 1
+    return Keep(
+        provenance=cfg.provenance,
+        views=folder / VIEWS if cfg.keep_views else None,
+        previews=frozenset(previews),
+    )
+
+
+def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -> dict[str, Any]:
+    """All that decides the bytes of a dataset: what a resume is compared with.
+
+    A folder of meshes is described by the content of its files, not by where it lies.
+    """
+    # Only what was asked for: a dataset without it is described as it always was.
+    kept = [key for key in ("provenance", "keep_views") if cfg[key]]
+    return {
+        **({"kept": kept} if kept else {}),
+        "settings": settings(cfg),
+        "objects": [_name_and_content(item) for item in items],
+        "versions": {
+            **renderer,
+            "qs3": qs3.__version__,
+            "numpy": version("numpy"),
+            "opencv": version("opencv-python-headless"),
+            "fpsample": version("fpsample"),
+            "machine": platform.machine(),
+        },
+    }
+
+
+def settings(cfg: DictConfig) -> dict[str, Any]:
+    """The settings that decide the bytes of an object, as plain values."""
+    plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    chosen = {
+        "domain": Path(plain["domain"]["path"]).name,
+        "seed": plain["seed"],
+        "recipe": _with_content_of_poses(plain["recipe"]),
+        "meshes": "folder" if plain["meshes"] else plain["catalogue"],
+    }
+    if plain["renderer"]:
+        chosen["renderer"] = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}
+    return chosen
+
+
+def _with_content_of_poses(recipe: dict[str, Any]) -> dict[str, Any]:
+    """The recipe with a hash of the poses in place of their path; without them, with nothing."""
+    poses = dict(recipe.get("poses") or {})
+    path = poses.pop("path", None)
+    rest = {key: value for key, value in recipe.items() if key != "poses"}
+    if path is None:
+        return rest
+    return {**rest, "poses": {**poses, "sha256": read_poses(Path(path).expanduser()).sha256}}
+
+
+def stored_config(cfg: DictConfig) -> dict[str, Any]:
+    """The composed config as meta.yaml holds it: all but places and what changes no byte."""
+    plain: Any = OmegaConf.to_container(cfg, resolve=False)
+    for key in _UNSTORED:
+        plain.pop(key, None)
+    for key in _NOT_DECISIVE:
+        plain["renderer"].pop(key, None)
+    if plain["meshes"] is not None:
+        plain["meshes"] = "folder"
+    if plain.get("poses") is not None:
+        plain["poses"] = "file"
+    return plain
+
+
+def benchmark(cfg: DictConfig, recipe: dict[str, Any]) -> str:
+    """Whether this is the benchmark that a domain's version names, or something like it.
+
+    Returns:
+        "kinectsim10 v1", or "like kinectsim10 v1, but not it" where settings or objects
+        differ; empty for domains without a version.
+    """
+    stated = cfg.get("benchmark")
+    if stated is None:
+        return ""
+    name = f"{cfg.domain.name} v{stated.version}"
+    same = plan_hash(recipe) == stated.plan_sha256
+    return name if same else f"like {name}, but not it (other settings or objects)"
+
+
+def stated_hash(cfg: DictConfig, recipe: dict[str, Any]) -> str:
+    """Content hash that the benchmark should have with this renderer variant; empty if unknown."""
+    stated = cfg.get("benchmark")
+    if stated is None or plan_hash(recipe) != stated.plan_sha256:
+        return ""
+    return str(stated.content_sha256.get(recipe["versions"].get("variant"), ""))
+
+
+def plan_hash(recipe: dict[str, Any]) -> str:
+    """Hash of settings and objects, without versions and without the renderer's variant."""
+    plan = {"settings": dict(recipe["settings"]), "objects": recipe["objects"]}
+    renderer = dict(plan["settings"].get("renderer", {}))
+    renderer.pop("variant", None)
+    plan["settings"]["renderer"] = renderer
+    return hashlib.sha256(json.dumps(plan, sort_keys=True).encode()).hexdigest()
+
+
+def _name_and_content(item: MeshItem) -> str:
+    content = "" if item.path is None else f" {sha256_file(item.path)[:16]}"
+    return f"{item.id} {item.origin}{content}"
+
+
+def _scan_of(item: MeshItem, scan: int) -> MeshItem:
+    """The same mesh under another id, so with other randomness; scan 0 keeps its id."""
+    return item if scan == 0 else replace(item, id=f"{item.id}~{scan}")
+
+
+def _first_of_each(items: Sequence[MeshItem], limit: int | None, fraction: float) -> list[MeshItem]:
+    totals = Counter((item.cls, item.split) for item in items)
+    seen: Counter[tuple[str, str]] = Counter()
+    kept = []
+    for item in items:
+        group = (item.cls, item.split)
+        wanted = math.ceil(fraction * totals[group] - 1e-9)
+        if seen[group] < min(wanted, limit or wanted):
+            kept.append(item)
+        seen[group] += 1
+    return kept

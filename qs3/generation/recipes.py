@@ -1,0 +1,315 @@
+"""Recipes: how a domain turns one mesh into one point cloud.
+
+`Mesh2Point` is the paper's pipeline (section 3.1, figure 2): place, look from several
+views, measure depth, back-project, crop, fuse, sample. `SurfaceSamples` is what ModelNet10
+and its dropout variant are. Both are plain values, so that they can be sent to workers and
+written into a dataset's recipe file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from qs3.errors import ConfigError, DataError
+from qs3.generation.camera_poses import AnchoredViews, Drift, Views
+from qs3.generation.provenance import Keep, preview_of, provenance_of
+from qs3.generation.released.placement import PoseFile
+from qs3.generation.released.views import box_of_corners
+from qs3.generation.scenes import Alone, Surroundings
+from qs3.generation.view_files import save_view
+from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
+from qs3.meshes.mesh import Mesh
+from qs3.meshes.placement import Placing, UnitCube
+from qs3.sensors.base import DepthFrame, DepthSensor
+from qs3.sensors.renderers.base import Renderer
+from qs3.utils.object_rng import object_rng
+
+_NOTHING = Keep()
+
+
+class TooFewPointsError(DataError):
+    """The views of an object gave too little to make a cloud of."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """What a recipe makes of one mesh.
+
+    Attributes:
+        arrays: [P, 3] float32 by name; "points", and "points_clean" where there is a twin;
+            where it was asked for also "provenance" [P, 5] of "points".
+        views: frames that gave points.
+        valid_points: points before sampling.
+        frames: the depth frames, for looking at (empty where there are none).
+        preview: small pictures of the first view by name, where they were asked for.
+    """
+
+    arrays: dict[str, np.ndarray]
+    views: int
+    valid_points: int
+    frames: tuple[DepthFrame, ...] = ()
+    preview: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+class Recipe(Protocol):
+    """Turns a mesh into a cloud, the same bytes for the same (seed, object id)."""
+
+    points: int
+    needs_renderer: bool
+
+    def make(
+        self,
+        mesh: Mesh,
+        object_id: str,
+        seed: int,
+        renderer: Renderer | None,
+        keep: Keep = _NOTHING,
+    ) -> Cloud:
+        """Make the cloud; TooFewPointsError, MeshError or RenderError say why not.
+
+        `keep` asks for more than the cloud and never changes it.
+        """
+        ...
+
+
+class Crop(Protocol):
+    """Which measurements belong to the object."""
+
+    def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
+        """[h, w] bool in the image; None keeps all."""
+        ...
+
+    def inside(self, points: np.ndarray, box_m: np.ndarray) -> np.ndarray:
+        """[M] bool for points [M, 3] in the world and the object's box [2, 3]."""
+        ...
+
+
+@dataclass(frozen=True)
+class BoxCrop:
+    """Keep the points in the object's axis-aligned box, enlarged by a margin.
+
+    The released code has no margin: of a face that lies in the box's side only the errors
+    that point inwards survive. Ours keeps both as long as the margin exceeds the noise
+    (3 cm are two standard deviations or more of the paper's sensor up to 5 m).
+    """
+
+    margin_m: float = 0.03
+
+    def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
+        """No mask in the image: the box decides after back-projection."""
+        return None
+
+    def inside(self, points: np.ndarray, box_m: np.ndarray) -> np.ndarray:
+        """[M] bool for points [M, 3] in the world."""
+        return _in_box(points, box_m, self.margin_m)
+
+
+@dataclass(frozen=True)
+class MaskCrop:
+    """Keep the pixels of the object's mask and box, drawn as sloppily as annotations are.
+
+    The mask of what is really seen grows or shrinks by a few pixels and is shifted, so that
+    a little background comes in and a little of the object's rim goes. Of what came in, the
+    annotated box, taken generously, keeps what is near the object.
+
+    Attributes:
+        min_grow_px, max_grow_px: the mask's outline moves outwards by a whole number of
+            pixels drawn from this range.
+        max_shift_px: and the mask moves by up to so many pixels along each axis.
+        margin_m: by which the object's axis-aligned box is enlarged.
+    """
+
+    min_grow_px: int = -1
+    max_grow_px: int = 3
+    max_shift_px: int = 2
+    margin_m: float = 0.1
+
+    def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
+        """[h, w] bool."""
+        mask = (frame.label == 1).astype(np.uint8)
+        grow = int(rng.integers(self.min_grow_px, self.max_grow_px + 1))
+        shift = rng.integers(-self.max_shift_px, self.max_shift_px + 1, 2)
+        if grow:
+            size = 2 * abs(grow) + 1
+            kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+            mask = (cv2.dilate if grow > 0 else cv2.erode)(mask, kernel)
+        move = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], dtype=np.float64)
+        mask = cv2.warpAffine(mask, move, mask.shape[::-1], flags=cv2.INTER_NEAREST)
+        return mask.astype(bool)
+
+    def inside(self, points: np.ndarray, box_m: np.ndarray) -> np.ndarray:
+        """[M] bool for points [M, 3] in the world."""
+        return _in_box(points, box_m, self.margin_m)
+
+
+def _in_box(points: np.ndarray, box_m: np.ndarray, margin_m: float) -> np.ndarray:
+    return ((points >= box_m[0] - margin_m) & (points <= box_m[1] + margin_m)).all(axis=1)
+
+
+@dataclass(frozen=True)
+class Mesh2Point:
+    """Mesh to points through a simulated depth sensor.
+
+    Attributes:
+        points: of the final cloud, by farthest point sampling (paper: 2,048). A cloud with
+            fewer measured points repeats some.
+        min_points: objects with fewer measured points over all views are recorded as failed.
+        min_view_points: frames with fewer points are left out.
+        clean: also make the twin from the true depth at the same views (the paper's S_c).
+        min_clean_points: as `min_points`, of the twin; None: the same. A thin lamp may give
+            few: a matcher's patches make thin parts wide, the true depth does not.
+        poses: from a file, in place of `placing` and of `views` (whose count is kept).
+        box_of_corners: crop by the box of the turned corners of the mesh's own box, as the
+            released code does, and not by the object's own axis-aligned box.
+    """
+
+    sensor: DepthSensor
+    placing: Placing = field(default_factory=UnitCube)
+    scene: Surroundings = field(default_factory=Alone)
+    views: Views = field(default_factory=AnchoredViews)
+    drift: Drift = field(default_factory=Drift)
+    crop: Crop = field(default_factory=BoxCrop)
+    points: int = 2048
+    min_points: int = 128
+    min_view_points: int = 1
+    clean: bool = True
+    min_clean_points: int | None = None
+    poses: PoseFile | None = None
+    box_of_corners: bool = False
+    needs_renderer: bool = True
+
+    def __post_init__(self) -> None:
+        if self.points < 1:
+            raise ConfigError(f"points must be at least 1, got {self.points}")
+        if self.poses is not None:
+            object.__setattr__(self, "placing", self.poses.placing)
+            object.__setattr__(self, "views", self.poses.views(self.views.count))
+
+    def make(
+        self,
+        mesh: Mesh,
+        object_id: str,
+        seed: int,
+        renderer: Renderer | None,
+        keep: Keep = _NOTHING,
+    ) -> Cloud:
+        """See Recipe.make."""
+        if renderer is None:
+            raise ConfigError("Mesh2Point needs a renderer: set renderer=mitsuba or blender")
+        rng = object_rng(seed, object_id, 0)
+        placed = self.placing.place(mesh, rng, object_id)
+        box = placed.bounds
+        crop_box = box_of_corners(mesh, placed) if self.box_of_corners else box
+        pose_rng = object_rng(seed, object_id, 1)
+        true_poses = self.views.poses(pose_rng, box, object_id)
+        bodies = self.scene.bodies(placed, np.stack(true_poses)[:, :3, 3], rng)
+        believed_poses = self.drift.believed(true_poses, pose_rng)
+
+        noisy, clean, frames, origins = [], [], [], []
+        for i, (pose, believed) in enumerate(zip(true_poses, believed_poses, strict=True)):
+            view_rng = object_rng(seed, object_id, 2 + i)
+            frame = self.sensor.scan(
+                bodies, box, pose, renderer, view_rng, explain=keep.views is not None
+            )
+            if frame is None:
+                continue
+            frames.append(frame)
+            if keep.views is not None:
+                save_view(keep.views, object_id, i, frame, pose, believed)
+            mask = self.crop.keep(frame, view_rng)
+            depth = frame.depth_m if mask is None else np.where(mask, frame.depth_m, np.nan)
+            points = frame.points(depth, believed)
+            # A box is known in the world; with drift the cloud and the box part company,
+            # as they do when a scan is cropped by an annotation made on the fused model.
+            inside = self.crop.inside(points, crop_box)
+            points = points[inside]
+            if len(points) >= self.min_view_points:
+                noisy.append(points)
+                if keep.provenance:
+                    origins.append(provenance_of(frame, depth, i)[inside])
+            if self.clean:
+                seen = np.where(frame.label == 1, frame.clean_m, np.nan)
+                clean.append(frame.points(seen, pose))
+
+        fused, order = self._sample(noisy, "the sensor", "min_points")
+        arrays = {"points": fused[order]}
+        if self.clean:
+            least = "min_points" if self.min_clean_points is None else "min_clean_points"
+            true, true_order = self._sample(clean, "the true depth", least)
+            arrays["points_clean"] = true[true_order]
+        if keep.provenance:
+            arrays["provenance"] = np.concatenate(origins)[order]
+        preview = preview_of(frames[0]) if object_id in keep.previews else {}
+        return Cloud(arrays, len(noisy), sum(map(len, noisy)), tuple(frames), preview)
+
+    def _sample(
+        self, parts: list[np.ndarray], what: str, least: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """All points [M, 3] float32, and which of them make the cloud: [P] indices."""
+        total, wanted = sum(map(len, parts)), getattr(self, least)
+        if total < max(wanted, 1):
+            raise TooFewPointsError(
+                f"{what} gave {total} points over {self.views.count} views, fewer than "
+                f"recipe.{least}={wanted}"
+            )
+        fused = np.concatenate(parts).astype(np.float32)
+        return fused, farthest_point_sampling_np(fused, self.points)
+
+
+@dataclass(frozen=True)
+class RegionDropout:
+    """Holes in a surface sample, to imitate missing parts (the paper's M_d).
+
+    The paper gives no parameters; these are ours: one to three balls around random points
+    of the cloud, each emptying a share of the cloud.
+    """
+
+    min_regions: int = 1
+    max_regions: int = 3
+    min_share: float = 0.1
+    max_share: float = 0.25
+
+    def apply(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """The points [N, 3] that remain; each region takes its share of the N."""
+        total = len(points)
+        for _ in range(int(rng.integers(self.min_regions, self.max_regions + 1))):
+            share = rng.uniform(self.min_share, self.max_share)
+            centre = points[int(rng.integers(len(points)))]
+            distance = ((points - centre) ** 2).sum(axis=1)
+            order = np.argsort(distance, kind="stable")
+            points = points[np.sort(order[int(share * total) :])]
+        return points
+
+
+@dataclass(frozen=True)
+class SurfaceSamples:
+    """Uniform samples of the whole surface, as in ModelNet10 (M) and its dropout (M_d)."""
+
+    placing: Placing = field(default_factory=UnitCube)
+    dropout: RegionDropout | None = None
+    points: int = 2048
+    needs_renderer: bool = False
+
+    def make(
+        self,
+        mesh: Mesh,
+        object_id: str,
+        seed: int,
+        renderer: Renderer | None,
+        keep: Keep = _NOTHING,
+    ) -> Cloud:
+        """See Recipe.make."""
+        rng = object_rng(seed, object_id, 0)
+        placed = self.placing.place(mesh, rng, object_id)
+        # Regions take up to 75 % of the cloud; five times as many samples leave enough.
+        drawn = self.points if self.dropout is None else 5 * self.points
+        points = surface_sample(placed.vertices, placed.faces, drawn, rng)
+        if self.dropout is not None:
+            points = self.dropout.apply(points, rng)
+            points = points[np.sort(rng.permutation(len(points))[: self.points])]
+        points = points.astype(np.float32)
+        return Cloud({"points": points}, views=0, valid_points=len(points))

@@ -1,0 +1,326 @@
+"""A trained net as one file that needs no qs3: .pt2 for `torch.export.load`, .onnx for runtimes."""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import json
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+import qs3
+from qs3.clouds.files import measured, parse_clouds
+from qs3.config.checks import whole
+from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.inference.export_graph import Plain, least_points
+from qs3.inference.predictor import Predictor, load
+from qs3.models.base import PointClassifier
+from qs3.models.norms import norms_for, use_domain
+from qs3.utils.files import atomic_path, make_folder
+
+log = logging.getLogger(__name__)
+
+ALLOWED = 1e-4  # difference of logits
+ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
+SUFFIXES = (".onnx", ".pt2")
+INPUT, OUTPUT = "points", "logits"
+_CHECKED = 32  # clouds to compare on
+_MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
+_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+_LOGGERS = ("torch", "torch.onnx", "torch._dynamo", "torch.export", "onnxscript", "onnx_ir")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The exported net's logits beside the net's own.
+
+    Sums in another order differ in their last digits. Where two neighbours or farthest points are
+    equally far but for these, a net may take the other one, and a cloud's logits differ by more;
+    that happens to single clouds, an error to all.
+
+    Attributes:
+        clouds: compared.
+        typical: the median over the clouds of the largest difference of a cloud's logits.
+        largest: the largest of all.
+        odd: clouds that differ by more than `ALLOWED`.
+        other_class: clouds whose likeliest class differs.
+    """
+
+    clouds: int
+    typical: float
+    largest: float
+    odd: int
+    other_class: int
+
+    @classmethod
+    def of(cls, theirs: Float[np.ndarray, "n c"], ours: Float[np.ndarray, "n c"]) -> Comparison:
+        """Of two nets on the same n clouds."""
+        difference = np.abs(theirs - ours).max(axis=1)
+        odd = ~(difference <= ALLOWED)  # NaN is odd
+        other = theirs.argmax(axis=1) != ours.argmax(axis=1)
+        return cls(
+            len(ours),
+            float(np.median(difference)),
+            float(difference.max()),
+            int(odd.sum()),
+            int(other.sum()),
+        )
+
+    @property
+    def agrees(self) -> bool:
+        """At most a tenth of the clouds differ by more than 1e-4 (one of a few)."""
+        return self.typical <= ALLOWED and self.odd <= max(1, int(ALLOWED_ODD * self.clouds))
+
+    def __str__(self) -> str:
+        text = (
+            f"logits on {self.clouds} clouds differ by {self.typical:.1e} (median) and "
+            f"{self.largest:.1e} (largest)"
+        )
+        if self.odd:
+            text += (
+                f"; {self.odd} differ by more than {ALLOWED:g}, as where two neighbours are "
+                f"equally far; {self.other_class} get another class"
+            )
+        return text
+
+
+def export_command(
+    ckpt: str | Path, out: str | Path, check: str | Path | None = None, threads: int = 1
+) -> str:
+    """Export a run's classifier and compare; text for the terminal.
+
+    Args:
+        ckpt: a run's folder or result.pt.
+        out: .onnx or .pt2.
+        check: a file or folder of clouds, z up, to compare on; clouds made up if None.
+        threads: of torch.
+    """
+    from qs3.inference.command import saved
+
+    torch.set_num_threads(whole("threads", threads, 1))
+    predictor = load(ckpt)
+    clouds = None if check is None else clouds_of(predictor, check)
+    replaces = Path(out).expanduser().exists()
+    compared = export(predictor, out, clouds)
+    how = f"onnxruntime.InferenceSession({str(out)!r})"
+    if Path(out).suffix == ".pt2":
+        how = f"torch.export.load({str(out)!r}).module()"
+    points = (
+        f"{predictor.points} (or another number of)" if any_points(predictor) else predictor.points
+    )
+    return (
+        f"{compared}\n"
+        f"{saved(out, replaces)}: {how} takes {INPUT!r}, float32 [clouds, points, 3],\n"
+        f"any number of prepared clouds of {points} points, and gives {OUTPUT!r} of\n"
+        f"{', '.join(predictor.classes)}; NaN is not noticed"
+    )
+
+
+def export(
+    predictor: Predictor, out: str | Path, clouds: Float[Tensor, "n m 3"] | None = None
+) -> Comparison:
+    """Write the net to `out`, read it back, and compare it with the net, one cloud and many.
+
+    Args:
+        predictor: the classifier.
+        out: .onnx or .pt2.
+        clouds: prepared ones to compare on; None makes some up.
+
+    Raises:
+        ConfigError: another kind of file, or a package for it is missing.
+        Qs3Error: torch cannot export this net, or the logits differ: then there is no file.
+    """
+    out = Path(out).expanduser()
+    if out.suffix not in SUFFIXES:
+        raise ConfigError(f"out={out} must end in {' or '.join(SUFFIXES)}")
+    if out.suffix == ".onnx":
+        check_packages()
+    clouds = made_up(predictor.points) if clouds is None else clouds
+    # A copy that nobody trains: some operations of the graph have no gradients.
+    net = copy.deepcopy(predictor.net).cpu().requires_grad_(False)
+    # Two, also where there is one: torch takes a size of 1 for one that never changes.
+    example = clouds[:1].repeat(2, 1, 1)
+    make_folder(out.parent)
+    # What torch compiled for another net's loops, whose sizes would become limits of this one's.
+    torch.compiler.reset()
+    with _quiet(), torch.no_grad(), use_domain(net, norms_for(net, "target")):
+        write: Callable[..., Any] = _write_onnx if out.suffix == ".onnx" else _write_pt2
+        with atomic_path(out) as temporary:
+            try:
+                run = write(Plain(net).eval(), example, predictor, temporary)
+            except Exception as error:  # torch raises dozens of kinds
+                raise _cannot(predictor, error) from error
+            ours = np.concatenate([net(part).numpy() for part in clouds.split(16)])
+            parts = [clouds[:1], *clouds[1:].split(15)]  # the number of clouds must not matter
+            theirs = np.concatenate([run(part.contiguous()) for part in parts if len(part)])
+            compared = Comparison.of(theirs, ours)
+            if not compared.agrees:
+                raise Qs3Error(f"the exported net is not the same: {compared}; {out} not written")
+    return compared
+
+
+def any_points(predictor: Predictor) -> bool:
+    """Whether the exported net takes clouds of any number of points (from some number on)."""
+    net = predictor.net
+    return isinstance(net, PointClassifier) and predictor.points >= least_points(net.backbone)
+
+
+def clouds_of(predictor: Predictor, place: str | Path) -> Float[Tensor, "n m 3"]:
+    """The first clouds of a file or folder, prepared; z up. Damaged ones are left out and told.
+
+    Raises:
+        MissingDataError: there are no files.
+        DataError: all are damaged.
+    """
+    from qs3.inference.command import find_files
+
+    found: list[Tensor] = []
+    for path in find_files(place, "check")[0]:
+        try:
+            clouds = parse_clouds(path).clouds
+        except DataError as error:
+            log.warning("left out: %s", error)
+            continue
+        for i, given in enumerate(clouds):
+            where = f"{path}, cloud {i}"
+            try:
+                found.append(predictor.prepare(measured(given, where)[0], where).points)
+            except DataError as error:
+                log.warning("left out: %s", error)
+            if len(found) == 8 * _CHECKED:
+                return torch.stack(found)
+    if not found:
+        raise DataError(f"check={place} holds no cloud that can be read; see the lines above")
+    return torch.stack(found)
+
+
+def made_up(points: int, count: int = _CHECKED) -> Float[Tensor, "n m 3"]:
+    """Noisy ellipsoids and boxes in the unit ball; every fourth one repeats some of its points."""
+    rng = np.random.default_rng(0)
+    clouds = rng.normal(size=(count, points, 3))
+    clouds[::2] /= np.linalg.norm(clouds[::2], axis=2, keepdims=True)
+    clouds[1::2] /= np.abs(clouds[1::2]).max(axis=2, keepdims=True)
+    clouds = clouds * rng.uniform(0.1, 1, (count, 1, 3)) + rng.normal(scale=0.02, size=clouds.shape)
+    some = max(1, 2 * points // 3)
+    clouds[::4] = clouds[::4, np.arange(points) % some]
+    clouds -= clouds.mean(axis=1, keepdims=True)
+    clouds /= np.linalg.norm(clouds, axis=2).max(axis=1)[:, None, None]
+    return torch.from_numpy(clouds.astype(np.float32))
+
+
+def metadata(predictor: Predictor) -> dict[str, str]:
+    """What using the net takes, beside its weights; stands in the ONNX file's metadata_props."""
+    result = predictor.result
+    upright = result.gravity == "z"
+    return {
+        "qs3": qs3.__version__,
+        "classes": json.dumps(list(predictor.classes)),
+        "points": str(predictor.points),
+        "any_number_of_points": str(any_points(predictor)).lower(),
+        "up": "z" if upright else "none (frame of the camera)",
+        "target": result.target,
+        "unit": "none: clouds are scaled to the unit ball",
+        "normalisation": "subtract the mean of the points, divide by the largest distance from it",
+        "sampling": f"then farthest point sampling to {predictor.points} points, from the first "
+        f"one on; in training clouds had {result.stored_points} points before",
+        "input": f"{INPUT}: float32 [clouds, points, 3]",
+        "output": f"{OUTPUT}: float32 [clouds, {len(predictor.classes)}], before the softmax",
+    }
+
+
+def check_packages() -> None:
+    """Raise ConfigError if a package that writes or checks ONNX files is not installed."""
+    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"an .onnx file needs {', '.join(missing)}, not installed here: "
+            "pip install 'qs3[onnx]'; out=model.pt2 needs torch alone"
+        )
+
+
+def _shapes(predictor: Predictor) -> tuple[dict[int, Any]]:
+    """Which axes of the input are free."""
+    free: dict[int, Any] = {0: torch.export.Dim("clouds", min=1, max=_MOST_CLOUDS)}
+    if any_points(predictor):
+        net: Any = predictor.net
+        least = least_points(net.backbone)
+        free[1] = torch.export.Dim("points", min=least, max=_MOST_POINTS)
+    return (free,)
+
+
+def _write_pt2(
+    net: Plain, example: Tensor, predictor: Predictor, path: Path
+) -> Callable[[Tensor], np.ndarray]:
+    """Returns the net as read back."""
+    graph = torch.export.export(
+        net, (example,), dynamic_shapes=_shapes(predictor), strict=False
+    ).run_decompositions({})  # plain operations: nested ones (autocast) cannot be read back
+    torch.export.save(graph, path)
+    again = torch.export.load(path).module()
+    return lambda points: again(points).numpy()
+
+
+def _write_onnx(
+    net: Plain, example: Tensor, predictor: Predictor, path: Path
+) -> Callable[[Tensor], np.ndarray]:
+    """Returns the net as onnxruntime reads and runs it."""
+    import onnxruntime  # type: ignore[import-untyped]
+
+    program = torch.onnx.export(
+        net,
+        (example,),
+        dynamo=True,
+        dynamic_shapes=_shapes(predictor),
+        input_names=[INPUT],
+        output_names=[OUTPUT],
+        verbose=False,
+    )
+    assert program is not None
+    program.model.metadata_props.update(metadata(predictor))
+    program.save(str(path), external_data=False)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    session = onnxruntime.InferenceSession(
+        path.read_bytes(), options, providers=["CPUExecutionProvider"]
+    )
+    return lambda points: session.run([OUTPUT], {INPUT: points.numpy()})[0]
+
+
+def _cannot(predictor: Predictor, error: Exception) -> Qs3Error:
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    cause = error.__cause__ or error
+    first = next(iter(str(cause).splitlines()), "") or (lines or [""])[0]
+    return Qs3Error(
+        f"torch {torch.__version__} cannot export {predictor.result.model['_target_']}: its layers "
+        "do what depends on values or on the number of clouds, which a graph cannot hold; use it "
+        f"by qs3.load ({type(cause).__name__}: {first[:200]})"
+    )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without reports for those who write nets; what matters comes as an exception."""
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            # Of tensors that share memory; the logits are compared after reading back.
+            warnings.filterwarnings("ignore", message="No complete tensor found")
+            # torch 2.13 asks its own tree of arguments in an old way, when it copies it.
+            warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

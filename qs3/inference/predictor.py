@@ -1,0 +1,196 @@
+"""Using a trained classifier: `qs3.load(run)(clouds)`.
+
+    predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
+    probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up
+
+A cloud goes the way of the target's clouds in the run: thinned to as many points as these were
+stored with (farthest points from the first one on), or filled up by repeating its points from the
+first on; put into the unit ball; and of it the farthest `points` points. The test clouds of a run
+get the probabilities of its predictions.csv.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.clouds.files import checked
+from qs3.data.importers.base import check_cloud
+from qs3.data.importers.folders import CloudFolder
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.fps_samples import sample
+from qs3.errors import ConfigError, DataError
+from qs3.evaluation.metrics import predict
+from qs3.evaluation.ood import enough, measure, strange
+from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
+
+BATCH = 32  # clouds: more are no faster on a CPU
+
+
+class Prepared(NamedTuple):
+    """A cloud as the net sees it.
+
+    Attributes:
+        points: [m, 3] in the unit ball.
+        given: how many points there were.
+        strange: in what it is unlike the clouds of training, in words; see `qs3.evaluation.ood`.
+    """
+
+    points: Float[Tensor, "m 3"]
+    given: int
+    strange: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """A trained classifier.
+
+    Attributes:
+        net: [B, N, 3] to logits [B, C], in eval mode; it wants prepared clouds.
+        result: where it comes from, and how its clouds are prepared.
+        device: of the net.
+    """
+
+    net: nn.Module
+    result: Result
+    device: torch.device
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names in the order of the probabilities."""
+        return self.result.classes
+
+    @property
+    def points(self) -> int:
+        """Of a cloud as the net sees it."""
+        return self.result.points
+
+    def prepare(self, cloud: np.ndarray, name: str = "the cloud", up: str = "z") -> Prepared:
+        """A cloud [n, >= 3] of any n >= 1 as the net sees it.
+
+        Args:
+            cloud: x y z in any unit.
+            name: for messages: its file.
+            up: the axis that points up in it: x, y, z, -x, -y or -z.
+
+        Raises:
+            DataError: no points, or NaN or infinite coordinates; says which.
+        """
+        cloud = _array(cloud, name)
+        if cloud.ndim != 2 or cloud.shape[1] < 3:
+            raise DataError(f"{name}: the array has shape {cloud.shape}, expected [n, 3]")
+        cloud = checked(cloud[:, :3], name)
+        # By the importer of one's own clouds, so that both ways give the same bits.
+        rules = CloudFolder(".", points=self.result.stored_points, up=up)
+        stored = rules.turn(check_cloud(rules.thin(cloud, name), rules.points, name), "")
+        stored = np.ascontiguousarray(stored)  # as on disk: sums take another order otherwise
+        whole = stored[None]  # [1, P, 3]
+        some = self.points < rules.points
+        ready = Clouds.of(whole, sample(whole, self.points, 1) if some else None).all()[0]
+        usual = enough(self.result.usual, self.points)
+        found = strange(measure(stored, ready.numpy()), usual)
+        return Prepared(ready, len(cloud), tuple(found))
+
+    def probabilities(
+        self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
+    ) -> Float[np.ndarray, "n c"]:
+        """Of prepared clouds; n >= 1."""
+        found = predict(self.net, points, batch_size, self.device)
+        if found.shape[1] != len(self.classes):
+            raise DataError(
+                f"the net tells {found.shape[1]} classes apart, the file names {len(self.classes)}"
+            )
+        return found
+
+    def __call__(
+        self,
+        clouds: Float[np.ndarray, "n p 3"] | Float[Tensor, "n p 3"] | Sequence[np.ndarray],
+        *,
+        names: Sequence[str] | None = None,
+        up: str = "z",
+        batch_size: int = BATCH,
+    ) -> Float[np.ndarray, "n c"]:
+        """Class probabilities of clouds, float64, a row a cloud.
+
+        Args:
+            clouds: [N, P, 3], or a list of clouds with different numbers of points.
+            names: theirs, for messages; None counts them from 0.
+            up: the axis that points up in them.
+            batch_size: clouds that the net sees at a time.
+
+        Raises:
+            DataError: no list of clouds; or names the cloud that is empty or not finite.
+        """
+        if clouds is None or isinstance(clouds, str | bytes) or not hasattr(clouds, "__iter__"):
+            raise DataError(f"got {clouds!r:.60}; give a list of clouds, [n, 3] arrays")
+        if getattr(clouds, "ndim", 3) == 2:
+            raise DataError(
+                f"got one array of shape {tuple(clouds.shape)}; give a list of clouds, "  # type: ignore[union-attr]
+                "predictor([cloud])"
+            )
+        arrays = list(clouds)
+        names = [f"cloud {i}" for i in range(len(arrays))] if names is None else names
+        if not arrays:
+            return np.empty((0, len(self.classes)))
+        ready = [self.prepare(c, name, up).points for c, name in zip(arrays, names, strict=True)]
+        return self.probabilities(torch.stack(ready), batch_size)
+
+
+def load(
+    run: str | Path, *, device: str | torch.device = "cpu", packages: Sequence[str] = PACKAGES
+) -> Predictor:
+    """The classifier that a finished run reports; also as `qs3.load`.
+
+    Args:
+        run: its folder, or the file result.pt of it, which needs nothing beside it.
+        device: where to run it: "cpu", "cuda", "cuda:1".
+        packages: where the net of the file may be defined. For a net of your own add your
+            package, if you trust it to be built with any arguments.
+
+    Raises:
+        MissingDataError: no finished run there.
+        DataError: the file is damaged, or asks for something else than a net of `packages`.
+        ConfigError: no such device.
+    """
+    result = read_result(run)
+    place = device_of(device)
+    return Predictor(build_net(result, packages).to(place), result, place)
+
+
+def _array(cloud: Any, name: str) -> np.ndarray:
+    """An array, tensor or nested list of numbers as an array.
+
+    Raises:
+        DataError: something else.
+    """
+    if isinstance(cloud, Tensor):
+        cloud = cloud.detach().cpu()
+    try:
+        found = np.asarray(cloud)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise DataError(f"{name}: no array of numbers [n, 3] ({error})") from error
+    if found.dtype.kind not in "fiu":
+        raise DataError(f"{name}: {type(cloud).__name__} of {found.dtype}, no numbers [n, 3]")
+    return found
+
+
+def device_of(device: Any) -> torch.device:
+    """The device, if it works here.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    try:
+        place = torch.device(device)
+        torch.empty(1, device=place)
+    except (RuntimeError, AssertionError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"device={device} cannot be used here ({reason}); try cpu") from error
+    return place

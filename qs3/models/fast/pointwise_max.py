@@ -1,0 +1,99 @@
+"""The maximum over the points of a linear layer and its norm, without the layer's output.
+
+For PointNet's layers of 1,024 channels on the CPU. Norm and ReLU are monotone in a channel, so of
+z = W y only the maximum over each cloud is needed, or the minimum where the norm's weight is
+negative (then W comes with that sign). Mean and variance of z follow from those of y:
+mean(z) = W mean(y), var(z) = diag(W cov(y) W'). Backwards
+
+    dz = D + (dmean + 2 (z - mean) dvar) / rows,   D the gradient at the maxima,
+
+so that dy and dW are products of the input's width, and a row for each entry of D.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from qs3.geometry.matmul import times
+from qs3.models.fast.edgeconv import max_over_rows
+from qs3.models.norms import active, track, uses_batch
+
+_AT_ONCE = 1 << 20  # values of z worked on at once: 4 MB in float32
+
+
+class _Largest(torch.autograd.Function):
+    """[b, n, c] and W [d, c] to the maximum [b, d] of z, and its mean and biased variance [d]."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, y: Tensor, weight: Tensor, statistics: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        b, n, c = y.shape
+        best = y.new_empty(b, len(weight))
+        where = torch.empty(best.shape, dtype=torch.int64, device=y.device)
+        step = max(1, _AT_ONCE // (n * len(weight)))
+        rows = y.reshape(b * n, c)
+        for i in range(0, b, step):
+            z = times(rows[i * n : (i + step) * n], weight).view(-1, n, len(weight))
+            best[i : i + step], where[i : i + step] = max_over_rows(z)
+        centre = covariance = None
+        mean = var = best.new_zeros(len(weight))
+        if statistics:
+            centre = rows.mean(0)
+            covariance = torch.zeros(c, c, dtype=torch.float64, device=y.device)
+            for part in (rows - centre).split(n):
+                covariance += part.T @ part
+            covariance /= b * n
+            wide = weight.double()
+            mean = weight @ centre
+            var = ((wide @ covariance) * wide).sum(1).clamp_min(0).to(y.dtype)
+        ctx.save_for_backward(rows, weight, where, centre, covariance)
+        return best, mean, var
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, dbest: Tensor, dmean: Tensor, dvar: Tensor) -> tuple[Tensor | None, ...]:
+        rows, weight, where, centre, covariance = ctx.saved_tensors
+        b, c = len(where), rows.shape[1]
+        n = len(rows) // b
+        if centre is not None:
+            slope = 2 * dvar / len(rows)
+            product = weight.T @ (weight * slope[:, None])  # [c, c], symmetric
+            dy = times(rows, product, (dmean / len(rows)) @ weight - centre @ product)
+            dweight = 2 * dvar[:, None] * (weight @ covariance.to(weight.dtype))
+            dweight += torch.outer(dmean, centre)
+        else:
+            dy, dweight = torch.zeros_like(rows), torch.zeros_like(weight)
+        for i in range(b):  # D has one entry a cloud and channel
+            at, grad = where[i] + i * n, dbest[i, :, None]
+            dy.index_add_(0, at, grad * weight)
+            dweight += grad * rows.index_select(0, at)
+        return dy.view(b, n, c), dweight, None
+
+
+def normed_maximum(
+    y: Float[Tensor, "b n c"], layer: nn.Linear, norm: nn.Module
+) -> Float[Tensor, "b d"]:
+    """`norm(layer(y))`, its maximum over the points; `norm` is a batch norm (of the domain).
+
+    The gradient of a maximum goes to one of the points that have it.
+    """
+    plain = active(norm)
+    gamma = plain.weight
+    sign = torch.where(gamma < 0, -1.0, 1.0).to(gamma.dtype)
+    best, mean, var = _Largest.apply(y, layer.weight * sign[:, None], uses_batch(plain))
+    best, mean = best * sign, mean * sign
+    if layer.bias is not None:
+        best, mean = best + layer.bias, mean + layer.bias
+    if uses_batch(plain):
+        track(plain, mean.detach(), var.detach(), y.shape[0] * y.shape[1])
+    else:
+        assert plain.running_mean is not None
+        assert plain.running_var is not None
+        mean, var = plain.running_mean, plain.running_var
+    return (best - mean) * (gamma * torch.rsqrt(var + plain.eps)) + plain.bias

@@ -1,0 +1,1 @@
+"""Pictures of data: contact sheets, class balance, an object through the pipeline."""

@@ -1,0 +1,169 @@
+"""A run's clouds as pictures: both domains, their classes, the surest mistakes, one object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from qs3.data.store import PointSet
+from qs3.errors import Qs3Error
+from qs3.report.figures.canvas import NothingToDrawError
+from qs3.report.figures.class_balance import class_picture
+from qs3.report.figures.contact_sheets import class_sheet, contact_sheet, padded, scan_picture
+from qs3.report.runs.data import RunFiles
+from qs3.report.runs.domains import domain_of, open_domain
+from qs3.runs.predictions import Predictions
+
+ROLES = ("source", "target")
+_SHEET, _ROW = 30, 6
+"""Clouds on a sheet of mistakes, and in its rows."""
+
+
+def cloud_pictures(
+    run: RunFiles, data_dir: str | Path | None = None
+) -> dict[str, Callable[[Path], object]]:
+    """What draws each of them into a PNG; it raises NothingToDrawError, which says why not.
+
+    Args:
+        run: as read.
+        data_dir: where the datasets lie; None: where the run's config says.
+    """
+    domains = _Domains(run, data_dir)
+    makers: dict[str, Callable[[Path], object]] = {
+        "domains": domains.side_by_side,
+        "source_clouds": partial(domains.sheet, "source"),
+        "target_clouds": partial(domains.sheet, "target"),
+        "class_balance": domains.balance,
+    }
+    said = run.predictions
+    if said is None or (said.labels >= 0).any():
+        makers["mistakes"] = domains.mistakes
+    else:
+        makers["named"] = domains.named
+    makers["pipeline"] = domains.pipeline
+    return {name: partial(_or_say_why, make) for name, make in makers.items()}
+
+
+def _or_say_why(make: Callable[[Path], object], path: Path) -> None:
+    try:
+        make(path)
+    except Qs3Error as error:  # a damaged dataset: the run's other pictures are none the worse
+        raise NothingToDrawError(str(error)) from error
+
+
+class _Domains:
+    """Source and target of a run, opened when first asked for."""
+
+    def __init__(self, run: RunFiles, data_dir: str | Path | None) -> None:
+        self.run, self.data_dir = run, data_dir
+        self._open: dict[str, PointSet] = {}
+
+    def data(self, role: str) -> PointSet:
+        if role not in self._open:
+            self._open[role] = open_domain(self.run, role, self.data_dir)
+        return self._open[role]
+
+    def label(self, role: str) -> str:
+        return f"{role}: {domain_of(self.run, role, self.data_dir).label}"
+
+    def sheet(self, role: str, path: Path) -> None:
+        data = self.data(role)
+        split = next(iter(data.counts()))
+        class_sheet(data, path, split=split, heading=f"{self.label(role)}, {split}")
+
+    def side_by_side(self, path: Path) -> None:
+        sets = {role: self.data(role) for role in ROLES}
+        for role, data in sets.items():
+            if not data.labelled:
+                raise NothingToDrawError(f"the {role} has no labels to choose objects by")
+        if sets["source"].classes != sets["target"].classes:
+            raise NothingToDrawError("the two domains do not have the same classes")
+        found = [domain_of(self.run, role, self.data_dir) for role in ROLES]
+        titles = [f"{d.symbol}: {d.title}{' (simulated)' * d.simulated}" for d in found]
+        if titles[0] == titles[1]:
+            titles = [f"{title}, {role}" for title, role in zip(titles, ROLES, strict=True)]
+        scan_picture(dict(zip(titles, sets.values(), strict=True)), path)
+
+    def balance(self, path: Path) -> None:
+        class_picture({self.label(role): self.data(role) for role in ROLES}, path)
+
+    def mistakes(self, path: Path) -> None:
+        """The wrongly named clouds that the result is surest of; one a mesh."""
+        said = self._said()
+        wrong = (said.labels >= 0) & (said.predicted != said.labels)
+        if not wrong.any():
+            raise NothingToDrawError("the result makes no mistake")
+        known = f"{wrong.sum()} mistakes in {(said.labels >= 0).sum()} clouds"
+        self._sheet_of(said, _surest(said, wrong)[:_SHEET], f"surest of {known}", path)
+
+    def named(self, path: Path) -> None:
+        """Without labels: the clouds that the result is surest of, a row a class."""
+        said = self._said()
+        rows = {
+            name: _surest(said, said.predicted == k)[:_ROW] for k, name in enumerate(said.classes)
+        }
+        rows = {name: row for name, row in rows.items() if row}
+        shown = [i for row in rows.values() for i in padded(row, _ROW)]
+        words = "surest of each class as named by the result"
+        self._sheet_of(said, shown, words, path, tuple(rows))
+
+    def _said(self) -> Predictions:
+        if self.run.predictions is None:
+            raise NothingToDrawError("there are no predictions")
+        return self.run.predictions
+
+    def _sheet_of(
+        self,
+        said: Predictions,
+        shown: Sequence[int | None],
+        words: str,
+        path: Path,
+        rows: tuple[str, ...] = (),
+    ) -> None:
+        data = self.data("target")
+        place = {id_: i for i, id_ in enumerate(data.ids)}
+
+        def title(i: int) -> str:
+            named = f"{said.classes[said.predicted[i]]} {said.probabilities[i].max():.2f}"
+            return named + (f", is {said.classes[said.labels[i]]}" if said.labels[i] >= 0 else "")
+
+        contact_sheet(
+            [None if i is None else np.asarray(data.points[place[said.ids[i]]]) for i in shown],
+            ["" if i is None else title(i) for i in shown],
+            path,
+            columns=_ROW,
+            heading=f"{self.label('target')}: {words}",
+            rows=rows,
+        )
+
+    def pipeline(self, path: Path) -> None:
+        """The first object of whichever dataset kept its views."""
+        from qs3.generation.shards import VIEWS
+        from qs3.report.figures.pipeline import kept_object
+        from qs3.report.figures.pipeline_figure import save_pipeline
+
+        scanned = []
+        for role in ROLES:
+            data = self.data(role)  # that it is the run's is checked here
+            domain = domain_of(self.run, role, self.data_dir)
+            if (domain.folder / VIEWS).is_dir():
+                save_pipeline(kept_object(domain.folder), path)
+                return
+            if "sensor" in ((data.meta.get("settings") or {}).get("recipe") or {}):
+                scanned.append(domain.name)
+        why = "no views of its clouds were kept (generate.py keep_views=true)"
+        if scanned:
+            why += f"; python -m qs3.report pipeline domain={scanned[0]} scans an object again"
+        raise NothingToDrawError(why)
+
+
+def _surest(said: Predictions, which: np.ndarray) -> list[int]:
+    """Positions where `which` [n] holds, the largest probability first, one of each mesh."""
+    order = np.argsort(-said.probabilities.max(axis=1), kind="stable")
+    found: dict[str, int] = {}
+    for i in order[which[order]]:
+        found.setdefault(said.meshes[i], int(i))
+    return list(found.values())

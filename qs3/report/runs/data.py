@@ -1,0 +1,333 @@
+"""What a run's folder says about the run, read for its pictures. Needs neither torch nor data.
+
+Everything is read from the files that training writes (see `qs3.runs.folder`); what an unfinished
+or older run does not have is None, and what is damaged is refused by the name of its file.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.errors import DataError, MissingDataError
+from qs3.runs import folder as runs
+from qs3.runs.predictions import FILE as PREDICTIONS
+from qs3.runs.predictions import Predictions, read_predictions
+from qs3.runs.pseudo_labels import PseudoLabel, path_of, read_pseudo_labels
+
+HISTORY = "history.csv"
+BINS = 15
+"""Of the reliability diagram: those of `qs3.evaluation.metrics.CALIBRATION_BINS`."""
+
+_ROUND = re.compile(r"round_(\d+)")
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """`history.csv`, one entry an epoch.
+
+    Attributes:
+        epoch: [n] counted from 0.
+        phase: [n] 0 in the warm-up, r + 1 in round r.
+        learning_rate: [n].
+        loss: [n] by column; NaN where an epoch has none.
+        accuracy: [n] in [0, 1] likewise, of held-out labelled clouds, such as "source_val/acc".
+    """
+
+    epoch: Int[np.ndarray, " n"]
+    phase: Int[np.ndarray, " n"]
+    learning_rate: Float[np.ndarray, " n"]
+    loss: Mapping[str, Float[np.ndarray, " n"]]
+    accuracy: Mapping[str, Float[np.ndarray, " n"]]
+
+    def spans(self) -> list[tuple[int, int, int]]:
+        """Phase, its first and its last epoch, in order."""
+        return [
+            (int(p), int(self.epoch[self.phase == p].min()), int(self.epoch[self.phase == p].max()))
+            for p in np.unique(self.phase)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One round of self-training.
+
+    Attributes:
+        number: from 0.
+        record: what metrics.json says; empty in an unfinished run.
+        labels: its pseudo_labels.csv; None if that is gone.
+    """
+
+    number: int
+    record: Mapping[str, Any]
+    labels: list[PseudoLabel] | None
+
+    def named(self, classes: tuple[str, ...]) -> Int[np.ndarray, " c"] | None:
+        """How many target clouds the teacher gave to each class; None if not known."""
+        return None if self.labels is None else _count([row.label for row in self.labels], classes)
+
+    def selected(self, classes: tuple[str, ...]) -> Int[np.ndarray, " c"] | None:
+        """How many of them are trained on: from the table, else from metrics.json."""
+        if self.labels is not None:
+            return _count([row.label for row in self.labels if row.selected], classes)
+        return _by_class(self.record.get("selected"), classes, int)
+
+    def confident(self, classes: tuple[str, ...]) -> Int[np.ndarray, " c"] | None:
+        """How many were sure enough to be candidates."""
+        return _by_class(self.record.get("confident"), classes, int)
+
+    def of_class(self, key: str, classes: tuple[str, ...]) -> Float[np.ndarray, " c"] | None:
+        """What the record says under "mu" or "thresholds"."""
+        return _by_class(self.record.get(key), classes, float)
+
+
+@dataclass(frozen=True, eq=False)
+class RunFiles:
+    """A run, read.
+
+    Attributes:
+        folder: of the run.
+        metrics: contents of metrics.json; None if the run is not finished.
+        history: None if not one epoch is done.
+        rounds: in order.
+        predictions: None if there are none (yet, or of an older run).
+        classes: names in label order.
+        config: as composed, not resolved; None if Hydra did not write it.
+        command: that started the run; None likewise.
+        notes: what is missing, in words.
+    """
+
+    folder: Path
+    metrics: Mapping[str, Any] | None
+    history: History | None
+    rounds: tuple[Round, ...]
+    predictions: Predictions | None
+    classes: tuple[str, ...]
+    config: Mapping[str, Any] | None
+    command: str | None
+    notes: tuple[str, ...]
+
+    @property
+    def title(self) -> str:
+        """Such as "qs3_s2d, seed 0"."""
+        if self.metrics is None:
+            return f"{self.folder.parent.name}/{self.folder.name} (not finished)"
+        return f"{self.metrics['experiment']}, seed {self.metrics['seed']}"
+
+    @property
+    def target(self) -> str:
+        """The target's name, with "(simulated)" where that is so."""
+        if self.metrics is None:
+            return "the target"
+        return f"{self.metrics['target']}{' (simulated)' if self.metrics['simulated'] else ''}"
+
+    @property
+    def final(self) -> Mapping[str, Any]:
+        """The reported figures; empty in an unfinished run."""
+        return {} if self.metrics is None else self.metrics["final"]
+
+
+def read_run(folder: str | Path) -> RunFiles:
+    """Read a run's folder.
+
+    Raises:
+        MissingDataError: it is no run's folder.
+        DataError: one of its files is damaged.
+    """
+    folder = Path(folder).expanduser()
+    if not any((folder / name).exists() for name in (runs.METRICS, runs.STARTED, HISTORY)):
+        raise MissingDataError(
+            f"{folder} is not the folder of a run: it has no {runs.METRICS} and no {HISTORY}; give "
+            "<paths.log_dir>/<experiment_name>/seed<seed>-<hash>"
+        )
+    metrics, notes = _metrics(folder), []
+    if metrics is None:
+        notes.append("the run is not finished: the same command continues it")
+    predictions = None
+    if (folder / PREDICTIONS).is_file():
+        predictions = read_predictions(folder / PREDICTIONS)
+    elif metrics is not None:
+        notes.append(f"{PREDICTIONS} is not there: the run is of an older version")
+    rounds = _rounds(folder, metrics, notes)
+    return RunFiles(
+        folder=folder,
+        metrics=metrics,
+        history=_history(folder / HISTORY),
+        rounds=rounds,
+        predictions=predictions,
+        classes=_classes(metrics, predictions, rounds),
+        config=_yaml(folder / ".hydra" / "config.yaml"),
+        command=_command(folder),
+        notes=tuple(notes),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """Confidence against accuracy in bins ((b-1)/B, b/B] of the largest probability.
+
+    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, figure 1 and eq. 1 to 3.
+
+    Attributes:
+        count: [B] clouds in each bin.
+        confidence: [B] their mean largest probability; NaN in an empty bin.
+        accuracy: [B] the share that is right; NaN likewise.
+        error: expected calibration error in [0, 1].
+    """
+
+    count: Int[np.ndarray, " b"]
+    confidence: Float[np.ndarray, " b"]
+    accuracy: Float[np.ndarray, " b"]
+    error: float
+
+
+def reliability(predictions: Predictions, bins: int = BINS) -> Reliability | None:
+    """The diagram's figures; None if no cloud has a label. Clouds without one are left out."""
+    known = predictions.labels >= 0
+    if not known.any():
+        return None
+    confidence = predictions.probabilities[known].max(axis=1)
+    right = (predictions.predicted == predictions.labels)[known]
+    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    count = np.bincount(place, minlength=bins)
+    sums = [np.bincount(place, weights=w, minlength=bins) for w in (confidence, right)]
+    some = np.where(count, count, 1)
+    means = [np.where(count, total / some, np.nan) for total in sums]
+    error = float(np.abs(sums[1] - sums[0]).sum() / len(confidence))
+    return Reliability(count, means[0], means[1], error)
+
+
+def _metrics(folder: Path) -> dict[str, Any] | None:
+    metrics = runs.read_metrics(folder)
+    if metrics is None:
+        return None
+    path = folder / runs.METRICS
+    needed = ("experiment", "seed", "target", "simulated", "final")
+    missing = [key for key in needed if not isinstance(metrics, dict) or key not in metrics]
+    if missing or not isinstance(metrics["final"], dict):
+        raise DataError(
+            f"{path} is damaged: it lacks {', '.join(missing) or 'figures under final'}; delete it "
+            "and repeat the run's command, which trains nothing again"
+        )
+    return metrics
+
+
+def _history(path: Path) -> History | None:
+    if not path.is_file():
+        return None
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        if not rows:
+            return None
+
+        def column(name: str) -> np.ndarray:
+            cells = [row[name] for row in rows]
+            return np.array([float(cell) if cell else math.nan for cell in cells])
+
+        names = [name for name in rows[0] if name]
+        return History(
+            epoch=np.array([int(row["epoch"]) for row in rows]),
+            phase=np.array([int(row["phase"]) for row in rows]),
+            learning_rate=column("lr"),
+            loss={name: column(name) for name in names if "loss" in name},
+            accuracy={name: column(name) for name in names if name.endswith("_val/acc")},
+        )
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise _damaged(path, error) from error
+
+
+def _rounds(folder: Path, metrics: Mapping[str, Any] | None, notes: list[str]) -> tuple[Round, ...]:
+    records = {record["round"]: record for record in (metrics or {}).get("rounds", [])}
+    there = {
+        int(match[1])
+        for path in folder.glob("round_*")
+        if (match := _ROUND.fullmatch(path.name)) and path_of(folder, int(match[1])).is_file()
+    }
+    found = []
+    for number in sorted({*records, *there}):
+        path, labels = path_of(folder, number), None
+        if number in there:
+            try:
+                labels = read_pseudo_labels(path)
+                if not labels:
+                    raise ValueError("it has no rows")
+            except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+                raise _damaged(path, error) from error
+        else:
+            notes.append(f"{path.relative_to(folder)} is gone: counts are those of {runs.METRICS}")
+        found.append(Round(number, records.get(number, {}), labels))
+    return tuple(found)
+
+
+def _classes(
+    metrics: Mapping[str, Any] | None, predictions: Predictions | None, rounds: tuple[Round, ...]
+) -> tuple[str, ...]:
+    """In label order, where anything says what that is; else the names found, sorted."""
+    if predictions is not None:
+        return predictions.classes
+    if metrics is not None:
+        return tuple(metrics["final"].get("predicted", {}))
+    return tuple(sorted({row.label for round_ in rounds for row in round_.labels or []}))
+
+
+def _yaml(path: Path) -> dict[str, Any] | None:
+    from omegaconf import OmegaConf
+
+    if not path.is_file():
+        return None
+    try:
+        found: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    except Exception as error:  # yaml's and omegaconf's kinds have nothing else in common
+        raise _damaged(path, error) from error
+    return found if isinstance(found, dict) else None
+
+
+def _command(folder: Path) -> str | None:
+    path = folder / ".hydra" / "overrides.yaml"
+    if not path.is_file():
+        return None
+    words = [line[2:] for line in path.read_text("utf-8").splitlines() if line.startswith("- ")]
+    return shlex.join(["python", "train.py", *(word.strip("'") for word in words)])
+
+
+def _by_class(
+    values: Mapping[str, Any] | None, classes: tuple[str, ...], kind: Callable[[Any], Any]
+) -> np.ndarray | None:
+    if values is None:
+        return None
+    return np.array([kind(values.get(name, 0)) for name in classes])
+
+
+def _count(names: list[str], classes: tuple[str, ...]) -> np.ndarray:
+    return np.array([names.count(name) for name in classes])
+
+
+def _damaged(path: Path, error: Exception) -> DataError:
+    what = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return DataError(
+        f"{path} is damaged ({type(error).__name__}: {what}); repeat the run with force=true"
+    )
+
+
+def settings_of(run: RunFiles) -> str | None:
+    """The composed config as one line a key, sorted; None if it is not there."""
+    if run.config is None:
+        return None
+    return "\n".join(f"{key}: {value}" for key, value in sorted(_flat(run.config)))
+
+
+def _flat(node: Any, prefix: str = "") -> list[tuple[str, str]]:
+    if isinstance(node, dict) and node:
+        return [pair for key, value in node.items() for pair in _flat(value, f"{prefix}{key}.")]
+    return [(prefix[:-1], json.dumps(node, ensure_ascii=False))]

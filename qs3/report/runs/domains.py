@@ -1,0 +1,75 @@
+"""The datasets of a run, found again by its config and compared with the hash in its result."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from qs3.data.domain import Domain
+from qs3.data.store import PointSet, is_finished
+from qs3.errors import Qs3Error
+from qs3.report.figures.canvas import NothingToDrawError
+from qs3.report.runs.data import RunFiles
+
+_KEYS = tuple(field.name for field in dataclasses.fields(Domain))
+
+
+def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> Domain:
+    """A domain as the run's config describes it; nothing is opened.
+
+    Args:
+        run: as read.
+        role: "source" or "target".
+        data_dir: where the datasets lie; None: where the run's config says.
+
+    Raises:
+        NothingToDrawError: there is no config, or it describes no domain.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    import qs3.config.hydra  # noqa: F401 (registers the resolvers of a config)
+
+    if run.config is None:
+        raise NothingToDrawError("the run's folder has no .hydra/config.yaml that names its data")
+    try:
+        cfg = OmegaConf.create(dict(run.config))
+        if data_dir is not None:
+            cfg.paths.data_dir = str(Path(data_dir).absolute())
+        found: Any = OmegaConf.to_container(cfg.data[role], resolve=True)
+        # Not instantiated: the folder may be somebody else's, and a config can name any code.
+        about = {key: found[key] for key in _KEYS if key in found}
+        return Domain(**{**about, "published": None, "synthesis": None})
+    except (OmegaConfBaseException, TypeError, ValueError, Qs3Error) as error:
+        raise NothingToDrawError(
+            f"data.{role} of the run's .hydra/config.yaml describes no domain ({error})"
+        ) from error
+
+
+def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) -> PointSet:
+    """A domain's dataset, if it is the one that the run used. Nothing is imported or made.
+
+    Args:
+        run: as read.
+        role: "source" or "target".
+        data_dir: where the datasets lie; None: where the run's config says.
+
+    Raises:
+        NothingToDrawError: the dataset is not there, or is another; says what to do.
+        DataError: it is damaged.
+    """
+    domain = domain_of(run, role, data_dir)
+    if run.metrics is None:
+        raise NothingToDrawError("the run is not finished")
+    if not is_finished(domain.folder):
+        raise NothingToDrawError(
+            f"its {role}, {domain.name}, is not at {domain.folder}; give data_dir="
+        )
+    data = domain.open(verify=False)
+    if data.sha256 != run.metrics.get("data", {}).get(role, data.sha256):
+        raise NothingToDrawError(
+            f"{domain.folder} holds another version of {domain.name} than the run used; give "
+            "data_dir="
+        )
+    return data

@@ -1,0 +1,114 @@
+"""Features of both domains on a plane, of the warm-up's net and of the reported one."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.data.store import PointSet
+from qs3.datamodules.adaptation import load_clouds
+from qs3.errors import Qs3Error
+from qs3.inference.model_file import build_net, read_result
+from qs3.models.norms import norms_for, use_domain
+from qs3.report.figures.canvas import NothingToDrawError
+from qs3.report.runs import figures as run_figures
+from qs3.report.runs.data import RunFiles
+from qs3.report.runs.domains import open_domain
+from qs3.report.runs.tsne import tsne
+from qs3.runs.checkpoints import load
+from qs3.utils.seeding import derive
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CLOUDS = 600
+"""Of a domain, at most."""
+
+_WARMUP = "warmup_selected.pt"  # of qs3.selftraining.callback, which imports Lightning
+_BATCH = 32
+
+
+def draw_embedding(
+    run: RunFiles, data_dir: str | Path | None = None, clouds: int = CLOUDS
+) -> Figure:
+    """t-SNE of the global features of test clouds of source and target, before and after.
+
+    "Before" are the weights that the warm-up selected, "after" those of the result: without rounds
+    they are the same, and there is one panel. Which clouds follows from the run's seed.
+
+    Args:
+        run: a finished one.
+        data_dir: where the datasets lie; None: where the run's config says.
+        clouds: of a domain, at most.
+
+    Raises:
+        NothingToDrawError: data or weights are not there; says which.
+    """
+    sets = [open_domain(run, role, data_dir) for role in ("source", "target")]
+    assert run.metrics is not None
+    try:
+        result = read_result(run.folder)
+        nets = {"result": build_net(result)}
+        if run.rounds and (run.folder / _WARMUP).is_file():
+            before = load(run.folder / _WARMUP)
+            nets = {"after the warm-up": build_net(dataclasses.replace(result, weights=before))} | {
+                "after self-training": nets["result"]
+            }
+    except Qs3Error as error:
+        raise NothingToDrawError(str(error)) from error
+    if not all(callable(getattr(net, "features", None)) for net in nets.values()):
+        raise NothingToDrawError("the net says nothing about its features")
+    parts, labels, names = [], [], []
+    for role, data in zip(("source", "target"), sets, strict=True):
+        split = "test" if "test" in data.counts() else "train"
+        points = load_clouds(data, split, points=result.points).points
+        chosen = sample(len(points), clouds, derive(run.metrics["seed"], "embedding", role))
+        parts.append(points[chosen])
+        labels.append(_labels(data, split)[chosen])
+        names.append(f"{role}: {data.name}, {split}" + ("" if split == "test" else " split"))
+    domain = np.repeat([0, 1], [len(part) for part in parts])
+    places = {}
+    for title, net in nets.items():
+        features = [
+            global_features(net, part, role)
+            for role, part in zip(("source", "target"), parts, strict=True)
+        ]
+        places[title] = tsne(np.concatenate(features))
+    return run_figures.embedding(
+        f"{run.title}, on {run.target}: features of clouds (t-SNE)\n"
+        "colours are true classes, evaluation only",
+        places,
+        np.concatenate(labels),
+        domain,
+        run.classes,
+        names,
+    )
+
+
+def sample(n: int, most: int, seed: int) -> np.ndarray:
+    """[min(n, most)] different positions below n, ascending; all of them if there are few."""
+    return np.sort(np.random.default_rng(seed).permutation(n)[:most])
+
+
+@torch.no_grad()
+def global_features(
+    net: nn.Module, points: Float[Tensor, "n p 3"], domain: str
+) -> Float[np.ndarray, "n d"]:
+    """What the backbone says about each cloud, in eval mode with the norms of its domain."""
+    net.eval()
+    with use_domain(net, norms_for(net, domain)):
+        parts = [
+            net.features(points[i : i + _BATCH]).global_  # type: ignore[operator]
+            for i in range(0, len(points), _BATCH)
+        ]
+    return torch.cat(parts).double().numpy()
+
+
+def _labels(data: PointSet, split: str) -> np.ndarray:
+    return np.array(data.labels[data.indices(split)])

@@ -1,0 +1,129 @@
+"""One page about one run: figures, pictures, settings. Nothing in it comes from elsewhere."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from html import escape
+from pathlib import Path
+
+from qs3.evaluation.estimates_text import table as quality_table
+from qs3.report.figures.html_page import html
+from qs3.report.runs.data import RunFiles, settings_of
+from qs3.report.runs.figures import EVALUATION_ONLY
+
+_TITLES = {
+    "curves": "Training",
+    "confusion": "Confusion of classes",
+    "pseudo_labels": "Pseudo-labels",
+    "classes": "Balance of classes",
+    "calibration": "Calibration",
+    "embedding": "Features of both domains",
+    "domains": "One object of each class",
+    "source_clouds": "Clouds of the source",
+    "target_clouds": "Clouds of the target",
+    "class_balance": "Classes of both domains",
+    "mistakes": "Surest mistakes",
+    "named": "Surest of each class",
+    "pipeline": "From mesh to cloud",
+}
+_STYLE = """
+body { max-width: 62rem; }
+img { max-width: 100%; height: auto; }
+th, td { padding: .2rem .9rem .2rem 0; border-bottom: 1px solid #e3e6eb; }
+.note { color: #8a5a12; }
+"""
+
+
+def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]) -> str:
+    """The page as HTML, with its images inside.
+
+    Args:
+        run: as read.
+        pictures: PNG by name.
+        skipped: why one is not there, by name.
+    """
+    parts = [
+        *(f'<p class="note">Note: {escape(note)}.</p>' for note in run.notes),
+        _table(key_figures(run)),
+    ]
+    parts += _quality(run)
+    if run.command:
+        parts += ["<h2>Command</h2>", f"<pre>{escape(run.command)}</pre>"]
+    for name, path in pictures.items():
+        data = base64.b64encode(path.read_bytes()).decode("ascii")
+        words = _TITLES.get(name, name)
+        parts.append(f"<h2>{words}</h2>")
+        parts.append(f'<img alt="{words}" src="data:image/png;base64,{data}">')
+    if skipped:
+        parts.append("<h2>Not drawn</h2><ul>")
+        parts += [
+            f"<li>{_TITLES.get(name, name)}: {escape(reason)}</li>"
+            for name, reason in skipped.items()
+        ]
+        parts.append("</ul>")
+    settings = settings_of(run)
+    if settings:
+        parts.append(
+            f"<h2>Settings</h2><details><summary>all of them</summary>"
+            f"<pre>{escape(settings)}</pre></details>"
+        )
+    return html(run.title, parts, _STYLE)
+
+
+def _quality(run: RunFiles) -> list[str]:
+    """What can be said without the target's labels; nothing for runs of older versions."""
+    rows = quality_table((run.metrics or {}).get("quality") or {})
+    if not rows:
+        return []
+    cells = (
+        f"<tr><th>{escape(name)}</th><td>{escape(value)}</td><td>{escape(meaning)}</td></tr>"
+        for name, value, meaning in rows
+    )
+    return ["<h2>Quality without labels</h2>", f"<table>{''.join(cells)}</table>"]
+
+
+def key_figures(run: RunFiles) -> dict[str, str]:
+    """What the page says first, in order."""
+    if run.metrics is None:
+        done = 0 if run.history is None else len(run.history.epoch)
+        return {"status": "not finished", "epochs done": str(done)}
+    m, final = run.metrics, run.final
+    found = {
+        "source": str(m.get("source", "")),
+        "target": run.target,
+        "method": str(m.get("method", "")),
+        "self-training": str(m.get("selftraining", "")),
+        "model": str(m.get("model", "")),
+    }
+    if final.get("accuracy") is None:
+        found["accuracy"] = "not known: the target has no labels"
+    else:
+        found["accuracy"] = f"{final['accuracy']:.1%}"
+        found["balanced accuracy"] = f"{final['balanced_accuracy']:.1%}"
+        found["majority rate"] = f"{final['majority_rate']:.1%}"
+    if final.get("calibration_error") is not None:
+        found["expected calibration error"] = (
+            f"{final['calibration_error']:.1%} ({EVALUATION_ONLY})"
+        )
+    found["clouds evaluated"] = str(final.get("n", ""))
+    before = (m.get("warmup") or {}).get("selected") or {}
+    if run.rounds and before.get("accuracy") is not None:
+        found["accuracy before self-training"] = f"{before['accuracy']:.1%}"
+    chosen = m.get("selection", {})
+    found["teacher selected by"] = str(chosen.get("teacher", ""))
+    if run.rounds:
+        found["student selected by"] = str(chosen.get("student", ""))
+    seconds = m.get("times", {}).get("seconds")
+    if seconds is not None:
+        found["time"] = f"{seconds:.0f} s"
+    found["hash of the settings"] = str(m.get("hash", ""))
+    found["versions"] = ", ".join(f"{k} {v}" for k, v in m.get("versions", {}).items())
+    return {key: value for key, value in found.items() if value}
+
+
+def _table(rows: Mapping[str, str]) -> str:
+    cells = (
+        f"<tr><th>{escape(key)}</th><td>{escape(value)}</td></tr>" for key, value in rows.items()
+    )
+    return f"<table>{''.join(cells)}</table>"

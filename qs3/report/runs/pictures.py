@@ -1,0 +1,180 @@
+"""All pictures of one run, as files in `<run>/pictures`, and a page that shows them.
+
+A picture that has nothing to show is left out, and the reason is said.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qs3.errors import Qs3Error
+from qs3.report.figures.canvas import NothingToDrawError
+from qs3.report.runs import figures as run_figures
+from qs3.report.runs.clouds import cloud_pictures
+from qs3.report.runs.data import RunFiles, read_run
+from qs3.report.runs.page import page
+from qs3.runs import folder as runs
+from qs3.utils.files import atomic_path, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+FOLDER = "pictures"
+PAGE = "index.html"
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What became of a run's pictures.
+
+    Attributes:
+        pictures: PNG by name, such as "curves".
+        skipped: why a picture is not there, by name.
+        notes: what the run's folder lacks, in words.
+        page: the HTML page.
+    """
+
+    pictures: Mapping[str, Path]
+    skipped: Mapping[str, str]
+    notes: tuple[str, ...]
+    page: Path
+
+
+def draw(
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    data_dir: str | Path | None = None,
+    embed: bool = True,
+    config: Mapping[str, Any] | None = None,
+) -> Drawn:
+    """Draw a run's pictures; those of an earlier call are replaced.
+
+    Args:
+        folder: of the run.
+        out: folder for the files; None: `pictures` in the run's.
+        data_dir: where the datasets lie; None: where the run's config says.
+        embed: also lay out the features of both domains; takes a minute.
+        config: of the run; None: what Hydra wrote into its folder.
+
+    Raises:
+        MissingDataError, DataError: see `qs3.report.runs.data.read_run`.
+    """
+    run = read_run(folder)
+    if config is not None:
+        run = dataclasses.replace(run, config=config)
+    out = run.folder / FOLDER if out is None else Path(out)
+    pictures, skipped = {}, {}
+    for name, make in _makers(run, data_dir, embed).items():
+        path = out / f"{name}.png"
+        try:
+            make(path)
+            pictures[name] = path
+        except NothingToDrawError as reason:
+            skipped[name] = str(reason)
+            path.unlink(missing_ok=True)
+    write_text(out / PAGE, page(run, pictures, skipped))
+    return Drawn(pictures, skipped, run.notes, out / PAGE)
+
+
+def _makers(
+    run: RunFiles, data_dir: str | Path | None, embed: bool
+) -> dict[str, Callable[[Path], object]]:
+    """What writes each picture, in the order of the page."""
+
+    def classes() -> Figure:
+        return run_figures.classes(run, _train_labels(run, data_dir))
+
+    def embedding() -> Figure:
+        from qs3.report.runs.embedding import draw_embedding  # torch
+
+        return draw_embedding(run, data_dir)
+
+    figures: dict[str, Callable[[], Figure]] = {
+        "curves": lambda: run_figures.curves(run),
+        "confusion": lambda: run_figures.confusion(run),
+        "pseudo_labels": lambda: run_figures.pseudo_labels(run),
+        "classes": classes,
+        "calibration": lambda: run_figures.calibration(run),
+    }
+    if embed:
+        figures["embedding"] = embedding
+    saving = {name: partial(_save, make) for name, make in figures.items()}
+    return {**saving, **cloud_pictures(run, data_dir)}
+
+
+def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | None:
+    """[n] labels of the target's training split, if the run's dataset is there and has some."""
+    from qs3.report.runs.domains import open_domain
+
+    try:
+        data = open_domain(run, "target", data_dir)
+    except (Qs3Error, NothingToDrawError):
+        return None  # the picture is complete without them
+    return np.array(data.labels[data.indices("train")]) if data.labelled else None
+
+
+def _save(make: Callable[[], Figure], path: Path) -> None:
+    """Write the PNG, atomically and without a date in it."""
+    figure = make()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", metadata={"Software": None})
+
+
+def after_training(folder: Path, config: Mapping[str, Any] | None = None) -> None:
+    """Draw a finished run's pictures, and log them to wandb's active run, if there is one.
+
+    A picture that cannot be made is a warning: the result is saved already.
+
+    Args:
+        folder: of the run.
+        config: as composed; None: what Hydra wrote into the folder.
+    """
+    try:
+        drawn = draw(folder, embed=False, config=config)
+        _log_to_wandb(drawn, runs.read_metrics(folder) or {})
+        log.info("pictures: %s", drawn.page)
+    except Exception as error:
+        log.warning(
+            "the run is finished, but its pictures failed (%s: %s); python -m qs3.report "
+            "run=%s draws them again",
+            type(error).__name__,
+            error,
+            folder,
+        )
+
+
+def _log_to_wandb(drawn: Drawn, metrics: Mapping[str, Any]) -> None:
+    import sys
+
+    wandb: Any = sys.modules.get("wandb")  # not imported: there is no such logger
+    if wandb is None or wandb.run is None:
+        return
+    content: dict[str, Any] = {
+        f"pictures/{name}": wandb.Image(str(path)) for name, path in drawn.pictures.items()
+    }
+    final = metrics["final"]
+    if final["confusion"] is not None:
+        names = list(final["predicted"])
+        content["confusion"] = wandb.Table(
+            columns=["true class", *names],
+            data=[[name, *row] for name, row in zip(names, final["confusion"], strict=True)],
+        )
+    wandb.run.log(content)
+    wandb.run.summary.update(
+        {
+            f"final/{key}": value
+            for key, value in final.items()
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        }
+    )

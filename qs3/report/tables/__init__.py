@@ -1,0 +1,1 @@
+"""Tables of runs: cells, statistics, formats, paired comparisons."""

@@ -1,0 +1,228 @@
+"""All rows of a table against one of them: differences with their intervals."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from qs3.errors import ConfigError, DataError
+from qs3.report.tables.aggregate import align
+from qs3.report.tables.formats import SIMULATED, marks
+from qs3.report.tables.paired import LEVEL, Difference, compare_on_average
+from qs3.report.tables.table import Cell, Table
+from qs3.runs.predictions import FILE, read_predictions
+
+_MORE_MESHES = "more meshes"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A cell against the base's cell of the same column.
+
+    Attributes:
+        name: of the row, and of the column if there are several.
+        differences: accuracy, balanced accuracy; None if `why` says what is missing.
+        why: "" or the reason.
+        objects_known: whether it is known which clouds show the same object.
+    """
+
+    name: str
+    differences: tuple[Difference, Difference] | None
+    why: str = ""
+    objects_known: bool = True
+
+
+def against(table: Table, base: str) -> list[Compared]:
+    """Each other row minus the row `base`, column by column.
+
+    Raises:
+        ConfigError: there is no such row.
+    """
+    if base not in table.rows:
+        raise ConfigError(
+            f"table {table.name} has no row {base!r}; rows are {', '.join(map(repr, table.rows))}"
+        )
+    found = []
+    for row, cells in table.rows.items():
+        if row == base:
+            continue
+        for column, cell, other in zip(table.columns, cells, table.rows[base], strict=True):
+            if cell is None or other is None or not cell.runnable:
+                continue
+            name = f"{row}, {column}" if len(table.columns) > 1 else row
+            found.append(_compared(name, [(cell, other)]))
+    return found
+
+
+def effects(table: Table) -> list[Compared]:
+    """Main effects: each column minus the first over the rows that have both, then rows likewise.
+
+    Rows whose two cells are one run (a teacher that no column changes) are left out.
+    """
+    columns = {
+        name: [cells[i] for cells in table.rows.values()] for i, name in enumerate(table.columns)
+    }
+    by_row = {name: list(cells) for name, cells in table.rows.items()}
+    return [
+        *_main_effects(columns, list(table.rows)),
+        *_main_effects(by_row, list(table.columns)),
+    ]
+
+
+def _same(one: Cell, two: Cell) -> bool:
+    """Whether two cells are one experiment, however their overrides are written."""
+    if one.group and two.group:
+        return (one.group.experiment, one.group.hash) == (two.group.experiment, two.group.hash)
+    return one.overrides == two.overrides
+
+
+def _main_effects(
+    lines: Mapping[str, Sequence[Cell | None]], others: Sequence[str]
+) -> list[Compared]:
+    """Each line of cells minus the first one, over the others that both have."""
+    (base, base_cells), *rest = lines.items()
+    found = []
+    for name, cells in rest:
+        both = {
+            other: (one, two)
+            for other, one, two in zip(others, cells, base_cells, strict=True)
+            if one and two and one.runnable and two.runnable and not _same(one, two)
+        }
+        if both:
+            title = f"{name} minus {base}, over {', '.join(both)}"
+            found.append(_compared(title, list(both.values())))
+    return found
+
+
+def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
+    """The mean difference of pairs of cells, or why there is none."""
+    cells = [cell for pair in pairs for cell in pair]
+    if any(cell.take != "final" for cell in cells):
+        return Compared(name, None, "a warm-up's predictions are not kept")
+    finished = [
+        {run.seed: run for run in cell.group.finished} if cell.group else {} for cell in cells
+    ]
+    seeds = sorted(seed for seed in set.intersection(*map(set, finished)) if seed is not None)
+    if len(seeds) < 2:
+        if not all(finished):
+            return Compared(name, None, "not run")
+        return Compared(name, None, f"fewer than two seeds in common ({seeds})")
+    for cell in cells:
+        if cell.group and not cell.group.comparable:
+            return Compared(name, None, f"{cell.row}, {cell.column}: not averaged, see the table")
+    targets = {runs[seed].metrics["data"].get("target") for runs in finished for seed in seeds}
+    if len(targets) > 1:
+        return Compared(name, None, "the runs saw different versions of the target")
+    try:
+        said = [[read_predictions(runs[seed].folder / FILE) for seed in seeds] for runs in finished]
+        both = list(zip(said[::2], said[1::2], strict=True))
+        plain, balanced = (compare_on_average(both, balanced=b) for b in (False, True))
+    except DataError as error:
+        return Compared(name, None, str(error))
+    return Compared(name, (plain, balanced), objects_known=said[0][0].meshes != said[0][0].ids)
+
+
+def text(
+    found: Sequence[Compared], base: str = "", markdown: bool = False, table: Table | None = None
+) -> str:
+    """A line a row: differences in percentage points, and how many seeds would tell them apart.
+
+    Args:
+        found: of `against` or `effects`.
+        base: the row that all are compared with, if it is one.
+        markdown: instead of columns for the terminal.
+        table: that they are of: its title and what must not be overlooked come first.
+    """
+    header = [
+        f"minus {base}" if base else "difference",
+        "accuracy",
+        "balanced accuracy",
+        "seeds",
+        "to tell apart",
+    ]
+    lines = [header]
+    reasons: dict[str, list[str]] = {}
+    for one in found:
+        if one.differences is None:
+            reasons.setdefault(one.why, []).append(one.name)
+            continue
+        accuracy, balanced = one.differences
+        lines.append(
+            [one.name, _shown(accuracy), _shown(balanced), str(accuracy.seeds), _needed(accuracy)]
+        )
+    notes = [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
+    meshes = {one.differences[0].meshes for one in found if one.differences}
+    notes.insert(
+        0,
+        f"differences in percentage points with {LEVEL:.0%} intervals over seeds and test meshes"
+        + (f" ({', '.join(map(str, sorted(meshes)))} meshes)" if meshes else "")
+        + "; * marks those whose interval does not reach 0, each line by itself: of twenty rows "
+        "that are no better than the other one gets a star",
+    )
+    if any(_needed(one.differences[0]) == _MORE_MESHES for one in found if one.differences):
+        notes.append(
+            f"{_MORE_MESHES}: no number of seeds would tell them apart, the test split has too few"
+        )
+    if any(one.differences and not one.objects_known for one in found):
+        notes.insert(
+            1,
+            "which clouds show the same object is not known, so each counts as one of its own: "
+            "where several do, the intervals are too narrow",
+        )
+    head = []
+    if table:
+        # Whatever else is missing: numbers on a simulated target are never shown without the word.
+        simulated = [mark for mark in marks(table) if mark.startswith(SIMULATED)]
+        head = [f"{'## ' if markdown else ''}{table.title}", "", *simulated, ""]
+    layout: Callable[[Sequence[Sequence[str]]], list[str]] = _markdown if markdown else align
+    body = layout(lines) if len(lines) > 1 else []
+    return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"
+
+
+def csv_text(found: Sequence[Compared], table: Table) -> str:
+    """A line a difference and metric, in percentage points.
+
+    Args:
+        found: of `against` or `effects`.
+        table: that they are of.
+    """
+    file = io.StringIO(newline="")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(
+        ["name", "metric", "difference", "low", "high", "seeds", "meshes", "seeds_needed",
+         "simulated", "why"]
+    )  # fmt: skip
+    simulated = str(any(cell.simulated for cell in table.cells)).lower()
+    for one in found:
+        for i, metric in enumerate(("accuracy", "balanced accuracy")):
+            if one.differences is None:
+                writer.writerow([one.name, metric, *[""] * 6, simulated, one.why])
+                continue
+            d = one.differences[i]
+            points = [f"{100 * value:.4f}" for value in (d.mean, d.low, d.high)]
+            needed = "" if d.seeds_needed is None else d.seeds_needed
+            writer.writerow([one.name, metric, *points, d.seeds, d.meshes, needed, simulated, ""])
+    return file.getvalue()
+
+
+def _shown(d: Difference) -> str:
+    star = " *" if d.clear else ""
+    return f"{100 * d.mean:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}]{star}"
+
+
+def _needed(d: Difference) -> str:
+    if d.clear:
+        return "-"
+    return _MORE_MESHES if d.seeds_needed is None else f"{d.seeds_needed} seeds"
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+
+    def row(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)) + " |"
+
+    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+    return [row(lines[0]), rule, *(row(line) for line in lines[1:])]

@@ -1,0 +1,283 @@
+"""A table as Markdown, LaTeX (booktabs) and CSV. What all of them say comes from the same lines."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from typing import Any
+
+from qs3.report.tables.aggregate import FEW_SEEDS, Group, task
+from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Table
+
+_ACCURACY = "accuracy"  # what papers give
+SIMULATED = "SIMULATED target"
+TO_RUN = "Not run yet, or fewer than three seeds"
+_RULES = {"source_val": "source validation", "last": "last epoch"}
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "±": r"$\pm$", "→": r"$\rightarrow$", "†": r"$\dagger$", "<": r"$<$", ">": r"$>$",
+    "|": r"$|$",
+}  # fmt: skip
+
+
+def grid(table: Table) -> list[list[str]]:
+    """The table as strings, header first."""
+    return _benchmark_grid(table) if table.benchmark else _plain_grid(table)
+
+
+def _plain_grid(table: Table) -> list[list[str]]:
+    """For each task our metrics, then the paper's if any."""
+    many = len(table.columns) > 1
+    header = ["method"]
+    for i in range(len(table.columns)):
+        paper = "paper" if _ACCURACY in table.metrics else f"paper, {METRICS[_ACCURACY]}"
+        header += _heads(table, i, many) + ([paper] if _has_paper(table, i) else [])
+    lines = [header if many else [*header, "seeds"]]
+    for name, cells in table.rows.items():
+        line = [name]
+        for i, cell in enumerate(cells):
+            line += [cell.text(metric) if cell else "" for metric in table.metrics]
+            if _has_paper(table, i):
+                line.append(cell.paper.text() if cell and cell.paper else "")
+        if not many:
+            finished = cells[0].group.seeds if cells[0] and cells[0].group else []
+            line.append(", ".join(map(str, finished)) or "-")
+        lines.append(line)
+    return lines
+
+
+def _heads(table: Table, column: int, named: bool) -> list[str]:
+    mark = " (simulated)" if table.simulated(column) else ""
+    name = f"{table.columns[column]}{mark}, " if named else ""
+    return [f"{name}{METRICS[m]}{'' if named else mark}" for m in table.metrics]
+
+
+def _benchmark_grid(table: Table) -> list[list[str]]:
+    """Published numbers and ours on a line each, with the rule by which the epoch was chosen."""
+    header = ["method", "by"]
+    for i in range(len(table.columns)):
+        named = len(table.metrics) > 1
+        mark = " (simulated)" if table.simulated(i) else ""
+        header += _heads(table, i, True) if named else [table.columns[i] + mark]
+    header += [f"average {METRICS[m]}" for m in table.metrics]
+    lines = [[*header, "epoch selected by"]]
+    for name, cells in table.rows.items():
+        papers = [cell.paper if cell else None for cell in cells]
+        if any(papers) and _ACCURACY in table.metrics:
+            line = [name, "published"]
+            for paper in [*papers, table.published_average(name)]:
+                line += [paper.text() if paper and m == _ACCURACY else "" for m in table.metrics]
+            lines.append([*line, " or ".join(dict.fromkeys(p.selected for p in papers if p))])
+        if any(cell and cell.runnable for cell in cells):
+            line = [name, "ours"]
+            for cell in cells:
+                line += [cell.text(metric) if cell else "" for metric in table.metrics]
+            line += [table.average_text(name, metric) for metric in table.metrics]
+            rules = dict.fromkeys(_rule(c, "student") for c in cells if c and c.group)
+            lines.append([*line, " or ".join(_RULES.get(rule, rule) for rule in rules if rule)])
+    return lines
+
+
+def _has_paper(table: Table, column: int) -> bool:
+    return any((cell := row[column]) and cell.paper for row in table.rows.values())
+
+
+def _rule(cell: Cell, role: str) -> str:
+    """How the epochs of a cell's runs were chosen: "source_val", without the epoch."""
+    runs = cell.group.finished if cell.group else ()
+    role = "teacher" if cell.take == "warmup" else role
+    rules = (run.metrics.get("selection", {}).get(role) for run in runs)
+    return " or ".join(sorted({str(rule).split(", epoch")[0] for rule in rules if rule}))
+
+
+def details(table: Table) -> list[list[str]]:
+    """What stands behind each of our numbers, a line a cell, header first."""
+    header = ["method", "task", "target", "mean ± SEM %", "n", "seeds", "teacher selected by",
+              "student selected by", "time a run", "runs"]  # fmt: skip
+    lines = [header]
+    for cell in table.cells:
+        if cell.group is None or not cell.group.finished:
+            continue
+        stat = cell.ours(table.metrics[0])
+        lines.append(
+            [
+                cell.row,
+                cell.column,
+                cell.target + " (simulated)" * cell.simulated,
+                stat.percent() if stat else cell.text(table.metrics[0]),
+                str(stat.n if stat else 0),
+                ", ".join(map(str, cell.group.seeds)),
+                _rule(cell, "teacher"),
+                _rule(cell, "student"),
+                _time(cell.group),
+                f"{cell.group.experiment}/seed*-{cell.group.hash}",
+            ]
+        )
+    return lines
+
+
+def seconds(group: Group) -> list[float]:
+    """Wall time of each finished run over all of its starts, where it is known."""
+    found = (run.metrics.get("times", {}).get("seconds") for run in group.finished)
+    return [float(value) for value in found if isinstance(value, int | float)]
+
+
+def _time(group: Group) -> str:
+    """Such as "3.5 min" or "3.5 to 4.1 min"."""
+    if not (found := seconds(group)):
+        return "not known"
+    unit, name = next(
+        (u, n) for u, n in ((3600, "h"), (60, "min"), (1, "s")) if max(found) >= u or u == 1
+    )
+    ends = dict.fromkeys(f"{value / unit:.1f}" for value in (min(found), max(found)))
+    return f"{' to '.join(ends)} {name}"
+
+
+def marks(table: Table) -> list[str]:
+    """What must not be overlooked; stands in the table itself where a format has no other text."""
+    lines = []
+    found = [name for i in range(len(table.columns)) for name in table.simulated(i)]
+    if found:
+        lines.append(f"{SIMULATED}: {', '.join(dict.fromkeys(found))}")
+    if any(cell.incomplete for cell in table.cells):
+        lines.append(f"{INCOMPLETE} seeds that failed, are not finished or do not fit: see below")
+    return lines
+
+
+def remarks(table: Table) -> list[str]:
+    """The lines below a table: what it is measured on, how models were chosen, what is missing."""
+    found = [g for cell in table.cells if (g := cell.group) and g.finished]
+    lines = [*marks(table), *table.notes]
+    for target in dict.fromkeys(str(g.first["target"]) for g in found):
+        of = [g for g in found if str(g.first["target"]) == target]
+        simulated = "simulated target" if of[0].first.get("simulated") else "target"
+        rates = sorted(
+            {f"{100 * s.mean:.1f} %" for g in of if (s := g.stat("final", "majority_rate"))}
+        )
+        lines.append(
+            f"majority rate of the {simulated} {target}: {' or '.join(rates) or 'unknown'}"
+        )
+    for role in ("teacher", "student"):
+        rules = {rule for cell in table.cells if (rule := _rule(cell, role))}
+        if rules:
+            lines.append(f"{role} selected by: {', '.join(sorted(rules))}")
+    splits = {
+        str(run.metrics.get("selection", {}).get("validation", "lineage"))
+        for g in found
+        for run in g.finished
+    }
+    if splits - {"lineage"}:
+        lines.append(f"validation split: {', '.join(sorted(splits))}")
+    if found:
+        counts = sorted({len(g.finished) for g in found})
+        few, most = counts[0], counts[-1]
+        seeds = f"{few} seed{'s' * (few > 1)}" if few == most else f"{few} to {most} seeds"
+        lines.append(f"mean ± standard error over {seeds}; (n=...) marks fewer than {FEW_SEEDS}")
+        if any(seconds(g) for g in found):
+            lines.append(
+                "time: wall time of each run, the least and the most; all of its starts together, "
+                "also the warm-up that was taken from another run"
+            )
+    for source in dict.fromkeys(c.paper.source for c in table.cells if c.paper and c.paper.source):
+        rows = dict.fromkeys(c.row for c in table.cells if c.paper and c.paper.source == source)
+        lines.append(f"published numbers of {', '.join(rows)}: {source}")
+    for cell in table.cells:
+        for problem in cell.group.problems if cell.group else ():
+            lines.append(f"{cell.row}, {cell.column}: {problem}")
+    missing = [c for c in table.cells if c.missing]
+    for reason in dict.fromkeys(c.missing for c in missing):
+        lines.append(f"not available yet: {reason}")
+    return list(dict.fromkeys(lines))
+
+
+def to_run(table: Table) -> list[str]:
+    """Commands that fill the cells without a number or with few seeds, each once."""
+    empty = [
+        cell
+        for cell in table.cells
+        if cell.runnable
+        and not cell.missing
+        and ((stat := cell.ours(table.metrics[0])) is None or stat.n < FEW_SEEDS)
+        and not (cell.group and cell.group.unlabelled)
+    ]
+    return list(dict.fromkeys(cell.command for cell in empty))
+
+
+def markdown(table: Table) -> str:
+    """Title, table, remarks, what stands behind each number, the commands of what is not run."""
+    lines = [f"## {table.title}", "", *_markdown_table(grid(table))]
+    lines += ["", *(f"- {remark}" for remark in remarks(table))]
+    if len(behind := details(table)) > 1:
+        lines += ["", "Behind each number:", "", *_markdown_table(behind)]
+    if commands := to_run(table):
+        lines += ["", f"{TO_RUN}:", "", "```", *commands, "```"]
+    return "\n".join(lines) + "\n"
+
+
+def _markdown_table(lines: Sequence[Sequence[str]]) -> list[str]:
+    lines = [[cell.replace("|", r"\|").replace("*", r"\*") for cell in line] for line in lines]
+    widths = [max(len(row[i]) for row in lines) for i in range(len(lines[0]))]
+
+    def row(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)) + " |"
+
+    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+    return [row(lines[0]), rule, *(row(line) for line in lines[1:])]
+
+
+def latex(table: Table) -> str:
+    """A booktabs tabular; remarks as comments, and what must be seen as lines below the rule."""
+    header, *body = grid(table)
+    behind = details(table)
+    notes = remarks(table) + (["; ".join(line) for line in behind] if len(behind) > 1 else [])
+    package = r"\usepackage{booktabs}"
+    lines = [f"% {' '.join(note.split())}" for note in [table.title, package, *notes]]
+    lines += [rf"\begin{{tabular}}{{@{{}}l{'c' * (len(header) - 1)}@{{}}}}", r"\toprule"]
+    lines += [_latex_row(header), r"\midrule", *map(_latex_row, body), r"\bottomrule"]
+    for mark in marks(table):
+        text = latex_text(mark.removesuffix(": see below"))
+        lines.append(rf"\multicolumn{{{len(header)}}}{{@{{}}l@{{}}}}{{\footnotesize {text}}} \\")
+    return "\n".join([*lines, r"\end{tabular}"]) + "\n"
+
+
+def latex_text(text: str) -> str:
+    """Plain text with what LaTeX would take for a command escaped."""
+    return "".join(_LATEX.get(letter, letter) for letter in text)
+
+
+def _latex_row(cells: Sequence[str]) -> str:
+    return " & ".join(map(latex_text, cells)) + r" \\"
+
+
+def csv_text(table: Table) -> str:
+    """A line a cell and metric, in percent, with the command and what is wrong."""
+    file = io.StringIO(newline="")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(
+        ["row", "column", "metric", "mean", "sem", "n", "seeds", "paper_mean", "paper_sem",
+         "paper_selected", "paper_source", "task", "target", "simulated", "teacher_selected",
+         "student_selected", "seconds", "problems", "hash", "command"]
+    )  # fmt: skip
+    for cell in table.cells:
+        known = cell.group.first if cell.group else {}
+        times = seconds(cell.group) if cell.group else []
+        for metric in table.metrics:
+            stat, paper = cell.ours(metric), cell.paper if metric == _ACCURACY else None
+            values: list[Any] = [cell.row, cell.column, METRICS[metric].removesuffix(" %")]
+            values += [100 * stat.mean, _percent(stat.sem), stat.n] if stat else ["", "", 0]
+            values.append(" ".join(map(str, cell.group.seeds)) if cell.group else "")
+            values += [paper.mean, "" if paper.sem is None else paper.sem] if paper else ["", ""]
+            values += [paper.selected, paper.source] if paper else ["", ""]
+            values += [task(known) if known else "", cell.target]
+            values.append(str(cell.simulated).lower() if cell.target else "")
+            values += [_rule(cell, "teacher"), _rule(cell, "student")]
+            values.append(" ".join(f"{value:g}" for value in times))
+            values.append("; ".join(cell.group.problems) if cell.group else "")
+            writer.writerow([*values, cell.group.hash if cell.group else "", cell.command])
+    return file.getvalue()
+
+
+def _percent(value: float | None) -> float | str:
+    return "" if value is None else 100 * value

@@ -1,0 +1,260 @@
+"""The paper's tables and the field's benchmarks, with our numbers beside theirs.
+
+A table is a file of conf/table/. Each cell names a run by its command line; composing it gives the
+config hash by which the runs of its seeds are found under the log folder. This module reads the
+file and finds the runs; `formats` and `table_page` print.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped,unused-ignore]
+
+from qs3.config.location import CONF
+from qs3.config.quoting import override
+from qs3.errors import ConfigError
+from qs3.evaluation.selection_rules import ORACLE, ORACLE_IN_WORDS
+from qs3.report.tables.aggregate import DIAGNOSTIC, Group, group, load_runs
+from qs3.report.tables.cells import METRICS, Cell, Published, Table
+from qs3.report.tables.formats import csv_text, grid, latex, markdown, remarks, to_run
+
+__all__ = [
+    "CONF",
+    "Cell",
+    "Table",
+    "build_table",
+    "composing",
+    "csv_text",
+    "grid",
+    "latex",
+    "markdown",
+    "remarks",
+    "table_names",
+    "to_run",
+]
+BENCHMARK = "benchmark"
+_SUPERVISED = "qs3.methods.supervised.Supervised"
+_KEYS = ("title", "layout", "notes", "metrics", "columns", "rows", "sources")
+
+
+def table_names() -> list[str]:
+    """The tables there are."""
+    return sorted(path.stem for path in (CONF / "table").glob("*.yaml"))
+
+
+def build_table(
+    name: str,
+    log_dir: str | Path = "logs",
+    extra: Sequence[str] = (),
+    target: str | None = None,
+) -> Table:
+    """Read a table's file and find our runs of its cells.
+
+    Args:
+        name: of a file in conf/table, or the path of one's own, NAME.yaml.
+        log_dir: `paths.log_dir` of the runs.
+        extra: overrides of train.py for every cell, as the runs had them.
+        target: another target domain for all cells, e.g. "kinectsim10"; the paper's numbers,
+            measured on another target, are then left out.
+
+    Raises:
+        ConfigError: no such table, its file or an override is wrong, or `target` is given for
+            a benchmark, whose columns have targets of their own.
+    """
+    path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
+    if not path.is_file():
+        raise ConfigError(
+            f"there is no table {name!r}; there are {', '.join(table_names())}; or give a "
+            "file of your own, NAME.yaml"
+        )
+    name = path.stem
+    try:
+        spec = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if target is not None:
+        check_domain("target=", target)
+    runs = load_runs(log_dir)
+    groups = {(g.experiment, g.hash): g for g in group(runs)}
+    more = [*extra, *([f"domain@data.target={target}"] if target else [])]
+    if str(log_dir) != "logs":
+        more.append(override("paths.log_dir", log_dir))
+    try:
+        benchmark = _is_benchmark(spec, path)
+        if benchmark and target:
+            raise ConfigError(
+                f"target={target}: the columns of table {name} have several targets; leave it out"
+            )
+        cells = [
+            replace(cell, column=_column(column, target))
+            for row in spec["rows"]
+            for i, column in enumerate(spec["columns"])
+            if (cell := _cell(spec, row, i, column, more, published=not target))
+        ]
+        filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
+        metrics = tuple(spec["metrics"])
+        columns = tuple(_column(column, target) for column in spec["columns"])
+        rows = {
+            row["name"]: tuple(filled.get((row["name"], column)) for column in columns)
+            for row in spec["rows"]
+        }
+        title, notes = spec["title"], spec.get("notes", [])
+        averages = {r["name"]: float(r["average"]) for r in spec["rows"] if "average" in r}
+    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+        raise ConfigError(f"{path}: missing or wrong entry {error}") from error
+    if odd := [note for note in notes if not isinstance(note, str)]:
+        raise ConfigError(f"{path}: notes: {odd[0]} is no line of text; put quotes around it")
+    if unknown := sorted(set(metrics) - set(METRICS)):
+        raise ConfigError(f"{path}: unknown metrics {unknown}; known are {', '.join(METRICS)}")
+    if target:
+        title = f"{title}, on another target: {target}"
+        notes = [*notes, f"all cells on the target {target}, which is not the paper's"]
+    if left_out := sum(run.status == DIAGNOSTIC for run in runs):
+        notes = [*notes, f"runs left out: {left_out}, chosen by the {ORACLE_IN_WORDS}"]
+    return Table(name, title, tuple(notes), metrics, columns, rows, benchmark, averages)
+
+
+def _is_benchmark(spec: Mapping[str, Any], path: Path) -> bool:
+    if unknown := sorted(set(spec) - set(_KEYS)):
+        raise ConfigError(f"{path}: unknown keys {unknown}; known are {', '.join(_KEYS)}")
+    layout = spec.get("layout", "")
+    if layout not in ("", BENCHMARK):
+        raise ConfigError(f"{path}: layout: {layout!r} is not known; leave it out or {BENCHMARK}")
+    return bool(layout)
+
+
+def _column(name: str, target: str | None) -> str:
+    """A column's name with another target: "S → D" becomes "S → kinectsim10"."""
+    source, arrow, _ = name.partition(" → ")
+    return f"{source}{arrow}{target}" if target and arrow else name
+
+
+def _cell(
+    spec: Mapping[str, Any],
+    row: Mapping[str, Any],
+    i: int,
+    column: str,
+    more: Sequence[str],
+    published: bool,
+) -> Cell | None:
+    """Of an entry `<column>: {run:, paper:, ...}`, or of what the row says for all columns.
+
+    A row's `run` is followed by the overrides of its columns; its `paper` has a number a column.
+    """
+    own = row.get(column, {})
+    line = own.get("run")
+    if line is None and "run" in row:
+        line = f"{row['run']} {spec['columns'][column]}"
+    numbers = row.get("paper")
+    if numbers is not None and len(numbers) != len(spec["columns"]):
+        raise ConfigError(
+            f"table row {row['name']!r}: paper: has {len(numbers)} numbers, one for each of the "
+            f"{len(spec['columns'])} columns is needed"
+        )
+    number = own.get("paper", numbers[i] if numbers else None)
+    if line is None and number is None:
+        return None
+    paper = None
+    if published and number is not None:
+        mean, sem = number if isinstance(number, list) else (number, None)
+        source = own.get("source", row.get("source", ""))
+        paper = Published(
+            float(mean),
+            None if sem is None else float(sem),
+            own.get("selected", row.get("selected", "")),
+            spec.get("sources", {}).get(source, source),
+        )
+    overrides = () if line is None else (*shlex.split(line), *more)
+    take = own.get("take", row.get("take", "final"))
+    return Cell(row["name"], column, overrides, paper, take)
+
+
+def check_domain(key: str, name: str) -> None:
+    """Raise ConfigError, with the names there are, if `name` after `key` is no domain's."""
+    known = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        meant = f" (did you mean {near[0]}?)" if near else ""
+        raise ConfigError(f"{key}{name} is no domain{meant}; there are {', '.join(known)}")
+
+
+def _fill(
+    cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group], target: str | None = None
+) -> list[Cell]:
+    """The cells with their runs, or with the reason why they cannot be run."""
+    from hydra.errors import (
+        ConfigCompositionException,
+        MissingConfigException,
+        OverrideParseException,
+    )
+
+    from qs3.runs.folder import config_hash
+
+    filled = []
+    with composing() as compose:
+        for cell in cells:
+            if not cell.runnable:
+                filled.append(cell)
+                continue
+            try:
+                cfg = compose("train", list(cell.overrides))
+                if target and cfg.method.get("_target_") == _SUPERVISED:
+                    # The upper bound has labels of its target: the other target is its source too.
+                    words = (*cell.overrides, f"domain@data.source={target}")
+                    cell, cfg = replace(cell, overrides=words), compose("train", list(words))
+            except MissingConfigException as error:
+                filled.append(replace(cell, missing=_first_line(error)))
+                continue
+            except (ConfigCompositionException, OverrideParseException) as error:
+                raise ConfigError(
+                    f"table cell {cell.row!r}, {cell.column!r}: {_first_line(error)}"
+                ) from error
+            _refuse_oracle(cell, cfg)
+            key = (str(cfg.experiment_name), config_hash(cfg))
+            domain = cfg.data.target
+            filled.append(
+                replace(
+                    cell,
+                    group=groups.get(key),
+                    target=str(domain.name),
+                    simulated=bool(domain.simulated),
+                )
+            )
+    return filled
+
+
+def _refuse_oracle(cell: Cell, cfg: Any) -> None:
+    if cfg.selection.student == ORACLE:
+        raise ConfigError(
+            f"table cell {cell.row!r}, {cell.column!r}: selection.student={ORACLE} chooses by the "
+            "target's test labels. That is a diagnostic and enters no table; take it out of the "
+            "cell's line, of its experiment, or of overrides="
+        )
+
+
+@contextlib.contextmanager
+def composing() -> Iterator[Callable[..., Any]]:
+    """Hydra's compose on the repository's conf/, also inside a running Hydra application."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    import qs3.config.hydra  # noqa: F401  registers the resolvers that the configs use
+
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            yield compose
+    finally:
+        GlobalHydra.instance().hydra = running
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

@@ -1,0 +1,109 @@
+"""`predictions.csv`: what a run's result says of each evaluated cloud of the target, one row each.
+
+Columns: id; mesh (hash of the object's mesh: scans of one mesh are no independent samples; the id
+where no mesh is known); label (empty if nobody knows it); predicted; and a probability per class.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.errors import DataError
+from qs3.utils.files import write_text
+
+FILE = "predictions.csv"
+OF_FILES = "predictions_of_files.csv"
+_FIRST = ("id", "mesh", "label", "predicted")
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Of n clouds.
+
+    Attributes:
+        classes: names in label order.
+        ids: unique.
+        meshes: cluster of each cloud.
+        labels: [n] true classes; -1 where unknown.
+        probabilities: [n, C] in [0, 1].
+    """
+
+    classes: tuple[str, ...]
+    ids: tuple[str, ...]
+    meshes: tuple[str, ...]
+    labels: Int[np.ndarray, " n"]
+    probabilities: Float[np.ndarray, "n c"]
+
+    @property
+    def predicted(self) -> Int[np.ndarray, " n"]:
+        """The likeliest class of each, the first one on ties."""
+        return self.probabilities.argmax(axis=1)
+
+
+def write_predictions(path: Path, predictions: Predictions) -> None:
+    """Write the table, atomically; probabilities with all their digits."""
+    p, text = predictions, io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*_FIRST, *(f"p_{name}" for name in p.classes)])
+    rows = zip(p.ids, p.meshes, p.labels, p.predicted, p.probabilities, strict=True)
+    for id_, mesh, label, predicted, row in rows:
+        name = "" if label < 0 else p.classes[label]
+        writer.writerow([id_, mesh, name, p.classes[predicted], *map(repr, row.tolist())])
+    write_text(path, text.getvalue())
+
+
+def write_predictions_of_files(
+    path: Path, files: Sequence[str], reasons: Sequence[str], predictions: Predictions
+) -> None:
+    """A table for whoever owns the files: one row each, in the order of their names.
+
+    Columns: file; class; confidence; unlike_source (yes or no), reason (in what); and a probability
+    per class, to four digits.
+
+    Args:
+        path: to write.
+        files: name of each cloud's file.
+        reasons: in what a cloud is unlike the source's; "" if in nothing.
+        predictions: of the clouds.
+    """
+    p, text = predictions, io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    first = ("file", "class", "confidence", "unlike_source", "reason")
+    writer.writerow([*first, *(f"p_{name}" for name in p.classes)])
+    rows = zip(files, p.predicted, reasons, p.probabilities, strict=True)
+    for file, predicted, reason, row in sorted(rows, key=lambda r: r[0]):
+        flag, digits = "yes" if reason else "no", [f"{value:.4f}" for value in row]
+        writer.writerow([file, p.classes[predicted], digits[predicted], flag, reason, *digits])
+    write_text(path, text.getvalue())
+
+
+def read_predictions(path: Path) -> Predictions:
+    """Read the table.
+
+    Raises:
+        DataError: it is not there, or not as `write_predictions` writes it.
+    """
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            header, *rows = list(csv.reader(file))
+        classes = tuple(name.removeprefix("p_") for name in header[len(_FIRST) :])
+        if tuple(header[: len(_FIRST)]) != _FIRST or not classes or not rows:
+            raise ValueError("it has other columns, or no rows")
+        return Predictions(
+            classes,
+            tuple(row[0] for row in rows),
+            tuple(row[1] for row in rows),
+            np.array([classes.index(row[2]) if row[2] else -1 for row in rows]),
+            np.array([[float(cell) for cell in row[len(_FIRST) :]] for row in rows]),
+        )
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be read ({error}); repeat the run with force=true") from (
+            error
+        )

@@ -1,0 +1,56 @@
+"""A round's pseudo-labels on disk: `round_03/pseudo_labels.csv`, one row a target sample."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.utils.files import write_text
+
+_COLUMNS = ("id", "label", "confidence", "selected")
+
+
+@dataclass(frozen=True)
+class PseudoLabel:
+    """One row: the predicted class's name and probability, and whether it is trained on."""
+
+    id: str
+    label: str
+    confidence: float
+    selected: bool
+
+
+def path_of(folder: Path, round_: int) -> Path:
+    """Where the table of a round lies in a run's folder."""
+    return folder / f"round_{round_:02d}" / "pseudo_labels.csv"
+
+
+def write_pseudo_labels(
+    path: Path,
+    ids: Sequence[str],
+    predicted: np.ndarray,
+    confidence: np.ndarray,
+    selected: np.ndarray,
+    classes: Sequence[str],
+) -> None:
+    """Write the table, atomically; confidences with all their digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for id_, label, p, kept in zip(ids, predicted, confidence, selected, strict=True):
+        writer.writerow([id_, classes[label], repr(float(p)), int(kept)])
+    write_text(path, text.getvalue())
+
+
+def read_pseudo_labels(path: Path) -> list[PseudoLabel]:
+    """Read the table."""
+    with open(path, encoding="utf-8", newline="") as file:
+        return [
+            PseudoLabel(row["id"], row["label"], float(row["confidence"]), row["selected"] == "1")
+            for row in csv.DictReader(file)
+        ]

@@ -1,0 +1,56 @@
+"""Controls: what a selection is worth beside one of the same size that does not choose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from qs3.config.checks import one_of, whole
+from qs3.errors import ConfigError
+from qs3.selftraining.selectors import Selection, Selector, TeacherPredictions
+from qs3.utils.seeding import derive
+
+
+@dataclass(frozen=True)
+class Random:
+    """As many samples of each class as another selector keeps, drawn at random.
+
+    A sample's chance is a number made from (seed, round, id): the same whatever the order and
+    whatever else is in the table.
+
+    Attributes:
+        of: the other selector; its pseudo-labels are kept, its choice is not.
+        seed: of the run.
+        pool: drawn from the "confident" samples, above theta, or from "all" of the class.
+    """
+
+    of: Selector
+    seed: int = 0
+    pool: str = "confident"
+
+    def __post_init__(self) -> None:
+        if not hasattr(self.of, "select"):
+            raise ConfigError("selftraining.selector.of must be a selector")
+        whole("selftraining.selector.seed", self.seed, 0)
+        one_of("selftraining.selector.pool", self.pool, ("confident", "all"))
+
+    @property
+    def own_thresholds(self) -> bool:
+        """Whether the other selector has thresholds of its own."""
+        return bool(getattr(self.of, "own_thresholds", False))
+
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
+        """As `Selector.select`; figures are those of the other selector."""
+        given = self.of.select(teacher, theta, round_)
+        if given.labels is not None:
+            teacher = teacher.relabelled(given.labels)
+        every = np.ones(len(teacher.ids), dtype=bool)
+        allowed = teacher.confidence > theta if self.pool == "confident" else every
+        lot = np.array([derive(self.seed, "random selection", round_, id_) for id_ in teacher.ids])
+        drawn = np.argsort(lot, kind="stable")
+        selected = np.zeros(len(teacher.ids), dtype=bool)
+        for k in range(teacher.classes):
+            of_class = drawn[allowed[drawn] & (teacher.predicted[drawn] == k)]
+            selected[of_class[: given.kept[k]]] = True
+        return replace(given, selected=selected)

@@ -1,0 +1,1 @@
+"""The depth sensors: one device, one file."""

@@ -1,0 +1,220 @@
+"""A camera as a few frames of a wall describe it: true depth plus fitted noise.
+
+Here noise is added to a depth map. That is all that depth frames can tell; the speckle sensors,
+whose noise comes out of matched images, need more than that. `python -m qs3.sensors.fit` writes
+presets of this sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import Camera, Intrinsics
+from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.grids import on_grid
+from qs3.sensors.optics.visibility import reached_from
+from qs3.sensors.pixel_status import Reason
+from qs3.sensors.renderers.base import Body, Renderer, Scene
+
+
+@dataclass(frozen=True)
+class FittedDepth:
+    """An empirical depth camera.
+
+    depth = quantise(Z + bias(Z) + sigma(Z) n), where n is normal noise of variance 1 that is
+    smooth over `correlation_px`, and sigma(Z) = noise_floor_m + noise_factor * Z ** noise_power.
+
+    Attributes:
+        width_px, height_px, focal_px: of the camera.
+        cx_px, cy_px: principal point; null is the middle.
+        step_px: every step-th pixel of every step-th row gives a depth, the middle of each step.
+        min_depth_m, max_depth_m: depths outside are dropped.
+        noise_floor_m, noise_factor, noise_power: of sigma(Z), Z in metres; power 2 for cameras
+            that triangulate, 1 for time of flight.
+        correlation_px: standard deviation of the Gaussian that smooths the noise; 0 is white.
+        inverse_step_per_m: step of 1 / Z in 1/m (Kinect v1: 1 / (8 f b)); 0 is none.
+        depth_step_m: step of Z, applied after that; 0 is none.
+        bias_m: coefficients of bias(Z), the constant first.
+        tilts_deg, fill_rates: share of valid pixels at these angles of incidence, interpolated
+            in between and constant outside.
+        hole_px: size of holes, standard deviation of the Gaussian behind them; 0: single pixels.
+        baseline_m: projector minus camera along the camera's x; what it does not reach is not
+            measured. null: no shadows.
+    """
+
+    width_px: int = 640
+    height_px: int = 480
+    focal_px: float = 580.0
+    cx_px: float | None = None
+    cy_px: float | None = None
+    step_px: int = 1
+    min_depth_m: float = 0.3
+    max_depth_m: float = 8.0
+    noise_floor_m: float = 0.0
+    noise_factor: float = 0.0015
+    noise_power: float = 2.0
+    correlation_px: float = 0.0
+    inverse_step_per_m: float = 0.0
+    depth_step_m: float = 0.0
+    bias_m: tuple[float, ...] = (0.0,)
+    tilts_deg: tuple[float, ...] = (0.0,)
+    fill_rates: tuple[float, ...] = (1.0,)
+    hole_px: float = 0.0
+    baseline_m: float | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("noise_floor_m", "noise_factor", "inverse_step_per_m", "depth_step_m"):
+            if not getattr(self, key) >= 0:
+                raise ConfigError(f"sensor.{key} must not be negative, got {getattr(self, key)}")
+        for key in ("correlation_px", "hole_px"):
+            if not 0 <= getattr(self, key) <= 50:
+                raise ConfigError(f"sensor.{key} must be in 0..50, got {getattr(self, key)}")
+        if self.step_px < 1:
+            raise ConfigError(f"sensor.step_px must be at least 1, got {self.step_px}")
+        if not 0 < self.min_depth_m < self.max_depth_m:
+            raise ConfigError(
+                "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
+                f"{self.min_depth_m} and {self.max_depth_m}"
+            )
+        if len(self.tilts_deg) != len(self.fill_rates) or not self.tilts_deg:
+            raise ConfigError(
+                f"sensor.tilts_deg has {len(self.tilts_deg)} values and fill_rates "
+                f"{len(self.fill_rates)}: give as many of each, one at least"
+            )
+        if any(b <= a for a, b in zip(self.tilts_deg, self.tilts_deg[1:], strict=False)):
+            raise ConfigError(f"sensor.tilts_deg must increase, got {list(self.tilts_deg)}")
+        if not all(0 <= rate <= 1 for rate in self.fill_rates):
+            raise ConfigError(f"sensor.fill_rates must be in 0..1, got {list(self.fill_rates)}")
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the camera."""
+        centred = Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
+        return Intrinsics(
+            self.width_px,
+            self.height_px,
+            self.focal_px,
+            centred.cx_px if self.cx_px is None else self.cx_px,
+            centred.cy_px if self.cy_px is None else self.cy_px,
+        )
+
+    def noise_law_m(self, depth_m: float) -> float:
+        """Standard deviation of the noise at a distance, before the quantiser."""
+        return self.noise_floor_m + self.noise_factor * depth_m**self.noise_power
+
+    def measure(
+        self, clean_m: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What the camera says of true depths.
+
+        Args:
+            clean_m: [h, w] float32, inf where nothing is.
+            cosine: [h, w] float32 of the angle of incidence.
+            rng: of this frame.
+
+        Returns:
+            [h, w] float32 depth with NaN; [h, w] uint8 `Reason`.
+        """
+        noise, holes = (
+            _smooth(clean_m.shape, size, rng) for size in (self.correlation_px, self.hole_px)
+        )
+        hit = np.isfinite(clean_m)
+        true = np.where(hit, clean_m, 1.0).astype(np.float64)
+        sigma = self.noise_floor_m + self.noise_factor * true**self.noise_power
+        found = true + np.polynomial.polynomial.polyval(true, self.bias_m) + sigma * noise
+        found = np.maximum(found, 1e-3)
+        if self.inverse_step_per_m:
+            steps = np.maximum(np.rint(1 / (found * self.inverse_step_per_m)), 1)
+            found = 1 / (steps * self.inverse_step_per_m)
+        if self.depth_step_m:
+            found = np.rint(found / self.depth_step_m) * self.depth_step_m
+        tilt = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
+        rate = np.interp(tilt, self.tilts_deg, self.fill_rates)
+        lost = _share_below(holes) >= rate
+        inside = (found > self.min_depth_m) & (found < self.max_depth_m)
+        reason = np.select(
+            [~hit, lost, ~inside],
+            [np.uint8(Reason.EMPTY), np.uint8(Reason.UNMATCHED), np.uint8(Reason.RANGE)],
+            np.uint8(Reason.OK),
+        ).astype(np.uint8)
+        depth = np.where(reason == Reason.OK, found, np.nan).astype(np.float32)
+        return depth, reason
+
+    def scan(
+        self,
+        bodies: tuple[Body, ...],
+        box_m: np.ndarray,
+        world_from_camera: np.ndarray,
+        renderer: Renderer,
+        rng: np.random.Generator,
+        explain: bool = False,
+    ) -> DepthFrame | None:
+        """Take one frame; see qs3.sensors.base.DepthSensor. Shadows are always explained."""
+        whole = Camera(self.intrinsics, world_from_camera)
+        window = window_of(box_m, whole)
+        if window is None:
+            return None
+        camera = Camera(self.intrinsics, world_from_camera, window)
+        (image,) = renderer.render(
+            Scene(bodies), [camera], seed=int(rng.integers(2**31)), geometry=[True]
+        )
+        first_col, cols = on_grid(window.left, window.width, self.step_px)
+        first_row, rows = on_grid(window.top, window.height, self.step_px)
+        grid = (rows, cols)
+        clean, cosine, label = (
+            np.ascontiguousarray(a[grid]) for a in (image.depth_m, image.cosine, image.label)
+        )
+        depth, reason = self.measure(clean, cosine, rng)
+        pictures = {"clean": image.depth_m}
+        if self.baseline_m is not None:
+            projector = whole.moved((self.baseline_m, 0.0, 0.0)).world_from_camera
+            lit = reached_from(bodies, camera, projector, renderer)
+            pictures["lit"] = lit
+            dark = ~lit[grid] & np.isfinite(clean)
+            depth[dark], reason[dark] = np.nan, Reason.SHADOW
+        return DepthFrame(
+            camera=whole,
+            left=first_col,
+            top=first_row,
+            step_px=self.step_px,
+            depth_m=depth,
+            clean_m=clean,
+            label=label,
+            cosine=cosine,
+            reason=reason,
+            images=pictures,
+        )
+
+
+def neighbour_correlation(size_px: float) -> float:
+    """Correlation of horizontal neighbours in noise that `correlation_px` = size_px smooths."""
+    kernel = _kernel(size_px)
+    return float((kernel[1:] * kernel[:-1]).sum() / (kernel**2).sum())
+
+
+def _kernel(size_px: float) -> np.ndarray:
+    """[k] float32 Gaussian that sums to 1."""
+    reach = max(1, round(4 * size_px))
+    return cv2.getGaussianKernel(2 * reach + 1, max(size_px, 1e-6), cv2.CV_32F)[:, 0]
+
+
+def _smooth(shape: tuple[int, ...], size_px: float, rng: np.random.Generator) -> np.ndarray:
+    """[h, w] float32 normal noise of variance 1, correlated over size_px."""
+    white = rng.standard_normal(shape, dtype=np.float32)
+    if size_px <= 0 or white.size == 0:
+        return white
+    kernel = _kernel(size_px)
+    border = cv2.BORDER_REFLECT_101
+    smooth = cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel, borderType=border)
+    return smooth / np.float32((kernel**2).sum())
+
+
+def _share_below(normal: np.ndarray) -> np.ndarray:
+    """Distribution function of the normal law: uniform in 0..1."""
+    from scipy.special import ndtr
+
+    return ndtr(normal)

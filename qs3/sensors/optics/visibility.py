@@ -1,0 +1,61 @@
+"""Who sees what: whether surfaces in an image are reached from another place, by rendering.
+
+A point lamp at that place with a white slide lights exactly what can be seen from there, so any
+renderer answers, with its own geometry.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from qs3.geometry.cameras import Camera
+from qs3.sensors.pixel_status import Reason
+from qs3.sensors.renderers.base import Body, Projector, Renderer, Scene
+
+_WHITE = np.ones((2, 2), dtype=np.float32)
+_WIDE = 10.0  # tangent of half the lamp's angle: all that lies before it
+
+
+def reached_from(
+    bodies: tuple[Body, ...], camera: Camera, world_from_source: np.ndarray, renderer: Renderer
+) -> np.ndarray:
+    """Whether the surface in each pixel can be seen from another place.
+
+    Args:
+        bodies: the scene.
+        camera: with its window.
+        world_from_source: [4, 4] pose of the other camera or the projector, which looks along
+            its +z; what lies behind it is not reached.
+
+    Returns:
+        [h, w] bool, False where no surface is. A pixel counts if any part of it is reached.
+    """
+    lamp = Projector(world_from_source, _WHITE, _WIDE)
+    (image,) = renderer.render(Scene(bodies, lamp), [camera], seed=0, geometry=[False])
+    return image.radiance > 0
+
+
+def explained(
+    reason: np.ndarray,
+    clean_m: np.ndarray,
+    lit: np.ndarray,
+    seen: np.ndarray | None,
+) -> np.ndarray:
+    """Reasons that geometry gives, put before the matcher's.
+
+    Args:
+        reason: [h, w] uint8 of matcher and filters.
+        clean_m: [h, w] true depth, inf where nothing is.
+        lit: [h, w] bool, reached by the projector.
+        seen: [h, w] bool, reached by the other camera; None if there is none.
+
+    Returns:
+        [h, w] uint8.
+    """
+    out = reason.copy()
+    invalid = reason != Reason.OK
+    if seen is not None:
+        out[invalid & ~seen] = Reason.OCCLUDED
+    out[invalid & ~lit] = Reason.SHADOW
+    out[invalid & ~np.isfinite(clean_m)] = Reason.EMPTY
+    return out

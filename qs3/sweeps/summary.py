@@ -1,0 +1,184 @@
+"""What a multirun says at its end: mean and SEM over seeds, then every job that failed."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import logging
+import os
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.errors import CompactHydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from qs3.runs import folder as runs
+from qs3.sweeps import listed_jobs as sweepers
+
+log = logging.getLogger(__name__)
+
+_NO_END = "did not end: killed, interrupted or still running; the same command goes on with it"
+
+
+class SummaryOfSeeds(Callback):
+    """After a multirun: mean and SEM over the seeds of each config, and what failed.
+
+    Jobs may run in other processes and on other machines (joblib, submitit), so what becomes of
+    them is noted in a file beside the runs; its name travels to the jobs inside this object.
+
+    Args:
+        table: whether finished runs are summarised; a search has a table of its own.
+    """
+
+    def __init__(self, table: bool = True) -> None:
+        self.table = table
+        self.journal: Path | None = None
+        self._main = 0
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Begin a new list."""
+        sweepers.register()
+        self._main = os.getpid()
+        self.journal = _new_file(Path(config.hydra.sweep.dir).resolve())
+        # Hydra leaves a sweep by the first failed job's exception, past `on_multirun_end`; the
+        # finished seeds are worth a table nevertheless.
+        atexit.register(self._summarise)
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Note that the job has begun: a job that is killed says nothing later."""
+        self._note(config, overrides=list(config.hydra.overrides.task))
+
+    def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
+        """Note how the job has ended (and say what went wrong: Hydra shows the first error only).
+
+        What all jobs lack, say the data, is said once.
+        """
+        if self.journal is None:
+            return
+        error = getattr(job_return, "_return_value", None)
+        text = in_words(error) if isinstance(error, Exception) else ""
+        if text and text not in (entry.get("error") for entry in self._read()[0]):
+            log.error("%s failed: %s", " ".join(job_return.overrides), text)
+        self._note(config, overrides=list(job_return.overrides), error=text)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Print the summary."""
+        self._summarise()
+
+    def _note(self, config: DictConfig, **more: Any) -> None:
+        if self.journal is None:
+            return
+        entry = {"folder": str(config.hydra.runtime.output_dir), **more}
+        try:  # never made here: a job that ends after the summary leaves nothing behind
+            handle = os.open(self.journal, os.O_WRONLY | os.O_APPEND)
+        except FileNotFoundError:
+            return
+        with open(handle, "wb") as file:  # one short write: atomic, save on a network's disk
+            file.write((json.dumps(entry) + "\n").encode())
+
+    def _summarise(self) -> None:
+        if self.journal is None or os.getpid() != self._main:
+            return
+        entries, unreadable = self._read()
+        jobs = last_words(entries)
+        self.journal.unlink(missing_ok=True)
+        self.journal = None
+        folders = sorted({Path(job["folder"]) for job in jobs})
+        if self.table and any((folder / runs.METRICS).is_file() for folder in folders):
+            sys.stdout.write(summarise(folders, differences(jobs)) + "\n")
+        sys.stdout.write(failures(jobs))
+        if unreadable:
+            sys.stdout.write(
+                f"{unreadable} of the notes of the jobs could not be read: the list may lack some, "
+                "or say of a job that went well that it did not end\n"
+            )
+        sys.stdout.flush()
+
+    def _read(self) -> tuple[list[dict[str, Any]], int]:
+        """What was noted, and how many lines are damaged: two machines may write at one place."""
+        assert self.journal is not None
+        try:
+            lines = self.journal.read_bytes().splitlines()
+        except FileNotFoundError:  # by a job that ends after the summary
+            lines = []
+        entries = []
+        for line in lines:
+            with contextlib.suppress(ValueError):
+                entry = json.loads(line)
+                if isinstance(entry, dict) and {"folder", "overrides"} <= set(entry):
+                    entries.append(entry)
+        return entries, len(lines) - len(entries)
+
+
+def in_words(error: BaseException) -> str:
+    """The first line of an error, with its kind."""
+    lines = str(error).strip().splitlines()
+    if isinstance(error, CompactHydraException) and lines:  # its text begins with the kind
+        return lines[0]
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def last_words(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """A journal's last entry of each job, in the order in which the jobs began."""
+    last: dict[tuple[str, ...], Mapping[str, Any]] = {}
+    for entry in entries:
+        last[entry["folder"], *entry["overrides"]] = entry
+    return list(last.values())
+
+
+def failures(jobs: Sequence[Mapping[str, Any]]) -> str:
+    """The jobs that failed, by error; "" if there are none.
+
+    Args:
+        jobs: with "folder", "overrides" and "error", which is "" for a job that went well and
+            missing for one that never ended.
+    """
+    failed = [job for job in jobs if job.get("error") != ""]
+    if not failed:
+        return ""
+    by_error: dict[str, list[Mapping[str, Any]]] = {}
+    for job in failed:
+        by_error.setdefault(job.get("error", _NO_END), []).append(job)
+    lines = [f"{len(failed)} of {len(jobs)} jobs failed:"]
+    for error, members in by_error.items():
+        lines.append(f"  {error}")
+        lines += sorted(f"    {' '.join(job['overrides'])}  ({job['folder']})" for job in members)
+    return "\n".join(lines) + "\n"
+
+
+def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
+    """By folder the overrides in which jobs differ, without the seed; "" if they do not.
+
+    Args:
+        jobs: with "folder" and "overrides".
+    """
+    words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
+    keys = dict.fromkeys(key for one in words for key in one if key != "seed")
+    several = [key for key in keys if len({one.get(key) for one in words}) > 1]
+    return {
+        Path(job["folder"]): " ".join(f"{key}={one[key]}" for key in several if key in one)
+        for job, one in zip(jobs, words, strict=True)
+    }
+
+
+def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:
+    """A small table of the runs in `folders`; `settings`: in what they differ."""
+    from qs3.report.tables.aggregate import summarise as table
+
+    return table(folders, settings)
+
+
+def _new_file(folder: Path) -> Path:
+    """An empty file in `folder`, which machines of a cluster share, or in the temporary one."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=".multirun-", suffix=".txt", dir=folder)
+    except OSError:  # whether runs can be written there is for each of them to say
+        handle, name = tempfile.mkstemp(prefix="qs3-multirun-", suffix=".txt")
+    os.close(handle)
+    return Path(name)

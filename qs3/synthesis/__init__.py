@@ -1,1 +1,0 @@
-"""Mesh2Point: place, view, scan, fuse, sample; workers and resume."""

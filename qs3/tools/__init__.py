@@ -1,0 +1,1 @@
+"""Quickstart, doctor, and a toy problem for demonstrations."""

@@ -1,0 +1,1 @@
+"""The train command: check, load, build, fit, evaluate, write; resume and shared warm-ups."""

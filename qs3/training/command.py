@@ -1,0 +1,246 @@
+"""The stories of the two commands, top to bottom."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from qs3.config.checks import number, one_of, whole
+from qs3.config.hydra import build, in_multirun
+from qs3.data.domain import check_all
+from qs3.data.store import is_finished
+from qs3.datamodules.phases import Phases, Scheme
+from qs3.errors import ConfigError
+from qs3.evaluation.estimates_text import in_words
+from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
+from qs3.runs import folder as runs
+from qs3.runs.folder import Run
+from qs3.runs.predictions import OF_FILES
+from qs3.training.ensure_source import make_if_missing
+
+log = logging.getLogger(__name__)
+
+TEACHERS = ("source_val", "last")
+SCHEDULES = ("cosine", "plateau")
+_SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
+
+
+def train(cfg: DictConfig) -> dict[str, Any]:
+    """Train, continue or skip the run that `cfg` describes; returns what `metrics.json` holds.
+
+    Everything that can be wrong with the settings or the data is found before torch is imported.
+    """
+    _check_settings(cfg)
+    scheme: Scheme = build(cfg.selftraining)
+    run = Run(
+        cfg=cfg,
+        seed=runs.check_seed(cfg.seed),
+        folder=runs.run_folder(cfg),
+        scheme=scheme,
+        phases=Phases(cfg.protocol.epochs, scheme.rounds, scheme.epochs),
+        source=build(cfg.data.source),
+        target=build(cfg.data.target),
+    )
+    _refuse_rounds_of_upper_bound(run)
+    _refuse_choice_without_rounds(run)
+    check_objective(cfg.objective, cfg.selection.student)
+    _refuse_ddp_in_multirun(cfg)
+    if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
+        with _wandb_forgotten():
+            return _fit(run)
+
+    _warn_of_one_domain(run)
+    with runs.locked(run.folder):
+        if cfg.force:
+            runs.clear(run.folder)
+        metrics = runs.read_metrics(run.folder)
+        if metrics is None:
+            with _wandb_forgotten():
+                metrics = _fit(run)
+                runs.write_metrics(run.folder, metrics)
+                if cfg.report.pictures:
+                    _draw(run)
+        else:
+            runs.check_config(run.folder, metrics.get("config_sha256"), runs.config_sha256(cfg))
+            _refuse_other_data(run, metrics["data"])
+            log.info("already finished (force=true repeats it)")
+    log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
+    if (run.folder / OF_FILES).is_file():
+        log.info("the class of each file: %s", run.folder / OF_FILES)
+    log.info("see %s", run.folder / runs.METRICS)
+    return metrics
+
+
+def objective_of(cfg: DictConfig, metrics: dict[str, Any]) -> float | None:
+    """What a search over hyper-parameters looks at; None if there is no search.
+
+    NaN for a run that has diverged: it is finished, and would diverge again.
+
+    Raises:
+        ConfigError: the finished run has no such figure.
+    """
+    if cfg.objective is None:
+        return None
+    validators = metrics.get("validators", {})
+    if cfg.objective not in validators:
+        raise ConfigError(
+            f"the run's metrics.json has no {cfg.objective} under validators: it was finished by "
+            "an earlier version, which force=true repeats, or (snd) its target has a single cloud"
+        )
+    value = validators[cfg.objective]
+    return math.nan if value is None else float(value)
+
+
+def judged(cfg: DictConfig, metrics: dict[str, Any]) -> str:
+    """The result of a search's trial in one line: no accuracy, it would be nothing to choose by."""
+    value = metrics.get("validators", {}).get(cfg.objective)
+    text = "none: the net has diverged" if value is None else f"{value:.4f}"
+    return f"{metrics['experiment']}, seed {metrics['seed']}: objective={cfg.objective} {text}"
+
+
+def headline(metrics: dict[str, Any]) -> str:
+    """The result in one line; says when the target is simulated."""
+    final, run = metrics["final"], f"{metrics['experiment']}, seed {metrics['seed']}"
+    target = f"{metrics['target']}{' (simulated)' if metrics['simulated'] else ''}"
+    if final["accuracy"] is None:
+        counts = ", ".join(f"{name} {count}" for name, count in final["predicted"].items() if count)
+        estimate = in_words(metrics.get("quality", {}))
+        return (
+            f"{run}: no labels to judge {target} by; predicted {counts}"
+            f"{f'; {estimate}' if estimate else ''}{_chosen(metrics)}"
+        )
+    return (
+        f"{run}: accuracy {final['accuracy']:.1%}, balanced {final['balanced_accuracy']:.1%} "
+        f"on {target}, majority rate {final['majority_rate']:.1%}{_chosen(metrics)}"
+    )
+
+
+def _chosen(metrics: dict[str, Any]) -> str:
+    """How teacher and student were selected, for the end of the headline."""
+    teacher, student = metrics["selection"]["teacher"], metrics["selection"]["student"]
+    if teacher == student:  # no rounds
+        return f"; selected by {teacher}"
+    return f"; teacher selected by {teacher}; student by {student}"
+
+
+def _fit(run: Run) -> dict[str, Any]:
+    if run.cfg.data.make_source:
+        run.target.check()  # before minutes are spent on the source
+        make_if_missing(run.source)
+    check_all(run.source, run.target)
+    from qs3.training.fit import fit  # torch and Lightning from here on
+
+    return fit(run)
+
+
+def _draw(run: Run) -> None:
+    from qs3.report.runs.pictures import after_training  # matplotlib from here on
+
+    config: Any = OmegaConf.to_container(run.cfg, resolve=False)
+    after_training(run.folder, config)
+
+
+@contextlib.contextmanager
+def _wandb_forgotten() -> Iterator[None]:
+    """End wandb's run after the block: it would live on into the next job of a multirun."""
+    try:
+        yield
+    finally:
+        if "wandb" in sys.modules:
+            sys.modules["wandb"].finish()
+            os.environ.pop("WANDB_MODE", None)  # set by Lightning's logger when offline
+
+
+def _check_settings(cfg: DictConfig) -> None:
+    """Raise ConfigError for settings that would otherwise fail late, and without their key."""
+    one_of("selection.teacher", cfg.selection.teacher, TEACHERS)
+    one_of("selection.student", cfg.selection.student, STUDENT_RULES)
+    whole("data.points", cfg.data.points, 1)
+    whole("data.fps_starts", cfg.data.fps_starts, 1)
+    for key in ("clouds_a_class", "clouds_a_split"):
+        if cfg.data[key] is not None:
+            whole(f"data.{key}", cfg.data[key], 1)
+    if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
+        raise ConfigError(f"ckpt_path must be last or a path, got {cfg.ckpt_path!r}")
+    if cfg.ckpt_path is not None and cfg.force:
+        raise ConfigError(
+            "force=true begins the run anew and ckpt_path goes on with one; give one of them"
+        )
+    whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
+    one_of("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
+    whole("evaluation.rotations", cfg.evaluation.rotations, 0)
+    whole("protocol.batch_size", cfg.protocol.batch_size, 2)  # batch norm needs two clouds
+    one_of("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
+    highest = 1 - 1 / whole("num_classes", cfg.num_classes, 2)  # there all classes are alike
+    if not 0 <= number("protocol.smoothing", cfg.protocol.smoothing) <= highest:
+        raise ConfigError(
+            f"protocol.smoothing must lie in [0, {highest:g}], got {cfg.protocol.smoothing}"
+        )
+    if number("protocol.regulariser", cfg.protocol.regulariser) < 0:
+        raise ConfigError(f"protocol.regulariser must be >= 0, got {cfg.protocol.regulariser}")
+    if "lr" in cfg.protocol.optimizer:
+        number("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
+    if not isinstance(cfg.data.make_source, bool):
+        raise ConfigError(f"data.make_source must be true or false, got {cfg.data.make_source!r}")
+    if not isinstance(cfg.report.pictures, bool):
+        raise ConfigError(f"report.pictures must be true or false, got {cfg.report.pictures!r}")
+    if cfg.trainer.threads is not None:
+        whole("trainer.threads", cfg.trainer.threads, 1)
+
+
+def _is_upper_bound(cfg: DictConfig) -> bool:
+    return cfg.method.get("_target_") == _SUPERVISED
+
+
+def _refuse_rounds_of_upper_bound(run: Run) -> None:
+    if _is_upper_bound(run.cfg) and run.scheme.rounds:
+        raise ConfigError(
+            "method=supervised trains on the target's labels and has no use for pseudo-labels; "
+            "set selftraining=none"
+        )
+
+
+def _refuse_choice_without_rounds(run: Run) -> None:
+    rule = run.cfg.selection.student
+    if rule != LAST and not run.scheme.rounds:
+        raise ConfigError(
+            f"selection.student={rule} chooses among the epochs of the last round, and this run "
+            "has no rounds: selection.teacher decides what is reported; set "
+            f"selection.student={LAST}, or a selftraining with rounds"
+        )
+
+
+def _warn_of_one_domain(run: Run) -> None:
+    if run.source.folder == run.target.folder and not _is_upper_bound(run.cfg):
+        log.warning(
+            "data.source (%s) and data.target (%s) are the same dataset: the target's training "
+            "labels are used, so this is no adaptation",
+            run.source.name,
+            run.target.name,
+        )
+
+
+def _refuse_other_data(run: Run, hashes: dict[str, str]) -> None:
+    """Raise if a dataset is there and is not the one that the finished run used."""
+    for role, domain in (("source", run.source), ("target", run.target)):
+        if is_finished(domain.folder):  # else it was put away since, and the result stands
+            runs.check_data(run.folder, domain.name, hashes[role], domain.open(verify=False).sha256)
+
+
+def _refuse_ddp_in_multirun(cfg: DictConfig) -> None:
+    """Lightning would start each further process with the whole sweep's command line."""
+    devices = cfg.trainer.get("devices", 1)
+    one = len(devices) == 1 if isinstance(devices, ListConfig) else str(devices) == "1"
+    several = not one or cfg.trainer.get("num_nodes", 1) > 1
+    if several and in_multirun():
+        raise ConfigError(
+            "trainer uses several processes (DDP), which cannot be swept with -m; run each seed by "
+            "itself, or sweep one-process runs with hydra/launcher=joblib"
+        )

@@ -1,0 +1,49 @@
+"""`data.make_source=true`: a source that is not there is made, by its domain's own command."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shlex
+import subprocess
+import sys
+
+from qs3.config.location import ROOT
+from qs3.data.domain import Domain
+from qs3.errors import ConfigError, MissingDataError, Qs3Error
+
+log = logging.getLogger(__name__)
+
+_GENERATE = ["python", "generate.py"]
+
+
+def make_if_missing(domain: Domain) -> None:
+    """Run `generate.py` for a domain whose data are not there; it shows its progress.
+
+    An interrupted one goes on where it stopped when it is called again.
+
+    Raises:
+        ConfigError: the domain is published, not generated, so that nothing can make it.
+        Qs3Error: the generation failed; its message is on the terminal.
+    """
+    try:
+        domain.check()
+    except MissingDataError:
+        pass
+    else:
+        return
+    words = shlex.split(domain.make or "")
+    if words[:2] != _GENERATE:
+        raise ConfigError(
+            f"data.make_source=true, but domain {domain.name} is not generated; set it to false, "
+            "and the message says where its files come from"
+        )
+    if int(os.environ.get("LOCAL_RANK", 0)) > 0:
+        return  # the first process makes it
+    log.info("%s is not there and is made: %s", domain.label, shlex.join(words))
+    done = subprocess.run([sys.executable, str(ROOT / words[1]), *words[2:]], check=False)
+    if done.returncode:
+        raise Qs3Error(
+            f"domain {domain.name} could not be made (exit status {done.returncode}): see above; "
+            "the same command goes on with it"
+        )

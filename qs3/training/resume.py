@@ -1,0 +1,84 @@
+"""`ckpt_path`: where a run goes on. By itself it goes on from its own last checkpoint, if any."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from qs3.errors import ConfigError, MissingDataError
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import LAST
+from qs3.runs.folder import Run
+from qs3.training.provenance import warn_of_versions
+from qs3.utils.files import atomic_path, make_folder
+
+log = logging.getLogger(__name__)
+
+_LAST = "last"
+_STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, runs.METRICS)
+
+
+def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
+    """Do what `ckpt_path` asks for, before training begins.
+
+    null does nothing. "last" insists on a checkpoint of the run. A path, of a run's folder or of
+    the `last.ckpt` in it, brings the same run from elsewhere: another machine's logs, a backup. As
+    settings, seed and data must be the same, the result is that of a run that was never moved;
+    other versions of torch may change it, which is a warning. A run that has a checkpoint of its
+    own goes on from that.
+
+    Args:
+        run: whose folder it is.
+        started: what the run is started with, as in `started.json`.
+
+    Raises:
+        MissingDataError: there is no such checkpoint.
+        ConfigError: it is another run's.
+        DataError: it was trained on other data.
+        Qs3Error: it is still being trained.
+    """
+    where = run.cfg.ckpt_path
+    own = run.folder / LAST
+    if where is None or own.is_file() or int(os.environ.get("LOCAL_RANK", 0)) > 0:
+        return
+    if where == _LAST:
+        raise MissingDataError(
+            f"ckpt_path={_LAST}, but {own} is not there: a run with these settings and seed has "
+            "not begun, or was not an epoch old; leave ckpt_path out to begin it"
+        )
+    path = Path(where).expanduser()
+    path = path / LAST if path.is_dir() else path
+    if path.name != LAST or not path.is_file():
+        raise MissingDataError(
+            f"ckpt_path={where}: no {LAST} of a run is there; name a run's folder or the {LAST} in "
+            "it (python -m qs3.inference uses finished runs)"
+        )
+    other = path.resolve().parent
+    begun = runs.read_started(other)
+    if begun is None or other.name != run.folder.name:
+        raise ConfigError(
+            f"ckpt_path={where} belongs to another run: its folder is {other.name}, this one's "
+            f"{run.folder.name} (seed and hash of the settings). Give the command that began it, "
+            "or leave ckpt_path out"
+        )
+    runs.check_config(other, begun.get("config_sha256"), started["config_sha256"])
+    runs.check_idle(other)
+    warn_of_versions(begun["versions"], started["versions"])
+    for role in ("source", "target"):
+        runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])
+    log.info("going on from %s", path)
+    for file in sorted(file for file in other.rglob("*") if file.is_file()):
+        part = file.relative_to(other)
+        if part.parts[0] not in _STAYS and file.suffix != ".log" and part.name != LAST:
+            _copy(file, run.folder / part)
+    _copy(path, run.folder / LAST)  # the checkpoint last: with it a run counts as begun
+
+
+def _copy(source: Path, target: Path) -> None:
+    make_folder(target.parent)
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)

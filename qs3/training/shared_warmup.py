@@ -1,0 +1,107 @@
+"""Warm-ups are trained once: runs that differ only in what follows go on from one checkpoint.
+
+When a run is one epoch away from the end of its warm-up, its checkpoint is copied to
+
+    <paths.warmup_dir>/<hash>-seed<seed>/last.ckpt, history.csv, started.json
+
+The hash covers everything that the warm-up depends on, datasets and versions included. A new run
+of the same hash begins from that copy as if it had been interrupted there: it trains the last
+epoch itself, so teacher, pseudo-labels and result are the same, to the bit, as without it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
+from omegaconf import DictConfig, OmegaConf
+
+from qs3.errors import DataError
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import LAST
+from qs3.utils.files import atomic_path, make_folder, write_json
+
+log = logging.getLogger(__name__)
+
+HISTORY = "history.csv"
+# Not `selection`: the checkpoint holds the teacher chosen so far.
+_AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_name")
+
+
+def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
+    """64 hex digits over what a warm-up depends on, except its seed.
+
+    Args:
+        cfg: of the run.
+        started: hashes of the datasets and versions, as in `started.json`.
+    """
+    before: Any = OmegaConf.to_container(cfg, resolve=False)
+    before = OmegaConf.create(before)
+    for key in _AFTERWARDS:
+        OmegaConf.update(before, key, None)
+    parts = [runs.config_sha256(before), started["data"], started["versions"]]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+class SharedWarmup(Checkpoint):
+    """Gives a run's warm-up to others, and takes theirs.
+
+    It belongs behind `SaveLast` in the list of callbacks.
+
+    Args:
+        folder: of the run.
+        shared: `paths.warmup_dir`; None shares nothing.
+        sha256: of the warm-up.
+        seed: of the run.
+        warmup: epochs of the warm-up; of a single one nothing is worth sharing.
+    """
+
+    def __init__(
+        self, folder: Path, shared: str | Path | None, sha256: str, seed: int, warmup: int
+    ) -> None:
+        self.folder, self.sha256, self.last_but_one = folder, sha256, warmup - 2
+        self.shared = None if shared is None else Path(shared) / f"{sha256[:8]}-seed{seed}"
+
+    def take(self) -> bool:
+        """Begin from a shared warm-up, if there is one and the run has no checkpoint yet."""
+        if self.shared is None or (self.folder / LAST).exists() or not self._is_there():
+            return False
+        log.info("the warm-up was trained before: going on from %s", self.shared)
+        for name in (HISTORY, LAST):  # the checkpoint last: with it a run counts as begun
+            _copy(self.shared / name, self.folder / name)
+        return True
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Copy the checkpoint that has just been written, one epoch before the warm-up's end."""
+        if trainer.current_epoch != self.last_but_one or not trainer.is_global_zero:
+            return
+        if self.shared is None or self._is_there():
+            return
+        try:
+            make_folder(self.shared)
+            for name in (HISTORY, LAST):
+                _copy(self.folder / name, self.shared / name)
+            write_json(self.shared / runs.STARTED, {"warmup_sha256": self.sha256})
+        except Exception as error:  # a full disk, say: sharing is a convenience
+            log.warning("the warm-up cannot be shared (%s); training goes on", error)
+
+    def _is_there(self) -> bool:
+        """Whether a complete one of this hash lies there; the mark is written last."""
+        assert self.shared is not None
+        try:
+            mark = runs.read_started(self.shared)
+        except DataError:  # damaged: as good as not there
+            return False
+        return mark is not None and mark.get("warmup_sha256") == self.sha256
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)

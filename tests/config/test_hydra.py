@@ -1,0 +1,52 @@
+"""Errors while building from the config, and what loggers are told of a run."""
+
+from __future__ import annotations
+
+import pytest
+from hydra.errors import InstantiationException
+from omegaconf import OmegaConf
+
+from qs3.config.hydra import build
+from qs3.errors import ConfigError
+from tests.training.toy import toy_config
+
+
+def refuses(value: int) -> int:
+    raise ValueError(f"{value} is too small")
+
+
+def fails() -> None:
+    raise RuntimeError("a defect")
+
+
+def node(**settings):
+    return OmegaConf.create({"a": {"b": settings}}).a.b
+
+
+def test_what_a_target_does_not_take_is_an_error_of_the_config():
+    with pytest.raises(ConfigError, match=r"^a\.b: 3 is too small$"):
+        build(node(_target_="tests.config.test_hydra.refuses", value=3))
+    with pytest.raises(ConfigError, match=r"^a\.b: .*unexpected keyword argument 'k'"):
+        build(node(_target_="tests.config.test_hydra.refuses", k=3))
+    inner = {"_target_": "tests.config.test_hydra.refuses", "value": 3}
+    with pytest.raises(ConfigError, match=r"^a\.b\.value: 3 is too small$"):
+        build(node(_target_="tests.config.test_hydra.refuses", value=inner))
+
+
+def test_our_own_errors_are_raised_as_they_were():
+    with pytest.raises(ConfigError, match=r"^selftraining\.selector\.mu must be one of"):
+        build(node(_target_="qs3.selftraining.selectors.Qbst", mu="two"))
+
+
+def test_other_errors_keep_their_traceback():
+    with pytest.raises(InstantiationException, match="a defect"):
+        build(node(_target_="tests.config.test_hydra.fails"))
+
+
+def test_tags(tmp_path):
+    """By class, where no command line has named the choices."""
+    assert toy_config(tmp_path, "logger=wandb").logger.wandb.tags == [
+        "specklenet10 -> kinectsim10", "pcm", "qbst", "tinynet", "simulated",
+    ]  # fmt: skip
+    cfg = toy_config(tmp_path, "logger=wandb", "selftraining=none", "domain@data.target=scannet10")
+    assert cfg.logger.wandb.tags == ["specklenet10 -> scannet10", "pcm", "tinynet"]

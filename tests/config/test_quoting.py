@@ -1,0 +1,86 @@
+"""What we hand to Hydra as text, Hydra reads as that text."""
+
+from __future__ import annotations
+
+import shlex
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import example, given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from qs3.api import composed
+from qs3.config.quoting import override, quoted
+from qs3.errors import ConfigError
+from qs3.report.__main__ import _built
+from qs3.report.tables.running import Job, launch
+from qs3.tools.toy import toy_overrides
+
+ODD = "/a b/(c),[d]{e}='f\"g\\h/${i}:é"
+FOLDERS = [ODD, "1e3", "null", "a,b", "x=y", "", " a ", "\\", "'", "\\'", "~", "a\\${b}\\", "${"]
+
+
+def understood(word: str):
+    """As Hydra parses it and OmegaConf then resolves it."""
+    one = OverridesParser.create().parse_override(word)
+    assert not one.is_sweep_override()
+    cfg = OmegaConf.create({"folder": None, "data": "${folder}/data"})
+    OmegaConf.update(cfg, one.key_or_group, one.value())
+    assert cfg.data == f"{cfg.folder}/data"
+    return cfg.folder
+
+
+@given(st.text(st.sampled_from("ab1.,:=~/\\'\"()[]{}$ \té日\n-+e") | st.characters(codec="utf-8")))
+@example("${oc.env:HOME}")
+@example("\\\\${a}")
+@example(ODD)
+def test_any_text_is_read_back(text):
+    assert understood(override("folder", text)) == text
+
+
+@pytest.mark.parametrize("text", FOLDERS)
+def test_odd_names_of_folders_are_read_back(text):
+    assert understood(override("folder", text)) == text
+    again = shlex.split(shlex.join([override("folder", text)]))  # as a shell would hand it over
+    assert understood(again[0]) == text
+
+
+@pytest.mark.parametrize("text", ["/home/me/logs", "a_b-c.d", "../x", "dgcnn", "a+b"])
+def test_plain_words_stay_as_they_are(text):
+    assert quoted(text) == text
+
+
+def test_an_interpolation_stays_one_where_it_was_typed():
+    assert quoted("${paths.data_dir}/x") == "${paths.data_dir}/x"
+
+
+@pytest.mark.parametrize("name", ["a, b (c) [d] it's ${x}", "1"])
+def test_every_path_of_ours_reaches_the_config(name, tmp_path):
+    """The toy's words, and those of a table's cells."""
+    folder = tmp_path / name
+    cfg = composed("train", *toy_overrides(folder))
+    paths = [cfg.paths.data_dir, cfg.paths.log_dir, cfg.paths.warmup_dir]
+    assert paths == [str(folder / part) for part in ("data", "logs", "warmups")]
+    assert cfg.data.target.path == str(folder / "data" / "toy_target")
+    assert list(cfg.data.source.classes) == ["ball", "rod", "slab", "plank"]
+    options = {"table": "quickstart", "log_dir": str(folder), "data_dir": f"{folder}/data"}
+    with pytest.raises(ConfigError, match="is not there; it is the paths"):
+        _built(options)
+    assert not folder.exists()
+    folder.mkdir()
+    table = _built(options)
+    (cell, *_) = [cell for cell in table.cells if cell.runnable]
+    paths = composed("train", *cell.overrides).paths
+    assert (paths.log_dir, paths.data_dir) == (str(folder), f"{folder}/data")
+
+
+@pytest.mark.slow
+def test_a_launched_job_finds_its_folder(tmp_path):
+    """It ends there, because there are no data."""
+    folder = tmp_path / "a, b (c) [d] it's"
+    paths = override("paths.log_dir", folder), override("paths.data_dir", folder / "data")
+    job = Job("r", ("experiment=quickstart", *paths))
+    assert launch([job], "joblib", 1, str(folder)) == 1
+    (config,) = folder.glob("quickstart/seed0-*/.hydra/config.yaml")
+    assert OmegaConf.load(config).paths.data_dir == str(folder / "data")

@@ -1,0 +1,495 @@
+"""Published formats: known answers, then every kind of damage we could think of."""
+
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from qs3.classes import CLASSES
+from qs3.data.importers import NamedArrays, NpyTree, PointDAH5, XyzTree, import_into
+from qs3.data.importers.base import check_cloud, y_up_to_z_up
+from qs3.data.importers.trees import read_npy, read_xyz
+from qs3.data.store import open_pointset, read_manifest
+from qs3.errors import ConfigError, DataError
+from tests.fixtures import published as fixtures
+
+TWO = ("bed", "chair")
+
+
+def xyz_tree(root, names=("a", "b"), classes=TWO, splits=("train", "test"), rows=4):
+    for c, cls in enumerate(classes):
+        for s, split in enumerate(splits):
+            (root / cls / split).mkdir(parents=True, exist_ok=True)
+            for n, name in enumerate(names):
+                cloud = np.full((rows, 3), 100 * c + 10 * s + n) + np.arange(rows * 3).reshape(
+                    -1, 3
+                )
+                np.savetxt(root / cls / split / f"{name}.xyz", cloud)
+    return root
+
+
+def test_order_ids_and_coordinates(tmp_path):
+    importer = XyzTree(xyz_tree(tmp_path), points=4)
+    assert importer.is_there()
+    clouds, rows = importer.read(TWO)
+    assert [row.id for row in rows] == [
+        "bed/train/a", "bed/train/b", "chair/train/a", "chair/train/b",
+        "bed/test/a", "bed/test/b", "chair/test/a", "chair/test/b",
+    ]  # fmt: skip
+    assert [cloud[0, 0] for cloud in clouds] == [0, 1, 100, 101, 10, 11, 110, 111]
+    assert clouds[0].tolist() == np.arange(12).reshape(4, 3).tolist()
+    assert clouds[0].dtype == np.float32
+    assert rows[0].origin == os.path.join("bed", "train", "a.xyz")
+    assert {row.valid_points for row in rows} == {4}
+
+
+def test_few_points_are_repeated_and_counted(tmp_path, caplog):
+    clouds, rows = XyzTree(xyz_tree(tmp_path), points=10).read(TWO)
+    assert (
+        clouds[0].tolist() == np.arange(12).reshape(4, 3)[[0, 1, 2, 3, 0, 1, 2, 3, 0, 1]].tolist()
+    )
+    assert {row.valid_points for row in rows} == {4}
+    assert "8 clouds have under 10 points" in caplog.text
+
+
+def test_more_points_than_published_is_another_dataset(tmp_path):
+    with pytest.raises(DataError, match=r"a\.xyz: the cloud has 4 points, expected 1 to 3"):
+        XyzTree(xyz_tree(tmp_path), points=3).read(TWO)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "0 bytes"),
+        (b"\n\n", "the file is blank"),
+        (b"1 2 3\n4 5\n", r"line 2: '4 5' is not three numbers"),
+        (b"1 2 3\n4 5 6 7\n", r"line 2: '4 5 6 7' is not three numbers"),
+        (b"1 2 3\n\n4 x 6\n", r"line 3: '4 x 6' is not three numbers"),
+        (b"1,2,3\n", "line 1"),
+        (b"1 2 3\n4 nan 6\n", r"point 2: \[4.0, nan, 6.0\] is not finite"),
+        (b"1 2 3\n4 1e39 6\n", "point 2: .*inf.* is not finite"),
+        (b"\xff\xfe\x00", "line 1"),
+        (b"# 1\n1 2 3\n", "line 1"),
+        (b"1 2\n3 4\n", "line 1"),
+    ],
+)
+def test_damaged_text_names_file_and_line(tmp_path, text, message):
+    xyz_tree(tmp_path)
+    (tmp_path / "chair" / "test" / "b.xyz").write_bytes(text)
+    with pytest.raises(DataError, match=r"chair.test.b\.xyz.*(" + message + ")"):
+        XyzTree(tmp_path, points=4).read(TWO)
+
+
+def test_skipping_damage_is_recorded(tmp_path, caplog):
+    xyz_tree(tmp_path / "p")
+    (tmp_path / "p" / "chair" / "test" / "b.xyz").write_text("1 2\n")
+    importer = XyzTree(tmp_path / "p", points=4, on_error="skip")
+    import_into(tmp_path / "s", importer, name="s", classes=TWO)
+    assert len(open_pointset(tmp_path / "s")) == 7
+    skipped = [row for row in read_manifest(tmp_path / "s", TWO) if row.status != "ok"]
+    assert [row.id for row in skipped] == ["chair/test/b"]
+    assert "is not three numbers" in skipped[0].reason
+    assert "1 clouds left out" in caplog.text
+
+
+def test_truncated_text_never_gives_wrong_rows(tmp_path):
+    path = tmp_path / "a.xyz"
+    np.savetxt(path, np.random.default_rng(0).normal(size=(3, 3)), fmt="%.3f")
+    whole, data = read_xyz(path), path.read_bytes()
+    for size in range(1, len(data)):
+        path.write_bytes(data[:size])
+        try:
+            found = read_xyz(path)
+        except DataError:
+            continue
+        # a cut inside the last number of a row cannot be seen; all before it must be right
+        assert np.array_equal(found.ravel()[:-1], whole.ravel()[: found.size - 1])
+
+
+def test_names_of_classes_and_splits(tmp_path):
+    xyz_tree(tmp_path, classes=("Night_Stand", "COUCH"), splits=("train", "val"))
+    _, rows = XyzTree(tmp_path, points=4).read(("cabinet", "sofa"))
+    assert {row.cls for row in rows} == {"cabinet", "sofa"}
+    assert {row.split for row in rows} == {"train", "validation"}
+
+
+def test_unknown_class_or_split(tmp_path):
+    xyz_tree(tmp_path)
+    (tmp_path / "cat").mkdir()
+    with pytest.raises(DataError, match=f"{tmp_path}: unknown class 'cat'; known are bed, chair"):
+        XyzTree(tmp_path, points=4).read(TWO)
+    (tmp_path / "cat").rmdir()
+    (tmp_path / "bed" / "dev").mkdir()
+    with pytest.raises(DataError, match="unknown split 'dev'"):
+        XyzTree(tmp_path, points=4).read(TWO)
+
+
+def test_two_folders_of_one_class(tmp_path):
+    xyz_tree(tmp_path, classes=("bed", "chair", "Chair"))
+    with pytest.raises(DataError, match="are the same class"):
+        XyzTree(tmp_path, points=4).read(TWO)
+
+
+def test_two_files_of_one_name(tmp_path):
+    xyz_tree(tmp_path)
+    (tmp_path / "bed" / "test" / "a.XYZ").write_text("1 2 3\n")
+    with pytest.raises(DataError, match="have one name"):
+        XyzTree(tmp_path, points=4).read(TWO)
+
+
+def test_an_empty_class_is_an_error(tmp_path):
+    xyz_tree(tmp_path)
+    for path in (tmp_path / "chair" / "test").iterdir():
+        path.unlink()
+    (tmp_path / "chair" / "test" / "readme.txt").write_text("moved")
+    with pytest.raises(DataError, match="split 'test' has no clouds of chair"):
+        XyzTree(tmp_path, points=4).read(TWO)
+    with pytest.raises(DataError, match="holds no clouds"):
+        XyzTree(tmp_path / "chair" / "test", points=4).read(TWO)
+
+
+def test_hidden_files_are_passed_over(tmp_path):
+    xyz_tree(tmp_path)
+    (tmp_path / "__MACOSX" / "train").mkdir(parents=True)
+    (tmp_path / ".git").mkdir()
+    (tmp_path / "bed" / ".DS_Store").write_text("")
+    (tmp_path / "bed" / "train" / "._a.xyz").write_bytes(b"\0")
+    (tmp_path / "README").write_text("")
+    assert len(XyzTree(tmp_path, points=4).read(TWO)[0]) == 8
+
+
+def test_links_may_not_leave_the_folder(tmp_path):
+    root = xyz_tree(tmp_path / "root")
+    (root / "bed" / "train" / "inside.xyz").symlink_to(root / "bed" / "train" / "a.xyz")
+    assert len(XyzTree(root, points=4).read(TWO)[0]) == 9
+    (tmp_path / "secret.xyz").write_text("1 2 3\n")
+    (root / "bed" / "train" / "c.xyz").symlink_to(tmp_path / "secret.xyz")
+    with pytest.raises(DataError, match=r"c\.xyz is a link that leads out of"):
+        XyzTree(root, points=4).read(TWO)
+    (root / "bed" / "train" / "c.xyz").unlink()
+    (root / "sofa").symlink_to(tmp_path)
+    with pytest.raises(DataError, match="sofa is a link that leads out of"):
+        XyzTree(root, points=4).read((*TWO, "sofa"))
+    elsewhere = tmp_path / "link"  # the folder itself may be one: the user chose it
+    (root / "sofa").unlink()
+    elsewhere.symlink_to(root)
+    assert len(XyzTree(elsewhere, points=4).read(TWO)[0]) == 9
+
+
+def test_npy_axes(tmp_path):
+    cloud = np.array([[1, 2, 3], [4, 5, 6]], "f4")
+    for cls in ("chair", "plant"):
+        (tmp_path / cls / "train").mkdir(parents=True)
+        np.save(tmp_path / cls / "train" / "x.npy", cloud)
+    importer = NpyTree(tmp_path, points=2, up="y", up_z_classes=["plant"])
+    (chair, plant), _ = importer.read(("chair", "plant"))
+    assert chair.tolist() == [[1, -3, 2], [4, -6, 5]]  # y is up in the file
+    assert plant.tolist() == cloud.tolist()
+
+
+def test_turning_is_a_rotation():
+    matrix = y_up_to_z_up(np.eye(3)).T
+    assert np.linalg.det(matrix) == pytest.approx(1)
+    assert (matrix @ [0, 1, 0]).tolist() == [0, 0, 1]
+
+
+TRAP = Path(tempfile.gettempdir()) / "qs3-test-trap"
+
+
+class Trap:
+    def __reduce__(self):
+        return (os.mkdir, (str(TRAP),))
+
+
+def test_pickled_arrays_are_refused_unopened(tmp_path):
+    path = tmp_path / "x.npy"
+    np.save(path, np.array([Trap(), Trap()]), allow_pickle=True)
+    with pytest.raises(DataError, match=r"x\.npy: a pickled array, refused"):
+        read_npy(path)
+    path.write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(DataError, match=r"not a readable \.npy"):
+        read_npy(path)
+    assert not TRAP.exists()
+
+
+def test_npy_damage_anywhere(tmp_path):
+    path = tmp_path / "x.npy"
+    np.save(path, np.ones((4, 3), "f4"))
+    data = path.read_bytes()
+    for size in range(1, len(data), 3):
+        path.write_bytes(data[:size])
+        with pytest.raises(DataError, match=r"x\.npy"):
+            read_npy(path)
+    for at in range(128):  # of the header: an error, or still numbers
+        changed = bytearray(data)
+        changed[at] ^= 1 << (at % 8)
+        path.write_bytes(changed)
+        try:
+            check_cloud(read_npy(path), 4, str(path))
+        except DataError as error:
+            assert "x.npy" in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize("array", [np.array(["a"]), np.ones((4, 2)), np.ones(3), np.ones((0, 3))])
+def test_npy_of_other_things(tmp_path, array):
+    np.save(tmp_path / "x.npy", array)
+    with pytest.raises(DataError, match=r"x\.npy"):
+        check_cloud(read_npy(tmp_path / "x.npy"), 4, str(tmp_path / "x.npy"))
+
+
+def h5_file(path, n=2, points=4, **changes):
+    content = {
+        "data": np.arange(n * points * 6, dtype="f4").reshape(n, points, 6),
+        "label": np.arange(n, dtype="i4")[:, None],
+        **changes,
+    }
+    with h5py.File(path, "w") as file:
+        for key, value in content.items():
+            if value is not None:
+                file[key] = value
+
+
+def h5_folder(folder, **changes):
+    folder.mkdir(exist_ok=True)
+    for name in ("train_0", "train_1", "test_0"):
+        h5_file(folder / f"{name}.h5", **changes)
+    return folder
+
+
+def test_h5_axes_and_mirror(tmp_path):
+    h5_folder(tmp_path)
+    clouds, rows = PointDAH5(tmp_path, points=4, undo_mirror=False).read(TWO)
+    assert clouds[0][:2].tolist() == [[0, -2, 1], [6, -8, 7]]  # (x, y, z) -> (x, -z, y)
+    clouds, rows = PointDAH5(tmp_path, points=4).read(TWO)
+    assert clouds[0][:2].tolist() == [[0, 2, 1], [6, 8, 7]]
+    assert [row.id for row in rows] == [
+        "bed/train/train_0_0000", "chair/train/train_0_0001",
+        "bed/train/train_1_0000", "chair/train/train_1_0001",
+        "bed/test/test_0_0000", "chair/test/test_0_0001",
+    ]  # fmt: skip
+    assert rows[3].origin == "train_1.h5[1]"
+
+
+def test_h5_needs_both_splits(tmp_path):
+    h5_folder(tmp_path)
+    assert PointDAH5(tmp_path).is_there()
+    (tmp_path / "test_0.h5").unlink()
+    assert not PointDAH5(tmp_path).is_there()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"data": None}, "no dataset 'data'"),
+        ({"label": None}, "no dataset 'label'"),
+        ({"data": np.zeros((2, 4, 2), "f4")}, r"expected floats \[n, P, 3 or 6\]"),
+        ({"data": np.zeros((2, 4, 3), "i4")}, "expected floats"),
+        ({"label": np.array([0, 2])}, "cloud 1: label 2 is not 0..1"),
+        ({"label": np.array([-1, 0])}, "cloud 0: label -1"),
+        ({"label": np.zeros(3, "i4")}, r"expected integers \[2\]"),
+        ({"label": np.zeros(2)}, "expected integers"),
+        ({"data": np.full((2, 4, 6), np.nan)}, "cloud 0, point 1: .* is not finite"),
+        ({"data": np.zeros((2, 5, 6))}, "the cloud has 5 points, expected 1 to 4"),
+        ({"data": h5py.SoftLink("/label")}, "no dataset 'data' in the file itself"),
+        ({"data": h5py.ExternalLink("/etc/passwd", "/x")}, "no dataset 'data' in the file itself"),
+    ],
+)
+def test_h5_of_other_things(tmp_path, changes, message):
+    h5_folder(tmp_path)
+    h5_file(tmp_path / "train_1.h5", **changes)
+    with pytest.raises(DataError, match=r"train_1\.h5.*" + message):
+        PointDAH5(tmp_path, points=4).read(TWO)
+
+
+def test_h5_with_its_numbers_in_another_file(tmp_path):
+    h5_folder(tmp_path)
+    with h5py.File(tmp_path / "test_0.h5", "w") as file:
+        file.create_dataset("data", (2, 4, 3), "f4", external=[("/etc/passwd", 0, 96)])
+        file["label"] = np.arange(2)
+    with pytest.raises(DataError, match="takes its numbers from other files"):
+        PointDAH5(tmp_path, points=4).read(TWO)
+
+
+def test_h5_behind_a_link(tmp_path):
+    root = h5_folder(tmp_path / "root")
+    (root / "test_0.h5").rename(tmp_path / "outside.h5")
+    (root / "test_0.h5").symlink_to(tmp_path / "outside.h5")
+    with pytest.raises(DataError, match=r"test_0\.h5 is a link that leads out of"):
+        PointDAH5(root, points=4).read(TWO)
+
+
+def test_truncated_h5(tmp_path):
+    h5_folder(tmp_path)
+    path = tmp_path / "train_0.h5"
+    data = path.read_bytes()
+    for size in range(0, len(data), 97):
+        path.write_bytes(data[:size])
+        with pytest.raises(DataError, match=r"train_0\.h5: not a readable HDF5 file"):
+            PointDAH5(tmp_path, points=4).read(TWO)
+
+
+def npz(folder, **changes):
+    content = {
+        "points": np.arange(4 * 2 * 3, dtype="f4").reshape(4, 2, 3),
+        "cls": np.array(["bed", "chair", "bed", "chair"]),
+        "split": np.array(["test", "train", "train", "test"]),
+        "name": np.array(["a", "b", "c", "d"]),
+        **changes,
+    }
+    np.savez(folder / "points.npz", **{k: v for k, v in content.items() if v is not None})
+    return folder
+
+
+def test_named_arrays(tmp_path):
+    clouds, rows = NamedArrays(npz(tmp_path), points=2).read(TWO)
+    assert [row.id for row in rows] == [
+        "bed/train/c",
+        "chair/train/b",
+        "bed/test/a",
+        "chair/test/d",
+    ]
+    assert [cloud[0, 0] for cloud in clouds] == [12, 6, 0, 18]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": None}, r"has no arrays \['name'\]"),
+        ({"cls": np.array([1, 2, 3, 4])}, "expected 4 strings"),
+        ({"cls": np.array(["bed"])}, "expected 4 strings"),
+        ({"cls": np.array(["bed", "chair", "cat", "bed"])}, r"cloud 2 \(c\): unknown class 'cat'"),
+        ({"split": np.array(["x", "test", "test", "test"])}, "unknown split 'x'"),
+        ({"points": np.zeros((4, 2, 2))}, r"not floats \[N, P, 3\]"),
+        ({"points": np.array([Trap()] * 4)}, "not a readable"),
+    ],
+)
+def test_named_arrays_of_other_things(tmp_path, changes, message):
+    with pytest.raises(DataError, match=r"points\.npz.*" + message):
+        NamedArrays(npz(tmp_path, **changes), points=2).read(TWO)
+    assert not TRAP.exists()
+
+
+def test_damaged_npz(tmp_path):
+    path = npz(tmp_path) / "points.npz"
+    data = path.read_bytes()
+    for size in range(0, len(data), 31):
+        path.write_bytes(data[:size])
+        with pytest.raises(DataError, match=r"points\.npz"):
+            NamedArrays(tmp_path, points=2).read(TWO)
+
+
+def test_wrong_settings(tmp_path):
+    for settings in ({"points": 0}, {"up": "x"}, {"on_error": "ignore"}):
+        with pytest.raises(ConfigError):
+            XyzTree(tmp_path, **settings)
+
+
+def test_import_is_all_or_nothing(tmp_path):
+    xyz_tree(tmp_path / "p")
+    bad = tmp_path / "p" / "bed" / "test" / "a.xyz"
+    good = bad.read_text()
+    bad.write_text("1 2\n")
+    importer = XyzTree(tmp_path / "p", points=4)
+    with pytest.raises(DataError):
+        import_into(tmp_path / "s", importer, name="s", classes=TWO)
+    assert not (tmp_path / "s").exists()
+    bad.write_text(good)
+    (tmp_path / ".s.importing").mkdir()  # what a kill would leave
+    (tmp_path / ".s.importing" / "points.npy").write_text("half")
+    import_into(tmp_path / "s", importer, name="s", classes=TWO)
+    assert sorted(p.name for p in (tmp_path / "s").iterdir()) == [
+        "manifest.csv", "meta.yaml", "points.npy",
+    ]  # fmt: skip
+    assert not (tmp_path / ".s.importing").exists()
+    before = (tmp_path / "s" / "meta.yaml").stat().st_ino
+    import_into(tmp_path / "s", importer, name="s", classes=TWO)  # once is enough
+    assert (tmp_path / "s" / "meta.yaml").stat().st_ino == before
+
+
+def test_a_folder_with_nothing_but_a_lock_is_empty(tmp_path):
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / ".lock").write_text("")  # a generation that was refused at once
+    import_into(tmp_path / "s", XyzTree(xyz_tree(tmp_path / "p"), points=4), name="s", classes=TWO)
+    assert len(open_pointset(tmp_path / "s")) == 8
+
+
+def test_an_unfinished_generation_is_not_overwritten(tmp_path):
+    xyz_tree(tmp_path / "p")
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "part.npz").write_text("")
+    with pytest.raises(DataError, match="holds a generation that was not finished"):
+        import_into(tmp_path / "s", XyzTree(tmp_path / "p", points=4), name="s", classes=TWO)
+
+
+def test_height_is_z_in_every_published_format(tmp_path):
+    """The classes' shapes are the same in all fixtures, so their heights must agree."""
+    fixtures.write_all(tmp_path, {"train": 2, "test": 1})
+    at = tmp_path / "published"
+    importers = [
+        XyzTree(at / "depthscannet10"),
+        NpyTree(at / "modelnet10"),
+        NpyTree(at / "shapenet10", points=1024, up="y", up_z_classes=["plant"]),
+        PointDAH5(at / "scannet10"),
+        NamedArrays(at, points=1024, file="modelnet10_points.npz"),
+    ]
+    for importer in importers:
+        clouds, rows = importer.read(CLASSES)
+        for cloud, row in zip(clouds, rows, strict=True):
+            extent = np.ptp(cloud, axis=0)
+            if row.cls == "lamp":
+                assert extent[2] > 2 * extent[:2].max()
+            if row.cls in ("bed", "table", "bathtub"):
+                assert extent[2] < extent[:2].max()
+            assert cloud[:, 2].min() > -0.1  # they stand on the floor
+
+
+def test_kill_9_during_an_import(tmp_path):
+    """Whenever the import is killed, there is no store or a whole one; then it is made."""
+    xyz_tree(tmp_path / "p", names=[f"{i:02d}" for i in range(60)], rows=200)
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from qs3.data.importers import XyzTree, import_into\n"
+        "print('go', flush=True)\n"
+        "import_into(Path(sys.argv[1]), XyzTree(sys.argv[2], points=200), name='s',\n"
+        "            classes=('bed', 'chair'))\n"
+    )
+    for delay in (0.0, 0.02, 0.05, 0.08, 0.12):
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, tmp_path / "s", tmp_path / "p"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(delay)
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        if (tmp_path / "s").exists():
+            assert len(open_pointset(tmp_path / "s")) == 240
+    importer = XyzTree(tmp_path / "p", points=200)
+    import_into(tmp_path / "s", importer, name="s", classes=TWO)
+    assert len(open_pointset(tmp_path / "s")) == 240
+    assert not (tmp_path / ".s.importing").exists()
+
+
+SHARED = Path(__file__).parents[4] / "shared" / "data"
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/data is not there")
+def test_the_real_modelnet10(tmp_path):
+    importer = NamedArrays(SHARED, points=1024, file="modelnet10_points.npz")
+    import_into(tmp_path / "m", importer, name="modelnet10", classes=CLASSES)
+    counts = open_pointset(tmp_path / "m").counts()
+    expected = {  # the official split of these classes of ModelNet40
+        "train": [106, 515, 572, 200, 889, 124, 465, 240, 680, 392],
+        "test": [50, 100, 100, 86, 100, 20, 100, 100, 100, 100],
+    }
+    assert {split: list(of.values()) for split, of in counts.items()} == expected

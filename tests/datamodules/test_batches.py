@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.datamodules.batches import Batches, Table, balanced
+from qs3.datamodules.clouds import Clouds
+from qs3.utils.seeding import derive
+
+SAMPLES = 3
+
+
+def table(n: int, balance: str | None = None, starts: int = 1) -> Table:
+    """n clouds of the points 0 and i + 1; with several samples, sample s is the point s alone."""
+    stored = np.zeros((n, SAMPLES, 3), dtype=np.float32)
+    stored[:, :, 0] = np.arange(SAMPLES)
+    order = None if starts == 1 else np.tile(np.arange(starts)[:, None], (n, 1, 1))
+    labels = {"y": torch.arange(n), "class": torch.arange(n).clamp(max=1)}
+    return Table(Clouds.of(stored, order), labels, balance)
+
+
+def seen(batches: Batches, name: str = "a") -> list[int]:
+    return [int(y) for batch in batches for y in batch[name]["y"]]
+
+
+def batches(n: int, size: int = 4, balance: str | None = None, **kw) -> Batches:
+    return Batches({"a": table(n, balance)}, size, **{"seed": 0, "epoch": 0, **kw})
+
+
+@given(st.integers(2, 50), st.integers(2, 9))
+def test_each_cloud_once_and_no_batch_of_one(n, size):
+    epoch = batches(n, size)
+    assert sorted(seen(epoch)) == list(range(n))
+    sizes = [len(batch["a"]["points"]) for batch in epoch]
+    assert len(sizes) == len(epoch)
+    assert min(sizes) >= 2
+    assert max(sizes) <= size + 1
+
+
+def test_order_is_a_function_of_seed_and_epoch():
+    assert seen(batches(20)) == seen(batches(20))
+    assert seen(batches(20)) != seen(batches(20, epoch=1))
+    assert seen(batches(20)) != seen(batches(20, seed=1))
+    assert seen(batches(20, shuffle=False)) == list(range(20))
+
+
+def one_by_one(name: str, n: int, rank: int, world: int):
+    """The order, written straight: this process's share of one permutation after another."""
+    for passed in itertools.count():
+        generator = torch.Generator().manual_seed(derive(0, "shuffle", name, 5, passed))
+        order = torch.randperm(n, generator=generator).tolist()
+        padded = order + order[: -n % world]
+        yield from padded[rank::world]
+
+
+@given(st.integers(2, 40), st.integers(2, 40), st.integers(1, 3), st.integers(2, 9))
+def test_order_against_one_drawn_cloud_by_cloud(n, other, world, size):
+    for rank in range(world):
+        both = Batches(
+            {"a": table(n), "b": table(other)}, size, seed=0, epoch=5, rank=rank, world=world
+        )
+        for name, count in (("a", n), ("b", other)):
+            expected = one_by_one(name, count, rank, world)
+            assert seen(both, name) == list(itertools.islice(expected, sum(both.sizes)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 8, 9])
+def test_processes_share_the_clouds_equally(n):
+    parts = [seen(batches(n, rank=r, world=4)) for r in range(4)]
+    assert len({len(part) for part in parts}) == 1
+    assert set().union(*parts) == set(range(n))
+
+
+def test_the_first_table_decides_the_length():
+    both = Batches({"a": table(10), "b": table(3)}, 4, seed=0, epoch=0)
+    assert [len(batch["b"]["y"]) for batch in both] == [4, 4, 2]
+    assert sorted(seen(both, "b")[:3]) == [0, 1, 2]
+
+
+# --- one of several samples -------------------------------------------------------------------
+
+
+def samples(seed: int = 0, epoch: int = 0, **kw) -> dict[int, int]:
+    """Which sample of each cloud an epoch takes, by the point that the sample consists of."""
+    drawn = Batches({"a": table(60, starts=3)}, 8, seed=seed, epoch=epoch, **kw)
+    radius = 1.0  # of the points 0, 1, 2 about 1
+    return {
+        int(y): round(float(point[0, 0]) * radius + 1)
+        for batch in drawn
+        for y, point in zip(batch["a"]["y"], batch["a"]["points"], strict=True)
+    }
+
+
+def test_an_epoch_draws_a_sample_for_each_cloud():
+    first = samples()
+    assert set(first.values()) == {0, 1, 2}
+    counts = np.bincount(list(first.values()))
+    assert counts.min() > 10  # of 60; a third each
+    assert samples() == first
+    assert samples(epoch=1) != first
+    assert samples(seed=1) != first
+    assert set(samples(shuffle=False).values()) == {0}  # evaluation
+
+
+def test_the_sample_does_not_depend_on_the_number_of_processes():
+    whole = samples()
+    for rank in range(3):
+        part = samples(rank=rank, world=3)
+        assert len(part) == 20
+        assert part.items() <= whole.items()
+
+
+# --- balanced classes -------------------------------------------------------------------------
+
+
+def test_all_classes_are_equally_likely_and_the_epoch_stays_as_long():
+    drawn = seen(batches(4000, balance="class"))
+    assert len(drawn) == 4000
+    first_class = drawn.count(0)  # one cloud of 4,000
+    assert first_class == pytest.approx(2000, abs=160)  # 5 sigma
+    assert seen(batches(4000, balance="class")) == drawn
+    assert seen(batches(4000, balance="class", epoch=1)) != drawn
+
+
+def test_no_cloud_twice_before_all_of_its_class():
+    classes = torch.tensor([0] * 5 + [1] * 95)
+    drawn = balanced(classes, torch.Generator().manual_seed(0))
+    times = torch.bincount(drawn, minlength=100)
+    assert times[5:].max() == 1
+    assert times[:5].max() - times[:5].min() <= 1
+    assert times[:5].sum() == pytest.approx(50, abs=25)
+
+
+def test_a_class_that_does_not_occur_is_not_drawn():
+    classes = torch.tensor([2, 2, 7, 7, 7])
+    assert set(balanced(classes, torch.Generator()).tolist()) <= set(range(5))
+
+
+def test_processes_get_different_clouds_of_a_balanced_epoch():
+    parts = [set(seen(batches(400, balance="class", rank=r, world=2))) for r in range(2)]
+    assert len(parts[0]) > 60
+    assert parts[0] & parts[1] <= {0}  # the only cloud of its class

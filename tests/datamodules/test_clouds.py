@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.datamodules.clouds import Clouds
+from qs3.geometry.sampling import unit_ball
+
+STORED = np.random.default_rng(0).normal(size=(5, 40, 3)).astype(np.float32) * [3, 1, 0.1] + 7
+STORED = STORED.astype(np.float32)
+ORDER = np.stack([np.random.default_rng(i).permutation(40)[:8] for i in range(10)])
+ORDER = ORDER.reshape(5, 2, 8).astype(np.int16)
+
+
+@pytest.fixture
+def mapped(tmp_path) -> Clouds:
+    np.save(tmp_path / "stored.npy", STORED)
+    np.save(tmp_path / "order.npy", ORDER)
+    return Clouds.of(
+        np.load(tmp_path / "stored.npy", mmap_mode="r"),
+        np.load(tmp_path / "order.npy", mmap_mode="r"),
+    )
+
+
+def test_batch_equals_the_normalised_clouds_to_the_bit(mapped):
+    index, start = torch.tensor([3, 0, 3]), torch.tensor([1, 0, 0])
+    batch = mapped.take(index, start)
+    assert batch.dtype == torch.float32
+    for points, i, s in zip(batch.numpy(), (3, 0, 3), (1, 0, 0), strict=True):
+        assert np.array_equal(points, unit_ball(STORED[i])[ORDER[i, s]])
+
+
+def test_without_choice_the_whole_cloud_in_its_order():
+    clouds = Clouds.of(STORED)
+    assert clouds.starts == 1
+    assert np.array_equal(clouds.all().numpy(), unit_ball(STORED))
+
+
+def test_a_batch_is_a_copy(mapped):
+    mapped.take(torch.tensor([1])).zero_()
+    assert np.array_equal(mapped.stored, STORED)
+    whole = Clouds.of(STORED.copy())
+    whole.take(torch.tensor([1])).zero_()
+    assert np.array_equal(whole.stored, STORED)
+
+
+def test_a_part_shares_the_clouds(mapped):
+    part = mapped.at(np.array([4, 2]))
+    assert len(part) == 2
+    assert part.stored is mapped.stored
+    assert torch.equal(part.all(), mapped.all()[[4, 2]])
+    again = part.at(np.array([False, True]))
+    assert torch.equal(again.all(), mapped.all()[[2]])
+
+
+def test_a_cloud_of_one_repeated_point_becomes_zeros():
+    clouds = Clouds.of(np.full((1, 9, 3), 5.3, dtype=np.float32))
+    assert not clouds.all().any()
+
+
+def test_nothing_of_a_map_is_copied(mapped):
+    held = (mapped.stored, mapped.order)
+    assert all(isinstance(array, np.memmap) for array in held)
+    assert mapped.centre.nbytes + mapped.radius.nbytes + mapped.rows.nbytes == 5 * (12 + 4 + 8)

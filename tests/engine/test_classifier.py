@@ -1,0 +1,66 @@
+"""The classifier around a method: heads, progress, learning rates."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+
+from qs3.datamodules.phases import Phases
+from qs3.engine.classifier import Classifier
+from qs3.methods.dann import Dann
+from qs3.methods.gast import Gast
+from qs3.methods.pointdan import PointDan
+from qs3.methods.source_only import SourceOnly
+from qs3.models.pointdan import pointdan
+from qs3.selftraining.student_loss import Student
+from tests.methods.shapes import tiny_net
+
+
+def _classifier(method: Any, seed: int = 0, **more: Any) -> Classifier:
+    settings = {
+        "build_net": lambda: tiny_net(torch.initial_seed()),
+        "build_optimizer": partial(torch.optim.Adam, lr=1e-3),
+        **more,
+    }
+    return Classifier(**settings, method=method, student=Student(), phases=Phases(4), seed=seed)
+
+
+def test_heads_are_a_function_of_the_seed() -> None:
+    made = []
+    for seed in (0, 0, 1):
+        torch.rand(7)  # whatever was drawn before
+        made.append(_classifier(Gast(), seed).method.state_dict())
+    first, again, other = made
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    assert not all(torch.equal(first[key], other[key]) for key in first)
+
+
+def test_heads_change_neither_the_net_nor_torch_s_generator() -> None:
+    torch.manual_seed(0)
+    plain = _classifier(SourceOnly()).net.state_dict()
+    state = torch.get_rng_state()
+    headed = _classifier(Dann()).net.state_dict()
+    assert torch.equal(torch.get_rng_state(), state)
+    assert all(torch.equal(plain[key], headed[key]) for key in plain)
+
+
+def test_heads_are_optimised() -> None:
+    classifier = _classifier(Dann())
+    optimised = classifier.configure_optimizers()["optimizer"].param_groups
+    assert len(optimised) == 1
+    parts = (classifier.net, classifier.method)
+    assert len(optimised[0]["params"]) == sum(len(list(part.parameters())) for part in parts)
+
+
+def test_each_module_has_its_learning_rate() -> None:
+    classifier = _classifier(PointDan(classifier_rate=3.0), build_net=lambda: pointdan(4, nodes=4))
+    groups = classifier.configure_optimizers()["optimizer"].param_groups
+    assert [group["lr"] for group in groups] == [1e-3, pytest.approx(3e-3)]
+    assert {id(p) for p in groups[1]["params"]} == {
+        id(p) for p in classifier.net.get_submodule("head").parameters()
+    }
+    ids = [id(p) for group in groups for p in group["params"]]
+    assert sorted(ids) == sorted(id(p) for p in classifier.parameters())

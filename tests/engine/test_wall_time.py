@@ -1,0 +1,33 @@
+"""The time of a run is that of all its starts."""
+
+from __future__ import annotations
+
+import torch
+
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import load
+from qs3.training.command import train
+from tests.training.test_resume import interrupt
+
+LONG = 1e6  # seconds; no test takes as long
+
+
+def wind_forward(checkpoint):
+    """As if the run had taken `LONG` until then."""
+    content = load(checkpoint)
+    content["callbacks"]["Clock"]["seconds"] += LONG
+    torch.save(content, checkpoint)
+
+
+def test_earlier_starts_count(toy):
+    cfg = toy("selftraining=none")
+    interrupt(cfg, "on_train_epoch_start", 3)
+    wind_forward(runs.run_folder(cfg) / "last.ckpt")
+    assert LONG < train(cfg)["times"]["seconds"] < 2 * LONG
+
+
+def test_a_shared_warmup_counts(toy, tmp_path):
+    assert 0 < train(toy("selftraining=none"))["times"]["seconds"] < LONG
+    (shared,) = (tmp_path / "logs" / "warmups").rglob("*.ckpt")
+    wind_forward(shared)
+    assert LONG < train(toy())["times"]["seconds"] < 2 * LONG

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import nn
+
+from qs3.datamodules.adaptation import Unlabelled
+from qs3.datamodules.augment import rotate_z
+from qs3.datamodules.clouds import Clouds
+from qs3.evaluation.metrics import (
+    Evaluation,
+    calibration_error,
+    figures,
+    figures_without_labels,
+    predict,
+    predict_turned,
+)
+
+
+def test_figures_worked_by_hand():
+    labels = np.array([0, 0, 0, 0, 1, 1])
+    predicted = np.array([0, 0, 0, 1, 1, 0])
+    result = figures(predicted, labels, ("a", "b", "c"))
+    assert result["accuracy"] == pytest.approx(4 / 6)
+    assert result["balanced_accuracy"] == pytest.approx((3 / 4 + 1 / 2) / 2)
+    assert result["per_class_recall"] == {"a": 0.75, "b": 0.5, "c": None}
+    assert result["confusion"] == [[3, 1, 0], [1, 1, 0], [0, 0, 0]]
+    assert result["majority_rate"] == pytest.approx(4 / 6)
+    assert result["n"] == 6
+    assert result["predicted"] == {"a": 4, "b": 2, "c": 0}
+
+
+def test_without_labels_only_counts():
+    result = figures_without_labels(np.array([0, 2, 2]), ("a", "b", "c"))
+    assert result["predicted"] == {"a": 1, "b": 0, "c": 2}
+    assert result["n"] == 3
+    assert result["accuracy"] is result["balanced_accuracy"] is result["confusion"] is None
+
+
+def test_calibration_worked_by_hand():
+    # bins of a half: (0, 1/2] holds two with confidence 0.5, one right; (1/2, 1] three
+    probabilities = np.array([[0.5, 0.5], [0.5, 0.5], [0.9, 0.1], [0.8, 0.2], [0.3, 0.7]])
+    labels = np.array([0, 1, 0, 1, 1])
+    expected = 2 / 5 * abs(1 / 2 - 0.5) + 3 / 5 * abs(2 / 3 - 0.8)
+    assert calibration_error(probabilities, labels, bins=2) == pytest.approx(expected)
+
+
+def test_calibration_of_the_sure():
+    sure = np.array([[1.0, 0.0], [1.0, 0.0]])
+    assert calibration_error(sure, np.array([0, 0])) == 0
+    assert calibration_error(sure, np.array([1, 1])) == 1
+
+
+@given(st.integers(0, 1000), st.integers(1, 30), st.integers(2, 5), st.integers(1, 20))
+def test_calibration_against_bin_by_bin(seed, n, k, bins):
+    rng = np.random.default_rng(seed)
+    probabilities = rng.dirichlet(np.ones(k), size=n)
+    labels = rng.integers(k, size=n)
+    confidence, right = probabilities.max(axis=1), probabilities.argmax(axis=1) == labels
+    expected = 0.0
+    for b in range(bins):
+        inside = (confidence > b / bins) & (confidence <= (b + 1) / bins)
+        if inside.any():
+            expected += inside.mean() * abs(right[inside].mean() - confidence[inside].mean())
+    assert calibration_error(probabilities, labels, bins) == pytest.approx(expected)
+
+
+def test_prediction_is_deterministic_and_leaves_the_mode_alone():
+    net = nn.Sequential(nn.Flatten(), nn.Linear(6, 3), nn.Dropout(0.5))
+    points = torch.rand(5, 2, 3)
+    net.train()
+    first = predict(net, points, 2)
+    assert net.training
+    assert np.array_equal(first, predict(net, points, 2))
+    assert np.allclose(first.sum(axis=1), 1)
+
+
+class Net(nn.Module):
+    """Sees the direction of a cloud's first point."""
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        return 3 * points[:, 0, :2]
+
+
+def test_mean_over_turns():
+    points = torch.nn.functional.normalize(torch.rand(6, 4, 3), dim=2)
+    net = Net()
+    assert np.array_equal(predict_turned(net, points, 1, 4), predict(net, points, 4))
+    by_hand = [
+        predict(net, rotate_z(points, torch.full((6,), angle)), 4)
+        for angle in (0.0, torch.pi / 2, torch.pi, 3 * torch.pi / 2)
+    ]
+    assert np.allclose(predict_turned(net, points, 4, 4), np.mean(by_hand, axis=0), atol=1e-6)
+    turned = rotate_z(points, torch.full((6,), 2 * torch.pi / 12))
+    twelve = predict_turned(net, points, 12, 4)
+    assert np.allclose(twelve, predict_turned(net, turned, 12, 4), atol=1e-6)
+    assert not np.allclose(predict(net, points, 4), predict(net, turned, 4), atol=1e-2)
+
+
+@pytest.mark.parametrize("rotations", [0, 3])
+@pytest.mark.parametrize("labelled", [True, False])
+def test_turned_figures_stand_beside_the_plain_ones(rotations, labelled):
+    clouds = Clouds.of(np.random.default_rng(0).normal(size=(5, 6, 3)).astype(np.float32))
+    labels = torch.tensor([0, 1, 0, 1, 1]) if labelled else None
+    evaluation = Evaluation(
+        Unlabelled(clouds, tuple("abcde")), labels, None, ("x", "y"), 2, rotations
+    )
+    net = Net()
+    plain, turned = evaluation.figures(net), evaluation.turned(net)
+    assert (turned is None) == (rotations == 0)
+    assert (plain["accuracy"] is None) == (not labelled)
+    predicted = predict(net, clouds.all(), 5).argmax(axis=1)
+    assert list(plain["predicted"].values()) == np.bincount(predicted, minlength=2).tolist()
+    if turned is not None:
+        assert turned.keys() == plain.keys()
+        predicted = predict_turned(net, clouds.all(), rotations, 5).argmax(axis=1)
+        assert list(turned["predicted"].values()) == np.bincount(predicted, minlength=2).tolist()

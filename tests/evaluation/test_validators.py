@@ -1,0 +1,216 @@
+"""Validators: values worked by hand, a twin for SND with all similarities at once, properties."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.evaluation.selection_rules import STUDENT_RULES, took_target_labels
+from qs3.evaluation.validators import (
+    LABEL_FREE,
+    entropy,
+    hold_out,
+    infomax,
+    is_better,
+    snd,
+)
+
+CERTAIN = np.eye(3)
+UNSURE = np.full((4, 3), 1 / 3)
+ONE_CLASS = np.tile([1.0, 0.0, 0.0], (5, 1))
+
+
+@st.composite
+def tables(draw, least=2):
+    """[n, K] probabilities; some of them 0, some rows equal."""
+    n, k = draw(st.integers(least, 40)), draw(st.integers(2, 6))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    p = rng.dirichlet(np.full(k, draw(st.sampled_from([0.05, 1.0, 20.0]))), size=n)
+    p[rng.random(n) < 0.2] = np.eye(k)[0]
+    return p
+
+
+def snd_of_all(p, temperature=0.05):
+    """All n x n similarities at once, row by row as the formula is written."""
+    f = [row / math.sqrt(sum(row * row)) for row in p]
+    values = []
+    for i in range(len(p)):
+        e = [math.exp(float(f[i] @ f[j]) / temperature) for j in range(len(p)) if j != i]
+        q = [x / sum(e) for x in e]
+        values.append(-sum(x * math.log(x) for x in q if x > 0))
+    return sum(values) / len(values)
+
+
+# --- by hand -----------------------------------------------------------------------------------
+
+
+def test_entropy_by_hand():
+    assert entropy(CERTAIN) == 0
+    assert entropy(UNSURE) == pytest.approx(math.log(3))
+    assert entropy(np.array([[0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])) == pytest.approx(math.log(2) / 2)
+    quarter = -(0.25 * math.log(0.25) + 0.75 * math.log(0.75))
+    assert entropy(np.array([[0.25, 0.75]])) == pytest.approx(quarter)
+
+
+@pytest.mark.parametrize("name", LABEL_FREE)
+def test_a_net_that_has_diverged_has_no_score(name):
+    assert math.isnan(LABEL_FREE[name].score(np.full((4, 3), np.nan)))
+
+
+def test_infomax_by_hand():
+    assert infomax(CERTAIN) == pytest.approx(math.log(3))
+    assert infomax(UNSURE) == 0
+    assert infomax(ONE_CLASS) == 0  # where the entropy alone is at its best
+    # mean (3/4, 1/4): H = 0.5623; mean of the entropies: ln 2 / 2 = 0.3466
+    assert infomax(np.array([[0.5, 0.5], [1.0, 0.0]])) == pytest.approx(0.2157615543)
+
+
+def test_snd_by_hand():
+    assert snd(CERTAIN) == pytest.approx(math.log(2))  # two neighbours, both at a right angle
+    assert snd(ONE_CLASS) == pytest.approx(math.log(4))
+    assert snd(np.array([[1.0, 0.0], [0.0, 1.0]])) == 0  # one neighbour, whatever it is like
+    # two pairs: each cloud has one neighbour at 1 and two at 0: weights 1, e^-20, e^-20
+    pairs = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+    small = math.exp(-20)
+    z = 1 + 2 * small
+    assert snd(pairs) == pytest.approx(math.log(z) + 2 * small * 20 / z, rel=1e-6)
+    assert snd(pairs, temperature=1.0) == pytest.approx(  # weights e, 1, 1
+        math.log(math.e + 2) - math.e / (math.e + 2)
+    )
+
+
+def test_snd_looks_at_directions():
+    """(0.9, 0.1) and (0.1, 0.9) are at cosine 0.18 / 0.82, whatever their lengths."""
+    table = np.array([[0.9, 0.1], [0.9, 0.1], [0.1, 0.9]])
+    cosine = 0.18 / 0.82
+    e = np.array([1.0, math.exp((cosine - 1) / 0.05)])
+    p = e / e.sum()
+    first = -(p * np.log(p)).sum()
+    assert snd(table) == pytest.approx((2 * first + math.log(2)) / 3)
+
+
+def test_no_neighbour():
+    with pytest.raises(ValueError, match="two clouds or more, got 1"):
+        snd(UNSURE[:1])
+
+
+# --- twin and properties -----------------------------------------------------------------------
+
+
+@given(tables(), st.integers(1, 50))
+def test_snd_in_blocks_is_snd_of_all(table, block):
+    assert snd(table, block=block) == pytest.approx(snd_of_all(table), abs=1e-9)
+
+
+@given(tables(), st.randoms(use_true_random=False))
+def test_order_of_clouds_and_classes_does_not_matter(table, random):
+    rows, columns = list(range(len(table))), list(range(table.shape[1]))
+    random.shuffle(rows)
+    random.shuffle(columns)
+    for name, validator in LABEL_FREE.items():
+        moved = validator.score(table[rows][:, columns])
+        assert moved == pytest.approx(validator.score(table), abs=1e-9), name
+
+
+@given(tables())
+def test_ranges(table):
+    n, k = table.shape
+    top = math.log(k) + 1e-12
+    assert 0 <= entropy(table) <= top
+    assert 0 <= infomax(table) <= top
+    assert 0 <= snd(table) <= math.log(n - 1)
+
+
+@given(tables())
+def test_what_is_known_of_the_class_is_not_more_than_its_entropy(table):
+    mean = table.mean(axis=0, keepdims=True)
+    assert infomax(table) + entropy(table) == pytest.approx(entropy(mean), abs=1e-9)
+
+
+def test_many_clouds_do_not_need_all_similarities_at_once():
+    import tracemalloc
+
+    table = np.random.default_rng(0).dirichlet(np.ones(10), size=4000)
+    tracemalloc.start()
+    snd(table, block=64)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4000 * 4000 * 8 / 8  # all of them are 128 MB
+
+
+# --- choosing ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rule", "scores", "best"),
+    [
+        ("entropy", [0.5, 0.3, 0.3, 0.4], 1),
+        ("infomax", [0.5, 0.7, 0.7, 0.6], 1),
+        ("snd", [2.0, 1.0], 0),
+        ("pseudo_val", [0.5, 0.5, 0.9], 2),
+        ("oracle", [0.5, 0.4], 0),
+        ("entropy", [math.nan, 0.6, math.nan, 0.5], 3),
+        ("snd", [math.nan, math.nan], 0),
+    ],
+)
+def test_the_best_and_the_earliest_of_them(rule, scores, best):
+    chosen, value = -1, None
+    for i, score in enumerate(scores):
+        if is_better(rule, score, value):
+            chosen, value = i, score
+    assert chosen == best
+
+
+def test_held_out_by_hand():
+    labels = np.repeat([0, 1, 2, 3], [10, 7, 3, 2])
+    held = hold_out(labels, [f"{i:02d}" for i in range(22)], seed=1)
+    assert np.bincount(labels[held], minlength=4).tolist() == [2, 1, 1, 0]
+
+
+@given(
+    st.lists(st.integers(0, 4), min_size=1, max_size=80),
+    st.integers(0, 2**63 - 1),
+    st.randoms(use_true_random=False),
+)
+def test_held_out_part(labels, seed, random):
+    y = np.array(labels)
+    ids = [f"cloud/{i}" for i in range(len(y))]
+    held = hold_out(y, ids, seed)
+    all_, out = np.bincount(y, minlength=5), np.bincount(y[held], minlength=5)
+    assert (np.abs(out - all_ / 5) <= 0.5).all()
+    assert ((out < all_) | (all_ == 0)).all()  # something of each class is left to train on
+    order = list(range(len(y)))
+    random.shuffle(order)
+    again = hold_out(y[order], [ids[i] for i in order], seed)
+    assert (again == held[order]).all()
+
+
+def test_another_seed_holds_others_out():
+    y, ids = np.zeros(100, dtype=int), [str(i) for i in range(100)]
+    assert (hold_out(y, ids, 3) == hold_out(y, ids, 3)).all()
+    assert (hold_out(y, ids, 3) != hold_out(y, ids, 4)).any()
+    confident = np.flatnonzero(hold_out(y, ids, 3))
+    assert confident.min() < 50 < confident.max()  # not only from one end
+
+
+def test_every_rule_has_a_name_and_every_score_a_rule():
+    assert ("last", "pseudo_val", *LABEL_FREE, "oracle") == STUDENT_RULES
+
+
+@pytest.mark.parametrize(
+    ("selection", "answer"),
+    [
+        ({"student": "oracle (target test labels: diagnostic only), epoch 3, score 0.5"}, True),
+        ({"student": "oracle"}, True),
+        ({"student": "last"}, False),
+        ({"student": "snd, epoch 3, score 2"}, False),
+        ({}, False),
+        (None, False),
+    ],
+)
+def test_who_looked_at_target_labels(selection, answer):
+    assert took_target_labels({"selection": selection}) is answer

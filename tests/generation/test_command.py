@@ -1,0 +1,247 @@
+"""generate.py from a folder of small meshes, with real workers and the real renderer."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hydra import compose, initialize_config_dir
+
+from qs3.data.store import open_pointset, read_manifest
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.generation.command import generate
+from qs3.generation.recipes import Cloud
+from qs3.generation.shards import Parts
+from qs3.generation.workers import Outcome
+from tests.generation.generating import ROOT, command, config, fingerprint
+
+
+def test_a_folder_of_meshes_becomes_a_dataset(finished):
+    folder, pointset = finished
+    assert pointset.points.shape == (15, 2048, 3)
+    assert pointset.counts()["train"]["chair"] == 3
+    assert pointset.counts()["test"]["lamp"] == 2
+    clean = open_pointset(folder, "points_clean")
+    # The unit cube and a margin of 3 cm bound the scan; the twin lies in the cube itself.
+    assert np.abs(pointset.points).max() <= np.sqrt(0.5) + 0.03 + 1e-6
+    assert np.abs(clean.points).max() <= np.sqrt(0.5) + 1e-4
+    assert not (folder / "parts").exists()
+    versions = pointset.meta["versions"]
+    assert versions["renderer"] == "mitsuba"
+    assert {"variant", "mitsuba", "opencv", "numpy"} <= set(versions)
+
+
+def test_the_scan_lies_near_the_surface_and_its_twin_on_it(finished, meshes):
+    folder, pointset = finished
+    clean = open_pointset(folder, "points_clean")
+    spheres = [i for i, name in enumerate(pointset.ids) if name.startswith("lamp")]
+    for i in spheres:
+        # A sphere fills the unit cube whatever its size: radius 0.5 about the origin.
+        noisy = np.abs(np.linalg.norm(pointset.points[i], axis=1) - 0.5)
+        true = np.abs(np.linalg.norm(clean.points[i], axis=1) - 0.5)
+        assert true.max() < 0.01  # facets are a little inside the sphere
+        assert np.median(noisy) < 0.06
+        assert noisy.mean() > 2 * true.mean()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_number_of_workers_changes_no_byte(finished, meshes, tmp_path, workers):
+    generate(config(tmp_path, meshes, f"workers={workers}"))
+    assert fingerprint(tmp_path / "specklenet10") == fingerprint(finished[0])
+
+
+def test_fewer_objects_or_classes_are_the_same_objects(finished, meshes, tmp_path):
+    _, whole = finished
+    part = generate(config(tmp_path, meshes, "workers=0", "limit=1", "classes=[table,lamp]"))
+    assert part.counts()["train"]["table"] == 1
+    assert part.counts()["train"]["chair"] == 0
+    for i, name in enumerate(part.ids):
+        np.testing.assert_array_equal(part.points[i], whole.points[whole.ids.index(name)])
+
+
+def test_a_finished_dataset_is_left_alone_and_other_settings_are_refused(finished, meshes):
+    folder, _ = finished
+    before = (folder / "points.npy").stat().st_mtime_ns
+    generate(config(folder.parent, meshes, "workers=0"))
+    assert (folder / "points.npy").stat().st_mtime_ns == before
+    with pytest.raises(ConfigError, match=r"renderer\.samples: 2 there, 3 now") as error:
+        generate(config(folder.parent, meshes, "workers=0", "renderer.samples=3"))
+    assert "force=true" in str(error.value)
+
+
+def test_a_resume_with_another_version_is_refused(finished, meshes, tmp_path):
+    folder = tmp_path / "specklenet10"
+    folder.mkdir()
+    recipe = json.loads((finished[0] / "recipe.json").read_text())
+    recipe["versions"]["mitsuba"] = "3.8.0"
+    (folder / "recipe.json").write_text(json.dumps(recipe))
+    with pytest.raises(ConfigError, match=r"versions\.mitsuba"):
+        generate(config(tmp_path, meshes, "workers=0"))
+    forced = generate(config(tmp_path, meshes, "workers=0", "force=true"))
+    assert forced.sha256 == finished[1].sha256
+
+
+def test_parts_without_a_recipe_are_not_taken_over(finished, meshes, tmp_path):
+    parts = tmp_path / "specklenet10" / "parts"
+    parts.mkdir(parents=True)
+    made = Parts(tmp_path / "specklenet10")
+    other = Outcome(
+        "chair/train/chair_0", "", Cloud({"points": np.ones((2048, 3), "f4")}, 1, 1), ""
+    )
+    made.save(other)
+    assert generate(config(tmp_path, meshes, "workers=0")).sha256 == finished[1].sha256
+
+
+def test_a_mended_mesh_is_noticed(meshes, tmp_path):
+    mine = tmp_path / "meshes" / "chair" / "train"
+    mine.mkdir(parents=True)
+    good = (meshes / "chair/train/chair_0.ply").read_bytes()
+    for split in ("train", "test"):
+        (mine.parent / split).mkdir(exist_ok=True)
+        for i in range(2):
+            (mine.parent / split / f"c{i}.ply").write_bytes(good)
+    (mine / "c0.ply").write_bytes(good[:200])
+    only = ["workers=0", "classes=[chair]"]
+    first = generate(config(tmp_path, tmp_path / "meshes", *only))
+    assert len(first.ids) == 3
+    row = read_manifest(tmp_path / "specklenet10", first.classes)
+    assert str(tmp_path) not in "".join(r.reason for r in row)
+    (mine / "c0.ply").write_bytes(good)
+    with pytest.raises(ConfigError, match=r"objects: 4, among them 'chair/train/c0"):
+        generate(config(tmp_path, tmp_path / "meshes", *only))
+    assert len(generate(config(tmp_path, tmp_path / "meshes", *only, "force=true")).ids) == 4
+
+
+def test_if_all_fail_nothing_is_left_in_the_way(meshes, tmp_path):
+    with pytest.raises(DataError, match="all 15 objects failed"):
+        generate(config(tmp_path, meshes, "workers=0", "recipe.min_points=1000000"))
+    assert len(generate(config(tmp_path, meshes, "workers=0", "limit=1")).ids) == 6
+
+
+def test_broken_meshes_are_recorded_and_the_others_go_on(finished, meshes, tmp_path):
+    broken = tmp_path / "meshes"
+    for path in meshes.rglob("*.ply"):
+        copy = broken / path.relative_to(meshes)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+    whole = (broken / "chair/train/chair_0.ply").read_bytes()
+    (broken / "chair/train/chair_0.ply").write_bytes(whole[: len(whole) // 2])
+    (broken / "table/train/table_1.ply").write_bytes(b"")
+    (broken / "lamp/test/lamp_1.ply").unlink()
+    (broken / "lamp/test/lamp_1.off").write_text("OFF\n3 1 0\nnan 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    pointset = generate(config(tmp_path, broken, "workers=1"))
+    assert len(pointset.ids) == 12
+    rows = {r.id: r for r in read_manifest(tmp_path / "specklenet10", pointset.classes)}
+    for bad in ("chair/train/chair_0", "table/train/table_1", "lamp/test/lamp_1"):
+        assert rows[bad].status == "failed"
+        assert Path(bad).name in rows[bad].reason
+    with pytest.raises(DataError, match="3 of 15 objects failed"):
+        generate(config(tmp_path, broken, "workers=1", "strict=true", "force=true"))
+    for path in broken.rglob("*.*"):
+        path.write_bytes(b"")
+    with pytest.raises(DataError, match="all 15 objects failed; the first: chair/"):
+        generate(config(tmp_path, broken, "workers=0", "force=true"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "message"),
+    [
+        (["views=0"], ConfigError, "views must be at least 1, got 0"),
+        (["limit=0"], ConfigError, "limit must be a whole number >= 1, got 0"),
+        (["workers=-1"], ConfigError, "workers must be a whole number >= 0, got -1"),
+        (["classes=[chair,dragon]"], ConfigError, "dragon"),
+        (["classes=[chair,bed]"], (ConfigError, MissingDataError), "bed"),
+        (["fraction=0"], ConfigError, r"fraction must be in \(0, 1\]"),
+        (["limit=abc"], ConfigError, "limit must be a whole number >= 1, got 'abc'"),
+        (["views=1.5"], ConfigError, r"views must be a whole number >= 0, got 1\.5"),
+    ],
+)
+def test_wrong_settings_name_the_key(meshes, tmp_path, overrides, error, message):
+    with pytest.raises(error, match=message):
+        generate(config(tmp_path, meshes, "workers=0", *overrides))
+
+
+@pytest.mark.parametrize("key", ["sensor", "renderer", "scene", "tracking", "crop"])
+def test_looking_needs_a_sensor_and_a_renderer(tmp_path, key):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("generate", [f"{key}=none", f"paths.data_dir={tmp_path}"])
+    with pytest.raises(ConfigError, match=f"{key}=none does not do"):
+        generate(cfg)
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(MissingDataError, match="nowhere"):
+        generate(config(tmp_path, tmp_path / "nowhere", "workers=0"))
+
+
+def test_surface_samples_lie_on_the_surface_and_dropout_takes_regions(meshes, tmp_path):
+    whole = generate(config(tmp_path, meshes, "workers=0", domain="modelnet10"))
+    holed = generate(config(tmp_path, meshes, "workers=0", domain="modelnet10_dropout"))
+    assert whole.ids == holed.ids
+    for i, name in enumerate(whole.ids):
+        if name.startswith("lamp"):
+            for cloud in (whole.points[i], holed.points[i]):
+                np.testing.assert_allclose(np.linalg.norm(cloud, axis=1), 0.5, atol=0.05)
+            # The largest empty cap of a sphere: seen from somewhere, much is missing.
+            directions = trimesh.creation.icosphere(3).vertices
+            gap = [
+                np.degrees(np.arccos(np.clip((cloud / 0.5 @ directions.T).max(0), -1, 1))).max()
+                for cloud in (whole.points[i], holed.points[i])
+            ]
+            assert gap[1] > gap[0] + 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("keep", [[], ["keep_views=true", "provenance=true"]], ids=["", "views"])
+@pytest.mark.parametrize("victim", ["parent", "worker"])
+def test_kill_at_random_instants_changes_no_byte(meshes, tmp_path, victim, keep):
+    """SIGKILL to the parent or to one of its workers, again and again, until it gets through."""
+    generate(config(tmp_path / "whole", meshes, "workers=0", *keep))
+    chance = random.Random(victim)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    kills = 0
+    for _ in range(60):
+        process = subprocess.Popen(
+            command(tmp_path, meshes, "workers=2", *keep), cwd=ROOT, env=environment,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        # Early kills hit the start, later ones the writing; a start takes about 4 s.
+        if kills < 12:
+            time.sleep(chance.uniform(0.5, 8.0))
+            kills += _kill(process.pid if victim == "parent" else _a_child(process.pid))
+        if process.wait() == 0:
+            if kills >= 10:
+                break
+            subprocess.run(["rm", "-rf", str(tmp_path / "specklenet10")], check=True)
+    else:
+        pytest.fail("it never finished")
+    whole = {
+        path.relative_to(tmp_path / "whole"): path.read_bytes()
+        for path in (tmp_path / "whole").rglob("*")
+        if path.is_file()
+    }
+    assert len(whole) == (9 if not keep else 10 + 15 * 2 * 2)
+    for path, content in whole.items():
+        if path.name != "config.yaml":  # which holds the folder
+            assert (tmp_path / path).read_bytes() == content, path
+    assert not list((tmp_path / "specklenet10").rglob("*.tmp*"))
+
+
+def _a_child(pid):
+    found = Path(f"/proc/{pid}/task/{pid}/children")
+    children = found.read_text().split() if found.exists() else []
+    return int(children[-1]) if children else None
+
+
+def _kill(pid):
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except (ProcessLookupError, TypeError):
+        return 0
+    return 1

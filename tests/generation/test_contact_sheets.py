@@ -1,0 +1,94 @@
+"""clouds.png and infrared.png: drawn from what was scanned, also after a resume."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from qs3.data.store import open_pointset
+from qs3.generation.command import generate
+from qs3.generation.contact_sheets import clouds_picture, infrared_picture
+from tests.generation.generating import config
+
+
+def picture(path):
+    return np.asarray(Image.open(path).convert("RGB")).astype(float)
+
+
+def test_a_finished_dataset_has_its_pictures_and_config(finished, meshes):
+    folder, pointset = finished
+    for name in ("clouds.png", "infrared.png"):
+        assert picture(folder / name).std() > 10
+    assert f"data_dir: {folder.parent}" in (folder / "config.yaml").read_text()
+    assert pointset.meta["config"]["classes"] == ["chair", "table", "lamp"]
+    assert pointset.meta["config"]["test_fraction"] == 0.2
+    assert str(folder.parent) not in (folder / "meta.yaml").read_text()
+
+
+def test_pictures_are_the_same_after_a_resume(finished, meshes, tmp_path):
+    folder, _ = finished
+    generate(config(tmp_path, meshes, "workers=0"))
+    made = tmp_path / "specklenet10"
+    for name in ("clouds.png", "infrared.png"):
+        assert (made / name).read_bytes() == (folder / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_pictures_survive_a_stop_in_between(finished, meshes, tmp_path, monkeypatch):
+    import qs3.generation.command
+
+    draw = qs3.generation.command._draw
+    monkeypatch.setattr(
+        qs3.generation.command, "_draw", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        generate(config(tmp_path, meshes, "workers=0"))
+    monkeypatch.setattr(qs3.generation.command, "_draw", draw)
+    generate(config(tmp_path, meshes, "workers=0"))
+    for name in ("clouds.png", "infrared.png"):
+        assert (tmp_path / "specklenet10" / name).read_bytes() == (finished[0] / name).read_bytes()
+
+
+def test_surface_samples_have_clouds_and_nothing_infrared(meshes, tmp_path):
+    generate(config(tmp_path, meshes, "workers=0", domain="modelnet10"))
+    assert (tmp_path / "modelnet10" / "clouds.png").is_file()
+    assert not (tmp_path / "modelnet10" / "infrared.png").exists()
+
+
+def test_force_takes_old_pictures_and_views_away(meshes, tmp_path):
+    folder = tmp_path / "modelnet10"
+    generate(config(tmp_path, meshes, "workers=0", domain="modelnet10"))
+    (folder / "infrared.png").write_bytes(b"old")
+    (folder / "views" / "chair").mkdir(parents=True)
+    (folder / "mine.txt").write_text("kept")
+    generate(config(tmp_path, meshes, "workers=0", "force=true", domain="modelnet10"))
+    assert {path.name for path in folder.iterdir()} == {
+        ".lock", "clouds.png", "config.yaml", "manifest.csv", "meta.yaml", "mine.txt", "points.npy",
+        "recipe.json",
+    }  # fmt: skip
+    assert len(open_pointset(folder)) == 15
+
+
+def test_one_scale_a_row(tmp_path):
+    """A cloud of half the size covers about a quarter of the area that its row's largest does."""
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(4000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    clouds = {"chair": [{"points": ball}, {"points": ball / 2}], "lamp": [{"points": ball / 9}]}
+    clouds_picture(tmp_path / "c.png", clouds, "heading", twin=False)
+    ink = (picture(tmp_path / "c.png") < 245).any(axis=2)
+    rows = {"chair": slice(62, 187), "lamp": slice(187, 312)}  # pixels: 100 an inch
+    widths = []
+    for cls, first in (("chair", 100), ("chair", 225), ("lamp", 100)):
+        columns = np.flatnonzero(ink[rows[cls], first : first + 125].any(axis=0))
+        widths.append(np.ptp(columns))
+    assert widths[0] == pytest.approx(117, abs=5)
+    assert widths[1] == pytest.approx(widths[0] / 2, abs=5)
+    assert widths[2] == pytest.approx(widths[0], abs=5)  # another row, another scale
+
+
+def test_a_class_without_clouds_and_a_view_without_depth_are_drawn(tmp_path):
+    clouds_picture(tmp_path / "c.png", {"chair": [], "lamp": []}, "none", twin=True)
+    nothing = np.full((20, 30), np.nan, np.float32)
+    infrared_picture(tmp_path / "i.png", {"chair": ("chair/train/a", {"depth_m": nothing})}, "x")
+    assert picture(tmp_path / "c.png").shape[0] > 100
+    assert picture(tmp_path / "i.png").shape[0] > 100

@@ -1,0 +1,221 @@
+"""Every domain that can be generated composes, instantiates, and says what it needs."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from qs3.classes import CLASSES
+from qs3.config.hydra import build
+from qs3.errors import ConfigError
+from qs3.generation.plan import benchmark, check, describe, mesh_items, stored_config
+from qs3.tools import quickstart
+
+ROOT = Path(__file__).resolve().parents[2]
+DOMAINS = (
+    "specklenet10",
+    "specklenet10_clean",
+    "blensor10",
+    "modelnet10",
+    "modelnet10_dropout",
+    "kinectsim10",
+)
+
+
+def config(*overrides, name="generate"):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
+def test_every_domain_has_a_recipe_and_all_ten_classes(domain):
+    cfg = config(f"domain={domain}")
+    check(cfg)
+    recipe = build(cfg.recipe)
+    assert recipe.points == 2048
+    items = mesh_items(cfg)
+    assert {item.cls for item in items} == set(CLASSES)
+    assert {item.split for item in items} == {"train", "test"}
+    assert len({item.id for item in items}) == len(items)
+
+
+def test_the_papers_settings_are_the_defaults_of_the_papers_dataset():
+    cfg = config("domain=specklenet10")
+    assert cfg.renderer.name == "blender"
+    recipe = build(cfg.recipe)
+    sensor = recipe.sensor
+    assert (sensor.width_px, sensor.height_px) == (1080, 1080)
+    assert sensor.width_px // sensor.step_px == 270
+    assert sensor.baseline_m == 0.1
+    assert (recipe.views.min_distance_m, recipe.views.max_distance_m) == (3, 5)
+    assert (recipe.views.min_elevation_deg, recipe.views.max_elevation_deg) == (20, 50)
+    assert (recipe.views.max_shift_m, recipe.views.max_turn_rad) == (0.1, 0.1)
+    assert recipe.views.count == 5
+
+
+def test_source_and_stand_in_share_no_mesh_no_pattern_no_matcher_and_no_noise():
+    source, target = config("domain=specklenet10"), config("domain=kinectsim10")
+    assert source.catalogue.seed != target.catalogue.seed
+    a, b = (build(cfg.recipe).sensor for cfg in (source, target))
+    assert a.pattern.seed != b.pattern.seed
+    assert type(a.matcher) is not type(b.matcher)
+    assert a.infrared.electrons_at_white != b.infrared.electrons_at_white
+    assert a.infrared.read_noise_e != b.infrared.read_noise_e
+    hashes = [
+        {item.load().sha256 for item in mesh_items(config(f"domain={name}", "limit=2"))}
+        for name in ("specklenet10", "kinectsim10")
+    ]
+    assert not hashes[0] & hashes[1]
+
+
+def test_the_stand_in_has_the_class_frequencies_of_scannet10():
+    scannet = dict(zip(CLASSES, (98, 329, 464, 650, 2578, 161, 210, 88, 495, 1037), strict=True))
+    train = config("domain=kinectsim10").catalogue.train
+    for name, count in scannet.items():
+        assert train[name] == max(12, round(count / 10))
+
+
+def plan(*overrides):
+    cfg = config("domain=kinectsim10", *overrides)
+    return benchmark(cfg, describe(cfg, mesh_items(cfg), {}))
+
+
+def test_the_benchmark_knows_itself():
+    """A change of any setting is another version: give it a new number and a new hash."""
+    assert plan() == "kinectsim10 v1"
+    assert plan("renderer.threads=2", "renderer.variant=scalar_rgb", "workers=1") == plan()
+    for other in ("fraction=0.5", "views=3", "renderer.samples=4", "recipe.min_points=100"):
+        assert plan(other).startswith("like kinectsim10 v1, but not it")
+
+
+def test_smaller_keeps_the_frequencies():
+    whole = mesh_items(config("domain=kinectsim10"))
+    part = mesh_items(config("domain=kinectsim10", "fraction=0.25"))
+    part_ids = [item.id for item in part]
+    assert set(part_ids) <= {item.id for item in whole}
+    chairs = sum(name.startswith("chair/train") for name in part_ids)
+    assert chairs == 65  # a quarter of 258, rounded up
+    several = mesh_items(config("domain=kinectsim10", "fraction=0.25", "scans=3"))
+    assert len(several) == 3 * len(part)
+
+
+def test_a_misspelt_key_is_an_error():
+    with pytest.raises(Exception, match="samplez"):
+        config("renderer.samplez=3")
+    with pytest.raises(Exception, match="veiws"):
+        config("veiws=3")
+
+
+def test_every_command_of_the_quickstart_composes():
+    for command in quickstart.DATASETS:
+        check(config(*command.split()[1:]))
+    for row in OmegaConf.load(quickstart.TABLE).rows:
+        cfg = config(*row["target test"]["run"].split(), name="train")
+        assert cfg.experiment_name == "quickstart"
+
+
+def test_quickstart_starts():
+    done = subprocess.run(
+        [sys.executable, "-m", "qs3.tools.quickstart", "--help"], cwd=ROOT, capture_output=True,
+        text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert "--out" in done.stdout
+
+
+@pytest.fixture(scope="module")
+def help_text():
+    done = subprocess.run(
+        [sys.executable, "generate.py", "--help"], cwd=ROOT, capture_output=True, text=True,
+        timeout=60, check=True,
+    )  # fmt: skip
+    return done.stdout
+
+
+def test_help_is_short(help_text):
+    for key in (
+        "domain=specklenet10", "meshes=PATH", "provenance=true", "keep_views=true", "poses=FILE",
+        "limit=", "classes=", "views=N", "workers=N", "force=true", "strict=true",
+        "paths.data_dir=",
+    ):  # fmt: skip
+        assert key in help_text
+    assert len(help_text.splitlines()) < 75
+    assert max(map(len, help_text.splitlines())) <= 110
+
+
+GROUPS = (
+    "sensor",
+    "synthesis",
+    "scene",
+    "tracking",
+    "crop",
+    "renderer",
+    "released",
+    "sensor/matcher",
+)
+
+
+def names(group):
+    files = {path.stem for path in (ROOT / "conf" / group).glob("*.yaml")}
+    if group == "synthesis":  # parts of others have no domain of their own
+        files &= {path.stem for path in (ROOT / "conf" / "domain").glob("*.yaml")}
+    return sorted(files - {"none"})
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_help_names_every_choice_that_conf_has(help_text, group):
+    for name in names(group):
+        assert re.search(rf"(^|[ |]){name}( |$)", help_text, re.MULTILINE), name
+
+
+def test_what_help_says_of_a_sensor_is_in_its_file(help_text):
+    (line,) = [x for x in help_text.splitlines() if x.startswith("  kinect_like ")]
+    first = (ROOT / "conf/sensor/kinect_like.yaml").read_text().splitlines()[0]
+    assert line.split(maxsplit=1)[1] == first.removeprefix("# ").removesuffix(".")
+
+
+def test_every_name_in_the_examples_of_help_composes(help_text):
+    examples = [x.split() for x in help_text.splitlines() if x.startswith("  python generate.py")]
+    assert len(examples) >= 6
+    for words in examples:
+        config(*(word for word in words[2:] if "=" in word))
+
+
+@pytest.mark.parametrize("domain", ["specklenet10", "kinectsim10"])
+@pytest.mark.parametrize("scene", names("scene"))
+@pytest.mark.parametrize("tracking", names("tracking"))
+def test_scene_tracking_and_crop_go_with_every_domain_that_looks(domain, scene, tracking):
+    for crop in names("crop"):
+        cfg = config(f"domain={domain}", f"scene={scene}", f"tracking={tracking}", f"crop={crop}")
+        check(cfg)
+        recipe = build(cfg.recipe)
+        assert type(recipe.scene).__name__.lower() == scene
+        assert (recipe.drift.shift_m > 0) == (tracking == "drifting")
+        assert type(recipe.crop).__name__.lower() == f"{crop}crop"
+
+
+def test_a_value_of_a_scene_can_be_given():
+    cfg = config("scene=room", "scene.max_clutter=0", "tracking=drifting", "tracking.shift_m=0.02")
+    recipe = build(cfg.recipe)
+    assert recipe.scene.max_clutter == 0
+    assert recipe.drift.shift_m == 0.02
+
+
+def test_meta_holds_the_whole_config_but_places_and_what_changes_no_byte():
+    overrides = ("limit=3", "scene=room", "renderer=mitsuba")
+    stored = stored_config(config(*overrides, "meshes=/mine", "workers=3", "paths.data_dir=/x"))
+    assert stored == stored_config(config(*overrides, "meshes=/yours", "renderer.threads=2"))
+    whole = OmegaConf.to_container(config(*overrides))
+    for key in set(whole) - {"paths", "workers", "force", "strict", "renderer", "meshes"}:
+        assert stored[key] == whole[key], key
+    assert stored["renderer"] == {k: v for k, v in whole["renderer"].items() if k != "threads"}
+    assert not re.search("/mine|/x", str(stored))
+
+
+@pytest.mark.parametrize("key", ["provenance", "keep_views", "force", "strict"])
+def test_switches_are_true_or_false(key):
+    with pytest.raises(ConfigError, match=f"{key} must be true or false, got 'maybe'"):
+        check(config(f"{key}=maybe"))

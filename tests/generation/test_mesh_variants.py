@@ -1,0 +1,274 @@
+"""The same object in every format and condition that files come in, through generate.py."""
+
+import resource
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from qs3.data.store import open_pointset
+from qs3.generation.command import generate
+from tests.generation.generating import ROOT, config
+
+
+def stool():
+    """A seat, a back and four legs: no symmetry, metres, z up, watertight parts."""
+    parts = [trimesh.creation.box((0.5, 0.45, 0.06)), trimesh.creation.box((0.5, 0.04, 0.45))]
+    parts[0].apply_translation((0, 0, 0.45))
+    parts[1].apply_translation((0, 0.2, 0.7))
+    for x in (-0.2, 0.2):
+        for y in (-0.17, 0.17):
+            leg = trimesh.creation.cylinder(0.03, 0.42)
+            leg.apply_translation((x, y, 0.21))
+            parts.append(leg)
+    return trimesh.util.concatenate(parts)
+
+
+def off_text(vertices, faces, header):
+    lines = [header.format(v=len(vertices), f=len(faces))]
+    lines += [" ".join(f"{x:.9g}" for x in v) for v in vertices]
+    lines += [f"3 {a} {b} {c}" for a, b, c in faces]
+    return "\n".join(lines) + "\n"
+
+
+def y_up(solid):
+    turned = solid.copy()
+    turned.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
+    return turned
+
+
+def turned_to(suffix):
+    def write(solid, path):
+        (y_up(solid) if suffix in ("glb", "gltf") else solid).export(path.with_suffix(f".{suffix}"))
+
+    return write
+
+
+def gltf(solid, path):
+    for name, data in y_up(solid).export(file_type="gltf").items():
+        (path.with_suffix(".gltf") if name == "model.gltf" else path.parent / name).write_bytes(
+            data
+        )
+
+
+def dae(solid, path):
+    """By hand, because trimesh needs pycollada for it: millimetres, and x up."""
+    # X_UP of COLLADA 1.4: right is -y, up is x, towards the viewer is z.
+    v = solid.vertices[:, [2, 0, 1]] * (1000, -1000, -1000)
+    numbers = " ".join(f"{x:.9g}" for x in v.ravel())
+    indices = " ".join(str(i) for i in solid.faces.ravel())
+    path.with_suffix(".dae").write_text(f"""<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="millimetre" meter="0.001"/><up_axis>X_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="{v.size}">{numbers}</float_array><technique_common>
+<accessor source="#a" count="{len(v)}" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="{len(solid.faces)}"><input semantic="VERTEX" source="#v" offset="0"/>
+<p>{indices}</p></triangles></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node><instance_geometry url="#g"/></node>
+</visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>""")
+
+
+def as_off(change=lambda s: s, header="OFF\n{v} {f} 0"):
+    def write(solid, path):
+        s = change(solid.copy())
+        path.with_suffix(".off").write_text(off_text(s.vertices, s.faces, header))
+
+    return write
+
+
+def faces_changed(change):
+    def apply(solid):
+        return trimesh.Trimesh(solid.vertices, change(solid.faces), process=False)
+
+    return as_off(apply)
+
+
+def some_reversed(faces):
+    faces = faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    return faces
+
+
+def scaled(factor):
+    return as_off(lambda s: s.apply_scale(factor))
+
+
+def shifted(solid):
+    solid.vertices += (1e3, -2e3, 500.0)
+    return solid
+
+
+def with_fin(solid):
+    """An edge of the seat that three faces share: no manifold, and nearly no area."""
+    n = len(solid.vertices)
+    a, b = solid.faces[0, :2]
+    middle = (solid.vertices[a] + solid.vertices[b]) / 2 + (0, 0, 1e-4)
+    return trimesh.Trimesh(
+        np.vstack([solid.vertices, middle]), np.vstack([solid.faces, [[a, b, n]]]), process=False
+    )
+
+
+SAME = {  # what must give the same cloud as the plain OFF
+    "off_one_line_header": as_off(header="OFF {v} {f} 0"),
+    "off_glued_header": as_off(header="OFF{v} {f} 0"),
+    "obj": turned_to("obj"),
+    "ply": turned_to("ply"),
+    "stl": turned_to("stl"),
+    "glb": turned_to("glb"),
+    "gltf": gltf,
+    "dae": dae,
+    "millimetres": scaled(1000.0),
+    "inches": scaled(1 / 0.0254),
+    "far_away": as_off(shifted),
+    "inverted": faces_changed(lambda f: f[:, ::-1]),
+    "half_inverted": faces_changed(some_reversed),
+    "duplicate_faces": faces_changed(lambda f: np.concatenate([f, f[::-1]])),
+    "duplicate_and_inverted": faces_changed(lambda f: np.concatenate([f, f[:, ::-1]])),
+    "degenerate_faces": faces_changed(lambda f: np.concatenate([f, f[:9, [0, 0, 1]]])),
+    "soup_without_normals": as_off(
+        lambda s: trimesh.Trimesh(
+            s.vertices[s.faces].reshape(-1, 3),
+            np.arange(3 * len(s.faces)).reshape(-1, 3),
+            process=False,
+        )
+    ),
+    "non_manifold": as_off(with_fin),
+}
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    root = tmp_path_factory.mktemp("plain")
+    return scan(root, as_off())
+
+
+def scan(root, write, *overrides):
+    folder = root / "meshes" / "chair" / "train"
+    folder.mkdir(parents=True)
+    write(stool(), folder / "stool")
+    generate(config(root, root / "meshes", "classes=[chair]", "workers=0", *overrides))
+    noisy = open_pointset(root / "specklenet10")
+    assert noisy.ids == ("chair/train/stool",)
+    return noisy.points[0], open_pointset(root / "specklenet10", "points_clean").points[0]
+
+
+def gap(a, b):
+    """The 99th percentile of the distance from points of one cloud to the other, both ways."""
+    there, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
+    return np.percentile(np.concatenate([there, back]), 99)
+
+
+QUICK = ("off_glued_header", "dae", "inverted", "duplicate_faces")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in SAME]
+)
+def test_the_same_object_gives_the_same_cloud(plain, tmp_path, name):
+    """The id is the same, so are yaw, poses and noise: what differs is rounding."""
+    noisy, clean = scan(tmp_path, SAME[name])
+    assert gap(noisy, plain[0]) < 1e-4
+    assert gap(clean, plain[1]) < 1e-4
+    np.testing.assert_allclose(clean.min(axis=0), plain[1].min(axis=0), atol=1e-3)
+    np.testing.assert_allclose(clean.max(axis=0), plain[1].max(axis=0), atol=1e-3)
+
+
+def test_other_objects_would_be_noticed(plain, tmp_path):
+    noisy, _ = scan(tmp_path, as_off(lambda s: s.apply_scale((1, 1, 0.8))))
+    assert gap(noisy, plain[0]) > 0.04
+
+
+def test_an_open_surface_is_scanned_from_both_sides(tmp_path):
+    """A single sheet, without thickness: half of its clouds see its back."""
+    sheet = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [1, 0, 0.8], [0, 0, 0.8]], [[0, 1, 2], [0, 2, 3]], process=False
+    )
+    folder = tmp_path / "meshes" / "chair" / "train"
+    folder.mkdir(parents=True)
+    for i in range(6):
+        sheet.export(folder / f"sheet_{i}.ply")
+    pointset = generate(config(tmp_path, tmp_path / "meshes", "classes=[chair]", "workers=0"))
+    assert len(pointset) == 6
+    clean = open_pointset(tmp_path / "specklenet10", "points_clean").points
+    for cloud in clean:
+        assert np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)[2] < 0.1  # flat
+        assert np.ptp(cloud[:, 2]) == pytest.approx(0.8, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("placing", "height"), [("UnitCube", 0.915 / 0.915), ("RealSize", 0.915)])
+def test_metres_are_kept_where_the_placing_keeps_them(tmp_path, placing, height):
+    _, clean = scan(tmp_path, as_off(), f"recipe.placing._target_=qs3.meshes.placement.{placing}")
+    # The feet may be hidden behind nothing: the whole height is seen from 20 degrees and more.
+    assert np.ptp(clean[:, 2]) == pytest.approx(height, abs=0.04)
+
+
+def test_a_thin_lamp_far_away_survives_the_default_thresholds(tmp_path):
+    """A pole of 4 mm, the whole lamp 1 m: at 4 to 5 m the pole is 1.2 to 1.5 pixels wide."""
+    bare = trimesh.creation.cylinder(0.002, 1.0)
+    base = trimesh.creation.cylinder(
+        0.1, 0.01, transform=trimesh.transformations.translation_matrix((0, 0, -0.5))
+    )
+    shade = trimesh.creation.cone(
+        0.08, 0.1, transform=trimesh.transformations.translation_matrix((0, 0, 0.4))
+    )
+    folder = tmp_path / "meshes" / "lamp" / "train"
+    folder.mkdir(parents=True)
+    bare.export(folder / "pole.ply")
+    trimesh.util.concatenate([bare, base, shade]).export(folder / "lamp.ply")
+    cfg = config(
+        tmp_path, tmp_path / "meshes", "classes=[lamp]", "workers=0", "scans=4",
+        "sensor=speckle_stereo", "views=5", "recipe.views.min_distance_m=4.0",
+    )  # fmt: skip
+    assert cfg.recipe.min_points == 128  # the paper's domain as it is
+    pointset = generate(cfg)
+    assert len(pointset) == 8
+    for cloud in pointset.points:
+        assert np.ptp(cloud[:, 2]) > 0.9  # the pole from top to bottom
+
+
+def sphere_of_two_million_faces(path):
+    """A UV sphere, written as binary PLY without trimesh: 1,000 x 1,000 quads."""
+    n = 1000
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, n + 1), np.linspace(0, np.pi, n + 1))
+    xyz = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=-1)
+    vertices = np.ascontiguousarray(xyz.reshape(-1, 3), dtype="<f4")
+    i = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    faces = np.concatenate(
+        [np.stack([i, i + 1, i + n + 2], 1), np.stack([i, i + n + 2, i + n + 1], 1)]
+    )
+    table = np.zeros(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
+    table["n"], table["v"] = 3, faces
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\nproperty float x\n"
+        f"property float y\nproperty float z\nelement face {len(faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    path.write_bytes(header.encode() + vertices.tobytes() + table.tobytes())
+    assert struct.calcsize("<B3i") == table.itemsize
+    return len(faces)
+
+
+@pytest.mark.slow
+def test_two_million_faces(tmp_path):
+    folder = tmp_path / "meshes" / "lamp" / "train"
+    folder.mkdir(parents=True)
+    assert sphere_of_two_million_faces(folder / "sphere.ply") == 2_000_000
+    done = subprocess.run(
+        [sys.executable, "generate.py", "domain=specklenet10", "renderer=mitsuba", "classes=[lamp]",
+         f"meshes={tmp_path / 'meshes'}", f"paths.data_dir={tmp_path}", "workers=1"],
+        cwd=ROOT, capture_output=True, text=True, timeout=500,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    cloud = open_pointset(tmp_path / "specklenet10", "points_clean").points[0]
+    np.testing.assert_allclose(np.linalg.norm(cloud, axis=1), 0.5, atol=1e-3)
+    # The largest child so far, in KiB on Linux: well within a small machine.
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 4 << 20

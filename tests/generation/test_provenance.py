@@ -1,0 +1,275 @@
+"""Provenance and views: they tell the truth about the points, and change none of them."""
+
+import io
+import shutil
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.data.store import open_pointset, open_table, read_meta
+from qs3.errors import ConfigError, DataError
+from qs3.generation.command import generate
+from qs3.generation.provenance import (
+    NO_INCIDENCE_DEG,
+    NO_RESIDUAL_M,
+    PROVENANCE,
+    preview_of,
+    provenance_of,
+)
+from qs3.generation.view_files import save_view, view_folder
+from qs3.geometry.cameras import Camera, Intrinsics
+from qs3.sensors.base import DepthFrame
+from qs3.sensors.pixel_status import Reason
+from tests.generation.generating import config, fingerprint
+
+KEPT = ["provenance=true", "keep_views=true", "tracking=drifting", "scene=room"]
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    """Two classes of one object a split."""
+    root = tmp_path_factory.mktemp("meshes")
+    for split, size in (("train", 0.5), ("test", 0.7)):
+        for cls, solid in (
+            ("chair", trimesh.creation.box((size, 0.5, 0.9))),
+            ("table", trimesh.creation.cylinder(size, 0.7)),
+        ):
+            (root / cls / split).mkdir(parents=True)
+            solid.export(root / cls / split / f"{cls} ä%2F_0.ply")
+    return root
+
+
+def two_classes(data_dir, meshes, *overrides, domain="specklenet10"):
+    return config(data_dir, meshes, "classes=[chair,table]", *overrides, domain=domain)
+
+
+@pytest.fixture(scope="module")
+def kept(meshes, tmp_path_factory):
+    data_dir = tmp_path_factory.mktemp("kept")
+    pointset = generate(two_classes(data_dir, meshes, "workers=1", *KEPT))
+    return data_dir / "specklenet10", pointset
+
+
+def views_of(folder, name):
+    paths = sorted(view_folder(folder / "views", name).glob("view_*.npz"))
+    assert paths
+    return [dict(np.load(path)) for path in paths]
+
+
+def test_every_point_is_its_pixel_at_the_measured_depth(kept):
+    folder, pointset = kept
+    table, columns = open_table(folder)
+    assert columns == PROVENANCE
+    assert table.shape == (*pointset.points.shape[:2], 5)
+    for cloud, rows, name in zip(pointset.points, table, pointset.ids, strict=True):
+        views = views_of(folder, name)
+        assert set(np.unique(rows[:, 0])) == set(range(len(views)))
+        for i, view in enumerate(views):
+            mine = rows[:, 0] == i
+            u, v, residual, angle = rows[mine, 1:].T
+            left, top, step = view["grid_px"]
+            col, row = (u - left) / step, (v - top) / step
+            np.testing.assert_array_equal(col, np.round(col))
+            col, row = col.astype(int), row.astype(int)
+            z = view["depth_m"][row, col].astype(float)
+            assert np.isfinite(z).all()
+            assert (view["reason"][row, col] == Reason.OK).all()
+            ray = np.stack([*((np.stack([u, v]).T - view["centre_px"]) / view["focal_px"]).T])
+            local = np.concatenate([ray * z, z[None]]).T
+            pose = view["world_from_camera_believed"]
+            np.testing.assert_allclose(cloud[mine], local @ pose[:3, :3].T + pose[:3, 3], atol=1e-5)
+            clean = view["clean_m"][row, col]
+            hit = np.isfinite(clean)
+            np.testing.assert_allclose(residual[hit], (z - clean)[hit], atol=1e-6)
+            assert (residual[~hit] == NO_RESIDUAL_M).all()
+            assert (angle[~hit] == NO_INCIDENCE_DEG).all()
+            expected = np.rad2deg(np.arccos(view["cosine"][row, col][hit]))
+            np.testing.assert_allclose(angle[hit], expected, atol=0.1)
+            assert (angle[hit] >= 0).all()
+            assert (angle[hit] <= 90).all()
+
+
+def test_drift_is_in_the_kept_poses(kept):
+    folder, pointset = kept
+    first, second = views_of(folder, pointset.ids[0])
+    np.testing.assert_allclose(first["world_from_camera"], first["world_from_camera_believed"])
+    moved = second["world_from_camera"][:3, 3] - second["world_from_camera_believed"][:3, 3]
+    assert 0.001 < np.linalg.norm(moved) < 0.1
+
+
+def test_what_is_kept_changes_no_point(kept, meshes, tmp_path):
+    folder, pointset = kept
+    plain = generate(two_classes(tmp_path, meshes, "workers=0", *KEPT[2:]))
+    assert plain.sha256 == pointset.sha256
+    bare = tmp_path / "specklenet10"
+    for name in ("points.npy", "points_clean.npy", "manifest.csv"):
+        assert (bare / name).read_bytes() == (folder / name).read_bytes()
+    assert not (bare / "views").exists()
+    assert not (bare / "provenance.npy").exists()
+    with pytest.raises(DataError, match=r"not 'provenance'.*provenance=true"):
+        open_table(bare)
+
+
+def test_the_table_is_no_variant_and_its_damage_is_noticed(kept, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(kept[0], folder)
+    with pytest.raises(DataError, match=r"\['points', 'points_clean'\], not 'provenance'"):
+        open_pointset(folder, "provenance")
+    data = bytearray((folder / "provenance.npy").read_bytes())
+    data[-1] ^= 1
+    (folder / "provenance.npy").write_bytes(data)
+    open_pointset(folder)
+    with pytest.raises(DataError, match=r"provenance\.npy is damaged"):
+        open_table(folder)
+    (folder / "provenance.npy").write_bytes(data[:-4])
+    with pytest.raises(DataError, match=r"provenance\.npy has \d+ bytes, expected \d+"):
+        open_table(folder)
+
+
+def test_asking_for_it_later_is_refused_and_says_so(kept, meshes):
+    with pytest.raises(ConfigError, match="kept: "):
+        generate(two_classes(kept[0].parent, meshes, "workers=0", *KEPT[1:]))
+
+
+def all_files(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted((folder / "views").rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_views_are_the_same_bytes_for_any_number_of_workers_and_after_a_resume(
+    kept, meshes, tmp_path
+):
+    folder, pointset = kept
+    whole = all_files(folder)
+    assert len(whole) == 4 * 2 * 2  # objects, views, a .npz and a .png each
+    generate(two_classes(tmp_path, meshes, "workers=0", *KEPT))
+    made = tmp_path / "specklenet10"
+    assert all_files(made) == whole
+    # As if killed while the last object was written: its part is missing, a view half written.
+    (made / "meta.yaml").unlink()
+    lost = view_folder(made / "views", pointset.ids[-1])
+    (lost / "view_1.npz").unlink()
+    (lost / ".view_1.npz.abc.tmp.npz").write_bytes(b"half")
+    generate(two_classes(tmp_path, meshes, "workers=2", *KEPT))
+    assert all_files(made) == whole
+    assert fingerprint(made) == fingerprint(folder)
+    assert (made / "provenance.npy").read_bytes() == (folder / "provenance.npy").read_bytes()
+
+
+def test_pictures_of_views_show_all_four_panels(kept):
+    folder, pointset = kept
+    path = view_folder(folder / "views", pointset.ids[0]) / "view_0.png"
+    picture = cv2.imread(str(path))
+    height, width = views_of(folder, pointset.ids[0])[0]["image_left"].shape
+    assert picture.shape[0] >= 300
+    assert picture.shape[1] > 3.5 * width * (picture.shape[0] - 22) / height
+    assert picture.std() > 20
+
+
+def test_ids_of_any_kind_stay_inside_the_folder_and_apart(tmp_path):
+    names = [f"a/b/{x}" for x in ("..", ".", "%2E%2E", "c d", "c%20d", "é" * 99, "é" * 100, "~1")]
+    names.append("chair/train/../../x")
+    folders = {view_folder(tmp_path, name) for name in names}
+    assert len(folders) == len(names)
+    for folder in folders:
+        assert folder.resolve().is_relative_to(tmp_path.resolve())
+        folder.mkdir(parents=True)
+
+
+def frame(seed=0, shape=(5, 7)):
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(1, 3, shape).astype(np.float32)
+    clean = (depth + rng.normal(0, 0.01, shape)).astype(np.float32)
+    depth[rng.random(shape) < 0.3] = np.nan
+    clean[rng.random(shape) < 0.3] = np.inf
+    cosine = np.where(np.isfinite(clean), rng.random(shape), 0).astype(np.float32)
+    camera = Camera(Intrinsics.centred(100, 80, 90.0), np.eye(4))
+    label = np.isfinite(clean).astype(np.uint8)
+    reason = np.where(np.isfinite(depth), Reason.OK, Reason.UNMATCHED).astype(np.uint8)
+    return DepthFrame(camera, 13, 21, 2, depth, clean, label, cosine, reason)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_rows_are_in_the_order_of_the_points(seed):
+    seen = frame(seed)
+    rows = provenance_of(seen, seen.depth_m, 3)
+    points = seen.points(seen.depth_m, np.eye(4))
+    assert len(rows) == len(points)
+    assert np.isfinite(rows).all()
+    k = seen.camera.intrinsics
+    np.testing.assert_allclose(points[:, 0] / points[:, 2] * k.focal_px + k.cx_px, rows[:, 1])
+    np.testing.assert_allclose(points[:, 1] / points[:, 2] * k.focal_px + k.cy_px, rows[:, 2])
+    for (view, u, v, residual, angle), z in zip(rows, points[:, 2], strict=True):
+        r, c = int(v - 21) // 2, int(u - 13) // 2
+        clean = seen.clean_m[r, c]
+        assert view == 3
+        if np.isfinite(clean):
+            assert residual == pytest.approx(z - clean, abs=1e-6)
+            assert np.cos(np.deg2rad(angle)) == pytest.approx(seen.cosine[r, c], abs=1e-4)
+        else:
+            assert (residual, angle) == (NO_RESIDUAL_M, NO_INCIDENCE_DEG)
+
+
+def test_a_frame_without_photograph_or_depth_can_be_kept(tmp_path):
+    seen = frame()
+    blind = DepthFrame(
+        seen.camera, 0, 0, 1, np.full_like(seen.depth_m, np.nan), seen.clean_m, seen.label,
+        seen.cosine, np.full(seen.reason.shape, Reason.DARK, np.uint8),
+    )  # fmt: skip
+    assert set(preview_of(blind)) == {"depth_m"}
+    save_view(tmp_path, "a/b", 0, blind, np.eye(4), np.eye(4))
+    with np.load(tmp_path / "a/b/view_0.npz") as file:
+        assert list(file["reason_names"])[Reason.DARK] == "DARK"
+        np.testing.assert_array_equal(file["reason"], blind.reason)
+    assert cv2.imread(str(tmp_path / "a/b/view_0.png")) is not None
+
+
+def test_kept_files_hold_no_date(tmp_path):
+    save_view(tmp_path, "a", 0, frame(), np.eye(4), np.eye(4))
+    with zipfile.ZipFile(io.BytesIO((tmp_path / "a/view_0.npz").read_bytes())) as file:
+        assert {info.date_time[0] for info in file.infolist()} == {1980}
+
+
+@pytest.mark.parametrize("key", ["provenance=true", "keep_views=true", "scene=room", "crop=mask"])
+def test_a_domain_that_looks_at_nothing_cannot_keep_or_place_anything(meshes, tmp_path, key):
+    with pytest.raises(ConfigError, match=f"looks at nothing, so {key.split('=')[0]}= says"):
+        generate(two_classes(tmp_path, meshes, key, domain="modelnet10"))
+
+
+def test_tables_are_checked_like_clouds(tmp_path):
+    from qs3.data.store import ManifestRow, write_pointset
+
+    arguments = {
+        "name": "x",
+        "classes": ["chair"],
+        "rows": [ManifestRow("a", "chair", "train")],
+        "meta": {},
+    }
+    points = np.ones((1, 4, 3))
+    for table, message in (
+        (np.ones((1, 4, 3)), r"expected \[N, P, 2\]"),
+        (np.ones((1, 5, 2)), "'points' has"),
+        (np.full((1, 4, 2), np.nan), "not finite"),
+    ):
+        with pytest.raises(DataError, match=message):
+            write_pointset(
+                tmp_path, arrays={"points": points, "t": table}, tables={"t": "ab"}, **arguments
+            )
+    for name in ("points", "nothing"):
+        with pytest.raises(DataError, match=r"is no table|are no arrays"):
+            write_pointset(tmp_path, arrays={"points": points}, tables={name: "abc"}, **arguments)
+    table = np.arange(8.0).reshape(1, 4, 2)
+    write_pointset(tmp_path, arrays={"points": points, "t": table}, tables={"t": "ab"}, **arguments)
+    read, columns = open_table(tmp_path, "t")
+    np.testing.assert_array_equal(read, table)
+    assert columns == ("a", "b")
+    assert read_meta(tmp_path)["tables"] == {"t": ["a", "b"]}

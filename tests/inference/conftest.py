@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+import qs3.config.hydra  # noqa: F401 (registers the resolvers)
+from qs3.runs import folder as runs
+from qs3.training.command import train
+from tests.training.toy import CONF, write_toy
+
+
+@pytest.fixture(scope="session")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The two toy domains."""
+    folder = tmp_path_factory.mktemp("predict")
+    write_toy(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a finished run: DGCNN, three classes, 32 of 64 points, called from Python."""
+    overrides = [
+        *("experiment=quickstart", "method=source_only", "selftraining=none"),
+        f"paths.data_dir={data_dir}",
+        f"paths.log_dir={tmp_path_factory.mktemp('logs')}",
+        *("num_classes=3", "model.k=6", "data.points=32", "data.fps_starts=1"),
+        *("protocol.epochs=3", "trainer.threads=1", "callbacks=none", "logger=csv"),
+    ]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("train", overrides)
+    train(cfg)
+    return runs.run_folder(cfg)

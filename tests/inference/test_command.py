@@ -1,0 +1,292 @@
+"""`python -m qs3.inference`: files of every kind, damaged ones among them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import qs3
+from qs3.data.store import open_pointset
+from qs3.inference.__main__ import main
+from qs3.runs.predictions import read_predictions
+
+ONE = (".xyz", ".txt", ".npy", ".npz", ".ply", ".pcd", ".h5", ".hdf5")
+
+
+def write(path: Path, cloud: np.ndarray) -> None:
+    """One cloud [n, 3], or several [m, n, 3] where the format can hold them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = "\n".join(" ".join(repr(float(v)) for v in row) for row in cloud.reshape(-1, 3))
+    if path.suffix in (".xyz", ".txt"):
+        path.write_text(rows + "\n")
+    elif path.suffix == ".npy":
+        np.save(path, cloud)
+    elif path.suffix == ".npz":
+        np.savez(path, points=cloud)
+    elif path.suffix == ".ply":
+        head = "".join(f"property float {axis}\n" for axis in "xyz")
+        path.write_text(
+            f"ply\nformat ascii 1.0\nelement vertex {len(cloud)}\n{head}end_header\n{rows}\n"
+        )
+    elif path.suffix == ".pcd":
+        n = len(cloud)
+        path.write_text(
+            "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+            f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA ascii\n{rows}\n"
+        )
+    else:
+        with h5py.File(path, "w") as file:
+            file["data"] = cloud
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with open(path, encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def probabilities(row: dict[str, str]) -> list[float]:
+    return [float(value) for key, value in row.items() if key.startswith("p_")]
+
+
+@pytest.fixture(scope="module")
+def clouds(data_dir: Path) -> np.ndarray:
+    return np.array(open_pointset(data_dir / "kinectsim10").split("test").points)
+
+
+def predict(run: Path, source: Path, out: Path, *more: str) -> int:
+    return main([f"ckpt={run}", f"input={source}", f"out={out}", "threads=2", *more])
+
+
+def test_test_clouds_get_what_the_run_said(run, data_dir, clouds, tmp_path, capsys):
+    np.save(tmp_path / "test.npy", clouds)
+    out = tmp_path / "new" / "said.csv"
+    assert predict(run, tmp_path / "test.npy", out, "batch_size=7") == 0
+    expected = read_predictions(run / "predictions.csv")
+    rows = table(out)
+    assert [row["file"] for row in rows] == [f"test.npy[{i}]" for i in range(24)]
+    found = np.array([probabilities(row) for row in rows])
+    np.testing.assert_allclose(found, expected.probabilities, atol=1e-6)
+    assert [row["class"] for row in rows] == [expected.classes[i] for i in expected.predicted]
+    for row, each in zip(rows, found, strict=True):
+        assert row["status"] == "ok"
+        assert float(row["confidence"]) == each.max()
+        assert row["points"] == "64"
+        assert (row["out_of_range"] == "yes") == bool(row["reason"])
+    said = capsys.readouterr().out
+    assert "24 clouds, " in said
+    assert f"saved {out}" in said
+
+
+def test_every_format_in_folders(run, clouds, tmp_path):
+    folder = tmp_path / "scans"
+    for i, suffix in enumerate(ONE):
+        write(folder / f"{'deep/er/' * (i % 2)}cloud{i}{suffix}", clouds[i])
+    (folder / "notes.md").write_text("passed over")
+    (folder / ".hidden.xyz").write_text("not a cloud")
+    out = tmp_path / "said.csv"
+    assert predict(run, folder, out) == 0
+    expected = qs3.load(run)(clouds[: len(ONE)])
+    rows = {Path(row["file"]).name: row for row in table(out)}
+    assert sorted(rows) == [f"cloud{i}{suffix}" for i, suffix in enumerate(ONE)]
+    assert any(row["file"].startswith("deep/er/cloud1") for row in rows.values())
+    for i, suffix in enumerate(ONE):
+        row = rows[f"cloud{i}{suffix}"]
+        np.testing.assert_allclose(probabilities(row), expected[i], atol=1e-6)
+        single = tmp_path / f"single{i}.json"
+        assert predict(run, folder / row["file"], single) == 0
+        (record,) = json.loads(single.read_text())["clouds"]
+        assert record["file"] == f"cloud{i}{suffix}"
+        np.testing.assert_allclose(list(record["probabilities"].values()), expected[i], atol=1e-6)
+
+
+def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, capsys):
+    folder = tmp_path / "scans"
+    write(folder / "a.xyz", clouds[0])
+    (folder / "b.xyz").write_text("1 2 3\n4 five 6\n")
+    (folder / "c.ply").write_text("ply\nformat ascii 1.0\nelement vertex 9\nend_header\n")
+    np.save(folder / "d.npy", np.stack([clouds[1], clouds[1] * np.nan, clouds[2]]))
+    np.save(folder / "e.npy", np.array([{}], dtype=object), allow_pickle=True)
+    (folder / "f.txt").write_text("")
+    write(folder / "g.pcd", clouds[3])
+    for out in (tmp_path / "said.csv", tmp_path / "said.json"):
+        assert predict(run, folder, out, "batch_size=2") == 1
+    rows = table(tmp_path / "said.csv")
+    status = {row["file"]: row["status"] for row in rows}
+    good = {"a.xyz", "d.npy[0]", "d.npy[2]", "g.pcd"}
+    assert {file for file, word in status.items() if word == "ok"} == good
+    assert {file for file, word in status.items() if word == "failed"} == {
+        *("b.xyz", "c.ply", "d.npy[1]", "e.npy", "f.txt")
+    }
+    assert list(status) == sorted(status)
+    reasons = {row["file"]: row["reason"] for row in rows}
+    assert "line 2" in reasons["b.xyz"]
+    assert reasons["d.npy[1]"] == "all 64 points are not finite (NaN or infinite)"
+    assert reasons["e.npy"] == "a pickled array, refused; save it as plain numbers"
+    assert not any(str(tmp_path) in reason for reason in reasons.values())  # that is `file`
+    failed = next(row for row in rows if row["file"] == "b.xyz")
+    assert {failed[key] for key in ("class", "confidence", "out_of_range", "p_ball")} == {""}
+    expected = qs3.load(run)(clouds[:4])
+    by_file = {row["file"]: row for row in rows}
+    for file, i in (("a.xyz", 0), ("d.npy[0]", 1), ("d.npy[2]", 2), ("g.pcd", 3)):
+        np.testing.assert_allclose(probabilities(by_file[file]), expected[i], atol=1e-6)
+    records = json.loads((tmp_path / "said.json").read_text())
+    assert records["classes"] == ["ball", "rod", "slab"]
+    assert [r["file"] for r in records["clouds"]] == [row["file"] for row in rows]
+    assert records["clouds"][1]["probabilities"] is None
+    said = capsys.readouterr().out
+    assert "4 clouds, " in said
+    assert "5 failed:" in said
+    assert "e.npy" in said
+
+
+@pytest.mark.parametrize("suffix", [*ONE, "many.npy"])
+def test_points_that_are_not_finite_are_left_out_and_counted(run, clouds, tmp_path, suffix, capsys):
+    rows = clouds[:2].astype("f8").repeat(2, axis=1)  # each point twice: the rest is all of it
+    rows[0, 5], rows[0, 8, 1], rows[0, 9, 2] = np.nan, np.inf, -np.inf
+    source = tmp_path / "in" / f"a{suffix}"
+    write(source, rows if "many" in suffix else rows[0])
+    assert predict(run, source.parent, tmp_path / "said.csv") == 0
+    assert predict(run, source.parent, tmp_path / "said.json") == 0
+    first, *others = table(tmp_path / "said.csv")
+    assert (first["status"], first["points"], first["dropped"]) == ("ok", "125", "3")
+    left = rows[0][np.isfinite(rows[0]).all(1)]
+    np.testing.assert_allclose(probabilities(first), qs3.load(run)([left])[0], atol=1e-6)
+    assert "finite" not in first["reason"]
+    assert [row["dropped"] for row in others] == ["0"] * ("many" in suffix)
+    assert json.loads((tmp_path / "said.json").read_text())["clouds"][0]["dropped"] == 3
+    assert "3 points of 1 clouds are NaN or infinite and were left out" in capsys.readouterr().out
+
+
+def test_numbers_too_large_are_no_missing_points(run, clouds, tmp_path):
+    large = clouds[0].astype("f8")
+    large[4] = 1e300
+    np.save(tmp_path / "a.npy", large)
+    assert predict(run, tmp_path / "a.npy", tmp_path / "said.csv") == 1
+    (row,) = table(tmp_path / "said.csv")
+    assert row["reason"].startswith("point 5: [1e+300, ")
+
+
+def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):
+    (tmp_path / "a.xyz").write_bytes(b"\x1b[31m\x00\xff\xfe\x07 binary\r more\n" * 9)
+    assert predict(run, tmp_path / "a.xyz", tmp_path / "said.csv") == 1
+    said = capsys.readouterr().out
+    assert all(c.isprintable() for c in said.replace("\n", ""))
+    assert said.isascii()
+    (row,) = table(tmp_path / "said.csv")
+    assert row["reason"].startswith(r"line 1: '\x1b[31m\x00\xff\xfe\x07 binary")
+    assert row["reason"].isascii()
+    assert row["reason"].isprintable()
+
+
+def test_words_for_files_clouds_and_what_is_replaced(run, clouds, tmp_path, capsys, caplog):
+    np.save(tmp_path / "a.npy", clouds[:3])
+    out = tmp_path / "out" / "said.csv"
+    with caplog.at_level("INFO"):
+        assert predict(run, tmp_path, out) == 0
+    assert "files read: 1 of 1" in caplog.text
+    said = capsys.readouterr().out
+    assert "3 clouds, " in said
+    assert "clouds a second, from 1 files" in said
+    assert said.endswith(f"saved {out}\n")
+    assert predict(run, tmp_path / "a.npy", out) == 0
+    assert capsys.readouterr().out.endswith(f"saved {out} (replaced what was there)\n")
+
+
+def test_nothing_but_damage_still_gives_a_table(run, tmp_path):
+    (tmp_path / "a.xyz").write_text("one two three\n")
+    assert predict(run, tmp_path / "a.xyz", tmp_path / "said.csv") == 1
+    assert [row["status"] for row in table(tmp_path / "said.csv")] == ["failed"]
+
+
+def test_up_and_flags(run, clouds, tmp_path):
+    y_up = np.stack([clouds[0][:, 0], clouds[0][:, 2], -clouds[0][:, 1]], 1)
+    write(tmp_path / "in" / "a.xyz", y_up)
+    write(tmp_path / "in" / "b.xyz", y_up[:9])
+    write(tmp_path / "in" / "c.xyz", y_up * (1, 1e-4, 1))
+    assert predict(run, tmp_path / "in", tmp_path / "said.csv", "up=y") == 0
+    rows = table(tmp_path / "said.csv")
+    np.testing.assert_allclose(probabilities(rows[0]), qs3.load(run)(clouds[:1])[0], atol=1e-6)
+    assert [row["out_of_range"] for row in rows] == ["no", "yes", "yes"]
+    assert "points 9 is under 32" in rows[1]["reason"]
+    assert "height" in rows[2]["reason"]
+    assert [row["points"] for row in rows] == ["64", "9", "64"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["ckpt={run}"], "input= is missing"),
+        (["input={clouds}"], "ckpt= is missing"),
+        (["ckpt={run}", "{clouds}"], "did you mean input="),
+        (["ckpt={run}", "input={clouds}", "gravity=z"], "unknown argument"),
+        (["ckpt={run}", "input={clouds}", "out=a.txt"], "must end in .csv or .json"),
+        (["ckpt={run}", "input={clouds}", "up=w"], "up must be one of"),
+        (["ckpt={run}", "input={clouds}", "batch_size=0"], "batch_size must be"),
+        (["ckpt={run}", "input={clouds}", "threads=many"], "threads must be"),
+        (["ckpt={run}", "input={clouds}", "device=quantum"], "device=quantum"),
+        (["ckpt={run}", "input={run}/nothing"], "is not there"),
+        (["ckpt={run}", "input={empty}"], "holds no file of"),
+        (["ckpt={run}", "input={run}/metrics.json"], "metrics.json: unknown format; known are"),
+        (["export", "ckpt={run}", "check={run}/nothing"], "check={run}/nothing is not there"),
+        (["export", "ckpt={run}", "check={empty}"], "check={empty} holds no file of"),
+        (["ckpt={run}/nothing", "input={clouds}"], "is not there"),
+        (["export", "ckpt={run}", "out=model.h5"], "must end in .onnx or .pt2"),
+        (["export"], "ckpt= is missing"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    write(tmp_path / "a.xyz", clouds[0])
+    places = {"run": run, "clouds": tmp_path / "a.xyz", "empty": tmp_path / "empty"}
+    assert main([word.format(**places) for word in words]) == 1
+    assert message.format(**places) in capsys.readouterr().err
+    assert not (tmp_path / "model.onnx").exists()
+    assert not (tmp_path / "predictions.csv").exists()
+
+
+def test_names_that_are_no_utf8(run, clouds, tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    try:
+        Path(f"{folder}/\udcff.xyz").write_text("0 0 0\n1 2 3\n")
+    except OSError:
+        pytest.skip("this file system takes no such names")
+    assert predict(run, folder, tmp_path / "said.csv") == 0
+    assert table(tmp_path / "said.csv")[0]["file"] == r"\xff.xyz"
+
+
+def test_help_is_short_and_light(tmp_path):
+    code = (
+        "import sys; from qs3.inference.__main__ import main; main(['--help']);"
+        "assert not {'torch', 'numpy', 'hydra'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    lines = done.stdout.splitlines()
+    assert len(lines) < 40
+    assert max(map(len, lines)) <= 100
+    assert "up=" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "words", [["export", "--help"], ["export", "ckpt=x", "-h"], ["ckpt=x", "--help"], ["help"]]
+)
+def test_help_anywhere_is_the_page(words, capsys):
+    assert main(words) == 0
+    assert "export writes the net" in capsys.readouterr().out
+
+
+def test_as_a_command(run, clouds, tmp_path):
+    write(tmp_path / "a.xyz", clouds[0])
+    command = [sys.executable, "-m", "qs3.inference", f"ckpt={run}", f"input={tmp_path / 'a.xyz'}"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert len(table(tmp_path / "predictions.csv")) == 1

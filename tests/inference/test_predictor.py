@@ -1,0 +1,347 @@
+"""A finished run gives its classifier back, the same to the last digit, and nothing else."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import nn
+
+import qs3
+from qs3.data.store import open_pointset
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.inference.model_file import read_result, write_result
+from qs3.inference.predictor import load
+from qs3.models.dgcnn import dgcnn
+from qs3.runs.predictions import read_predictions
+
+
+@pytest.fixture(scope="module")
+def predictor(run):
+    return qs3.load(run)
+
+
+@pytest.fixture(scope="module")
+def test_clouds(data_dir) -> np.ndarray:
+    return np.array(open_pointset(data_dir / "kinectsim10").split("test").points)
+
+
+def plain(run: Path) -> dict[str, Any]:
+    return torch.load(run / "result.pt", weights_only=True)
+
+
+def changed(run: Path, folder: Path, **values: Any) -> Path:
+    torch.save({**plain(run), **values}, folder / "result.pt")
+    return folder / "result.pt"
+
+
+def test_predictions_of_the_run_to_the_last_digit(run, predictor, test_clouds):
+    expected = read_predictions(run / "predictions.csv")
+    assert not (run / ".hydra").exists()  # called from Python: nothing but the run's own files
+    assert predictor.classes == expected.classes
+    np.testing.assert_array_equal(predictor(test_clouds, batch_size=64), expected.probabilities)
+    # sums in batches of another size may be added otherwise
+    np.testing.assert_allclose(
+        predictor(test_clouds, batch_size=5), expected.probabilities, atol=1e-6
+    )
+
+
+def test_the_file_alone_is_enough(run, tmp_path, test_clouds, predictor):
+    alone = tmp_path / "sent_by_mail.pt"
+    alone.write_bytes((run / "result.pt").read_bytes())
+    np.testing.assert_array_equal(qs3.load(alone)(test_clouds[:3]), predictor(test_clouds[:3]))
+
+
+def test_any_number_of_points_any_size_any_place(predictor, test_clouds):
+    rng = np.random.default_rng(0)
+    clouds = [rng.normal(size=(n, 3)) for n in (1, 7, 32, 63, 64, 65, 5000)]
+    found = predictor(clouds)
+    assert found.shape == (7, 3)
+    np.testing.assert_allclose(found.sum(1), 1, atol=1e-9)
+    moved = [1000 * cloud.astype(np.float32) + 4096 for cloud in test_clouds[:4]]
+    np.testing.assert_allclose(predictor(moved), predictor(test_clouds[:4]), atol=2e-2)
+
+
+def test_few_points_are_repeated_and_many_thinned_as_the_importer_does(predictor):
+    rng = np.random.default_rng(1)
+    few, many = rng.normal(size=(40, 3)), rng.normal(size=(300, 3))
+    repeated = few[np.arange(64) % 40]
+    np.testing.assert_array_equal(predictor([few]), predictor([repeated]))
+    prepared = predictor.prepare(few)
+    assert (prepared.given, len(prepared.points)) == (40, 32)
+    from qs3.geometry.sampling import farthest_point_sampling_np
+
+    thinned = many[farthest_point_sampling_np(many.astype(np.float32), 64, 0)]
+    np.testing.assert_array_equal(predictor([many]), predictor([thinned]))
+
+
+@pytest.mark.parametrize(
+    ("up", "axes"),
+    [
+        ("y", lambda c: np.stack([c[:, 0], c[:, 2], -c[:, 1]], 1)),
+        ("-y", lambda c: np.stack([c[:, 0], -c[:, 2], c[:, 1]], 1)),
+        ("x", lambda c: np.stack([c[:, 2], c[:, 1], -c[:, 0]], 1)),
+        ("-x", lambda c: np.stack([-c[:, 2], c[:, 1], c[:, 0]], 1)),
+        ("-z", lambda c: np.stack([c[:, 0], -c[:, 1], -c[:, 2]], 1)),
+    ],
+)
+def test_up_turns_the_cloud_back(predictor, test_clouds, up, axes):
+    turned = [axes(cloud) for cloud in test_clouds[:6]]  # z of the cloud lies along `up`
+    np.testing.assert_allclose(predictor(turned, up=up), predictor(test_clouds[:6]), atol=1e-6)
+    assert np.abs(predictor(turned) - predictor(test_clouds[:6])).max() > 1e-3
+
+
+def test_bad_clouds_are_named(predictor):
+    good = np.random.default_rng(0).normal(size=(50, 3))
+    bad = good.copy()
+    bad[7, 1] = np.nan
+    with pytest.raises(DataError, match=r"chair\.xyz, point 8.*not finite"):
+        predictor([good, bad], names=["sofa.xyz", "chair.xyz"])
+    with pytest.raises(DataError, match="cloud 1: there are no points"):
+        predictor([good, good[:0]])
+    with pytest.raises(DataError, match=r"cloud 0.*shape"):
+        predictor([good[:, :2]])
+    with pytest.raises(ConfigError, match="up"):
+        predictor([good], up="w")
+    assert predictor([]).shape == (0, 3)
+
+
+def test_too_few_points_are_fewer_than_the_net_sees(run, tmp_path, predictor):
+    """Also where result.pt says how many the files of training had: 64; the net sees 32."""
+    assert predictor.result.usual["points"][0] == 64
+    cloud = np.random.default_rng(0).normal(size=(64, 3))
+
+    def said(points: int, which=predictor) -> str:
+        return "; ".join(which.prepare(cloud[:points]).strange)
+
+    assert "points" not in said(32)
+    assert "points 31 is under 32" in said(31)
+    usual = {**plain(run)["usual"], "points": [20.0, float("inf")]}
+    seen_less = qs3.load(changed(run, tmp_path, usual=usual))
+    assert "points" not in said(20, seen_less)
+    assert "points 19 is under 20" in said(19, seen_less)
+
+
+def test_what_is_no_list_of_clouds_is_told(predictor, test_clouds):
+    cloud = test_clouds[0]
+    for one in (cloud, torch.from_numpy(cloud)):
+        with pytest.raises(DataError, match=r"shape \(64, 3\); give a list of clouds"):
+            predictor(one)
+    for wrong in (None, 7, "scan.xyz"):
+        with pytest.raises(DataError, match="give a list of clouds"):
+            predictor(wrong)
+    for wrong in (None, "scan.xyz", [[1, 2, 3], [4, 5]]):
+        with pytest.raises(DataError, match=r"cloud 1: .*no .*numbers"):
+            predictor([cloud, wrong])
+    with pytest.raises(DataError, match=r"point 3: .*leave such points out"):
+        predictor([np.where(np.arange(64)[:, None] == 2, np.nan, cloud)])
+    expected = predictor([cloud])
+    tensor = torch.from_numpy(cloud).requires_grad_()
+    np.testing.assert_array_equal(predictor([tensor]), expected)
+    np.testing.assert_array_equal(predictor([cloud.tolist()]), expected)
+
+
+def test_the_front_door_says_what_it_takes():
+    own, real = (inspect.signature(f).parameters for f in (qs3.load, load))
+    assert list(own) == list(real)
+    for name in own:
+        assert (own[name].kind, own[name].default) == (real[name].kind, real[name].default)
+        assert f"{name}:" in qs3.load.__doc__
+
+
+def test_random_numbers_of_the_caller_are_left_alone(run):
+    torch.manual_seed(5)
+    expected = torch.rand(1)
+    torch.manual_seed(5)
+    qs3.load(run)
+    assert torch.rand(1) == expected
+
+
+def test_missing_runs_are_told_apart(run, tmp_path):
+    with pytest.raises(MissingDataError, match="is not there"):
+        qs3.load(tmp_path / "nothing")
+    with pytest.raises(MissingDataError, match=r"it holds 1 of them: .*seed0"):
+        qs3.load(run.parent)
+    with pytest.raises(MissingDataError, match=r"has no result\.pt"):
+        qs3.load(tmp_path)
+    (tmp_path / "started.json").write_text("{}")
+    with pytest.raises(MissingDataError, match="not finished"):
+        qs3.load(tmp_path)
+    with pytest.raises(ConfigError, match="device=quantum"):
+        qs3.load(run, device="quantum")
+
+
+class _Evil:
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.mark),)
+
+
+def test_pickles_are_refused_unopened(run, tmp_path):
+    mark = tmp_path / "was_run"
+    for file, write in (("a.pt", pickle.dumps), ("b.pt", None)):
+        evil = _Evil(mark)
+        if write is not None:
+            (tmp_path / file).write_bytes(write(evil))
+        else:
+            torch.save({**plain(run), "classes": evil}, tmp_path / file)
+        with pytest.raises(DataError, match="nothing in it was run"):
+            qs3.load(tmp_path / file)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        {"_target_": "os.system", "command": "mkdir {mark}"},
+        {"_target_": "os.mkdir", "path": "{mark}"},
+        {"_target_": "qs3.models.os.mkdir", "path": "{mark}"},
+        {"_target_": "qs3.models.base.nn.Linear", "in_features": 1, "out_features": 1},
+        {"_target_": "qs3.models.base.DataError"},  # defined elsewhere
+        {"_target_": "qs3.models.dgcnn._PooledLinear"},
+        {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": {"_target_": "os.getcwd"}},
+        {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "_partial_": True},
+        {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "_args_": [1]},
+        {"_target_": "qs3.models.dgcnn.nothing", "num_classes": 3},
+        {"_target_": "qs3.models.nothing.dgcnn", "num_classes": 3},
+        {"_target_": "qs3.models.norms.head_norm", "kind": "batch"},  # ours, but gives no net
+        {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "colour": "red"},
+        {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "k": -1},
+        {"_target_": "tests.training.toy.TinyNet", "num_classes": 3},
+        {"_target_": 7},
+        {},
+    ],
+    ids=str,
+)
+def test_only_our_nets_are_built(run, tmp_path, model):
+    mark = tmp_path / "was_run"
+    model = {k: v.format(mark=mark) if isinstance(v, str) else v for k, v in model.items()}
+    with pytest.raises(DataError):
+        qs3.load(changed(run, tmp_path, model=model))
+    assert not mark.exists()
+
+
+def test_a_net_of_ones_own_is_asked_for_by_package(run, tmp_path):
+    from tests.training.toy import TinyNet
+
+    torch.manual_seed(0)
+    net = TinyNet(3).eval()
+    model = {"_target_": "tests.training.toy.TinyNet", "num_classes": 3}
+    file = changed(run, tmp_path, model=model, weights=net.state_dict())
+    found = load(file, packages=("qs3.models", "tests.training"))
+    assert isinstance(found.net, TinyNet)
+    assert not found.net.training
+    for name, value in net.state_dict().items():
+        assert torch.equal(found.net.state_dict()[name], value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("classes", ["a", "a", "b"]),
+        ("classes", ["only"]),
+        ("classes", [1, 2, 3]),
+        ("points", 0),
+        ("points", True),
+        ("points", 10**9),
+        ("points", 65),  # more than stored
+        ("stored_points", "64"),
+        ("gravity", "down"),
+        ("target", None),
+        ("usual", {"spacing": [0.0, float("nan")]}),
+        ("usual", {"colour": [0.0, 1.0]}),
+        ("usual", [1]),
+        ("weights", {"a": 1}),
+        ("weights", {}),
+        ("weights", {"a": torch.zeros(1)}),
+    ],
+    ids=str,
+)
+def test_damaged_values_are_named(run, tmp_path, key, value):
+    with pytest.raises(DataError, match=key):
+        qs3.load(changed(run, tmp_path, **{key: value}))
+
+
+def test_a_wrong_number_of_classes_is_noticed(run, tmp_path):
+    found = qs3.load(changed(run, tmp_path, classes=["a", "b"]))
+    with pytest.raises(DataError, match="3 classes apart, the file names 2"):
+        found([np.eye(3)])
+
+
+def test_truncated_files_are_damaged(run, tmp_path):
+    data = (run / "result.pt").read_bytes()
+    for size in (0, 10, len(data) // 2, len(data) - 1):
+        (tmp_path / "cut.pt").write_bytes(data[:size])
+        with pytest.raises(DataError, match="damaged"):
+            qs3.load(tmp_path / "cut.pt")
+
+
+def test_weights_alone_say_what_to_do(run, tmp_path):
+    torch.save(plain(run)["weights"], tmp_path / "result.pt")
+    with pytest.raises(DataError, match=r"older version.*metrics\.json"):
+        qs3.load(tmp_path)
+
+
+def test_domain_norms_are_those_of_the_target(run, tmp_path):
+    torch.manual_seed(0)
+    net = dgcnn(3, k=6, norm="domain")
+    for _ in range(3):
+        net(torch.randn(4, 32, 3))
+    for module in net.modules():
+        if getattr(module, "domain", None):
+            module.domain = "target"
+    net(3 * torch.randn(4, 32, 3))
+    model = {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "k": 6, "norm": "domain"}
+    found = qs3.load(changed(run, tmp_path, model=model, weights=net.state_dict()))
+    cloud = np.random.default_rng(0).normal(size=(64, 3))
+    ready = found.prepare(cloud).points[None]
+    with torch.no_grad():
+        expected = net.eval()(ready).double().softmax(1).numpy()  # still on "target"
+    np.testing.assert_allclose(found([cloud]), expected, atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    points=st.integers(1, 64),
+    gravity=st.sampled_from(["z", "none"]),
+    classes=st.lists(st.text(min_size=1), min_size=2, max_size=5, unique=True),
+    low=st.floats(allow_nan=False, width=64),
+)
+def test_written_is_read(tmp_path_factory, run, points, gravity, classes, low):
+    import dataclasses
+
+    result = dataclasses.replace(
+        read_result(run),
+        points=points,
+        gravity=gravity,
+        classes=tuple(classes),
+        usual={"height": [low, float("inf")]},
+    )
+    file = tmp_path_factory.mktemp("written") / "result.pt"
+    write_result(file, result)
+    again = read_result(file)
+    for field in ("points", "stored_points", "gravity", "classes", "usual", "model", "target"):
+        assert getattr(again, field) == getattr(result, field)
+    assert all(torch.equal(again.weights[k], v) for k, v in result.weights.items())
+
+
+def test_importing_qs3_imports_nothing_heavy():
+    code = "import qs3, sys; qs3.load; assert not {'torch', 'numpy', 'hydra'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_nets_are_in_eval_mode(predictor):
+    assert isinstance(predictor.net, nn.Module)
+    assert not any(module.training for module in predictor.net.modules())

@@ -1,0 +1,68 @@
+"""Reading CAD files: what trimesh writes, and what the file itself can be."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from qs3.errors import MeshError
+from qs3.meshes import io as files
+from qs3.meshes.formats import arrays
+from qs3.meshes.io import load_mesh
+from tests.meshes.written import EXPORTS, PYRAMID, SQUARE_OFF, corners, export, save, z_up
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_what_trimesh_writes_is_read(tmp_path, name):
+    mesh = load_mesh(save(tmp_path, name, export(name)))
+    expected = z_up(PYRAMID) if name.endswith("glb") else PYRAMID
+    np.testing.assert_allclose(corners(mesh), corners(expected), atol=1e-6)
+
+
+@pytest.mark.parametrize("newline", [b"\r\n", b"\r"])
+def test_suffix_in_capitals_and_other_line_ends(tmp_path, newline):
+    for name in ("a.off", "ascii.ply", "ascii.stl", "a.obj"):
+        content = export(name).replace(b"\n", newline)
+        mesh = load_mesh(save(tmp_path, name.upper(), content))
+        np.testing.assert_allclose(corners(mesh), corners(PYRAMID), atol=1e-6)
+
+
+def test_files_that_are_none(tmp_path):
+    (tmp_path / "folder.off").mkdir()
+    os.mkfifo(tmp_path / "fifo.off")
+    for name, reason in [
+        ("folder.off", "is no file"),
+        ("fifo.off", "is no file"),
+        ("gone.off", "does not exist"),
+        ("a.step", "no known format"),
+    ]:
+        with pytest.raises(MeshError, match=reason):
+            load_mesh(tmp_path / name)
+
+
+def test_size_limits(tmp_path, monkeypatch):
+    path = save(tmp_path, "a.off", SQUARE_OFF)
+    monkeypatch.setattr(arrays, "MAX_FACES", 1)
+    with pytest.raises(MeshError, match="limits"):
+        load_mesh(path)
+    monkeypatch.setattr(files, "MAX_BYTES", 10)
+    with pytest.raises(MeshError, match="more than the limit"):
+        load_mesh(path)
+
+
+def test_huge_sparse_file_is_not_read(tmp_path):
+    path = tmp_path / "huge.off"
+    with path.open("wb") as handle:
+        handle.truncate(files.MAX_BYTES + 1)
+    with pytest.raises(MeshError, match="more than the limit"):
+        load_mesh(path)
+
+
+def test_loading_is_silent_and_errors_travel_between_processes(tmp_path, caplog, capfd):
+    load_mesh(save(tmp_path, "a.off", SQUARE_OFF))
+    with pytest.raises(MeshError) as caught:
+        load_mesh(save(tmp_path, "a.glb", b"glTF" + bytes(30)))
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    assert not caplog.records
+    assert capfd.readouterr() == ("", "")

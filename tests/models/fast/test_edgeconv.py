@@ -1,0 +1,131 @@
+import pytest
+import torch
+from torch import nn
+
+from qs3.geometry.neighbours import knn
+from qs3.models.fast.edgeconv import EdgeConv, _Moments, max_over_rows, neighbour_max
+from tests.models.reference import NaiveEdgeConv
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+
+
+def _pair(norm: str, c: int = 6, d: int = 9, seed: int = 0) -> tuple[EdgeConv, NaiveEdgeConv]:
+    torch.manual_seed(seed)
+    ours = EdgeConv(c, d, norm=norm).double()
+    with torch.no_grad():
+        nn.init.normal_(ours.norm.weight)
+        nn.init.normal_(ours.norm.bias)
+        ours.norm.weight[0] = -1.3
+        if norm == "batch":
+            ours.norm.running_mean.normal_()
+            ours.norm.running_var.uniform_(0.5, 2)
+    assert (ours.norm.weight < 0).any()
+    assert (ours.norm.weight > 0).any()
+    return ours, NaiveEdgeConv(ours)
+
+
+def _compare(ours: EdgeConv, naive: NaiveEdgeConv, x: torch.Tensor, index: torch.Tensor) -> None:
+    a, b = x.clone().requires_grad_(), x.clone().requires_grad_()
+    out_a, out_b = ours(a, index), naive(b, index)
+    torch.testing.assert_close(out_a, out_b, **TIGHT)
+    upstream = torch.randn_like(out_a)
+    (out_a * upstream).sum().backward()
+    (out_b * upstream).sum().backward()
+    torch.testing.assert_close(a.grad, b.grad, **TIGHT)
+    torch.testing.assert_close(ours.linear.weight.grad, naive.weight.grad, **TIGHT)
+    torch.testing.assert_close(ours.norm.weight.grad, naive.bn.weight.grad, **TIGHT)
+    torch.testing.assert_close(ours.norm.bias.grad, naive.bn.bias.grad, **TIGHT)
+    if isinstance(ours.norm, nn.BatchNorm1d):
+        torch.testing.assert_close(ours.norm.running_mean, naive.bn.running_mean, **TIGHT)
+        torch.testing.assert_close(ours.norm.running_var, naive.bn.running_var, **TIGHT)
+
+
+@pytest.mark.parametrize("norm", ["batch", "instance"])
+@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize(("b", "n", "k"), [(3, 40, 7), (1, 5, 5), (2, 30, 1), (2, 2, 2)])
+def test_equals_naive_layer(norm: str, training: bool, b: int, n: int, k: int) -> None:
+    ours, naive = _pair(norm)
+    ours.train(training)
+    naive.train(training)
+    x = torch.randn(b, n, 6, dtype=torch.float64)
+    _compare(ours, naive, x, knn(x, k))
+
+
+def test_equals_naive_layer_far_from_origin() -> None:
+    ours, naive = _pair("batch", c=3)
+    x = torch.randn(2, 50, 3, dtype=torch.float64) + 100
+    _compare(ours, naive, x, knn(x, 6))
+
+
+def test_neighbours_may_be_any_and_repeat() -> None:
+    ours, naive = _pair("batch")
+    x = torch.randn(2, 30, 6, dtype=torch.float64)
+    index = torch.randint(10, (2, 30, 4))  # points 10.. are nobody's neighbours
+    _compare(ours, naive, x, index)
+
+
+def test_float32_statistics_do_not_cancel() -> None:
+    ours, _ = _pair("batch", c=3)
+    x = torch.randn(2, 200, 3) + 30  # std 1 at distance 30
+    index = knn(x, 10)
+    single = EdgeConv(3, 9)
+    single.load_state_dict(ours.state_dict())
+    torch.testing.assert_close(
+        single(x, index).double(), ours(x.double(), index), rtol=0, atol=2e-4
+    )
+
+
+def test_gamma_zero_gives_beta_and_finite_gradients() -> None:
+    ours, _ = _pair("batch")
+    with torch.no_grad():
+        ours.norm.weight.zero_()
+    x = torch.randn(2, 20, 6, dtype=torch.float64, requires_grad=True)
+    out = ours(x, knn(x, 5))
+    expected = nn.functional.leaky_relu(ours.norm.bias, 0.2).expand_as(out)
+    torch.testing.assert_close(out, expected)
+    out.sum().backward()
+    assert torch.isfinite(x.grad).all()
+    assert torch.isfinite(ours.norm.weight.grad).all()
+
+
+def test_one_repeated_point_has_no_variance() -> None:
+    layer = EdgeConv(3, 8)
+    x = torch.full((2, 16, 3), 0.7, requires_grad=True)
+    out = layer(x, knn(x, 4))
+    out.sum().backward()
+    torch.testing.assert_close(out, torch.zeros_like(out), rtol=0, atol=1e-4)
+    assert torch.isfinite(x.grad).all()
+
+
+def test_never_holds_all_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("qs3.models.fast.edgeconv._GATHERED", 1)  # many blocks
+    ours, naive = _pair("batch")
+    x = torch.randn(2, 100, 6, dtype=torch.float64)
+    _compare(ours, naive, x, knn(x, 3))
+
+
+def test_neighbour_ops_have_right_gradients() -> None:
+    torch.manual_seed(0)
+    x = torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
+    index = torch.randint(7, (5, 4))
+    assert torch.autograd.gradcheck(lambda x: neighbour_max(x, index), x)
+    clouds = torch.randn(2, 5, 3, dtype=torch.float64, requires_grad=True)
+    index = torch.randint(10, (10, 4))
+    assert torch.autograd.gradcheck(lambda x: _Moments.apply(x, index), clouds)
+
+
+def test_max_over_rows_known_answer() -> None:
+    x = torch.tensor([[[1.0, 5.0], [3.0, -2.0], [3.0, 5.0]]])
+    best, where = max_over_rows(x)
+    assert best.tolist() == [[3.0, 5.0]]
+    assert where.tolist() == [[1, 0]]  # the first of equals
+
+
+def test_autocast_keeps_statistics_in_float32() -> None:
+    torch.manual_seed(0)
+    layer = EdgeConv(3, 8)
+    x = torch.randn(2, 32, 3)
+    index = knn(x, 5)
+    plain = layer(x, index)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(layer(x, index), plain)

@@ -1,0 +1,375 @@
+"""Pictures of a run show what its files hold; what is missing or damaged is said in words."""
+
+import base64
+import csv
+import json
+import logging
+import re
+import shutil
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.evaluation.metrics import CALIBRATION_BINS, calibration_error
+from qs3.inference.model_file import Result, write_result
+from qs3.models.pointnet import pointnet
+from qs3.report.__main__ import main
+from qs3.report.figures.canvas import NothingToDrawError
+from qs3.report.runs import figures as run_figures
+from qs3.report.runs.data import BINS, read_run, reliability
+from qs3.report.runs.pictures import after_training, draw
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import save
+from qs3.runs.predictions import Predictions, read_predictions
+from qs3.training.command import train
+from tests.report.made_runs import change, not_blank, table
+from tests.report.wandb_files import read
+from tests.training.toy import CLASSES
+
+ALL = [
+    *("curves", "confusion", "pseudo_labels", "classes", "calibration"),
+    *("domains", "source_clouds", "target_clouds", "class_balance", "mistakes"),
+]
+
+
+def texts(ax):
+    return [text.get_text() for text in ax.texts]
+
+
+def line(ax, label):
+    (found,) = [each for each in ax.lines if each.get_label() == label]
+    return np.array(found.get_xdata()), np.array(found.get_ydata())
+
+
+def heights(ax, label):
+    (bars,) = [each for each in ax.containers if each.get_label() == label]
+    return [bar.get_height() for bar in bars]
+
+
+def test_files_and_page(run, tmp_path):
+    drawn = draw(run, embed=False)
+    assert list(drawn.pictures) == ALL
+    assert list(drawn.skipped) == ["pipeline"]
+    assert drawn.notes == ()
+    assert drawn.page == run / "pictures" / "index.html"
+    for name, path in drawn.pictures.items():
+        assert path == run / "pictures" / f"{name}.png"
+        assert not_blank(path), name
+    again = draw(run, tmp_path / "elsewhere", embed=False)
+    for name, path in again.pictures.items():
+        assert path.read_bytes() == drawn.pictures[name].read_bytes(), name
+    check_page(run, drawn)
+
+
+def check_page(run, drawn):
+    """It needs no other file, and says what the run was and is."""
+    page = drawn.page.read_text()
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    images = re.findall(r"base64,([A-Za-z0-9+/=]+)", page)
+    assert [base64.b64decode(i) for i in images] == [
+        p.read_bytes() for p in drawn.pictures.values()
+    ]
+    metrics = runs.read_metrics(run)
+    assert f"<td>{metrics['final']['accuracy']:.1%}</td>" in page
+    assert "kinectsim10 (simulated)" in page
+    assert "python train.py experiment=quickstart" in page
+    assert "protocol.epochs: 4" in page
+    assert "<script" not in page
+
+
+def test_curves_are_the_history(run):
+    rows, axes = table(run / "history.csv"), run_figures.curves(read_run(run)).axes
+    epochs = [int(row["epoch"]) for row in rows]
+    loss, accuracy = line(axes[0], "train/loss"), line(axes[1], "source_val/acc")
+    np.testing.assert_array_equal(loss, [epochs, [float(row["train/loss"]) for row in rows]])
+    np.testing.assert_allclose(accuracy[1], [100 * float(r["source_val/acc"]) for r in rows])
+    np.testing.assert_array_equal(line(axes[2], "lr")[1], [float(row["lr"]) for row in rows])
+    assert texts(axes[0]) == ["warm-up", "round 0", "round 1"]
+    assert [p.get_x() for p in axes[0].patches] == [-0.5, 6.5]  # warm-up and every other round
+    teacher = runs.read_metrics(run)["warmup"]["selected"]["epoch"]
+    assert line(axes[0], f"teacher: epoch {teacher}")[0].tolist() == [teacher, teacher]
+
+
+def test_chosen_student_is_marked(run):
+    change(run, student={"epoch": 8})
+    axes = run_figures.curves(read_run(run)).axes
+    assert line(axes[1], "student: epoch 8")[0].tolist() == [8, 8]
+
+
+def test_confusion_is_that_of_the_predictions(run):
+    figure = run_figures.confusion(read_run(run))
+    rows = table(run / "predictions.csv")
+    counts = Counter((row["label"], row["predicted"]) for row in rows)
+    drawn = np.array(figure.axes[0].images[0].get_array())
+    per_class = Counter(row["label"] for row in rows)
+    for i, true in enumerate(CLASSES):
+        for j, predicted in enumerate(CLASSES):
+            assert drawn[i, j] == pytest.approx(counts[true, predicted] / per_class[true])
+    words = [t.split("\n") for t in texts(figure.axes[0])]
+    assert sorted(int(n) for n, _ in words) == sorted(counts.values())
+    final, title = runs.read_metrics(run)["final"], figure.get_suptitle()
+    assert "kinectsim10 (simulated)" in title
+    for key in ("accuracy", "balanced_accuracy", "majority_rate"):
+        assert f"{final[key]:.1%}" in title
+    change(run, simulated=False)
+    assert "simulated" not in run_figures.confusion(read_run(run)).get_suptitle()
+
+
+def test_pseudo_labels_are_those_of_the_tables(run):
+    axes = run_figures.pseudo_labels(read_run(run)).axes
+    records = runs.read_metrics(run)["rounds"]
+    for r, record in enumerate(records):
+        rows = table(run / f"round_{r:02d}" / "pseudo_labels.csv")
+        kept = Counter(row["label"] for row in rows if row["selected"] == "1")
+        for k, name in enumerate(CLASSES):
+            assert np.array(axes[0].images[0].get_array())[k, r] == kept[name]
+            assert f"{kept[name]}/{record['confident'][name]}" in texts(axes[0])
+            assert np.array(axes[1].images[0].get_array())[k, r] == record["mu"][name]
+        assert heights(axes[2], "selected")[r] == sum(kept.values())
+        assert heights(axes[2], "confident")[r] == record["total_confident"]
+    assert line(axes[2], "all target clouds")[1].tolist() == [72, 72]
+    theta = line(axes[3], "theta, the confidence asked for")[1]
+    assert theta.tolist() == [record["theta"] for record in records]
+    for key in ("precision", "recall"):
+        judged = line(axes[3], f"{key} (with target labels, evaluation only)")[1]
+        assert judged.tolist() == [record["with_target_labels"][key] for record in records]
+
+
+def test_classes_are_counted(run):
+    axes = run_figures.classes(read_run(run), np.repeat([0, 1, 2], [5, 6, 7])).axes
+    rows = table(run / "predictions.csv")
+    predicted = Counter(row["predicted"] for row in rows)
+    assert heights(axes[1], "predicted by the result") == [predicted[name] for name in CLASSES]
+    assert heights(axes[1], "true (with target labels, evaluation only)") == [8, 8, 8]
+    assert heights(axes[0], "true (with target labels, evaluation only)") == [5, 6, 7]
+    named = Counter(row["label"] for row in table(run / "round_01" / "pseudo_labels.csv"))
+    assert heights(axes[0], "named by the teacher of round 1") == [named[name] for name in CLASSES]
+
+
+def test_calibration_is_the_reported_error(run):
+    assert BINS == CALIBRATION_BINS
+    p = read_predictions(run / "predictions.csv")
+    found = reliability(p)
+    assert found.error == pytest.approx(calibration_error(p.probabilities, p.labels))
+    assert found.error == pytest.approx(runs.read_metrics(run)["final"]["calibration_error"])
+    axes = run_figures.calibration(read_run(run)).axes
+    assert axes[1].containers[0].datavalues.sum() == 24
+    assert heights(axes[0], "accuracy") == pytest.approx(found.accuracy[found.count > 0])
+
+
+def test_reliability_of_known_bins():
+    """Edges belong to the bin below; clouds without a label do not count."""
+    top = np.array([0.6, 0.6, 0.61, 1.0, 0.9])
+    labels = np.array([0, 1, 0, 0, -1])
+    p = Predictions(("a", "b"), tuple("vwxyz"), tuple("vwxyz"), labels,
+                    np.stack([top, 1 - top], axis=1))  # fmt: skip
+    found = reliability(p, bins=5)
+    assert found.count.tolist() == [0, 0, 2, 1, 1]
+    np.testing.assert_allclose(found.accuracy[2:], [0.5, 1, 1])
+    np.testing.assert_allclose(found.confidence[2:], [0.6, 0.61, 1])
+    assert found.error == pytest.approx((2 * 0.1 + 0.39 + 0) / 4)
+    unknown = Predictions(p.classes, p.ids, p.meshes, np.full(5, -1), p.probabilities)
+    assert reliability(unknown) is None
+
+
+def test_missing_round_folders(run):
+    shutil.rmtree(run / "round_00")
+    drawn = draw(run, embed=False)
+    assert list(drawn.pictures) == ALL
+    assert "round_00/pseudo_labels.csv is gone" in " ".join(drawn.notes)
+    assert "round_00/pseudo_labels.csv is gone" in drawn.page.read_text()
+    kept = runs.read_metrics(run)["rounds"][0]["selected"]
+    axes = run_figures.pseudo_labels(read_run(run)).axes
+    assert np.array(axes[0].images[0].get_array())[:, 0].tolist() == [kept[c] for c in CLASSES]
+
+
+def test_unlabelled_target(run):
+    metrics = runs.read_metrics(run)
+    unknown = dict.fromkeys(("accuracy", "balanced_accuracy", "confusion", "majority_rate"))
+    rounds = [{**record, "with_target_labels": None} for record in metrics["rounds"]]
+    final = {**metrics["final"], **unknown, "calibration_error": None}
+    change(run, final=final, rounds=rounds)
+    rows = table(run / "predictions.csv")
+    with open(run / "predictions.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows({**row, "label": ""} for row in rows)
+    drawn = draw(run, embed=False)
+    reason = "the target has no labels"
+    assert {name for name, why in drawn.skipped.items() if why == reason} == {
+        "confusion", "calibration",
+    }  # fmt: skip
+    assert reason in drawn.page.read_text()
+    axes = run_figures.pseudo_labels(read_run(run)).axes
+    assert not any("precision" in str(each.get_label()) for each in axes[3].lines)
+    assert len(run_figures.classes(read_run(run)).axes[1].containers) == 1
+
+
+def test_stale_pictures_go(run):
+    stale = run / "pictures" / "pseudo_labels.png"
+    stale.parent.mkdir()
+    stale.touch()
+    change(run, rounds=[])
+    for folder in run.glob("round_*"):
+        shutil.rmtree(folder)
+    skipped = draw(run, embed=False).skipped
+    assert skipped["pseudo_labels"] == "the run has no rounds of self-training"
+    assert not stale.exists()
+
+
+def test_unfinished_run(run):
+    (run / "metrics.json").unlink()
+    (run / "predictions.csv").unlink()
+    drawn = draw(run)
+    assert list(drawn.pictures) == ["curves", "pseudo_labels", "classes"]
+    assert drawn.skipped["embedding"] == "the run is not finished"
+    assert "not finished" in drawn.page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("history.csv", "epoch,phase\n0,zero\n"),
+        ("history.csv", "a,b\n1,2\n"),
+        ("predictions.csv", "id,mesh\n"),
+        ("round_01/pseudo_labels.csv", "id,label,confidence,selected\na,ball,much,1\n"),
+        ("round_01/pseudo_labels.csv", ""),
+        ("metrics.json", "{"),
+        ("metrics.json", "{}"),
+        (".hydra/config.yaml", "a: [1"),
+    ],
+)
+def test_damaged_files_are_named(run, name, text, capsys):
+    (run / name).write_text(text)
+    with pytest.raises(DataError, match=re.escape(name)):
+        draw(run, embed=False)
+    assert main(["pictures", f"run={run}"]) == 1
+    assert name in capsys.readouterr().err
+
+
+def test_no_run(tmp_path):
+    with pytest.raises(MissingDataError, match="is not the folder of a run"):
+        draw(tmp_path)
+
+
+def use_real_net(run):
+    """A small net of ours in place of the toy's, with features."""
+    torch.manual_seed(0)
+    model = {"_target_": "qs3.models.pointnet.pointnet", "num_classes": 3, "variant": "basic"}
+    first, second = (pointnet(num_classes=3, variant="basic").state_dict() for _ in range(2))
+    save(first, run / "warmup_selected.pt")
+    result = Result(model, CLASSES, 32, 64, "kinectsim10", "z", {}, second)
+    write_result(run / "result.pt", result)
+
+
+def why_no_embedding(run, data_dir=None):
+    from qs3.report.runs.embedding import draw_embedding
+
+    with pytest.raises(NothingToDrawError) as error:
+        draw_embedding(read_run(run), data_dir)
+    return str(error.value)
+
+
+def test_embedding_needs_data_and_a_net(run, tmp_path):
+    assert "tests.training.toy" in why_no_embedding(run)  # a file may not name any code
+    use_real_net(run)
+    assert f"its source, specklenet10, is not at {tmp_path}" in why_no_embedding(run, tmp_path)
+    change(run, data={"source": "0" * 64, "target": "0" * 64})
+    assert "another version of specklenet10" in why_no_embedding(run)
+    (run / ".hydra" / "config.yaml").unlink()
+    assert "config.yaml" in why_no_embedding(run)
+
+
+def test_command_line(run, toy_data, tmp_path, capsys):
+    use_real_net(run)
+    out = tmp_path / "out"
+    assert main([f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
+    named = [*ALL[:5], "embedding", *ALL[5:]]
+    shown = [str(out / f"{name}.png") for name in named] + [str(out / "index.html")]
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if not line.startswith("no pipeline: ")] == shown
+    assert not_blank(out / "embedding.png")
+
+
+def test_embedding_shows_both_domains_before_and_after(run):
+    from qs3.report.runs.embedding import draw_embedding, sample
+
+    use_real_net(run)
+    figure = draw_embedding(read_run(run), clouds=9)
+    assert [ax.get_title() for ax in figure.axes] == ["after the warm-up", "after self-training"]
+    places = [np.concatenate([c.get_offsets() for c in ax.collections]) for ax in figure.axes]
+    assert [len(p) for p in places] == [18, 18]
+    assert np.abs(places[0] - places[1]).max() > 1e-3
+    again = draw_embedding(read_run(run), clouds=9)
+    np.testing.assert_array_equal(
+        places[0], np.concatenate([c.get_offsets() for c in again.axes[0].collections])
+    )
+    assert sample(5, 9, seed=0).tolist() == [0, 1, 2, 3, 4]
+    assert len(set(sample(100, 9, seed=0))) == 9
+    assert sample(100, 9, seed=0).tolist() != sample(100, 9, seed=1).tolist()
+
+
+def test_command_line_refuses_two_things_at_once(run, capsys):
+    assert main(["pictures", f"run={run}", "domains=[modelnet10]"]) == 1
+    assert "two commands" in capsys.readouterr().err
+    assert main(["pictures"]) == 1
+    assert "run=PATH" in capsys.readouterr().err
+
+
+def test_training_draws_and_its_hash_does_not_know(toy):
+    cfg = toy("report.pictures=true", "selftraining=none")
+    assert runs.config_sha256(cfg) == runs.config_sha256(toy("selftraining=none"))
+    train(cfg)
+    pictures = runs.run_folder(cfg) / "pictures"
+    assert {p.name for p in pictures.iterdir()} == {
+        *(f"{name}.png" for name in ALL if name != "pseudo_labels"), "index.html",
+    }  # fmt: skip
+    with pytest.raises(ConfigError, match=r"report\.pictures"):
+        train(toy("report.pictures=perhaps"))
+
+
+def test_a_failed_picture_is_a_warning(run, caplog):
+    (run / "pictures").write_text("in the way")
+    with caplog.at_level(logging.WARNING):
+        after_training(run)
+    assert "the run is finished, but its pictures failed" in caplog.text
+    assert "python -m qs3.report run=" in caplog.text
+
+
+def test_offline_wandb_holds_config_curves_pictures_and_table(toy):
+    cfg = toy("logger=wandb", "report.pictures=true")
+    metrics = train(cfg)
+    folder = runs.run_folder(cfg)
+    config, rows, summary, record = read(folder)
+    assert (record.run_group, record.job_type) == ("quickstart", "train")
+    assert (record.project, record.display_name) == ("qs3", "quickstart-seed0")
+    assert record.run_id == runs.run_name(cfg).replace("/", "-")
+    assert list(record.tags) == list(cfg.logger.wandb.tags)
+    assert {"specklenet10 -> kinectsim10", "qbst", "simulated"} <= set(record.tags)
+    assert config["protocol"]["epochs"] == 4
+    history = table(folder / "history.csv")
+    losses = [row["train/loss"] for row in rows if "train/loss" in row]
+    assert losses == pytest.approx([float(row["train/loss"]) for row in history])
+    logged = {key: value for row in rows for key, value in row.items() if key.startswith("pict")}
+    assert sorted(logged) == sorted(f"pictures/{name}" for name in ALL)
+    (files,) = folder.glob("wandb/offline-run-*/files")
+    for name in ALL:
+        value = logged[f"pictures/{name}"]
+        assert value["_type"] == "image-file"
+        drawn = (folder / "pictures" / f"{name}.png").read_bytes()
+        assert (files / value["path"]).read_bytes() == drawn
+    (confusion,) = [row["confusion"] for row in rows if "confusion" in row]
+    content = json.loads((files / confusion["path"]).read_text())
+    assert content["columns"] == ["true class", *CLASSES]
+    expected = metrics["final"]["confusion"]
+    assert content["data"] == [[c, *row] for c, row in zip(CLASSES, expected, strict=True)]
+    assert summary["final/accuracy"] == metrics["final"]["accuracy"]
+
+
+def test_nothing_to_draw_is_said(run):
+    (run / "history.csv").write_text("epoch,phase,lr\n")
+    with pytest.raises(NothingToDrawError, match="no epoch"):
+        run_figures.curves(read_run(run))

@@ -1,0 +1,124 @@
+"""Mean and SEM, and above all what must not be averaged."""
+
+import math
+import statistics
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from qs3.report.tables.aggregate import Stat, align, group, load_run, load_runs, summarise
+from tests.report.made_runs import write_run
+
+
+def test_mean_and_sem_by_hand():
+    stat = Stat.of([0.1, 0.2, 0.6])
+    assert stat.mean == pytest.approx(0.3)
+    assert stat.sem == pytest.approx(math.sqrt((0.04 + 0.01 + 0.09) / 2 / 3))
+    assert stat.n == 3
+    assert Stat.of([0.64, 0.66, 0.62]).percent() == "64.0 ± 1.2"
+    assert Stat.of([0.5]) == Stat(0.5, None, 1)
+    assert Stat.of([0.5]).percent() == "50.0"
+
+
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=9))
+def test_agrees_with_the_standard_library(values):
+    stat = Stat.of(values)
+    assert stat.mean == pytest.approx(statistics.fmean(values), abs=1e-12)
+    expected = statistics.stdev(values) / math.sqrt(len(values))
+    assert stat.sem == pytest.approx(expected, abs=1e-9)
+
+
+def test_groups_by_hash_not_by_seed(tmp_path):
+    for seed in (2, 0, 1):
+        write_run(tmp_path, seed=seed, accuracy=0.5 + seed / 100)
+    write_run(tmp_path, hash="ffff0000", accuracy=0.9)
+    groups = {g.hash: g for g in group(load_runs(tmp_path))}
+    assert set(groups) == {"0123abcd", "ffff0000"}
+    assert groups["0123abcd"].seeds == [0, 1, 2]
+    stat = groups["0123abcd"].stat("final", "accuracy")
+    assert stat is not None
+    assert (stat.mean, stat.n) == (pytest.approx(0.51), 3)
+    assert groups["0123abcd"].problems == ()
+
+
+def test_unfinished_failed_and_damaged_seeds_are_shown(tmp_path):
+    write_run(tmp_path, seed=0)
+    begun = tmp_path / "exp" / "seed1-0123abcd"
+    begun.mkdir()
+    (begun / "started.json").write_text("{}")
+    (write_run(tmp_path, seed=2) / "metrics.json").write_text('{"seed": 2, "sta')
+    write_run(tmp_path, seed=3, status="failed")
+    (write_run(tmp_path, seed=4) / "metrics.json").write_text("[]")
+    (found,) = group(load_runs(tmp_path))
+    assert found.seeds == [0]
+    text = "\n".join(found.problems)
+    assert f"seed 1: unfinished ({begun})" in text
+    assert "seed 2: metrics.json is not readable" in text
+    assert "seed 3: failed" in text
+    assert "seed 4: metrics.json has no experiment" in text
+    stat = found.stat("final", "accuracy")
+    assert stat is not None
+    assert stat.n == 1
+
+
+@pytest.mark.parametrize("role", ["source", "target"])
+def test_other_data_are_not_averaged(tmp_path, role):
+    write_run(tmp_path, seed=0)
+    write_run(tmp_path, seed=1)
+    data = {"source": "a" * 64, "target": "b" * 64, role: "c" * 64}
+    write_run(tmp_path, seed=2, data=data)
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("final", "accuracy") is None
+    assert f"the {role} dataset differs" in found.problems[0]
+    assert "seeds 2: cccccccccccc" in found.problems[0]
+    assert "not averaged" in summarise([r.folder for r in load_runs(tmp_path)])
+
+
+def test_a_seed_twice_is_not_averaged(tmp_path):
+    write_run(tmp_path / "a", seed=0)
+    write_run(tmp_path / "b", seed=0)
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("final", "accuracy") is None
+    assert "seeds 0 occur more than once" in found.problems[0]
+
+
+def test_values_that_are_no_numbers(tmp_path):
+    write_run(tmp_path, final={"accuracy": None, "balanced_accuracy": float("nan")})
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("final", "accuracy") is None
+    assert found.stat("final", "balanced_accuracy") is None
+    assert found.stat("final", "absent") is None
+    assert found.stat("absent", "deeper") is None
+
+
+def test_summary_of_a_multirun(tmp_path):
+    folders = [write_run(tmp_path, seed=s, accuracy=0.62 + 0.02 * s) for s in range(3)]
+    folders += [write_run(tmp_path, hash="ff00", method="source_only", selftraining="none")]
+    folders += [tmp_path / "exp" / "seed1-ff00"]
+    lines = summarise(folders).splitlines()
+    assert "mean ± SEM over seeds" in lines[0]
+    assert lines[1].split("  ")[0] == "experiment"
+    assert "specklenet10 -> kinectsim10 (simulated target)" in lines[3]
+    for part in ("pcm", "qbst", "64.0 ± 1.2", "54.0 ± 1.2"):
+        assert part in lines[3]
+    assert lines[3].endswith("  45.0")  # a property of the data: no SEM
+    assert "1 (!)" in lines[4]
+    assert lines[5] == f"exp ff00, seed 1: no result ({tmp_path / 'exp' / 'seed1-ff00'})"
+    assert lines[6] == "(!) fewer than 3 seeds"
+    starts = [line.index("  ") for line in lines[1:3]]
+    assert len(set(starts)) == 1
+
+
+def test_summary_of_nothing_finished(tmp_path):
+    text = summarise([tmp_path / "exp" / "seed0-ab"])
+    assert "no result" in text
+
+
+def test_load_run_of_another_name(tmp_path):
+    run = load_run(tmp_path / "elsewhere")
+    assert (run.seed, run.status) == (None, "unfinished")
+
+
+def test_align():
+    assert align([("a", "bb"), ("ccc", "d")]) == ["a    bb", "---  --", "ccc  d"]

@@ -1,0 +1,291 @@
+"""`report run` fills a table with real trainings, `report compare` says how rows differ."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import ConfigError
+from qs3.report.__main__ import main
+from qs3.report.tables.comparison import against, csv_text, effects, text
+from qs3.report.tables.running import Job, _chosen, _why, launch, missing, run_all
+from qs3.report.tables.table import Table, build_table
+from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
+from tests.report.tables.test_tables import run_cell
+from tests.training.toy import overrides, write_toy
+
+ROOT = Path(__file__).parents[3]
+
+
+def jobs_of(tmp_path, *rows, seeds=(0, 1, 2)):
+    return missing(build_table("cad10", tmp_path), seeds, rows)
+
+
+def test_only_what_is_missing_is_run(tmp_path):
+    table = build_table("cad10", tmp_path)
+    cells = {cell.row: cell for cell in table.cells}
+    run_cell(tmp_path, cells["DANN"], seeds=(0, 2))
+    assert [job.name for job in jobs_of(tmp_path, "dann")] == ["DANN, seed 1"]
+    assert [job.name for job in jobs_of(tmp_path, "adabn", "dann", seeds=(0,))] == ["AdaBN, seed 0"]
+    everything = jobs_of(tmp_path)
+    assert len(everything) == 3 * len(table.rows) - 2
+    assert everything[0].command.startswith("python train.py experiment=cad10 ")
+
+
+def test_runs_that_cells_share_are_run_once(tmp_path):
+    """factorial's last row is one run in two columns."""
+    table = build_table("factorial", tmp_path)
+    jobs = missing(table, [0])
+    assert len(jobs) == len(table.cells) - 1
+    assert len({job.overrides for job in jobs}) == len(jobs)
+
+
+def test_unknown_row(tmp_path):
+    with pytest.raises(ConfigError, match="no row of table cad10 has 'danm' in its name"):
+        jobs_of(tmp_path, "danm")
+
+
+def test_one_cell(tmp_path):
+    table = build_table("factorial", tmp_path)
+    every = missing(table, [0])
+    row, column = next((c.row, c.column) for c in table.cells if c.runnable)
+    (job,) = missing(table, [0], [row], [column])
+    assert job.name == f"{row}, {column}, seed 0"
+    assert len(missing(table, [0], columns=[column])) < len(every)
+    cells = [cell for cell in build_table("self_training", tmp_path).cells if cell.runnable]
+    chosen = _chosen((cell.column for cell in cells), ["s -> d"])
+    assert len([cell for cell in cells if cell.column in chosen]) == len(cells) / 2
+    names = ["PCM", "DefRec+PCM", "DANN", "PCM + QBST"]
+    assert _chosen(names, ["pcm"]) == {"PCM"}  # the row of that name, not all that contain it
+    assert _chosen(names, ["qbst", "dann"]) == {"PCM + QBST", "DANN"}
+    assert _chosen(names, ["rec+p"]) == {"DefRec+PCM"}
+    assert _chosen(names, []) == set(names)
+    with pytest.raises(ConfigError, match=r"no column of table .* has 'x' in its name; columns to"):
+        missing(table, [0], columns=["x"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["launcher=ray"], "launcher=ray; set launcher=joblib|submitit_local|submitit_slurm|slurm"),
+        (["hydra.launcher.partition=gpu"], "partition=gpu needs a launcher; set launcher=joblib|"),
+        (["jobs=0", "launcher=joblib"], "jobs must be at least 1"),
+    ],
+)  # fmt: skip
+def test_what_is_refused(words, message, tmp_path, capsys):
+    assert main(["run", "table=cad10", f"log_dir={tmp_path}", *words]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_nothing_to_launch():
+    assert launch([], "joblib", 2, "logs") == 0
+
+
+def start(job: Job, output: Path) -> subprocess.Popen[bytes]:
+    code = (
+        "import sys, time; time.sleep(0.3); print('[12:00:00] accuracy', sys.argv[1:]);"
+        "sys.exit('bad' in sys.argv[1])"
+    )
+    with open(output, "wb") as file:
+        return subprocess.Popen([sys.executable, "-c", code, *job.overrides], stdout=file)
+
+
+def test_a_failure_stops_nothing_and_is_told():
+    jobs = [Job(name, (name,)) for name in ("one", "bad", "three", "four")]
+    lines: list[str] = []
+    failed = run_all(jobs, 2, lines.append, start)
+    assert [job.name for job in failed] == ["bad"]
+    assert len(lines) == 4
+    assert lines[-1].startswith("[4/4] ")
+    (told,) = [line for line in lines if "FAILED" in line]
+    assert "python train.py bad" in told
+    assert "accuracy ['bad']" in told  # the end of its output
+    assert sum("accuracy ['one']" in line for line in lines) == 1
+
+
+def test_a_failed_run_shows_its_error_from_the_first_line():
+    lines = [*(f"epoch {i}" for i in range(20)), "MissingDataError: domain x is not there"]
+    lines += [*(f"    looked for {i}" for i in range(5)), ""]
+    lines += ["Set the environment variable HYDRA_FULL_ERROR=1 for a complete stack trace."]
+    assert list(_why(lines)) == [lines[20], *lines[21:26]]
+    assert list(_why(["a", "b"])) == ["a", "b"]
+
+
+def test_processes_do_not_outlive_an_interruption():
+    started: list[subprocess.Popen[bytes]] = []
+
+    def slow(job: Job, output: Path) -> subprocess.Popen[bytes]:
+        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]))
+        if len(started) == 2:
+            raise KeyboardInterrupt
+        return started[-1]
+
+    with pytest.raises(KeyboardInterrupt):
+        run_all([Job("a", ()), Job("b", ())], 2, print, slow)
+    assert started[0].returncode is not None
+    last = started.pop()  # never handed over
+    last.kill()
+    last.wait()
+
+
+def fill(log_dir: Path, name: str, right_of: dict[tuple[str, str], int]) -> Table:
+    """A table whose runs are right about so many of 20 clouds, the same for all seeds."""
+    cells = {(cell.row, cell.column): cell for cell in build_table(name, log_dir).cells}
+    for place in right_of:
+        run_cell(log_dir, cells[place])
+    for cell in build_table(name, log_dir).cells:
+        if (cell.row, cell.column) not in right_of:
+            continue
+        assert cell.group is not None
+        predicted = (np.arange(20) >= right_of[cell.row, cell.column]).astype(int)
+        names, labels = tuple(map(str, range(20))), np.zeros(20, dtype=int)
+        said = Predictions(("a", "b"), names, names, labels, np.eye(2)[predicted])
+        for run in cell.group.finished:
+            write_predictions(run.folder / FILE, said)
+    return build_table(name, log_dir)
+
+
+def test_compare_by_hand(tmp_path):
+    rows = {"source only": 10, "DANN": 14, "PCM": 10}
+    table = fill(tmp_path, "cad10", {(row, "target test"): n for row, n in rows.items()})
+    found = {one.name: one for one in against(table, "source only")}
+    assert len(found) == len(table.rows) - 1
+    dann, pcm = found["DANN"].differences, found["PCM"].differences
+    assert dann is not None
+    assert pcm is not None
+    assert dann[0].mean == pytest.approx(0.2)
+    assert (dann[0].seeds, dann[0].meshes) == (3, 20)
+    assert pcm[0].mean == 0
+    assert found["GAST"].why == "not run"
+    shown = text(list(found.values()), "source only")
+    assert "minus source only" in shown
+    assert "DANN" in shown
+    assert "+20.0 [" in shown
+    assert "(20 meshes)" in shown
+    assert "GAST" in next(line for line in shown.splitlines() if line.endswith(": not run"))
+    assert "simulated" not in shown
+    for markdown in (False, True):
+        shown = text(list(found.values()), "source only", markdown, table)
+        assert shown.splitlines()[0].removeprefix("## ") == table.title
+        assert "SIMULATED target: kinectsim10" in shown.splitlines()
+    rows = list(csv.DictReader(io.StringIO(csv_text(list(found.values()), table))))
+    assert len(rows) == 2 * len(found)
+    (row,) = (r for r in rows if (r["name"], r["metric"]) == ("DANN", "accuracy"))
+    assert float(row["difference"]) == pytest.approx(20)
+    assert (row["seeds"], row["meshes"], row["simulated"]) == ("3", "20", "true")
+    with pytest.raises(ConfigError, match="no row 'x'"):
+        against(table, "x")
+
+
+def test_what_a_table_does_not_average_is_not_compared(tmp_path):
+    place = "target test"
+    table = fill(tmp_path, "cad10", {("source only", place): 10, ("DANN", place): 14})
+    cells = {cell.row: cell for cell in table.cells if cell.group}
+    shown = text(against(table, "source only"), "source only")
+    assert "each counts as one of its own" in shown  # these predictions know no objects
+
+    def compared(path, target):
+        metrics = json.loads(path.read_text())
+        metrics["data"]["target"] = target
+        path.write_text(json.dumps(metrics))
+        again = build_table("cad10", tmp_path)
+        (one,) = (one for one in against(again, "source only") if one.name == "DANN")
+        return one
+
+    paths = [run.folder / "metrics.json" for run in cells["DANN"].group.finished]
+    one = compared(paths[0], "c" * 64)
+    assert one.differences is None
+    assert "not averaged" in one.why
+    compared(paths[1], "c" * 64)
+    one = compared(paths[2], "c" * 64)  # all of its seeds, but not the base's
+    assert one.differences is None
+    assert "different versions of the target" in one.why
+
+
+def test_objects_that_are_known_are_counted(tmp_path):
+    """Twenty clouds of four objects."""
+    place = "target test"
+    table = fill(tmp_path, "cad10", {("source only", place): 10, ("DANN", place): 14})
+    names = tuple(map(str, range(20)))
+    for cell in table.cells:
+        for run in cell.group.finished if cell.group else ():
+            said = read_predictions(run.folder / FILE)
+            meshes = tuple(str(i // 5) for i in range(20))
+            known = Predictions(said.classes, names, meshes, said.labels, said.probabilities)
+            write_predictions(run.folder / FILE, known)
+    (one,) = (one for one in against(table, "source only") if one.differences)
+    assert one.differences[0].meshes == 4
+    assert "each counts as one of its own" not in text([one])
+
+
+def test_effects_by_hand(tmp_path):
+    scratch, source = "from scratch on the target", "continued, with source"
+    half = {
+        ("QBST", scratch): 8,
+        ("QBST", source): 14,
+        ("SPST", scratch): 10,
+        ("SPST", source): 12,
+    }
+    scheme = f"{source} minus {scratch}, over QBST, SPST, CBST, all confident"
+    found = {one.name: one for one in effects(fill(tmp_path / "half", "factorial", half))}
+    assert found[scheme].why == "not run"  # two rows of four
+    spst = found[f"SPST minus QBST, over {scratch}, {source}"].differences
+    assert spst is not None
+    assert spst[0].mean == pytest.approx(0)  # (10 - 8 + 12 - 14) / 40
+    # no column changes the teacher of all, so it says nothing of columns
+    assert not any("none" in name.split(", over ")[1] for name in found)
+
+    rest = {(row, column): 9 for row in ("CBST", "all confident") for column in (scratch, source)}
+    table = fill(tmp_path / "all", "factorial", {**half, **rest})
+    (one,) = (one for one in effects(table) if one.name == scheme)
+    assert one.differences is not None
+    assert one.differences[0].mean == pytest.approx((6 + 2 + 0 + 0) / 4 / 20)
+    assert "+10.0 [" in text([one])
+
+
+@pytest.mark.slow
+def test_a_table_of_real_trainings(tmp_path):
+    """Two rows, two seeds, two at a time; a second call has nothing to do; rows are compared."""
+    write_toy(tmp_path / "data")
+    toy = [word for word in overrides(tmp_path)[1:] if not word.startswith("paths.")]
+    rows = [word for word in toy if not word.startswith("selftraining.")]
+    options = [
+        "table=quickstart", f"log_dir={tmp_path / 'logs'}", f"data_dir={tmp_path / 'data'}",
+        f"overrides={shlex.join(rows)}",
+    ]  # fmt: skip
+
+    def report(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "qs3.report", *words, *options],
+            cwd=ROOT, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
+            check=False,
+        )  # fmt: skip
+
+    first = report("run", "rows=speckle", "seeds=0,1", "jobs=2")
+    assert first.returncode == 0, first.stdout + first.stderr
+    assert "4 runs to do" in first.stdout
+    assert "[4/4]" in first.stdout
+    again = report("run", "rows=speckle", "seeds=0,1")
+    assert "0 runs to do" in again.stdout
+    more = ["rows=(S)", "seeds=0,1,2,3", "hydra.launcher.verbose=1"]
+    launched = report("run", *more, "launcher=joblib", "jobs=2")
+    assert launched.returncode == 0, launched.stdout + launched.stderr
+    assert "n_jobs=2" in launched.stdout
+    assert " 2 (!)" in launched.stdout  # the summary of the two that were missing
+    again = report("run", "rows=(S)", "seeds=0,1,2,3", "launcher=submitit_local")
+    assert again.returncode == 0
+    assert "0 runs to do" in again.stdout
+    compared = report("compare", "base=source only, speckle scans (S)")
+    assert compared.returncode == 0, compared.stderr
+    assert "QS3 = PCM + QBST, speckle scans  " in compared.stdout
+    assert "PCM, speckle scans: a warm-up's predictions are not kept" in compared.stdout
+    assert (tmp_path / "logs" / "tables" / "quickstart-compared.md").is_file()

@@ -1,0 +1,184 @@
+"""Tables: every cell composes, finds its runs by their hash, and shows what is missing."""
+
+import csv
+import io
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+from omegaconf import OmegaConf
+
+from qs3.errors import ConfigError
+from qs3.report.__main__ import main
+from qs3.report.tables import table as tables
+from qs3.report.tables.cells import Published
+from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
+from qs3.report.tables.table import build_table, composing
+from qs3.runs.folder import config_hash, run_folder
+from tests.report.made_runs import write_run
+
+EXPECTED = ("ablation", "noise", "quickstart", "self_training", "uda")
+
+
+def run_cell(log_dir, cell, seeds=(0, 1, 2), **changes):
+    """Leave results for a cell, as if its command had been run."""
+    with composing() as compose:
+        for seed in seeds:
+            cfg = compose("train", [*cell.overrides, f"seed={seed}"])
+            folder = write_run(
+                log_dir,
+                experiment=cfg.experiment_name,
+                hash=config_hash(cfg),
+                seed=seed,
+                **{"accuracy": 0.5 + seed / 100, **changes},
+            )
+            assert folder.resolve() == run_folder(cfg)  # so that what we fake is what is looked for
+
+
+def test_every_cell_composes(empty):
+    assert set(EXPECTED) <= set(empty)
+    for table in empty.values():
+        assert table.cells
+        for cell in table.cells:
+            assert cell.missing == "" or "Could not find" in cell.missing
+
+
+def test_the_papers_numbers(empty):
+    paper = {(c.row, c.column): c.paper for c in empty["uda"].cells}
+    assert paper["PCM + QBST (from S it is QS3)", "S → D"] == Published(72.4, 0.8)
+    assert paper["DGCNN (w/o adapt)", "M → D"] == Published(46.7, 1.4)
+    best = {(c.row, c.column): c.paper for c in empty["ablation"].cells}
+    assert best["SimpleView", "B → D"] == Published(65.1, 0.2)
+
+
+def test_cells_differ(empty):
+    for name in EXPECTED:
+        commands = [(c.overrides, c.take) for c in empty[name].cells if c.row != "Supervised"]
+        assert len(set(commands)) == len(commands)
+
+
+def test_quickstart_filled(tmp_path):
+    empty = build_table("quickstart", tmp_path)
+    # PCM is the warm-up of QS3: one command fills both rows.
+    assert markdown(empty).count("python train.py experiment=quickstart") == 3
+    assert markdown(empty).count("not run") == 8
+    for cell in empty.cells[:2]:
+        run_cell(tmp_path, cell)
+    warmup = {"selected": {"accuracy": 0.52, "balanced_accuracy": 0.42, "epoch": 7}}
+    run_cell(tmp_path, empty.cells[3], seeds=(0,), accuracy=0.7, warmup=warmup)
+    text = markdown(build_table("quickstart", tmp_path))
+    lines = text.splitlines()
+    rows = [[word.strip() for word in line.split("|")[1:-1]] for line in lines]
+    assert rows[2] == [
+        "method", "accuracy % (simulated)", "balanced accuracy % (simulated)", "seeds"
+    ]  # fmt: skip
+    assert ["source only, speckle scans (S)", "51.0 ± 0.6", "41.0 ± 0.6", "0, 1, 2"] in rows
+    assert ["PCM, speckle scans", "52.0 (n=1)", "42.0 (n=1)", "0"] in rows
+    assert ["QS3 = PCM + QBST, speckle scans", "70.0 (n=1)", "60.0 (n=1)", "0"] in rows
+    assert len({len(line) for line in lines[2:8]}) == 1  # aligned
+    assert "simulated target kinectsim10" in text
+    assert "not the paper's protocol" in text
+    assert "majority rate of the simulated target kinectsim10: 45.0 %" in text
+    assert "teacher selected by: source_val\n" in text
+    # What has one seed: both rows are filled by the same command.
+    shown = [line for line in lines if line.startswith("python train.py")]
+    assert shown == [build_table("quickstart", tmp_path).cells[3].command]
+    assert f"{TO_RUN}:" in lines
+    run_cell(tmp_path, empty.cells[3], seeds=(1, 2), accuracy=0.7, warmup=warmup)
+    assert TO_RUN not in markdown(build_table("quickstart", tmp_path))
+
+
+def test_paper_beside_ours(tmp_path, empty):
+    cell = next(c for c in empty["uda"].cells if c.paper == Published(72.4, 0.8))
+    cell = replace(cell, overrides=(*cell.overrides, f"paths.log_dir={tmp_path}"))
+    run_cell(tmp_path, cell, target="depthscannet10", simulated=False)
+    table = build_table("uda", tmp_path)
+    text = markdown(table)
+    assert "| 51.0 ± 0.6        | 72.4 ± 0.8 |" in text
+    assert "majority rate of the target depthscannet10: 45.0 %" in text
+    assert r"51.0 $\pm$ 0.6 & 72.4 $\pm$ 0.8 \\" in latex(table)
+    rows = list(csv.DictReader(io.StringIO(csv_text(table))))
+    (ours,) = [row for row in rows if row["n"] != "0"]
+    assert float(ours["mean"]) == pytest.approx(51)
+    assert (ours["paper_mean"], ours["paper_sem"], ours["seeds"]) == ("72.4", "0.8", "0 1 2")
+    assert ours["command"].startswith("python train.py experiment=qs3_s2d")
+
+
+def test_problems_reach_the_reader(tmp_path):
+    cell = build_table("quickstart", tmp_path).cells[0]
+    run_cell(tmp_path, cell, seeds=(0, 1))
+    run_cell(tmp_path, cell, seeds=(2,), data={"source": "x", "target": "y"})
+    text = markdown(build_table("quickstart", tmp_path))
+    assert "| not averaged † " in text
+    assert "the source dataset differs" in text
+
+
+def test_another_target(tmp_path):
+    table = build_table("uda", tmp_path, target="kinectsim10")
+    assert all("domain@data.target=kinectsim10" in c.overrides for c in table.cells)
+    assert all(c.paper is None for c in table.cells)
+    assert "which is not the paper's" in markdown(table)
+    assert "on another target: kinectsim10" in markdown(table)
+    upper = [c for c in table.cells if "experiment=supervised_d" in c.overrides]
+    assert upper
+    for cell in table.cells:  # the upper bound is trained on the other target, too
+        assert ("domain@data.source=kinectsim10" in cell.overrides) == (cell in upper)
+    with pytest.raises(ConfigError, match=r"no domain \(did you mean kinectsim10\?\)"):
+        build_table("uda", tmp_path, target="kinectsim1")
+
+
+def test_extra_overrides_are_part_of_the_command(tmp_path):
+    table = build_table("quickstart", tmp_path, extra=["data.points=64"])
+    assert f"data.points=64 paths.log_dir={tmp_path} seed=0,1,2 -m" in table.cells[0].command
+    with pytest.raises(ConfigError, match=r"table cell 'source only, surface.*no_such_key"):
+        build_table("quickstart", tmp_path, extra=["no_such_key=1"])
+
+
+def test_wrong_tables(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match="there is no table 'x'; there are ablation, cad10, "):
+        build_table("x")
+    monkeypatch.setattr(tables, "CONF", tmp_path)
+    (tmp_path / "table").mkdir()
+    path = tmp_path / "table" / "x.yaml"
+    for text in ("title: [", "title: x\nrows: []", "[]", "a"):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=str(path)):
+            build_table("x")
+
+
+def test_composing_inside_an_application():
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    with initialize_config_dir(str(tables.CONF), version_base="1.3"):
+        outer = GlobalHydra.instance().hydra
+        with composing() as compose:
+            assert OmegaConf.is_config(compose("train", []))
+        assert GlobalHydra.instance().hydra is outer
+
+
+def test_command_line(tmp_path, capsys):
+    assert main(["table=quickstart", f"log_dir={tmp_path}"]) == 0
+    printed = capsys.readouterr().out
+    saved = (tmp_path / "tables" / "quickstart.md").read_text()
+    assert saved in printed
+    assert {p.suffix for p in (tmp_path / "tables").iterdir()} == {".md", ".csv", ".tex", ".html"}
+    argv = ["table=quickstart", f"paths.log_dir={tmp_path}", f"paths.data_dir={tmp_path}/data"]
+    assert main(argv) == 0
+    assert f"paths.data_dir={tmp_path}/data paths.log_dir={tmp_path}" in capsys.readouterr().out
+    assert main(["tabel=quickstart"]) == 1
+    assert "unknown argument 'tabel=quickstart'" in capsys.readouterr().err
+    assert main([f"log_dir={tmp_path}"]) == 1
+    assert "which table?" in capsys.readouterr().err
+    assert main(["--help"]) == 0
+    assert "python -m qs3.report table=" in capsys.readouterr().out
+
+
+def test_the_report_needs_no_torch(tmp_path):
+    code = (
+        "import sys; from qs3.report.__main__ import main\n"
+        "main(['table=quickstart', 'log_dir=' + sys.argv[1]]); sys.exit('torch' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True)
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+import qs3.config.hydra  # noqa: F401 (registers the resolvers)
+from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.runs import folder as runs
+
+CONF = Path(__file__).parents[2] / "conf"
+
+BASE = {
+    "experiment_name": "x",
+    "seed": 0,
+    "force": False,
+    "paths": {"data_dir": "data", "log_dir": "logs"},
+    "data": {
+        "points": 1024,
+        "cache_dir": "cache",
+        "source": {
+            "name": "s",
+            "title": "S",
+            "path": "${paths.data_dir}/s",
+            "variant": "points",
+            "make": "do this",
+            "published": {"folder": "published", "points": 2048},
+        },
+        "target": {"published": None},
+    },
+    "selftraining": {"_target_": "qs3.datamodules.phases.Scheme", "rounds": 2, "theta": 0.8},
+    "logger": {"csv": None},
+    "callbacks": {"progress": {"enabled": True}},
+}
+
+
+def config(**changes):
+    return OmegaConf.merge(
+        OmegaConf.create(BASE), OmegaConf.from_dotlist([f"{k}={v}" for k, v in changes.items()])
+    )
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "seed",
+        "force",
+        "paths.data_dir",
+        "logger.wandb",
+        "callbacks.progress.enabled",
+        "data.source.make",
+        "data.source.synthesis",
+        "data.cache_dir",
+        *(f"data.source.{name}" for name in ("path", "title", "symbol", "published.folder")),
+    ],
+)
+def test_hash_ignores_what_does_not_change_the_result(key):
+    assert runs.config_hash(config(**{key: 7})) == runs.config_hash(config())
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "experiment_name",
+        "data.points",
+        *(f"data.source.{name}" for name in ("name", "variant", "published.points")),
+        "callbacks.mine",
+        "selftraining.theta",
+        "new_key",
+    ],
+)
+def test_hash_sees_everything_else(key):
+    assert runs.config_hash(config(**{key: 7})) != runs.config_hash(config())
+
+
+@pytest.mark.parametrize("none", [{"rounds": 0}, {"_target_": "qs3.datamodules.phases.no_rounds"}])
+def test_hash_ignores_settings_of_rounds_that_there_are_not(none):
+    changes = {f"selftraining.{key}": value for key, value in none.items()}
+    expected = runs.config_hash(config(**changes))
+    assert expected != runs.config_hash(config())
+    assert runs.config_hash(config(**changes, **{"selftraining.theta": 0.5})) == expected
+
+
+def test_hash_in_names_is_the_beginning_of_the_whole_one():
+    whole = runs.config_sha256(config())
+    assert len(whole) == 64
+    assert runs.config_hash(config()) == whole[:8]
+    runs.check_config(Path("run"), whole, whole)
+    with pytest.raises(ConfigError, match=r"run holds a run with other settings.*force=true"):
+        runs.check_config(Path("run"), whole[:8] + "0" * 56, whole)
+    with pytest.raises(ConfigError, match="other settings"):
+        runs.check_config(Path("run"), None, whole)
+
+
+def test_hash_does_not_depend_on_the_order_of_keys():
+    backwards = OmegaConf.create(dict(reversed(BASE.items())))
+    assert runs.config_hash(backwards) == runs.config_hash(config())
+
+
+def test_folder():
+    folder = runs.run_folder(config(seed=3))
+    assert folder.name == f"seed3-{runs.config_hash(config())}"
+    assert folder.parent.name == "x"
+
+
+@pytest.mark.parametrize("seed", [None, "1", 1.0, -1, True])
+def test_seed_must_be_a_whole_number(seed):
+    with pytest.raises(ConfigError, match="seed must be"):
+        runs.check_seed(seed)
+
+
+def test_seed_zero_is_a_seed():
+    assert runs.check_seed(0) == 0
+
+
+def test_metrics_mark_a_finished_run(tmp_path):
+    assert runs.read_metrics(tmp_path) is None
+    runs.write_metrics(tmp_path, {"status": "finished"})
+    assert runs.read_metrics(tmp_path) == {"status": "finished"}
+    (tmp_path / runs.METRICS).write_text("{")
+    with pytest.raises(DataError, match="force=true"):
+        runs.read_metrics(tmp_path)
+
+
+def test_lock(tmp_path):
+    with (
+        runs.locked(tmp_path / "run"),
+        pytest.raises(Qs3Error, match="another process"),
+        runs.locked(tmp_path / "run"),
+    ):
+        pass
+    with runs.locked(tmp_path / "run"):
+        pass
+
+
+def test_lock_says_what_the_other_process_does(tmp_path):
+    with (
+        runs.locked(tmp_path),
+        pytest.raises(Qs3Error, match=rf"another process is making {tmp_path}; wait for it"),
+        runs.locked(tmp_path, doing="making", advice="wait for it"),
+    ):
+        pass
+
+
+def test_lock_where_there_can_be_no_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(Qs3Error, match="cannot make the folder"), runs.locked(tmp_path / "file/x"):
+        pass
+    (tmp_path / "x" / ".lock").mkdir(parents=True)
+    with pytest.raises(Qs3Error, match="cannot write"), runs.locked(tmp_path / "x"):
+        pass
+
+
+def test_clear_keeps_what_hydra_wrote(tmp_path):
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / "round_00").mkdir()
+    for name in (".hydra/config.yaml", "round_00/x.csv", "train.log", "last.ckpt", "metrics.json"):
+        (tmp_path / name).write_text(json.dumps({}))
+    runs.clear(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".hydra", "train.log"]
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["experiment=cad10"], "cad10/seed0-f23ad346"),
+        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-03f7f66a"),
+        (["experiment=qs3_s2d"], "qs3_s2d/seed0-64cbc123"),
+        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-5a5c6274"),
+        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-5a5c6274"),
+        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-5a5c6274"),
+        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-41a8ab39"),
+        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-64cbc123"),
+    ],
+)
+def test_runs_from_before_are_found(words, name):
+    """A new key with its default must not give old runs another name: leave it out of the hash."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert runs.run_name(compose("train", words)) == name

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from qs3.errors import DataError
+from qs3.runs.predictions import Predictions, read_predictions, write_predictions
+
+
+def predictions(labels) -> Predictions:
+    p = np.array([[0.1, 0.7, 0.2], [1 / 3, 1 / 3, 1 / 3]])
+    return Predictions(("a", "b", "c, d"), ("x/1", 'y"2'), ("mesh", 'y"2'), np.array(labels), p)
+
+
+@pytest.mark.parametrize("labels", [[2, 0], [-1, -1]])
+def test_read_as_written(tmp_path, labels):
+    before = predictions(labels)
+    write_predictions(tmp_path / "p.csv", before)
+    after = read_predictions(tmp_path / "p.csv")
+    assert (after.classes, after.ids, after.meshes) == (before.classes, before.ids, before.meshes)
+    np.testing.assert_array_equal(after.labels, labels)
+    np.testing.assert_array_equal(after.probabilities, before.probabilities)  # every digit
+    np.testing.assert_array_equal(after.predicted, [1, 0])
+
+
+HEADER = "id,mesh,label,predicted,p_a\n"
+
+
+@pytest.mark.parametrize("text", ["", "id,mesh\n", HEADER, HEADER + "1,2,q,a,1\n"])
+def test_damage_is_an_error_that_names_the_file(tmp_path, text):
+    path = tmp_path / "p.csv"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"p\.csv cannot be read"):
+        read_predictions(path)
+
+
+def test_a_missing_file_is_an_error_that_names_it(tmp_path):
+    with pytest.raises(DataError, match=r"p\.csv cannot be read"):
+        read_predictions(tmp_path / "p.csv")

@@ -1,0 +1,205 @@
+"""The Kinect in the manner of BlenSor: known values, its window and its fill by brute force."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import Window, look_at
+from qs3.sensors.devices.blensor_kinect import DotMask, spread
+from qs3.sensors.matching.filters import Quantiser
+from qs3.sensors.optics.patterns import Speckle
+from qs3.sensors.optics.smooth_field import smooth_field
+from qs3.sensors.pixel_status import Reason
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.scenery import POSE, box_of, middle, rectangle, scan, square
+
+KINECT = DotMask()
+EXACT = DotMask(field_sigma_px=0.0)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return MitsubaRenderer(samples=4)
+
+
+@pytest.mark.parametrize("depth", [0.9, 1.7, 3.3])
+def test_a_plane_has_the_depth_of_its_rounded_disparity(renderer, depth):
+    frame = scan(EXACT, [square(depth, 0.2 * depth)], renderer)
+    fb = EXACT.focal_px * EXACT.baseline_m
+    expected = fb / (np.rint(fb / depth * 8) / 8)
+    measured = middle(frame.depth_m)
+    valid = np.isfinite(measured)
+    assert valid.mean() > 0.95
+    np.testing.assert_allclose(measured[valid], expected, rtol=1e-5)
+    assert abs(expected - depth) <= EXACT.depth_step_m(depth)
+
+
+def test_noise_is_as_large_as_stated_and_values_are_eighths(renderer):
+    camera = replace(KINECT, column_sigma_px=0.2)
+    exact = camera.focal_px * camera.baseline_m / 1.0
+    spreads = []
+    for seed in range(8):
+        frame = scan(camera, [square(1.0)], renderer, seed=seed)
+        disparity = middle(frame.images["disparity"])
+        values = disparity[np.isfinite(disparity)]
+        np.testing.assert_array_equal(values * 8, np.rint(values * 8))
+        assert len(np.unique(values)) > 5
+        spreads.append(((values - exact) ** 2).mean())
+    expected = 0.2**2 + camera.field_sigma_px**2 + 1 / (12 * 64)
+    assert np.mean(spreads) == pytest.approx(expected, rel=0.1)
+
+
+def test_only_dots_have_values_and_their_neighbours_up_to_the_radius(renderer):
+    bodies = [square(1.5, 0.15)]
+    alone = scan(replace(EXACT, fill_px=0.0), bodies, renderer)
+    filled = scan(EXACT, bodies, renderer)
+    dots = alone.images["left"] == 255
+    valid = np.isfinite(alone.depth_m)
+    assert not (valid & ~dots).any()
+    inner = middle(dots, 0.8)
+    assert inner.mean() == pytest.approx(KINECT.pattern.fill, abs=0.01)
+    assert middle(valid, 0.8).sum() == inner.sum()
+    # A fill needs a wider window: 3 px on each side.
+    assert (alone.left - filled.left, alone.top - filled.top) == (3, 3)
+    slowly = spread_slowly(alone.depth_m, 3.1)
+    np.testing.assert_array_equal(filled.depth_m[3:-3, 3:-3], slowly)
+    assert 0.95 < np.isfinite(middle(slowly)).mean() < 1  # a few pixels are far from any dot
+
+
+def spread_slowly(values, radius):
+    """The twin of `spread`, pixel by pixel."""
+    out = np.full_like(values, np.nan)
+    rows, cols = np.nonzero(np.isfinite(values))
+    for r, c in np.ndindex(values.shape):
+        if not len(rows):
+            break
+        squares = (rows - r) ** 2 + (cols - c) ** 2
+        nearest = squares.argmin()  # the first in reading order
+        if squares[nearest] <= radius**2:
+            out[r, c] = values[rows[nearest], cols[nearest]]
+    return out
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.integers(0, 2**31), st.integers(1, 14), st.integers(1, 14), st.sampled_from([0, 1, 2.5, 3.1])
+)
+def test_filling_is_that_of_the_nearest_dot(seed, height, width, radius):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(height, width)).astype(np.float32)
+    values[rng.uniform(size=values.shape) > 0.15] = np.nan
+    np.testing.assert_array_equal(spread(values, radius), spread_slowly(values, radius))
+
+
+def test_the_window_counts_as_a_loop_over_its_dots_does(renderer):
+    """Two thirds of the dots where the centre's depth would put them, within 5 cm."""
+    camera = replace(EXACT, fill_px=0.0, min_share=2 / 3)
+    bodies = [rectangle(1.2, -0.1, 0.02, -0.05, 0.08), rectangle(1.5, -0.15, 0.15, -0.1, 0.1)]
+    frame = scan(camera, bodies, renderer, explain=True)
+    clean, lit = frame.clean_m, frame.images["lit"]
+    slide = camera.pattern.slide
+    fb = camera.focal_px * camera.baseline_m
+    expected = np.zeros(clean.shape, dtype=bool)
+    for r, c in np.ndindex(clean.shape):
+        if not lit[r, c] or not np.isfinite(clean[r, c]):
+            continue
+        row = frame.top + r
+        col = int(np.rint(frame.left + c - fb / np.float64(clean[r, c])))
+        if not slide[row % 495, col % 633]:
+            continue
+        dots = seen = 0
+        for dr in range(-4, 5):
+            for dc in range(-4, 5):
+                if not slide[(row + dr) % 495, (col + dc) % 633]:
+                    continue
+                dots += 1
+                y, x = r + dr, c + dc
+                if 0 <= y < clean.shape[0] and 0 <= x < clean.shape[1] and lit[y, x]:
+                    seen += bool(abs(clean[y, x] - clean[r, c]) < np.float32(0.05))
+        expected[r, c] = 3 * seen > 2 * dots
+    assert expected.any()
+    np.testing.assert_array_equal(np.isfinite(frame.depth_m), expected)
+
+
+def test_the_projectors_shadow_is_as_wide_as_geometry_says(renderer):
+    near, far = 1.2, 2.4
+    bodies = [square(near, 0.15), square(far, 0.8)]
+    frame = scan(KINECT, bodies, renderer)
+    row = frame.depth_m.shape[0] // 2
+    shadow = frame.reason[row - 10 : row + 10] == Reason.SHADOW
+    width = KINECT.focal_px * KINECT.baseline_m * (1 / near - 1 / far)
+    # The dots' values are spread over its rim by up to 3 px on each side.
+    assert width - 7 < shadow.sum(axis=1).mean() < width + 1
+    left_edge = np.flatnonzero(np.diff((frame.clean_m[row] < 2).astype(int)))[0]
+    assert (np.nonzero(shadow)[1] <= left_edge).all()  # light comes from the right
+
+
+def test_what_is_much_thinner_than_the_window_is_lost(renderer):
+    def share(width_px):
+        half = width_px / 2 / KINECT.focal_px * 1.5
+        frame = scan(KINECT, [rectangle(1.5, -half, half)], renderer)
+        return np.isfinite(frame.depth_m[frame.label == 1]).mean()
+
+    assert share(2) < 0.05
+    assert share(30) > 0.9
+
+
+def test_every_step_th_pixel_of_one_image(renderer):
+    whole = scan(KINECT, [square(1.5)], renderer)
+    sparse = scan(replace(KINECT, step_px=4), [square(1.5)], renderer)
+    assert (sparse.left % 4, sparse.top % 4) == (2, 2)
+    rows = slice(sparse.top - whole.top, None, 4)
+    cols = slice(sparse.left - whole.left, None, 4)
+    for name in ("depth_m", "clean_m", "label", "cosine", "reason"):
+        np.testing.assert_array_equal(getattr(sparse, name), getattr(whole, name)[rows, cols])
+
+
+def test_reasons_bytes_and_empty_views(renderer):
+    frame, again = (scan(KINECT, [square(1.5)], renderer, seed=4) for _ in range(2))
+    assert frame.depth_m.tobytes() == again.depth_m.tobytes()
+    np.testing.assert_array_equal(np.isfinite(frame.depth_m), frame.reason == Reason.OK)
+    assert set(np.unique(frame.reason)) <= {Reason.OK, Reason.EMPTY, Reason.UNMATCHED}
+    far = scan(KINECT, [square(7.0, 1.0)], renderer)
+    assert (middle(far.reason) == Reason.RANGE).mean() > 0.95
+    away = look_at(np.zeros(3), np.array([-1.0, 0.0, 0.0]))
+    body = square(1.5)
+    assert KINECT.scan((body,), box_of(body), away, renderer, np.random.default_rng(0)) is None
+    points = frame.points(frame.clean_m, POSE)
+    assert np.abs(points[:, 0] - 1.5).max() < 1e-5
+
+
+def test_the_field_is_smooth_of_unit_size_and_knows_no_window():
+    whole, part = Window(0, 0, 200, 160), Window(60, 50, 90, 70)
+    fields = np.stack([smooth_field(whole, 32.0, np.random.default_rng(s)) for s in range(60)])
+    assert fields.std() == pytest.approx(1, rel=0.05)
+    assert abs(fields.mean()) < 0.05
+    inside = smooth_field(part, 32.0, np.random.default_rng(7))
+    np.testing.assert_allclose(inside, fields[7][50:120, 60:150], atol=1e-9)
+    # No wave is shorter than 32 px: the slope's variance is (2 pi / 32)^2 / 4 along each axis.
+    slope = np.gradient(fields, axis=2)[:, :, 1:-1]
+    assert slope.std() == pytest.approx(np.pi / 32, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("settings_", "message"),
+    [
+        ({"window_px": 8}, "window_px must be odd"),
+        ({"min_share": 1.0}, "min_share"),
+        ({"fill_px": -1.0}, "fill_px"),
+        ({"step_px": 0}, "step_px"),
+        ({"min_depth_m": 9.0}, "min_depth_m"),
+        ({"baseline_m": 0.0}, "baseline_m"),
+    ],
+)
+def test_wrong_settings_are_refused(settings_, message):
+    with pytest.raises(ConfigError, match=message):
+        DotMask(**settings_)
+
+
+def test_without_a_quantiser_there_is_no_step():
+    assert DotMask(quantiser=Quantiser(0)).depth_step_m(2.0) == 0
+    assert DotMask(pattern=Speckle(dot_px=1)).depth_step_m(2.0) == pytest.approx(4 / (8 * 43.5))

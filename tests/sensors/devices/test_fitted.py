@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import look_at
+from qs3.sensors.devices.fitted import FittedDepth, neighbour_correlation
+from qs3.sensors.pixel_status import Reason
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.devices.test_known_planes import plane
+
+POSE = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+FLAT = np.full((300, 400), 2.0, np.float32)
+FACING = np.ones((300, 400), np.float32)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.5, 4.0), st.floats(0, 0.004), st.floats(0.0005, 0.01), st.sampled_from([1, 2]))
+def test_noise_and_bias_follow_their_laws(depth, floor, factor, power):
+    sensor = FittedDepth(
+        noise_floor_m=floor, noise_factor=factor, noise_power=power, bias_m=(0.01, -0.002)
+    )
+    found, _ = sensor.measure(FLAT / 2 * np.float32(depth), FACING, np.random.default_rng(0))
+    law = floor + factor * depth**power
+    assert sensor.noise_law_m(depth) == pytest.approx(law)
+    assert found.std() == pytest.approx(law, rel=0.02)
+    assert found.mean() - depth == pytest.approx(0.01 - 0.002 * depth, abs=0.02 * law + 1e-5)
+
+
+def test_steps_are_of_one_size_in_what_they_are_said_to_be():
+    slope = np.linspace(1, 3, 120_000, dtype=np.float32).reshape(300, 400)
+    rng = np.random.default_rng(0)
+    inverse, _ = FittedDepth(inverse_step_per_m=0.003).measure(slope, FACING, rng)
+    steps = 1 / inverse / np.float32(0.003)
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-3)
+    whole, _ = FittedDepth(depth_step_m=0.01).measure(slope, FACING, rng)
+    np.testing.assert_allclose(whole * 100, np.rint(whole * 100), atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.8, 2.5])
+def test_neighbours_share_noise_as_stated(size):
+    sensor = FittedDepth(correlation_px=size)
+    error = sensor.measure(FLAT, FACING, np.random.default_rng(1))[0] - 2
+    across = np.corrcoef(error[:, 1:].ravel(), error[:, :-1].ravel())[0, 1]
+    down = np.corrcoef(error[1:].ravel(), error[:-1].ravel())[0, 1]
+    expected = neighbour_correlation(size) if size else 0.0
+    assert across == pytest.approx(expected, abs=0.02)
+    assert down == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("hole", [0.0, 3.0])
+def test_fill_rates_are_interpolated_over_the_tilt(hole):
+    sensor = FittedDepth(tilts_deg=(0, 60), fill_rates=(0.95, 0.35), hole_px=hole)
+    for tilt, rate in ((0, 0.95), (30, 0.65), (60, 0.35), (80, 0.35)):
+        cosine = np.full(FLAT.shape, np.cos(np.deg2rad(tilt)), np.float32)
+        shares = [
+            np.isfinite(sensor.measure(FLAT, cosine, np.random.default_rng(seed))[0]).mean()
+            for seed in range(4)
+        ]
+        assert np.mean(shares) == pytest.approx(rate, abs=0.005 if not hole else 0.03)
+
+
+def test_a_scan_casts_the_projectors_shadow_and_says_why():
+    renderer = MitsubaRenderer(samples=1)
+    near, far, f, b = 1.2, 2.4, 290.0, 0.075
+    front, _ = plane(near, half_m=0.15)
+    back, box = plane(far, half_m=0.8)
+    sensor = FittedDepth(width_px=320, height_px=240, focal_px=f, baseline_m=b)
+    frame = sensor.scan((*front, *back), box, POSE, renderer, np.random.default_rng(0))
+    row = frame.reason[len(frame.reason) // 2]
+    assert (row == Reason.SHADOW).sum() == pytest.approx(f * b * (1 / near - 1 / far), abs=2)
+    assert np.isnan(frame.depth_m[frame.reason == Reason.SHADOW]).all()
+    ok = frame.reason == Reason.OK
+    assert np.abs(frame.depth_m - frame.clean_m)[ok].std() < 0.01
+    again = sensor.scan((*front, *back), box, POSE, renderer, np.random.default_rng(0))
+    assert again.depth_m.tobytes() == frame.depth_m.tobytes()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"noise_factor": -1.0},
+        {"tilts_deg": (0.0, 10.0)},
+        {"fill_rates": (1.2,)},
+        {"tilts_deg": (10.0, 0.0), "fill_rates": (1.0, 1.0)},
+        {"min_depth_m": 9.0},
+        {"hole_px": -1.0},
+        {"step_px": 0},
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        FittedDepth(**wrong)

@@ -1,0 +1,215 @@
+"""Fringe projection obeys its own law, unwraps rightly, and has a projector's shadows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import Camera, Intrinsics, Window, look_at
+from qs3.sensors.devices.fringe import FringeProjection
+from qs3.sensors.optics.fringe_code import FringeCode, phase_of
+from qs3.sensors.optics.subpixel_offsets import sample_centres
+from qs3.sensors.pixel_status import Reason
+from qs3.sensors.renderers.base import Projector, Scene
+from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.scenery import POSE, box_of, middle, scan, square
+
+SIDE = FringeProjection()
+ABOVE = FringeProjection(
+    baseline_m=0.2, code=FringeCode((1.0, 6.0, 36.0), steps=5, along_rows=True)
+)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return MitsubaRenderer(samples=4)
+
+
+def law_of(camera, frame, depth):
+    """The law's sigma for each pixel in the middle of a frame, from what it recorded."""
+    finest = middle(frame.images["exposures"][-camera.code.steps :].astype(float))
+    per_grey = camera.infrared.electrons_at_white / 255
+    electrons = finest.mean(axis=0) * per_grey + camera.infrared.read_noise_e**2
+    noise = np.sqrt(electrons / per_grey**2 + 1 / 12)  # shot, read-out, rounding
+    return camera.depth_sigma_m(depth, noise, middle(frame.images["modulation"]))
+
+
+@pytest.mark.parametrize("camera", [SIDE, ABOVE], ids=["side", "above"])
+@pytest.mark.parametrize("white_level", [70.0, 220.0])
+def test_noise_and_bias_follow_the_stated_law(renderer, camera, white_level):
+    camera = replace(camera, infrared=replace(camera.infrared, white_level=white_level))
+    measured = []
+    for depth in (0.8, 1.5, 2.5):
+        frame = scan(camera, [square(depth, 0.2 * depth)], renderer, seed=int(10 * depth))
+        law, error = law_of(camera, frame, depth), middle(frame.depth_m) - depth
+        assert np.isfinite(error).all()
+        assert (error / law).std() == pytest.approx(1, abs=0.05)
+        assert abs(error.mean()) < 5 * law.mean() / np.sqrt(error.size) + 2e-5
+        measured.append(error.std())
+    # The square of the distance and a little: ambient light takes its share of the exposure.
+    assert np.log(measured[2] / measured[0]) / np.log(2.5 / 0.8) == pytest.approx(2.1, abs=0.2)
+
+
+@pytest.mark.parametrize("make", [MitsubaRenderer, BlenderRenderer])
+@pytest.mark.parametrize("along_rows", [False, True], ids=["columns", "rows"])
+def test_where_a_renderer_looks_does_not_depend_on_the_scene(make, along_rows):
+    """The twin: another plane, further away and larger, and another slide on it."""
+    camera = Camera(Intrinsics.centred(64, 48, 60.0), POSE, Window(20, 10, 16, 12))
+    renderer = make(samples=16)
+    found = sample_centres(camera, renderer, 5, along_rows=along_rows)
+    depth, half, albedo = 2.3, 0.9, 0.6
+    fall = ((np.arange(500) + 0.5) / 500)[::-1].astype(np.float32)  # 1 to 0
+    slide = np.ascontiguousarray(np.broadcast_to(fall[:, None] if along_rows else fall, (500, 500)))
+    scene = Scene((square(depth, 3.0, albedo),), Projector(POSE, slide, half))
+    (image,) = renderer.render(scene, [camera], seed=5, geometry=[False])
+    tangent = half * (1 - 2 * image.radiance.astype(float) * depth**2 / albedo)
+    k = camera.intrinsics
+    expected = tangent * k.focal_px + (k.cy_px if along_rows else k.cx_px)
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    pixels = np.indices(found.shape)[0 if along_rows else 1] + (10 if along_rows else 20)
+    assert 0.005 < (found - pixels).std() < 0.1  # not the centres
+
+
+@pytest.mark.parametrize("make", [MitsubaRenderer, BlenderRenderer])
+def test_samples_do_not_show_as_noise(make):
+    """Without camera noise what is left is far below the law's noise, in either renderer."""
+    quiet = replace(SIDE.infrared, electrons_at_white=1e9, read_noise_e=0.0)
+    camera = replace(SIDE, infrared=quiet, ambient=0.02)
+    frame = scan(camera, [square(1.5, 0.06)], make(samples=4))
+    error = middle(frame.depth_m) - 1.5
+    assert error.std() < 0.1e-3  # 0.58 mm with noise; 1.8 mm if the samples were not known
+    assert abs(error.mean()) < 0.03e-3
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    st.sampled_from([(1.0,), (1.0, 8.0), (0.5, 3.0, 20.0), (1.0, 7.0, 50.0)]),
+    st.integers(3, 9),
+    st.lists(st.floats(0.001, 0.999), min_size=1, max_size=5),
+    st.floats(1, 100),
+    st.floats(0, 100),
+)
+def test_decoding_undoes_the_slides(periods, steps, places, modulation, ambient):
+    code = FringeCode(periods, steps)
+    s = np.array(places)[None]
+    angle = 2 * np.pi * np.array(periods)[:, None, None, None] * s
+    step = 2 * np.pi / steps * np.arange(steps)[:, None, None]
+    exposures = ambient + modulation * (1 + np.cos(angle + step))
+    found, strength, misfit = code.decode(exposures)
+    np.testing.assert_allclose(found, s, atol=1e-9)
+    np.testing.assert_allclose(strength, modulation, rtol=1e-9)
+    assert misfit.max() < 1e-6
+
+
+def test_slides_are_what_decoding_expects():
+    for rows in (False, True):
+        code = FringeCode((1.0, 4.0), steps=4, columns=64, rows=48, along_rows=rows)
+        slides = code.slides
+        assert slides.shape == (2, 4, 48, 64)
+        assert slides.dtype == np.float32
+        assert 0 <= slides.min() < 0.01
+        assert 0.99 < slides.max() <= 1
+        place, _, _ = code.decode(slides.astype(float))
+        length = 48 if rows else 64
+        expected = (np.arange(length) + 0.5) / length
+        expected = expected[:, None] if rows else expected[None]
+        np.testing.assert_allclose(place, np.broadcast_to(expected, place.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [4, 5, 8])
+def test_phase_noise_is_the_textbooks(steps):
+    rng = np.random.default_rng(steps)
+    phase, modulation, noise = 0.7, 50.0, 2.0
+    angle = phase + 2 * np.pi / steps * np.arange(steps)[:, None, None]
+    exposures = 100 + modulation * np.cos(angle) + noise * rng.normal(size=(steps, 200, 200))
+    found, strength = phase_of(exposures)
+    assert (found - phase).std() == pytest.approx(np.sqrt(2 / steps) * noise / modulation, rel=0.02)
+    assert strength.mean() == pytest.approx(modulation, rel=0.01)
+
+
+def test_hardly_a_pixel_is_a_period_off(renderer):
+    """Even where the modulation is near the least that is accepted."""
+    dim = replace(SIDE.infrared, white_level=35.0)
+    camera = replace(SIDE, infrared=dim)
+    frame = scan(camera, [square(1.5, 0.4)], renderer)
+    modulation = middle(frame.images["modulation"])
+    assert 10 < np.median(modulation) < 20
+    error = middle(frame.depth_m) - 1.5
+    found = np.isfinite(error)
+    period = 1.5**2 / camera.baseline_m * 2 * camera.tan_half_width / 64
+    assert found.mean() > 0.9
+    assert (np.abs(error[found]) > period / 2).mean() < 1e-3
+
+
+@pytest.mark.parametrize("camera", [SIDE, ABOVE], ids=["side", "above"])
+def test_the_projectors_shadow_is_as_wide_as_geometry_says(renderer, camera):
+    near, far = 0.8, 1.6
+    bodies = [square(near, 0.1), square(far, 0.5)]
+    frame = scan(camera, bodies, renderer, explain=True)
+    shadow = frame.reason == Reason.SHADOW
+    width = camera.focal_px * camera.baseline_m * (1 / near - 1 / far)
+    if camera.code.along_rows:  # light comes from above, the shadow falls below
+        shadow = shadow.T
+        near_pixels = (frame.clean_m < 1).T
+    else:  # light comes from the right, the shadow falls to the left
+        shadow, near_pixels = shadow[:, ::-1], (frame.clean_m < 1)[:, ::-1]
+    line = len(shadow) // 2
+    # A pixel that is lit in part counts as lit.
+    assert shadow[line - 5 : line + 5].sum(axis=1) == pytest.approx(width, abs=2.5)
+    last = np.flatnonzero(near_pixels[line])[-1]
+    assert np.flatnonzero(shadow[line])[0] >= last
+    plain = scan(camera, bodies, renderer)
+    np.testing.assert_array_equal(plain.depth_m, frame.depth_m)
+    assert (plain.reason[frame.reason == Reason.SHADOW] == Reason.DARK).all()
+
+
+def test_reasons(renderer):
+    def reasons(camera, body):
+        frame = scan(camera, [body], renderer)
+        np.testing.assert_array_equal(np.isfinite(frame.depth_m), frame.reason == Reason.OK)
+        return frame
+
+    frame = reasons(SIDE, square(1.5))
+    empty = ~np.isfinite(frame.clean_m)
+    assert (frame.reason[empty & ~np.isfinite(frame.depth_m)] == Reason.EMPTY).all()
+    loud = replace(SIDE, infrared=replace(SIDE.infrared, white_level=255.0, white_quantile=0.1))
+    assert (middle(reasons(loud, square(1.5)).reason) == Reason.SATURATED).mean() > 0.5
+    assert (middle(reasons(SIDE, square(7.0)).reason) == Reason.RANGE).mean() > 0.99
+    narrow = replace(SIDE, tan_half_width=0.1)
+    beside = reasons(narrow, square(1.0, 0.4))
+    assert (beside.reason == Reason.OUTSIDE).mean() > 0.4
+    bright = replace(SIDE, ambient=20.0)  # the pattern drowns
+    assert (middle(reasons(bright, square(1.5)).reason) == Reason.DARK).all()
+
+
+def test_a_frame_is_complete_and_the_same_bytes_each_time(renderer):
+    frame, again = (scan(SIDE, [square(1.5)], renderer, seed=4) for _ in range(2))
+    assert frame.depth_m.tobytes() == again.depth_m.tobytes()
+    np.testing.assert_allclose(middle(frame.clean_m), 1.5, rtol=1e-5)
+    assert (middle(frame.label) == 1).all()
+    assert (middle(frame.cosine) > 0.9).all()
+    assert frame.images["left"].shape == frame.depth_m.shape
+    away = look_at(np.zeros(3), np.array([-1.0, 0.0, 0.0]))
+    body = square(1.5)
+    assert SIDE.scan((body,), box_of(body), away, renderer, np.random.default_rng(0)) is None
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: FringeCode(steps=2), "at least 3"),
+        (lambda: FringeCode((1.0, 64.0, 8.0)), "must increase"),
+        (lambda: FringeCode((2.0, 8.0)), "at most 1 period"),
+        (lambda: FringeCode((1.0, 200.0)), "at least 8 px"),
+        (lambda: FringeProjection(max_misfit=0.6), "max_misfit"),
+        (lambda: FringeProjection(baseline_m=0.0), "baseline_m"),
+        (lambda: FringeProjection(min_depth_m=7.0), "min_depth_m"),
+    ],
+)
+def test_wrong_settings_are_refused(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()

@@ -1,0 +1,234 @@
+"""Time of flight obeys its own law, folds where it must, and mixes what a pixel sees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import look_at
+from qs3.sensors.devices.gaussian_time_of_flight import GaussianTimeOfFlight
+from qs3.sensors.devices.time_of_flight import SPEED_OF_LIGHT, TimeOfFlight, unwrapped
+from qs3.sensors.grids import on_grid
+from qs3.sensors.pixel_status import Reason
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.scenery import POSE, box_of, middle, rectangle, scan, square
+
+CAMERA = TimeOfFlight()
+# Next to no noise, and a lamp in the lens, so without shadows.
+QUIET = TimeOfFlight(
+    lamp_offset_m=0.0, electrons_at_1m=1e12, full_well_e=1e15, read_noise_e=0.0, ambient=0.0
+)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return MitsubaRenderer(samples=4)
+
+
+def rays(frame):
+    """Length of the ray through each sample at depth 1."""
+    k = frame.camera.intrinsics
+    rows, cols = np.indices(frame.depth_m.shape) * frame.step_px
+    x, y = (frame.left + cols - k.cx_px) / k.focal_px, (frame.top + rows - k.cy_px) / k.focal_px
+    return np.sqrt(1 + x * x + y * y)
+
+
+@pytest.mark.parametrize("albedo", [0.2, 0.8])
+@pytest.mark.parametrize("frequencies", [(16e6,), (80e6, 16e6)], ids=["one", "two"])
+def test_noise_and_bias_follow_the_stated_law(renderer, albedo, frequencies):
+    camera = replace(CAMERA, frequencies_hz=frequencies)
+    seen = []
+    for depth in (1.0, 2.0, 3.5):
+        body = square(depth, half_m=0.3 * depth, albedo=albedo)
+        frame = scan(camera, [body], renderer, seed=int(depth))
+        error = middle((frame.depth_m - depth) * rays(frame))  # along the ray
+        assert np.isfinite(error).all()
+        light = albedo / depth**2  # white at 1 m has radiance 1
+        mean_e = camera.electrons_at_1m * (light + albedo * camera.ambient)
+        sigma = camera.distance_sigma_m(camera.electrons_at_1m * camera.contrast * light, mean_e)
+        assert error.std() == pytest.approx(sigma, rel=0.05)  # of about 8,000 pixels
+        assert abs(error.mean()) < 4 * sigma / np.sqrt(error.size) + 1e-6
+        seen.append(error.std())
+    # Between the first power of the distance (shot noise) and the second (read-out).
+    assert 1.0 < np.log(seen[2] / seen[0]) / np.log(3.5) < 2.0
+
+
+def test_the_preset_is_as_noisy_as_published_cameras():
+    """Azure Kinect: at most 17 mm up to 3.5 m; BlenderProc's fit 0.5 mm + 1 mm/m (z - 0.5)."""
+
+    def sigma(depth, albedo):
+        light = albedo / depth**2
+        mean = CAMERA.electrons_at_1m * (light + albedo * CAMERA.ambient)
+        return CAMERA.distance_sigma_m(CAMERA.electrons_at_1m * CAMERA.contrast * light, mean)
+
+    assert sigma(3.5, 0.2) < 0.017
+    for depth in (1.0, 2.0, 3.0):
+        assert 0.6 < sigma(depth, 0.8) / (0.0005 + 0.001 * (depth - 0.5)) < 1.6
+
+
+def test_one_frequency_folds_distances_back(renderer):
+    camera = replace(CAMERA, frequencies_hz=(40e6,), electrons_at_1m=1e7, full_well_e=1e9)
+    assert camera.ambiguity_m == pytest.approx(SPEED_OF_LIGHT / 80e6)
+    far = 1.2 + camera.ambiguity_m
+    folded = scan(camera, [square(far, 1.0)], renderer)
+    length = middle(rays(folded))
+    distance = middle(folded.depth_m) * length
+    expected = far * length - camera.ambiguity_m
+    np.testing.assert_allclose(distance, expected, atol=0.01)
+    both = replace(camera, frequencies_hz=(40e6, 16e6))  # their gcd, 8 MHz, reaches 18.7 m
+    right = scan(both, [square(far, 1.0)], renderer)
+    np.testing.assert_allclose(middle(right.depth_m), far, atol=0.01)
+
+
+FREQUENCIES = [(16e6,), (80e6, 16e6), (16e6, 80e6, 120e6), (60e6, 80e6), (100e6, 30e6)]
+
+
+@settings(deadline=None)
+@given(
+    st.sampled_from(FREQUENCIES),
+    st.lists(st.floats(0.01, 0.99), min_size=1, max_size=6),
+    st.floats(1.0, 1e4),
+)
+def test_unwrapping_finds_every_distance_in_range(frequencies, shares, amplitude):
+    camera = TimeOfFlight(frequencies_hz=frequencies)
+    true = np.array(shares)[None] * camera.ambiguity_m
+    f = np.array(frequencies)[:, None, None]
+    phase = (4 * np.pi * f * true / SPEED_OF_LIGHT) % (2 * np.pi)
+    amplitudes = amplitude * np.linspace(1, 2, len(f))[:, None, None] * np.ones_like(phase)
+    found, disagreement = unwrapped(phase, amplitudes, frequencies)
+    np.testing.assert_allclose(found, true, atol=1e-6)
+    assert disagreement.max() < 1e-6
+
+
+def edge_scene(camera, near, far, share_of_pixel):
+    """A near rectangle that ends inside pixels of one column, before a far one."""
+    column = 170
+    edge_u = column - 0.5 + share_of_pixel
+    edge = near * (edge_u - camera.intrinsics.cx_px) / camera.focal_px
+    return column, [rectangle(near, -0.2, edge), rectangle(far, -0.4, 0.4)]
+
+
+@pytest.mark.parametrize("thirds", [1, 2])
+def test_a_pixel_on_an_edge_adds_the_phasors_of_both_surfaces(renderer, thirds):
+    camera = replace(QUIET, frequencies_hz=(16e6,))
+    near, far, share = 1.2, 2.0, thirds / 3
+    column, bodies = edge_scene(camera, near, far, share)
+    frame = scan(camera, bodies, renderer, box=box_of(bodies[0]))
+    row = np.argmin(np.abs(frame.top + np.arange(len(frame.depth_m)) - camera.intrinsics.cy_px))
+    mixed = frame.depth_m[row, column - frame.left]
+    # Radiance falls with the square of the depth; near the axis a ray is as long as deep.
+    wave = 4j * np.pi * 16e6 / SPEED_OF_LIGHT
+    length = rays(frame)[row, column - frame.left]
+    phasor = share * np.exp(wave * near * length) / near**2
+    phasor += (1 - share) * np.exp(wave * far * length) / far**2
+    expected = np.angle(phasor) % (2 * np.pi) / abs(wave) / length
+    assert near + 0.05 < expected < far - 0.05
+    assert mixed == pytest.approx(expected, abs=0.002)
+    assert frame.depth_m[row, column - frame.left - 1] == pytest.approx(near, abs=1e-4)
+
+
+def test_without_supersampling_no_pixel_flies(renderer):
+    flying = {}
+    for n in (1, 3):
+        camera = replace(QUIET, supersampling=n)
+        _, bodies = edge_scene(camera, 1.2, 1.5, 0.5)
+        depth = scan(camera, bodies, renderer, box=box_of(bodies[0])).depth_m
+        flying[n] = int(((depth > 1.25) & (depth < 1.45)).sum())
+    assert flying[1] == 0
+    assert flying[3] > 50  # the rectangle is about 126 px high
+
+
+def test_reasons(renderer):
+    def reasons(camera, bodies, **more):
+        frame = scan(camera, bodies, renderer, **more)
+        np.testing.assert_array_equal(np.isfinite(frame.depth_m), frame.reason == Reason.OK)
+        return frame
+
+    ok = reasons(CAMERA, [square(1.0)])
+    assert set(np.unique(ok.reason)) <= {Reason.OK, Reason.EMPTY, Reason.DARK}
+    assert (ok.reason[~np.isfinite(ok.clean_m)] == Reason.EMPTY).mean() > 0.95
+    assert (middle(reasons(CAMERA, [square(4.0, albedo=0.02)]).reason) == Reason.DARK).all()
+    near = replace(CAMERA, min_depth_m=0.1)
+    assert (middle(reasons(near, [square(0.3, 0.1)]).reason) == Reason.SATURATED).all()
+    bright = replace(CAMERA, electrons_at_1m=1e6, full_well_e=1e9)
+    assert (middle(reasons(bright, [square(7.0)]).reason) == Reason.RANGE).all()
+
+
+def test_the_lamps_shadow_is_as_wide_as_geometry_says(renderer):
+    camera = replace(CAMERA, lamp_offset_m=0.1)
+    near, far = 0.8, 2.0
+    bodies = [square(near, 0.1), square(far, 0.6)]
+    frame = scan(camera, bodies, renderer, explain=True)
+    row = frame.depth_m.shape[0] // 2
+    shadow = (frame.reason[row - 5 : row + 5] == Reason.SHADOW).sum(axis=1)
+    width = camera.focal_px * camera.lamp_offset_m * (1 / near - 1 / far)
+    assert shadow == pytest.approx(width, abs=1.5)
+    assert not frame.images["lit"][frame.reason == Reason.SHADOW].any()
+
+
+def test_a_frame_is_the_same_bytes_each_time_and_none_out_of_view(renderer):
+    for camera in (CAMERA, GaussianTimeOfFlight()):
+        a, b = (scan(camera, [square(1.5)], renderer, seed=3) for _ in range(2))
+        assert a.depth_m.tobytes() == b.depth_m.tobytes()
+        away = look_at(np.zeros(3), np.array([-1.0, 0.0, 0.0]))
+        rng = np.random.default_rng(0)
+        body = square(1.5)
+        assert camera.scan((body,), box_of(body), away, renderer, rng) is None
+
+
+def test_frames_are_complete_and_clean_depth_is_exact(renderer):
+    for camera in (CAMERA, GaussianTimeOfFlight(step_px=2)):
+        frame = scan(camera, [square(1.7)], renderer)
+        np.testing.assert_allclose(middle(frame.clean_m), 1.7, rtol=1e-5)
+        np.testing.assert_allclose(middle(frame.cosine) * middle(rays(frame)), 1, rtol=1e-5)
+        assert (middle(frame.label) == 1).all()
+        shapes = {a.shape for a in (frame.depth_m, frame.clean_m, frame.label, frame.reason)}
+        assert len(shapes) == 1
+        types = (frame.depth_m.dtype, frame.clean_m.dtype, frame.label.dtype, frame.reason.dtype)
+        assert types == (np.float32, np.float32, np.uint8, np.uint8)
+        points = frame.points(frame.clean_m, POSE)
+        assert np.abs(points[:, 0] - 1.7).max() < 1e-5
+
+
+def test_blensors_noise_is_one_normal_law_along_the_ray(renderer):
+    camera = GaussianTimeOfFlight(noise_mean_m=0.01)
+    for depth in (1.0, 4.0):
+        frame = scan(camera, [square(depth, 0.3 * depth)], renderer, seed=1)
+        error = middle((frame.depth_m - depth) * rays(frame))
+        assert error.mean() == pytest.approx(0.01, abs=3e-4)
+        assert error.std() == pytest.approx(0.004, rel=0.05)
+
+
+def test_blensors_backfolding_and_reach(renderer):
+    exact = GaussianTimeOfFlight(noise_sigma_m=0.0, backfolding=True)
+    frame = scan(exact, [square(6.0, 1.0)], renderer)
+    length = middle(rays(frame))
+    np.testing.assert_allclose(middle(frame.depth_m) * length, 6.0 * length - 5.0, atol=1e-4)
+    near = replace(exact, max_distance_m=4.0)
+    assert (middle(scan(near, [square(6.0, 1.0)], renderer).reason) == Reason.RANGE).all()
+
+
+@given(st.integers(0, 50), st.integers(1, 50), st.integers(1, 7))
+def test_samples_lie_on_one_grid_whatever_the_window(start, count, step):
+    first, part = on_grid(start, count, step)
+    expected = [x for x in range(start, start + count) if x % step == step // 2]
+    assert list(np.arange(start, start + count)[part]) == expected
+    assert not expected or first == expected[0]
+
+
+@pytest.mark.parametrize(
+    ("settings_", "message"),
+    [
+        ({"frequencies_hz": ()}, "frequencies_hz"),
+        ({"supersampling": 2}, "supersampling must be 1, 3, 5"),
+        ({"contrast": 1.2}, "contrast"),
+        ({"min_depth_m": 7.0}, "min_depth_m"),
+        ({"read_noise_e": -1.0}, "read_noise_e"),
+    ],
+)
+def test_wrong_settings_are_refused(settings_, message):
+    with pytest.raises(ConfigError, match=message):
+        TimeOfFlight(**settings_)

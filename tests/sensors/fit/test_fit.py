@@ -1,0 +1,291 @@
+"""`python -m qs3.sensors.fit` must find what cameras hide."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from qs3.geometry.cameras import look_at
+from qs3.sensors.bench.laws import nguyen_axial_m
+from qs3.sensors.devices.fitted import FittedDepth
+from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
+from qs3.sensors.fit.__main__ import main
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.devices.test_known_planes import plane
+
+POSES = [(0.9, 8), (1.4, -6), (2.0, 10), (3.0, 7), (2.0, 30), (2.0, 55)]
+KINECT = Path(__file__).resolve().parents[4] / "shared" / "data" / "kinect_v1"
+
+HIDDEN = {
+    "steps of 1/Z, smooth holes": FittedDepth(
+        noise_factor=0.0013, inverse_step_per_m=1 / (8 * 43.5), bias_m=(0.004, -0.003),
+        tilts_deg=(0, 40, 70), fill_rates=(0.97, 0.95, 0.6), hole_px=2.0, correlation_px=1.5,
+    ),
+    "noise with a floor, growing with Z": FittedDepth(
+        width_px=320, height_px=240, focal_px=250.0, noise_floor_m=0.001, noise_factor=0.002,
+        noise_power=1.0, bias_m=(0.01,), fill_rates=(0.9,),
+    ),
+    "fine steps, wide noise": FittedDepth(
+        width_px=424, height_px=240, focal_px=212.0, noise_factor=0.004, correlation_px=3.0,
+        inverse_step_per_m=1 / (32 * 10.6), fill_rates=(0.99,), bias_m=(0.0, 0.01),
+    ),
+}  # fmt: skip
+
+
+def wall(sensor, depth_m, tilt_deg, seed):
+    """[h, w] float32 of a wall turned about the vertical axis, depth_m away in the middle."""
+    k, angle = sensor.intrinsics, np.deg2rad(tilt_deg)
+    x = ((np.arange(k.width_px) - k.cx_px) / k.focal_px)[None]
+    y = ((np.arange(k.height_px) - k.cy_px) / k.focal_px)[:, None]
+    along = np.sin(angle) * x + np.cos(angle) + 0 * y
+    with np.errstate(divide="ignore"):
+        clean = np.where(along > 0, depth_m * np.cos(angle) / along, np.inf)
+    cosine = np.abs(along) / np.sqrt(x**2 + y**2 + 1)
+    rng = np.random.default_rng(seed)
+    return sensor.measure(clean.astype(np.float32), cosine.astype(np.float32), rng)[0]
+
+
+def camera_of(sensor):
+    k = sensor.intrinsics
+    return f"{k.focal_px},{k.focal_px},{k.cx_px},{k.cy_px}"
+
+
+def fitted(folder, files, *arguments):
+    out = folder / "found.yaml"
+    assert main([*map(str, files), "--out", str(out), *arguments]) == 0
+    assert out.with_suffix(".png").stat().st_size > 20_000
+    text = out.read_text()
+    settings = yaml.safe_load(text)
+    assert settings.pop("_target_") == "qs3.sensors.devices.fitted.FittedDepth"
+    return FittedDepth(
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+    ), text
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_hidden_parameters_are_recovered(name, tmp_path):
+    hidden, files = HIDDEN[name], []
+    for i, (depth, tilt) in enumerate(POSES):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    distances = ",".join(str(depth) for depth, _ in POSES)
+    found, text = fitted(
+        tmp_path, files, "--intrinsics", camera_of(hidden), "--distances", distances
+    )
+    assert found.noise_power == hidden.noise_power
+    for depth in (0.9, 1.5, 2.5, 3.0):
+        assert found.noise_law_m(depth) == pytest.approx(hidden.noise_law_m(depth), rel=0.1)
+        bias = np.polynomial.polynomial.polyval
+        allowed = 0.001 + 0.1 * hidden.inverse_step_per_m * depth**2
+        assert bias(depth, found.bias_m) == pytest.approx(bias(depth, hidden.bias_m), abs=allowed)
+    assert found.inverse_step_per_m == pytest.approx(hidden.inverse_step_per_m, rel=0.02)
+    assert found.depth_step_m == 0
+    for tilt in (5, 20, 40, 60):
+        rates = [np.interp(tilt, s.tilts_deg, s.fill_rates) for s in (found, hidden)]
+        assert rates[0] == pytest.approx(rates[1], abs=0.02)
+    assert found.correlation_px == pytest.approx(hidden.correlation_px, rel=0.1, abs=0.05)
+    assert "python -m qs3.sensors.fit" in text
+
+
+def test_other_things_before_the_wall_and_millimetre_pictures(tmp_path):
+    hidden = FittedDepth(noise_factor=0.002)
+    files = []
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        image = wall(hidden, depth, tilt, seed=i)
+        image[200:400, 100:300] = 0.6  # a box, a fifth of the view
+        image[:90] = np.nan
+        files.append(tmp_path / f"{i}.png")
+        cv2.imwrite(str(files[-1]), np.nan_to_num(image * 1000).astype(np.uint16))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    assert found.noise_law_m(2.0) == pytest.approx(0.008, rel=0.1)
+    assert found.depth_step_m == pytest.approx(0.001)
+    assert found.inverse_step_per_m == 0
+    assert found.bias_m == (0.0,)
+
+
+def test_one_distance_cannot_tell_the_law(tmp_path):
+    hidden = FittedDepth(noise_factor=0.003)
+    np.save(tmp_path / "a.npy", wall(hidden, 1.5, 4, seed=0))
+    found, text = fitted(tmp_path, [tmp_path / "a.npy"], "--intrinsics", camera_of(hidden))
+    assert found.noise_power == 2
+    assert found.noise_factor == pytest.approx(0.003, rel=0.05)
+    assert "assumed: all walls are equally far" in text
+
+
+def test_the_steps_of_a_simulated_kinect_are_found(tmp_path):
+    """Frames of matched images, not of this model: 1/8 px steps of f b = 43.5 px m."""
+    sensor, renderer = ReferenceSpeckle(), MitsubaRenderer(samples=4)
+    pose = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    files = []
+    for i, (depth, tilt) in enumerate([(1.2, 12), (1.9, -15), (2.6, 20)]):
+        bodies, box = plane(depth, half_m=0.45, tilt_deg=tilt)
+        frame = sensor.scan(bodies, box, pose, renderer, np.random.default_rng(i))
+        whole = np.full((sensor.height_px, sensor.width_px), np.nan, np.float32)
+        height, width = frame.depth_m.shape
+        place = (slice(frame.top, frame.top + height), slice(frame.left, frame.left + width))
+        whole[place] = np.where(frame.label == 1, frame.depth_m, np.nan)
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], whole)
+    found, _ = fitted(tmp_path, files, "--focal", "580")
+    assert 1 / (8 * found.inverse_step_per_m) == pytest.approx(43.5, rel=0.02)
+    assert found.noise_power == 2
+
+
+@pytest.mark.parametrize("share", [0.1, 0.25])
+def test_noise_far_below_a_step_is_found(share, tmp_path):
+    """Taking step^2 / 12 off the variance would leave nothing but its own error."""
+    step, files = 1 / (8 * 43.5), []
+    hidden = FittedDepth(noise_factor=share * step, inverse_step_per_m=step)
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    assert found.noise_law_m(2.0) == pytest.approx(hidden.noise_law_m(2.0), rel=0.05)
+    assert found.correlation_px == 0
+
+
+def test_walls_that_show_too_few_levels_are_refused(tmp_path, capsys):
+    step = 1 / (8 * 43.5)
+    hidden = FittedDepth(noise_factor=0.3 * step, inverse_step_per_m=step)
+    np.save(tmp_path / "a.npy", wall(hidden, 1.5, 0.5, seed=0))
+    out = ["--out", str(tmp_path / "x.yaml")]
+    assert main([str(tmp_path / "a.npy"), "--focal", "580", *out]) == 2
+    assert "turn the camera by a few degrees" in capsys.readouterr().err
+    # Three such walls show the step, but two or three levels each hide noise far below it.
+    quiet = FittedDepth(noise_factor=0.2 * step, inverse_step_per_m=step)
+    files = [str(tmp_path / f"{i}.npy") for i in range(3)]
+    for i, depth in enumerate((1.0, 1.7, 2.5)):
+        np.save(files[i], wall(quiet, depth, 0.2, seed=i))
+    assert main([*files, "--focal", "580", *out]) == 2
+    assert "turn the camera by a few degrees" in capsys.readouterr().err
+
+
+def test_a_lens_that_bends_the_wall_adds_no_noise(tmp_path):
+    hidden, files = FittedDepth(noise_factor=0.001), []
+    bend = 0.01 * np.linspace(-1, 1, 640, dtype=np.float32) ** 3
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i) + bend)
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    for depth in (1.0, 2.0, 3.0):
+        assert found.noise_law_m(depth) == pytest.approx(hidden.noise_law_m(depth), rel=0.1)
+
+
+def test_the_true_distance_is_that_at_the_principal_point(tmp_path):
+    """Half a pixel beside it, a wall at a slant of 60 degrees is 1 % further away."""
+    hidden = FittedDepth(width_px=320, height_px=240, focal_px=90.0, noise_factor=0.0005)
+    files = []
+    for i, (depth, tilt) in enumerate([(1.0, 50), (1.5, -50), (2.0, 50)]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    camera = ["--intrinsics", camera_of(hidden), "--distances", "1,1.5,2"]
+    found, _ = fitted(tmp_path, files, *camera)
+    for depth in (1.0, 1.5, 2.0):
+        assert abs(np.polynomial.polynomial.polyval(depth, found.bias_m)) < 0.0007
+
+
+def test_walls_that_face_the_camera_do_not_hide_their_steps(tmp_path):
+    """Three distances with some levels each, in whole millimetres."""
+    step, files = 1 / (8 * 43.5), []
+    hidden = FittedDepth(
+        noise_factor=0.7 * step, inverse_step_per_m=step, depth_step_m=0.001, fill_rates=(0.93,)
+    )
+    for i, depth in enumerate((1.0, 1.7, 2.5)):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, 0.2, seed=i))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    assert found.inverse_step_per_m == pytest.approx(step, rel=0.02)
+    assert found.depth_step_m == pytest.approx(0.001)
+    assert found.noise_law_m(2.0) == pytest.approx(hidden.noise_law_m(2.0), rel=0.05)
+    assert np.mean(found.fill_rates) == pytest.approx(0.93, abs=0.01)
+
+
+def test_whole_millimetres_alone_are_no_steps_of_a_disparity(tmp_path):
+    hidden = FittedDepth(
+        noise_floor_m=0.0015, noise_factor=0.001, noise_power=1, depth_step_m=0.001
+    )
+    files = []
+    for i, depth in enumerate((1.0, 1.7, 2.5)):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, 0.0, seed=i))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    assert found.inverse_step_per_m == 0
+    assert found.noise_law_m(2.0) == pytest.approx(0.0035, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0.6, 4.0])
+def test_smooth_noise_below_a_step_is_found_to_be_smooth(size, tmp_path):
+    """Rounding tears neighbours apart; a simulation with the same steps knows by how much."""
+    step, files = 1 / (8 * 43.5), []
+    hidden = FittedDepth(noise_factor=0.3 * step, inverse_step_per_m=step, correlation_px=size)
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    assert found.correlation_px == pytest.approx(size, rel=0.15)
+
+
+@pytest.mark.parametrize(("rate", "hole"), [(0.9, 1.0), (0.6, 3.0), (0.5, 8.0)])
+def test_holes_of_any_size_count(rate, hole, tmp_path):
+    hidden, files = FittedDepth(fill_rates=(rate,), hole_px=hole), []
+    for i, (depth, tilt) in enumerate(POSES[:4]):
+        files.append(tmp_path / f"{i}.npy")
+        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    # Four frames hold some 300 holes a frame of the largest size: a few per cent of chance.
+    assert np.mean(found.fill_rates) == pytest.approx(rate, abs=0.01 + 0.004 * hole)
+    assert found.hole_px == pytest.approx(hole, rel=0.15)
+
+
+def test_the_shadow_of_a_thing_is_no_hole_of_the_wall(tmp_path):
+    image = wall(FittedDepth(noise_factor=0.001), 2.0, 5, seed=0)
+    image[200:300, 300:400] = 1.2
+    image[200:300, 280:300] = np.nan
+    np.save(tmp_path / "a.npy", image)
+    found, _ = fitted(tmp_path, [tmp_path / "a.npy"], "--focal", "580")
+    assert min(found.fill_rates) == 1
+
+
+@pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds beside the checkout")
+def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
+    files = sorted(KINECT.glob("*.pcd"))[:4]
+    found, _ = fitted(tmp_path, files, "--focal", "575")
+    # Published geometry: 580 px, 75 mm. Files hold whole millimetres.
+    assert 1 / (8 * found.inverse_step_per_m) == pytest.approx(43.5, rel=0.03)
+    assert found.depth_step_m == pytest.approx(0.001)
+    step = found.inverse_step_per_m * 0.8**2
+    total = np.hypot(found.noise_law_m(0.8), step / np.sqrt(12))
+    assert total == pytest.approx(float(nguyen_axial_m(0.8)), rel=0.3)
+    assert max(found.fill_rates) > 0.98
+
+
+@pytest.mark.parametrize(
+    ("image", "arguments", "message"),
+    [
+        (np.full((60, 80), np.nan, np.float32), [], "no pixel"),
+        (np.random.default_rng(0).uniform(1, 4, (200, 300)), [], "no plane was found"),
+        (np.full((200, 300), 60.0), [], "--unit"),
+        (np.full((200, 300), 2.0), ["--distances", "1,2"], "--distances has 2"),
+        (np.full((200, 300), 2.0), ["--intrinsics", "1,2,3"], "fx,fy,cx,cy"),
+        (np.zeros((5, 5, 3)), [], "no depth image"),
+    ],
+)
+def test_errors_say_what_to_do(image, arguments, message, tmp_path, capsys):
+    np.save(tmp_path / "a.npy", image)
+    camera = [] if "--intrinsics" in arguments else ["--focal", "300"]
+    out = ["--out", str(tmp_path / "x.yaml")]
+    assert main([str(tmp_path / "a.npy"), *camera, *out, *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "x.yaml").exists()
+
+
+def test_a_file_that_is_missing_and_frames_of_two_sizes(tmp_path, capsys):
+    assert main([str(tmp_path / "no.npy"), "--focal", "300", "--out", "x.yaml"]) == 2
+    np.save(tmp_path / "a.npy", np.full((100, 100), 2.0))
+    np.save(tmp_path / "b.npy", np.full((90, 100), 2.0))
+    files = [str(tmp_path / name) for name in ("a.npy", "b.npy")]
+    assert main([*files, "--focal", "300", "--out", str(tmp_path / "x.yaml")]) == 2
+    assert "one size" in capsys.readouterr().err

@@ -1,0 +1,301 @@
+"""Census strings, semi-global paths and sub-pixels: known answers and brute-force twins."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError
+from qs3.sensors.matching import CensusMatcher
+from qs3.sensors.matching.census import _best_of_other
+from qs3.sensors.matching.filters import Quantiser
+from qs3.sensors.matching.hamming import census, count_ones
+from qs3.sensors.matching.semiglobal import aggregate
+from qs3.sensors.matching.subpixel import Fit, linearised, offset
+from qs3.sensors.pixel_status import Reason
+
+FINE = 16  # positions a pixel along a row, and phases
+
+
+def dots(height, width, seed, fill=0.08, dot_px=1.5, sigma_px=0.6):
+    """Projected dots through a lens: [4 height, FINE width], 0..1."""
+    rng = np.random.default_rng(seed)
+    image = np.zeros((4 * height, FINE * width), np.float32)
+    count = round(fill * height * width)
+    rows, columns = rng.integers(0, 4 * height, count), rng.integers(0, FINE * width, count)
+    np.maximum.at(image, (rows, columns), rng.uniform(0.5, 1, count).astype(np.float32))
+    image = cv2.dilate(image, np.ones((round(4 * dot_px), round(FINE * dot_px))))
+    image = cv2.GaussianBlur(image, (0, 0), sigmaX=sigma_px * FINE, sigmaY=sigma_px * 4)
+    return cv2.blur(image, (FINE + 1, 4))  # a pixel's area
+
+
+def seen(texture, shift_px, seed):
+    """Moved right by shift_px; shot noise of 10000 electrons, read noise of a grey value."""
+    at = np.roll(texture, round(shift_px * FINE), axis=1)[2::4, FINE // 2 :: FINE]
+    grey = 15 + 200 * at
+    sigma = np.sqrt(grey * 255 / 10_000 + 1)
+    noisy = grey + sigma * np.random.default_rng(seed).standard_normal(grey.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 8])
+@given(st.lists(st.integers(0, 2**64 - 1), min_size=1, max_size=20))
+def test_ones_are_counted(size, numbers):
+    words = np.array([n % 2 ** (8 * size) for n in numbers], dtype=f"u{size}")
+    np.testing.assert_array_equal(count_ones(words), [int(word).bit_count() for word in words])
+
+
+def brighter(image, window, row, col):
+    """The census string by its definition."""
+    half = window // 2
+    padded = np.pad(image, half, mode="reflect")
+    part = padded[row : row + window, col : col + window].ravel()
+    return np.delete(part > image[row, col], window**2 // 2)
+
+
+@pytest.mark.parametrize("window", [3, 5, 9, 13])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_hamming_distances_equal_a_count_by_hand(window, dtype):
+    rng = np.random.default_rng(window)
+    a, b = (rng.integers(0, 9, (14, 15)).astype(dtype) for _ in range(2))
+    words = zip(census(a, window), census(b, window), strict=True)
+    distance = sum(count_ones(x ^ y).astype(int) for x, y in words)
+    for row, col in itertools.product(range(14), range(15)):
+        by_hand = (brighter(a, window, row, col) != brighter(b, window, row, col)).sum()
+        assert distance[row, col] == by_hand
+
+
+@pytest.mark.parametrize(("low", "first"), [(0, 0), (-3, 6), (-2, -4), (1, 12)])
+def test_costs_equal_sums_by_hand(low, first):
+    rng = np.random.default_rng(1)
+    image = rng.integers(0, 60, (8, 12)).astype(np.uint8)
+    other = (rng.random((8, 20)) * 60).astype(np.float32)
+    count = 5
+    matcher = CensusMatcher(count, low, 5, 3, difference_weight=0.7, difference_cap=20)
+    cost = matcher._cost(image, other, first - (low + count - 1))
+    worst = 24 + 14
+    single = np.zeros((8, 12, count), int)
+    for row, col, j in itertools.product(range(8), range(12), range(count)):
+        column = first + col - (low + count - 1 - j)
+        if not 0 <= column < 20:
+            single[row, col, j] = worst
+            continue
+        bits = brighter(image, 5, row, col) != brighter(other, 5, row, column)
+        grey = abs(int(image[row, col]) - round(float(other[row, column])))
+        single[row, col, j] = bits.sum() + round(0.7 * min(grey, 20))
+    padded = np.pad(single, ((1, 1), (1, 1), (0, 0)), mode="reflect")
+    block = sum(padded[y : y + 8, x : x + 12] for y in range(3) for x in range(3))
+    np.testing.assert_array_equal(cost, block)
+
+
+def path_costs(cost, small, large, step, grey=None, edge=0.0):
+    """One path by recursion over pixels."""
+    height, width, count = cost.shape
+    done = {}
+
+    def at(row, col):
+        if (row, col) not in done:
+            r, c = row - step[0], col - step[1]
+            here = cost[row, col].astype(int)
+            if 0 <= r < height and 0 <= c < width:
+                before, jump = at(r, c), large
+                if grey is not None:
+                    change = abs(float(grey[row, col]) - float(grey[r, c]))
+                    jump = max(small, round(large / (1 + change / edge)))
+                for d in range(count):
+                    near = [before[k] + small for k in (d - 1, d + 1) if 0 <= k < count]
+                    here[d] += min(before[d], *near, min(before) + jump) - min(before)
+            done[row, col] = here
+        return done[row, col]
+
+    return np.array([[at(row, col) for col in range(width)] for row in range(height)])
+
+
+@pytest.mark.parametrize("paths", [4, 8])
+@pytest.mark.parametrize("edge", [0.0, 15.0])
+def test_path_sums_equal_a_recursion_by_hand(paths, edge):
+    rng = np.random.default_rng(paths)
+    cost = rng.integers(0, 90, (6, 7, 4)).astype(np.uint16)
+    grey = rng.integers(0, 100, (6, 7)).astype(np.uint8)
+    steps = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)][:paths]
+    by_hand = sum(path_costs(cost, 5, 31, s, grey if edge else None, edge) for s in steps)
+    np.testing.assert_array_equal(aggregate(cost, 5, 31, paths, grey, edge), by_hand)
+
+
+def test_rows_are_the_same_however_they_are_cut_for_the_horizontal_paths(monkeypatch):
+    cost = np.random.default_rng(0).integers(0, 900, (11, 9, 6)).astype(np.uint16)
+    whole = aggregate(cost, 20, 90, 8)
+    monkeypatch.setattr("qs3.sensors.matching.semiglobal.STRIP_ROWS", 3)
+    np.testing.assert_array_equal(aggregate(cost, 20, 90, 8), whole)
+
+
+def test_the_best_place_of_the_other_image_is_read_along_the_diagonals():
+    total = np.random.default_rng(2).integers(0, 1000, (3, 7, 4)).astype(np.uint16)
+    best = _best_of_other(total)
+    for row, x in itertools.product(range(3), range(7 + 3)):
+        costs = {j: total[row, x - j, j] for j in range(4) if 0 <= x - j < 7}
+        assert best[row, x] == min(costs, key=costs.get)
+
+
+@given(st.floats(-0.5, 0.5), st.floats(1, 90), st.sampled_from(list(Fit)))
+def test_a_fit_returns_the_minimum_of_its_own_curve(true, scale, fit):
+    place = np.array([-1, 0, 1]) - true
+    costs = (place**2 if fit is Fit.PARABOLA else np.abs(place)) * scale + 7
+    found = offset(*costs.astype(np.float32).reshape(3, 1), fit)
+    assert found[0] == pytest.approx(true, abs=1e-3)
+
+
+@given(st.floats(-1, 1))
+@settings(deadline=None)
+def test_linearising_keeps_order_sign_and_ends(a_factor):
+    phase = np.linspace(-0.5, 0.5, 101, dtype=np.float32)
+    out = linearised(phase, a_factor)
+    assert (np.diff(out) > -1e-6).all()
+    np.testing.assert_allclose(out, -out[::-1], atol=1e-6)
+    np.testing.assert_allclose(out[[0, 50, 100]], [-0.5, 0, 0.5], atol=1e-6)
+
+
+TEXTURES = [
+    {"fill": 0.08, "sigma_px": 0.6},
+    {"fill": 0.15, "dot_px": 2.0, "sigma_px": 0.8},
+    {"fill": 0.1, "sigma_px": 1.2},
+]
+
+
+def errors(matcher, texture, true):
+    image, other = (
+        seen(texture, true, [1, int(true * FINE)]),
+        seen(texture, 0, [2, int(true * FINE)]),
+    )
+    return (matcher.match(image, other).disparity - true)[12:-12, 60:-30]
+
+
+@pytest.mark.parametrize("texture", TEXTURES)
+@pytest.mark.parametrize("fit", ["v", "parabola"])
+def test_no_phase_is_biased_and_the_noise_is_that_of_a_real_device(texture, fit):
+    """RealSense D400: 0.03 to 0.10 px on textured walls, in steps of 1/32 px (Intel)."""
+    image = dots(80, 210, 0, **texture)
+    matcher = CensusMatcher(24, 8, fit=fit)
+    medians, pooled = [], []
+    for phase in range(FINE):
+        true = 20 + phase / FINE
+        error = errors(matcher, image, true)
+        assert np.isfinite(error).mean() > 0.99
+        medians.append(np.nanmedian(error))
+        steps = Quantiser(32).apply(error + np.float32(true)) - true
+        pooled.append(steps[np.isfinite(steps)])
+    # The parabola is locked by 0.095 px without its A-factor; two harmonics of it stay.
+    assert np.abs(medians).max() < (0.02 if fit == "v" else 0.025)
+    assert abs(np.mean(medians)) < 0.005
+    assert 0.03 <= np.sqrt(np.mean(np.concatenate(pooled) ** 2)) <= 0.1
+
+
+def test_sub_pixels_from_path_sums_are_locked_to_whole_pixels():
+    image = dots(80, 210, 0)
+    found = [
+        np.nanmedian(errors(CensusMatcher(24, 8, path_phase=on), image, 20.25))
+        for on in (False, True)
+    ]
+    assert abs(found[0]) < 0.02
+    assert found[1] < -0.05
+
+
+@pytest.mark.parametrize("slope", [-0.03, 0.03])
+def test_a_slope_has_the_noise_of_a_plane(slope):
+    texture = dots(80, 300, 4)
+    columns = np.arange(300)
+    disparity = 24 + slope * (columns - 150)
+    at = np.rint((columns - disparity) * FINE + FINE / 2).astype(int) % texture.shape[1]
+    image = np.clip(np.rint(15 + 200 * texture[2::4, at]), 0, 255).astype(np.uint8)
+    found = CensusMatcher(48).match(image, seen(texture, 0, 2)).disparity
+    error = (found - disparity)[12:-12, 60:-30]
+    assert np.isfinite(error).mean() > 0.98
+    assert abs(np.nanmedian(error)) < 0.02
+    assert np.nanquantile(np.abs(error), 0.68) < 0.1
+
+
+def test_gain_and_offset_change_no_bit():
+    texture = dots(60, 200, 5)
+    image, other = (seen(texture, d, s) // 2 for d, s in ((14.5, 1), (0, 2)))
+    matcher = CensusMatcher(32, min_texture=0.0)  # which is measured in grey values
+    plain, loud = matcher.match(image, other), matcher.match(2 * image + 3, other + 60)
+    assert np.isfinite(plain.disparity[:, 50:]).mean() > 0.9
+    np.testing.assert_array_equal(plain.disparity, loud.disparity)
+    # A grey value of difference has a cost as soon as it has a weight.
+    weighted = CensusMatcher(32, min_texture=0.0, difference_weight=1.0)
+    a, b = weighted.match(image, other), weighted.match(2 * image + 3, other + 60)
+    assert not np.array_equal(a.disparity, b.disparity, equal_nan=True)
+
+
+@pytest.mark.parametrize("paths", [0, 8])
+def test_a_window_gives_the_values_of_the_whole_image(paths):
+    texture = dots(90, 320, 6)
+    image, other = seen(texture, 11.4, 1), seen(texture, 0, 2).astype(np.float32)
+    matcher = CensusMatcher(64, -20, paths=paths)
+    rows, columns, reach = slice(10, 80), slice(120, 240), matcher.reach_px
+    whole = matcher.match(image, other).disparity[rows, columns]
+    part = matcher.match(image[rows, columns], other[rows], first=120).disparity
+    inner = (slice(reach, -reach), slice(reach, -reach))
+    same = (whole[inner] == part[inner]) | (np.isnan(whole[inner]) & np.isnan(part[inner]))
+    if paths == 0:
+        assert same.all()
+    else:  # paths begin at the border of the window
+        assert same.mean() > 0.995
+
+
+@pytest.mark.parametrize("true", [-15.375, 0.0, 9.625])
+def test_a_stored_reference_wider_than_the_image_is_matched(true):
+    texture = dots(70, 320, 7)
+    reference = 255 * texture[2::4, FINE // 2 :: FINE]
+    part = seen(texture, true, 3)[:, 100:220]
+    found = CensusMatcher(48, -24).match(part, reference.astype(np.float32), 100)
+    inner = found.disparity[8:-8, 8:-8]
+    assert np.isfinite(inner).mean() > 0.98
+    assert np.nanmedian(inner) == pytest.approx(true, abs=0.03)
+
+
+def test_reasons_say_why_there_is_no_match():
+    texture = dots(60, 200, 8)
+    image, other = seen(texture, 20, 1), seen(texture, 0, 2)
+    matcher = CensusMatcher(32)
+    # Columns 0..39 of the image come from before the other one begins.
+    found = matcher.match(image[:, 20:], other[:, 40:], first=-20)
+    assert (found.reason[8:-8, :30] != Reason.OK).mean() > 0.95
+    assert (found.reason[8:-8, 56:-12] == Reason.OK).mean() > 0.98
+    nowhere = matcher.match(image[:, :50], other, first=-60).reason
+    assert (nowhere == Reason.OUTSIDE).all()
+    dark = np.full_like(image, 7)
+    assert (matcher.match(dark, other, 0).reason[:, 40:] == Reason.DARK).mean() > 0.99
+    # A pattern that repeats every 10 px fits at 5, 15 and 25 px. Paths would decide from what
+    # they met at the border.
+    tile = np.tile(seen(texture, 0, 3)[:, :10], (1, 20))
+    repeated = CensusMatcher(32, paths=0).match(tile, tile, first=5).reason[8:-8, 50:-20]
+    assert (repeated == Reason.AMBIGUOUS).mean() > 0.95
+    # Hidden from the other camera: those pixels find somebody else's partner.
+    hidden = image.copy()
+    hidden[:, 100:115] = seen(dots(60, 200, 9), 0, 4)[:, 100:115]
+    why = CensusMatcher(32, uniqueness_percent=0.0, block_px=3, paths=0).match(hidden, other).reason
+    assert (why[:, 103:112] == Reason.INCONSISTENT).mean() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "key"),
+    [
+        ({"num_disparities": 2}, "num_disparities"),
+        ({"window_px": 17}, "window_px"),
+        ({"block_px": 4}, "block_px"),
+        ({"block_px": 31}, "block_px 31 with costs"),
+        ({"paths": 6}, "paths"),
+        ({"small_step": 50.0}, "small_step"),
+        ({"difference_cap": -1}, "difference_cap"),
+        ({"uniqueness_percent": -1.0}, "uniqueness_percent"),
+        ({"a_factor": 2.0}, "a_factor"),
+        ({"fit": "spline"}, "fit must be parabola or v, got 'spline'"),
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong, key):
+    with pytest.raises(ConfigError, match=key):
+        CensusMatcher(**wrong)

@@ -1,0 +1,174 @@
+"""What every matcher must do, on textures with known disparities."""
+
+import cv2
+import numpy as np
+import pytest
+
+from qs3.errors import ConfigError
+from qs3.sensors.matching import (
+    CensusMatcher,
+    NormalisedCorrelation,
+    SemiGlobalMatcher,
+    StereoBlockMatcher,
+)
+from qs3.sensors.pixel_status import Reason
+
+FINE = 16  # positions a pixel
+
+
+def dots(height, width, seed):
+    """Blurred dots on [h, width * FINE] positions, 0..220."""
+    rng = np.random.default_rng(seed)
+    lit = (rng.random((height, width * FINE)) < 0.15 / FINE).astype(np.float32)
+    soft = cv2.GaussianBlur(lit, (0, 0), sigmaX=0.9 * FINE, sigmaY=0.9)
+    return soft / np.quantile(soft, 0.99) * 220
+
+
+def seen(texture, shift_px, seed=None, noise=2.0):
+    """The texture as an image, moved to the right by shift_px."""
+    height = len(texture)
+    image = np.roll(texture, round(shift_px * FINE), axis=1).reshape(height, -1, FINE).mean(axis=2)
+    if seed is not None:
+        image = image + np.random.default_rng(seed).normal(0, noise, image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+MATCHERS = {
+    "block": StereoBlockMatcher(64, 19),
+    "semi-global": SemiGlobalMatcher(64),
+    "correlation": NormalisedCorrelation(),
+    "census": CensusMatcher(64),
+}
+# Error of the median in one sub-pixel phase, rms of a pixel, mean of the medians over all phases.
+BARS = {
+    "block": (0.05, 0.06, 0.01),
+    "semi-global": (0.13, 0.11, 0.01),  # steps of 1/16 px, stretched against locking
+    "correlation": (0.04, 0.06, 0.005),
+    "census": (0.02, 0.05, 0.005),
+}
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_all_sub_pixel_phases_come_back(name):
+    single, spread, pooled = BARS[name]
+    medians = []
+    for phase in range(16):
+        texture, true = dots(80, 300, phase), 20 + phase / 16
+        image, other = seen(texture, true, seed=phase), seen(texture, 0, seed=100 + phase)
+        found = MATCHERS[name].match(image, other)
+        error = (found.disparity - true)[12:-12, 90:-20]
+        assert np.isfinite(error).mean() > 0.97
+        good = error[np.abs(error) < 1]
+        assert len(good) > 0.97 * error.size
+        assert abs(np.median(good)) < single
+        assert good.std() < spread
+        medians.append(np.median(good))
+    assert abs(np.mean(medians)) < pooled
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_a_slope_comes_back_as_a_slope(name):
+    texture = dots(80, 400, 3)
+    other = seen(texture, 0, seed=1)
+    columns = np.arange(400)
+    disparity = 20 + 0.02 * columns
+    fine = np.clip(np.rint((columns - disparity) * FINE + FINE / 2).astype(int), 0, 400 * FINE - 1)
+    blurred = cv2.blur(texture, (FINE, 1))
+    image = np.clip(np.rint(blurred[:, fine]), 0, 255).astype(np.uint8)
+    found = MATCHERS[name].match(image, other).disparity[12:-12, 100:-30]
+    error = found - disparity[100:-30]
+    assert np.isfinite(error).mean() > 0.9
+    assert abs(np.nanmedian(error)) < 0.08
+    slope = np.polyfit(columns[100:-30], np.nanmedian(found, axis=0), 1)[0]
+    assert slope == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_an_image_without_texture_matches_nowhere(name):
+    flat = np.full((40, 160), 90, np.uint8)
+    found = MATCHERS[name].match(flat, flat)
+    assert np.isnan(found.disparity).all()
+    assert (found.reason != Reason.OK).all()
+
+
+def test_block_matching_and_census_say_that_it_is_dark():
+    flat = np.zeros((40, 160), np.uint8)
+    for name in ("block", "census"):
+        reason = MATCHERS[name].match(flat, flat).reason
+        assert (reason[10:-10, 90:-20] == Reason.DARK).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_a_part_of_the_image_matches_as_the_whole_does(name):
+    texture = dots(80, 300, 5)
+    image, other = seen(texture, 17.3, seed=1), seen(texture, 0, seed=2)
+    whole = MATCHERS[name].match(image, other).disparity
+    part = MATCHERS[name].match(image[:, 100:220], other, first=100).disparity
+    inner = (slice(12, -12), slice(24, -24))
+    a, b = whole[:, 100:220][inner], part[inner]
+    both = np.isfinite(a) & np.isfinite(b)
+    assert both.mean() > 0.95
+    # Semi-global paths start elsewhere; most pixels do not notice.
+    assert (np.abs(a - b)[both] < 0.07).mean() > 0.97
+
+
+@pytest.mark.parametrize("name", ["correlation", "census"])
+def test_gain_and_offset_do_not_matter(name):
+    texture = dots(60, 260, 6)
+    image, other = seen(texture * 0.9, 12.5), seen(texture, 0)
+    dim = np.clip(image * 0.5 + 40, 0, 255).astype(np.uint8)
+    a, b = (MATCHERS[name].match(x, other).disparity[12:-12, 80:-20] for x in (image, dim))
+    both = np.isfinite(a) & np.isfinite(b)
+    assert both.mean() > 0.9
+    assert np.quantile(np.abs(a - b)[both], 0.9) < 0.1
+
+
+@pytest.mark.parametrize("name", ["correlation", "census", "semi-global", "block"])
+def test_negative_disparities_for_a_stored_reference(name):
+    make = {
+        "correlation": lambda: NormalisedCorrelation(min_disparity=-32),
+        "census": lambda: CensusMatcher(64, min_disparity=-32),
+        "semi-global": lambda: SemiGlobalMatcher(64, min_disparity=-32),
+        "block": lambda: StereoBlockMatcher(64, 19, min_disparity=-32),
+    }[name]
+    texture = dots(60, 300, 7)
+    reference = seen(texture, 0).astype(np.float32)
+    for true in (-14.0, 9.0):
+        image = seen(texture, true, seed=3)[:, 90:210]
+        found = make().match(image, reference, first=90).disparity[12:-12, 12:-12]
+        assert np.isfinite(found).mean() > 0.9
+        assert np.nanmedian(found) == pytest.approx(true, abs=0.07)
+
+
+@pytest.mark.parametrize("make", [StereoBlockMatcher, CensusMatcher, SemiGlobalMatcher])
+def test_the_left_right_check_drops_what_the_other_camera_does_not_see(make):
+    """A near bar hides a strip of the background from the right camera."""
+    back, front = dots(60, 300, 8), dots(60, 300, 9)
+    image, other = seen(back, 10, seed=1), seen(back, 0, seed=2)
+    near = seen(front, 30, seed=3), seen(front, 0, seed=4)
+    image[:, 150:210], other[:, 120:180] = near[0][:, 150:210], near[1][:, 120:180]
+    # Background columns whose partner u - 10 lies in 120..180 of the right image are hidden;
+    # of these 130..150 are not covered by the bar in the left image.
+    hidden = (slice(12, -12), slice(133, 147))
+    off, on = (
+        make(64, max_difference_px=limit).match(image, other).disparity[hidden] for limit in (-1, 1)
+    )
+    assert np.isfinite(on).mean() < 0.5
+    assert np.isfinite(on).mean() <= np.isfinite(off).mean()
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: SemiGlobalMatcher(50), "num_disparities"),
+        (lambda: SemiGlobalMatcher(block_size=4), "block_size"),
+        (lambda: SemiGlobalMatcher(mode="fast"), "mode"),
+        (lambda: SemiGlobalMatcher(p1=100, p2=50), "p1 < p2"),
+        (lambda: NormalisedCorrelation(window_px=4), "window_px"),
+        (lambda: CensusMatcher(window_px=8), "window_px"),
+        (lambda: CensusMatcher(paths=5), "paths"),
+    ],
+)
+def test_settings_out_of_range_are_refused(make, key):
+    with pytest.raises(ConfigError, match=key):
+        make()

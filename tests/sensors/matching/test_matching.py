@@ -1,0 +1,206 @@
+import cv2
+import numpy as np
+import pytest
+
+from qs3.errors import ConfigError
+from qs3.sensors.matching import (
+    STEREOBM_BIAS_PX,
+    NormalisedCorrelation,
+    ReferenceMatcher,
+    SemiGlobalMatcher,
+    StereoBlockMatcher,
+)
+from qs3.sensors.pixel_status import Reason
+
+
+def dots(height, width, seed, scale=8):
+    """A smooth random texture that can be shifted by fractions of a pixel: [h, w * scale]."""
+    rng = np.random.default_rng(seed)
+    fine = rng.random((height, width)).astype(np.float32)
+    fine = cv2.resize(fine, (width * scale, height), interpolation=cv2.INTER_CUBIC)
+    fine = cv2.GaussianBlur(fine, (0, 0), sigmaX=scale, sigmaY=1)  # the lens: one pixel
+    fine = (fine - fine.min()) / (fine.max() - fine.min())
+    return fine * 255
+
+
+def shifted(texture, shift_px, scale=8):
+    """The texture sampled at whole pixels after moving it to the right by shift_px."""
+    offset = round(shift_px * scale)
+    return np.roll(texture, offset, axis=1)[:, scale // 2 :: scale]
+
+
+@pytest.mark.parametrize("true", [20.0, 20.25, 20.5, 20.75, 33.125])
+def test_block_matching_finds_a_known_disparity_without_bias(true):
+    texture = dots(120, 400, seed=1)
+    left = shifted(texture, true).astype(np.uint8)
+    right = shifted(texture, 0.0).astype(np.uint8)
+    found = StereoBlockMatcher(64, 19).match(left, right).disparity[20:-20, 120:-40]
+    assert np.isfinite(found).mean() > 0.95
+    assert np.nanmedian(found) == pytest.approx(true, abs=0.06)
+
+
+def test_removing_the_bias_of_stereobm_is_a_switch():
+    texture = dots(60, 300, seed=2)
+    left, right = (shifted(texture, d).astype(np.uint8) for d in (12.0, 0.0))
+    with_bias = StereoBlockMatcher(32, 11, remove_bias=False).match(left, right).disparity
+    without = StereoBlockMatcher(32, 11).match(left, right).disparity
+    both = np.isfinite(with_bias)
+    np.testing.assert_allclose((with_bias - without)[both], STEREOBM_BIAS_PX, atol=1e-5)
+
+
+def test_a_dark_image_matches_nowhere():
+    dark = np.zeros((60, 200), np.uint8)
+    assert np.isnan(StereoBlockMatcher(32, 11).match(dark, dark).disparity).all()
+    reference = np.random.default_rng(0).random((60, 200)).astype(np.float32) * 255
+    assert np.isnan(ReferenceMatcher().match(dark, reference).disparity).all()
+
+
+@pytest.mark.parametrize("true", [-7.5, 0.0, 4.25, 11.625])
+def test_reference_matching_finds_a_known_disparity_at_its_steps(true):
+    texture = dots(80, 400, seed=3)
+    reference = shifted(texture, 0.0).astype(np.float32)
+    image = shifted(texture, true).astype(np.uint8)
+    part, left = image[:, 100:260], 100
+    found = ReferenceMatcher().match(part, reference, left).disparity[8:-8, 8:-8]
+    assert np.isfinite(found).mean() > 0.95
+    assert np.nanmedian(found) == pytest.approx(true, abs=0.125)
+    steps = found[np.isfinite(found)] * 8
+    np.testing.assert_array_equal(steps, np.rint(steps))
+
+
+def test_reference_matching_ignores_gain_and_offset():
+    texture = dots(60, 300, seed=4)
+    reference = shifted(texture, 0.0).astype(np.float32)
+    image = shifted(texture, 3.0)
+    matcher = ReferenceMatcher(steps_per_px=0)
+    plain = matcher.match(image.astype(np.uint8), reference).disparity
+    dim = matcher.match((image * 0.4 + 30).astype(np.uint8), reference).disparity
+    both = np.isfinite(plain) & np.isfinite(dim)
+    assert both[8:-8, 20:-20].mean() > 0.9
+    # Rounding to whole grey values moves a match a little, and a few to another dot.
+    assert np.quantile(np.abs(plain - dim)[both], 0.98) < 0.1
+
+
+def test_scores_equal_a_brute_force_correlation():
+    rng = np.random.default_rng(5)
+    reference = (rng.random((30, 60)) * 255).astype(np.float32)
+    image = (rng.random((30, 40)) * 255).astype(np.uint8)
+    matcher = ReferenceMatcher(window_px=5, min_disparity=-4, num_disparities=9)
+    scores = matcher._scores(image, reference, first=10)
+    grey = image.astype(float)
+    for k, row, col in [(0, 15, 20), (4, 10, 9), (8, 20, 31)]:
+        window = grey[row - 2 : row + 3, col - 2 : col + 3]
+        u = 10 + col - (-4 + k)
+        other = reference[row - 2 : row + 3, u - 2 : u + 3].astype(float)
+        covariance = (window * other).mean() - window.mean() * other.mean()
+        expected = covariance / (window.std() * other.std())
+        assert scores[k, row, col] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: StereoBlockMatcher(num_disparities=50), "num_disparities"),
+        (lambda: StereoBlockMatcher(block_size=10), "block_size"),
+        (lambda: ReferenceMatcher(window_px=4), "window_px"),
+        (lambda: ReferenceMatcher(num_disparities=2), "num_disparities"),
+    ],
+)
+def test_settings_out_of_range_are_refused(make, key):
+    with pytest.raises(ConfigError, match=key):
+        make()
+
+
+def test_the_way_back_is_the_best_column_of_the_other_image():
+    scores = np.random.default_rng(6).random((4, 3, 7)).astype(np.float32)
+    best = scores.argmax(axis=0)
+    for limit in (0, 1):
+        agrees = NormalisedCorrelation(num_disparities=4, max_difference_px=limit)._agrees(
+            scores, best
+        )
+        for row in range(3):
+            for u in range(7):
+                x = u - best[row, u]  # column of the other image, up to a constant
+                back = {k: scores[k, row, x + k] for k in range(4) if 0 <= x + k < 7}
+                there = max(back, key=back.get)
+                assert agrees[row, u] == (abs(there - best[row, u]) <= limit)
+
+
+def test_correlation_says_what_did_not_find_back():
+    texture = dots(60, 300, seed=7)
+    image, other = (shifted(texture, d).astype(np.uint8) for d in (20.0, 0.0))
+    # A poor copy of what is seen 15 px farther right: it finds the other image's pixel of that.
+    image[:, 150:170] = image[:, 165:185] + np.random.default_rng(0).integers(0, 4, (60, 20))
+    settings = {"num_disparities": 40, "min_score": 0.0, "uniqueness": 0.0}
+    off, on = (
+        NormalisedCorrelation(**settings, max_difference_px=limit).match(image, other)
+        for limit in (-1, 1)
+    )
+    foreign, same = (slice(8, -8), slice(159, 166)), (slice(8, -8), slice(60, 140))
+    assert (off.reason[foreign] == Reason.OK).mean() > 0.9
+    assert (on.reason[foreign] == Reason.INCONSISTENT).mean() > 0.8
+    assert (on.reason[same] == Reason.OK).mean() > 0.98
+    np.testing.assert_array_equal(on.disparity[same], off.disparity[same])
+
+
+def test_the_a_factor_removes_the_locking_of_the_parabola():
+    texture = dots(90, 400, seed=9)
+    worst = {}
+    for a_factor in (0.0, 0.18):
+        matcher = NormalisedCorrelation(9, 10, 20, a_factor=a_factor)
+        errors = []
+        for true in 20 + np.arange(8) / 8:
+            image, other = shifted(texture, true), shifted(texture, 0.0)
+            found = matcher.match(image.astype(np.uint8), other.astype(np.float32)).disparity
+            errors.append(np.nanmedian(found[8:-8, 40:-20]) - true)
+        worst[a_factor] = np.abs(errors).max()
+    assert worst[0.0] > 0.015
+    assert worst[0.18] < 0.01
+
+
+def test_the_reference_matcher_is_correlation_with_the_steps_of_a_kinect():
+    texture = dots(60, 300, seed=10)
+    reference = shifted(texture, 0.0).astype(np.float32)
+    image = shifted(texture, 4.3).astype(np.uint8)[:, 60:200]
+    plain = NormalisedCorrelation(9, -24, 64).match(image, reference, 60)
+    kinect = ReferenceMatcher().match(image, reference, 60)
+    np.testing.assert_array_equal(kinect.disparity, np.rint(plain.disparity * 8) / 8)
+    np.testing.assert_array_equal(kinect.reason, plain.reason)
+
+
+def test_sgbm_rounds_towards_zero_and_is_repaired():
+    """What StereoSGBM makes of every sub-pixel, by its formula, comes back without bias."""
+    true = 20 + (np.arange(4096) + 0.5) / 4096 - 0.5
+    whole = np.rint(true)
+    raw = whole + np.trunc((true - whole) * 16 + 0.5) / 16
+    assert np.mean(raw - true) == pytest.approx(1 / 32, abs=0.003)
+    repaired = SemiGlobalMatcher(64, a_factor=0.0)._repaired(raw.astype(np.float32))
+    error = repaired - true
+    assert abs(error.mean()) < 1e-3
+    assert np.abs(error).max() < 1 / 16 + 1e-3  # around a whole pixel two steps fall together
+    inner = np.abs(true - whole) > 1.6 / 16
+    assert np.abs(error[inner]).max() < 1 / 32 + 1e-3
+
+
+@pytest.mark.parametrize("a_factor", [0.0, 1.0])
+def test_locking_of_sgbm_is_a_switch(a_factor):
+    texture = dots(80, 300, seed=11)
+    matcher = SemiGlobalMatcher(32, a_factor=a_factor)
+    errors = []
+    for true in 20 + np.arange(8) / 8:
+        image, other = (shifted(texture, d).astype(np.uint8) for d in (true, 0.0))
+        errors.append(np.nanmedian(matcher.match(image, other).disparity[8:-8, 60:-20]) - true)
+    assert abs(np.mean(errors)) < 0.02
+    assert (np.abs(errors).max() < 0.13) == bool(a_factor)
+
+
+def test_block_matching_tells_dark_from_not_found():
+    texture = dots(60, 300, seed=12)
+    image, other = (shifted(texture, d).astype(np.uint8) for d in (20.0, 0.0))
+    image[:, 120:180] = 3
+    image[:, 200:240] = shifted(dots(60, 300, seed=13), 0.0).astype(np.uint8)[:, 200:240]
+    found = StereoBlockMatcher(64, 9).match(image, other)
+    assert (found.reason[8:-8, 130:170] == Reason.DARK).all()
+    foreign = found.reason[8:-8, 208:232]
+    assert (foreign == Reason.UNMATCHED).mean() > 0.5
+    assert (foreign != Reason.DARK).all()

@@ -1,0 +1,83 @@
+"""Every matcher in every sensor that matches, through the real renderer; and their configs."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+
+from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.matching import (
+    CensusMatcher,
+    NormalisedCorrelation,
+    ReferenceMatcher,
+    SemiGlobalMatcher,
+    StereoBlockMatcher,
+)
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.scenery import middle, scan, square
+
+CONF = Path(__file__).parents[3] / "conf"
+STEREO = {
+    "block": StereoBlockMatcher(80, 15),
+    "semi-global": SemiGlobalMatcher(80),
+    "correlation": NormalisedCorrelation(11, 0, 80),
+    "census": CensusMatcher(80),
+}
+KINECT = {
+    "reference": ReferenceMatcher(),
+    "correlation": NormalisedCorrelation(9, -24, 64),
+    "census": CensusMatcher(64, -24),
+}
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return MitsubaRenderer(samples=8)
+
+
+def depth_errors(sensor, renderer, depths):
+    """Errors in px of disparity, pooled over sub-pixel phases."""
+    scale = sensor.focal_px * sensor.baseline_m
+    for seed, depth in enumerate(depths):
+        frame = scan(sensor, [square(depth)], renderer, seed)
+        measured = middle(frame.depth_m)
+        assert np.isfinite(measured).mean() > 0.95
+        yield scale / measured[np.isfinite(measured)] - scale / depth
+
+
+@pytest.mark.parametrize("name", STEREO)
+def test_planes_of_a_stereo_sensor_come_back(renderer, name):
+    sensor = SpeckleStereo(
+        width_px=540, height_px=540, focal_px=750.0, step_px=2, matcher=STEREO[name]
+    )
+    pooled = np.concatenate(list(depth_errors(sensor, renderer, np.linspace(2.9, 3.1, 8))))
+    assert abs(np.median(pooled)) < 0.02
+    # Steps of 1/16 px, stretched against locking, make StereoSGBM the noisiest.
+    assert np.quantile(np.abs(pooled), 0.68) < (0.13 if name == "semi-global" else 0.1)
+
+
+@pytest.mark.parametrize("name", KINECT)
+def test_planes_of_a_sensor_with_a_stored_pattern_come_back(renderer, name):
+    sensor = ReferenceSpeckle(matcher=KINECT[name])
+    pooled = np.concatenate(list(depth_errors(sensor, renderer, np.linspace(1.95, 2.05, 8))))
+    assert abs(np.median(pooled)) < 0.04
+    assert np.quantile(np.abs(pooled), 0.68) < 0.15
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "sensor/matcher").iterdir()))
+def test_every_matcher_is_a_choice_and_its_file_shows_all_it_has(name):
+    sensor = "speckle_stereo_small" if name.endswith("_small") else "speckle_stereo"
+    if (CONF / f"sensor/{name}.yaml").is_file():  # a device's own
+        sensor = name
+    with initialize_config_dir(str(CONF), version_base=None):
+        choices = ["domain=specklenet10", f"sensor={sensor}", f"sensor/matcher={name}"]
+        cfg = compose("generate", choices)
+    assert (CONF / f"sensor/matcher/{name}.yaml").read_text().startswith("# ")
+    matcher = instantiate(cfg.sensor.matcher)
+    fields = {field.name for field in dataclasses.fields(matcher)}
+    assert set(cfg.sensor.matcher) - {"_target_"} == fields
+    assert instantiate(cfg.sensor, _convert_="all").matcher == matcher

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+
+from qs3.errors import ConfigError
+from qs3.sensors.optics.infrared import InfraredCamera
+
+
+def test_the_exposure_puts_the_quantile_at_the_level():
+    camera = InfraredCamera(white_quantile=1.0, white_level=200.0, read_noise_e=0.0)
+    radiance = np.linspace(0, 3, 1000, dtype=np.float32).reshape(10, 100)
+    gain = camera.gain(radiance, np.ones_like(radiance, dtype=bool))
+    assert gain * 3 == pytest.approx(200.0)
+
+
+def test_noise_has_the_variance_of_shot_and_read_noise():
+    camera = InfraredCamera(electrons_at_white=2000.0, read_noise_e=25.0)
+    rng = np.random.default_rng(0)
+    grey = camera.expose(np.full((400, 400), 128.0, np.float32), 1.0, rng).astype(float)
+    per_grey = 2000.0 / 255.0
+    electrons = 128 * per_grey
+    # 1/12 is the variance of rounding to whole grey values.
+    expected = (electrons + 25.0**2) / per_grey**2 + 1 / 12
+    assert grey.mean() == pytest.approx(128.0, abs=0.1)
+    assert grey.var() == pytest.approx(expected, rel=0.02)
+
+
+def test_an_empty_region_gives_a_dark_image_not_an_error():
+    camera = InfraredCamera()
+    radiance = np.ones((4, 4), np.float32)
+    assert camera.gain(radiance, np.zeros((4, 4), bool)) == 0.0
+
+
+@pytest.mark.parametrize("wrong", [{"white_level": 300.0}, {"white_quantile": 0.0}])
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        InfraredCamera(**wrong)
+
+
+def test_laser_speckle_has_the_contrast_it_says_and_grows_with_the_signal():
+    camera = InfraredCamera(
+        electrons_at_white=1e9, read_noise_e=0.0, speckle_contrast=0.2, fixed_gain=1.0
+    )
+    rng = np.random.default_rng(0)
+    for level in (40.0, 100.0):
+        grey = camera.expose(np.full((500, 500), level, np.float32), 1.0, rng).astype(float)
+        assert grey.mean() == pytest.approx(level, rel=0.005)
+        assert grey.var() == pytest.approx((0.2 * level) ** 2 + 1 / 12, rel=0.03)
+
+
+def test_grains_of_laser_speckle_share_a_value():
+    camera = InfraredCamera(
+        electrons_at_white=1e9, read_noise_e=0.0, speckle_contrast=0.3, speckle_grain_px=3
+    )
+    flat = np.full((301, 401), 60.0, np.float32)
+    grey = camera.expose(flat, 1.0, np.random.default_rng(0)).astype(float)
+    assert grey.shape == flat.shape
+    np.testing.assert_allclose(grey[0:300:3, 0:399:3], grey[2:300:3, 2:399:3], atol=1)
+    apart = np.corrcoef(grey[0:300:3, 0:396:3].ravel(), grey[0:300:3, 3:399:3].ravel())[0, 1]
+    assert abs(apart) < 0.03
+    assert grey.std() / grey.mean() == pytest.approx(0.3, rel=0.03)
+
+
+def test_the_lens_spreads_a_point_as_a_gaussian():
+    camera = InfraredCamera(electrons_at_white=1e9, read_noise_e=0.0, psf_px=1.5)
+    point = np.zeros((31, 31), np.float32)
+    point[15, 15] = 2000.0
+    grey = camera.expose(point, 1.0, np.random.default_rng(0)).astype(float)
+    place = np.arange(31) - 15
+    assert grey.sum() == pytest.approx(2000.0, rel=0.02)
+    assert (grey * place**2).sum() / grey.sum() == pytest.approx(1.5**2, rel=0.06)
+
+
+def test_a_fixed_gain_does_not_look_at_the_image_and_saturates():
+    camera = InfraredCamera(fixed_gain=100.0, read_noise_e=0.0, electrons_at_white=1e9)
+    bright = np.full((4, 4), 9.0, np.float32)
+    assert camera.gain(bright, np.ones((4, 4), bool)) == 100.0
+    assert (camera.expose(bright, 100.0, np.random.default_rng(0)) == 255).all()
+
+
+def test_what_is_off_draws_nothing():
+    """Old datasets keep their bytes: new kinds of noise must not shift the random numbers."""
+    radiance = np.random.default_rng(1).random((20, 20)).astype(np.float32)
+    a, b = np.random.default_rng(5), np.random.default_rng(5)
+    InfraredCamera().expose(radiance, 200.0, a)
+    b.standard_normal(radiance.shape, dtype=np.float32)
+    assert a.random() == b.random()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"speckle_contrast": 2.0}, {"speckle_grain_px": 0}, {"psf_px": -1.0}, {"fixed_gain": 0.0}],
+)
+def test_options_out_of_range_are_refused(wrong):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        InfraredCamera(**wrong)

@@ -1,0 +1,74 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import ConfigError, DataError
+from qs3.sensors.optics.patterns import PictureSlide, Speckle
+
+
+def test_the_default_slide_has_the_size_and_fill_of_the_released_one():
+    slide = Speckle().slide
+    assert slide.shape == (990, 1266)
+    assert slide.dtype == np.float32
+    assert set(np.unique(slide)) == {0.0, 1.0}
+    assert slide.mean() == pytest.approx(0.111, abs=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    columns=st.integers(8, 40),
+    rows=st.integers(8, 40),
+    spacing=st.integers(0, 2),
+    seed=st.integers(0, 9),
+)
+def test_dots_keep_their_distance_across_the_seams_of_tiles(columns, rows, spacing, seed):
+    fill = 0.5 / (1 + spacing) ** 2
+    tile = Speckle(columns, rows, 1, 1, fill, spacing, seed).slide > 0
+    for dy in range(-spacing, spacing + 1):
+        for dx in range(-spacing, spacing + 1):
+            if (dy, dx) != (0, 0):
+                assert not (tile & np.roll(tile, (dy, dx), axis=(0, 1))).any()
+
+
+def test_a_tile_repeats_and_a_seed_decides():
+    slide = Speckle(20, 16, tiles=3, dot_px=2, seed=4).slide
+    assert slide.shape == (96, 120)
+    np.testing.assert_array_equal(slide[:32, :40], slide[32:64, 80:120])
+    np.testing.assert_array_equal(slide, Speckle(20, 16, tiles=3, dot_px=2, seed=4).slide)
+    assert (slide != Speckle(20, 16, tiles=3, dot_px=2, seed=5).slide).any()
+
+
+def test_a_fill_that_cannot_be_reached_is_refused():
+    with pytest.raises(ConfigError, match=r"pattern\.fill 0\.2 cannot be reached with spacing 1"):
+        Speckle(fill=0.2, spacing=1)
+
+
+def test_dots_of_different_brightness_stand_where_the_equal_ones_do():
+    plain, varied = (
+        Speckle(40, 30, seed=2).slide,
+        Speckle(40, 30, seed=2, brightness_spread=0.5).slide,
+    )
+    np.testing.assert_array_equal(plain > 0, varied > 0)
+    lit = varied[varied > 0]
+    assert lit.min() >= 0.5
+    assert lit.max() <= 1
+    assert lit.std() > 0.1
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_picture_becomes_a_slide(tmp_path, dtype):
+    picture = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (12, 20)).astype(dtype)
+    cv2.imwrite(str(tmp_path / "dots.png"), picture)
+    slide = PictureSlide(str(tmp_path / "dots.png")).slide
+    np.testing.assert_allclose(slide, picture / np.iinfo(dtype).max, rtol=1e-6)
+    assert slide.dtype == np.float32
+
+
+def test_a_slide_that_is_no_picture_is_refused(tmp_path):
+    (tmp_path / "text.png").write_text("not a picture")
+    with pytest.raises(DataError, match="is no image"):
+        _ = PictureSlide(str(tmp_path / "text.png")).slide
+    with pytest.raises(DataError, match="there is no file"):
+        _ = PictureSlide(str(tmp_path / "missing.png")).slide

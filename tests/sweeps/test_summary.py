@@ -1,0 +1,170 @@
+"""What a multirun says at its end."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hydra.errors import CompactHydraException
+from omegaconf import OmegaConf
+
+from qs3.sweeps.summary import SummaryOfSeeds, differences, failures, in_words
+from tests.report.made_runs import write_run
+
+
+def config(folder: Path, *overrides: str):
+    hydra = {"runtime": {"output_dir": str(folder)}, "overrides": {"task": list(overrides)}}
+    return OmegaConf.create({"hydra": {**hydra, "sweep": {"dir": str(folder)}}})
+
+
+def ended(summary: SummaryOfSeeds, folder, error: Exception | None = None, seed: int = 0) -> None:
+    job = SimpleNamespace(_return_value=error, overrides=[f"seed={seed}"])
+    summary.on_job_start(config(folder, f"seed={seed}"))
+    summary.on_job_end(config(folder), job)
+
+
+@pytest.fixture
+def summary(tmp_path):
+    summary = SummaryOfSeeds()
+    summary.on_multirun_start(config(tmp_path))
+    yield summary
+    summary.on_multirun_end(config(tmp_path))
+    assert not list(tmp_path.glob(".multirun*"))
+
+
+def test_an_error_of_all_jobs_is_said_once(summary, tmp_path, caplog):
+    with caplog.at_level(logging.ERROR):
+        for seed, text in enumerate(["no data\nLooked for", "no data\nLooked for", "other", ""]):
+            ended(summary, tmp_path / f"seed{seed}-ab", ValueError(text))
+    assert [record.getMessage() for record in caplog.records] == [
+        "seed=0 failed: ValueError: no data", "seed=0 failed: ValueError: other",
+        "seed=0 failed: ValueError",
+    ]  # fmt: skip
+
+
+def test_the_table_says_in_what_its_lines_differ(tmp_path, capsys):
+    summary = SummaryOfSeeds()
+    summary.on_multirun_start(config(tmp_path))
+    hashes = {"0.5": "aaaaaaaa", "0.45": "bbbbbbbb", "0.4": "cccccccc"}
+    for theta, sha in hashes.items():
+        for seed in (0, 1):
+            words = ["experiment=quickstart", f"selftraining.theta={theta}", f"seed={seed}"]
+            folder = tmp_path / "exp" / f"seed{seed}-{sha}"
+            if theta != "0.4":
+                write_run(tmp_path, seed=seed, hash=sha)
+            else:
+                (folder / ".hydra").mkdir(parents=True)
+            summary.on_job_start(config(folder, *words))
+            summary.on_job_end(config(folder), SimpleNamespace(_return_value=None, overrides=words))
+    summary.on_multirun_end(config(tmp_path))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split()[:2] == ["experiment", "settings"]
+    assert sorted(line.split()[1] for line in lines[3:6]) == [
+        f"selftraining.theta={theta}" for theta in sorted(hashes)
+    ]  # also the one that is not finished
+    assert "experiment=quickstart" not in "".join(lines)  # what all have in common
+
+
+def test_only_what_differs_and_no_seed():
+    def job(*words):
+        return {"folder": words[-1], "overrides": list(words[:-1])}
+
+    assert set(differences([job("seed=0", "a=1", "/x"), job("seed=1", "a=1", "/y")]).values()) == {
+        ""
+    }
+    found = differences([job("seed=0", "model=dgcnn", "/x"), job("seed=0", "b=2", "/y")])
+    assert found == {Path("/x"): "model=dgcnn", Path("/y"): "b=2"}
+
+
+def test_no_table_without_a_finished_run(summary, tmp_path, capsys):
+    ended(summary, tmp_path / "seed0-ab", ValueError("no data"))
+    summary.on_multirun_end(config(tmp_path))
+    assert capsys.readouterr().out == (
+        f"1 of 1 jobs failed:\n  ValueError: no data\n    seed=0  ({tmp_path / 'seed0-ab'})\n"
+    )
+
+
+def test_finished_runs_make_a_table(summary, tmp_path, capsys):
+    ended(summary, write_run(tmp_path, seed=0))
+    ended(summary, tmp_path / "exp" / "seed1-0123abcd", ValueError("broken"), seed=1)
+    summary.on_multirun_end(config(tmp_path))
+    out = capsys.readouterr().out
+    assert "seed 1: no result" in out
+    assert out.splitlines()[-3] == "1 of 2 jobs failed:"
+
+
+def test_nothing_is_said_of_failures_when_there_are_none(summary, tmp_path, capsys):
+    ended(summary, write_run(tmp_path, seed=0))
+    summary.on_multirun_end(config(tmp_path))
+    assert "failed" not in capsys.readouterr().out
+
+
+def test_a_job_that_never_ended(summary, tmp_path, capsys):
+    ended(summary, write_run(tmp_path, seed=0))
+    summary.on_job_start(config(tmp_path / "exp" / "seed1-0123abcd", "seed=1"))
+    summary.on_multirun_end(config(tmp_path))
+    out = capsys.readouterr().out.splitlines()
+    assert out[-3:-1] == [
+        "1 of 2 jobs failed:",
+        "  did not end: killed, interrupted or still running; the same command goes on with it",
+    ]
+    assert out[-1].startswith("    seed=1  (")
+
+
+def test_a_damaged_line_costs_only_itself(summary, tmp_path, capsys):
+    """Two machines that write at the same place of a network's disk."""
+    ended(summary, write_run(tmp_path, seed=0))
+    with open(summary.journal, "ab") as file:
+        file.write(
+            b'{"folder": "/logs/se{"folder": "/x", "overr\n[1]\n"x"\n\xff{}\n{"folder": "/y"}\n'
+        )
+    ended(summary, tmp_path / "exp" / "seed1-0123abcd", ValueError("broken"), seed=1)
+    summary.on_multirun_end(config(tmp_path))
+    out = capsys.readouterr().out
+    assert "seed 1: no result" in out
+    assert "1 of 2 jobs failed:\n  ValueError: broken" in out
+    assert out.splitlines()[-1].startswith("5 of the notes of the jobs could not be read")
+
+
+def test_a_job_that_ends_after_the_summary_leaves_nothing_behind(summary, tmp_path, caplog):
+    """In a process of its own, on a cluster, when the main process was stopped by Ctrl-C."""
+    late = pickle.loads(pickle.dumps(summary))
+    late.on_job_start(config(tmp_path / "late", "seed=1"))
+    summary.on_multirun_end(config(tmp_path))
+    job = SimpleNamespace(_return_value=ValueError("late"), overrides=["seed=1"])
+    late.on_job_end(config(tmp_path / "late"), job)
+    assert "seed=1 failed: ValueError: late" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_failures_are_grouped_by_error():
+    def job(name, **more):
+        return {"folder": f"/logs/{name}", "overrides": [f"a={name}"], **more}
+
+    jobs = [job(3, error="x"), job(1, error="y"), job(2, error=""), job(4), job(0, error="x")]
+    assert failures(jobs).splitlines() == [
+        "4 of 5 jobs failed:",
+        "  x", "    a=0  (/logs/0)", "    a=3  (/logs/3)",
+        "  y", "    a=1  (/logs/1)",
+        "  did not end: killed, interrupted or still running; the same command goes on with it",
+        "    a=4  (/logs/4)",
+    ]  # fmt: skip
+    assert failures([job(2, error="")]) == ""
+
+
+def test_errors_in_words():
+    assert in_words(CompactHydraException("DataError: no\nmore")) == "DataError: no"
+    assert in_words(KeyError("k")) == "KeyError: 'k'"
+    assert in_words(CompactHydraException()) == "CompactHydraException"
+
+
+def test_a_folder_that_cannot_be_written_to_keeps_no_sweep_from_its_errors(tmp_path):
+    (tmp_path / "file").touch()
+    summary = SummaryOfSeeds()
+    summary.on_multirun_start(config(tmp_path / "file" / "logs"))
+    assert summary.journal is not None
+    assert summary.journal.is_file()
+    summary.on_multirun_end(config(tmp_path))

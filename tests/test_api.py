@@ -1,0 +1,81 @@
+"""The commands as functions, on the toy problem that the notebooks use."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from hydra.core.hydra_config import HydraConfig
+
+import qs3
+from qs3.api import composed, generate, train
+from qs3.errors import ConfigError, DataError
+from qs3.report.runs.data import read_run
+from qs3.report.tables.table import build_table
+from qs3.tools.toy import SHAPES, ToyNet, toy_overrides, write_toy
+
+SHORT = ["protocol.epochs=2", "selftraining.rounds=1", "selftraining.epochs=1"]
+SHORT += ["selftraining.theta=0.1"]
+
+
+def test_toy_is_the_same_each_time_and_as_it_says(tmp_path):
+    source, target = write_toy(tmp_path / "a")
+    again = write_toy(tmp_path / "b")
+    assert (source.sha256, target.sha256) == (again[0].sha256, again[1].sha256)
+    assert source.sha256 != write_toy(tmp_path / "c", seed=1)[0].sha256
+    assert set(source.counts()["train"].values()) == {30}
+    assert list(target.counts()["train"].values()) == [120, 30, 60, 30]
+    for cls, half_axes in SHAPES.items():  # the source hardly leaves its ellipsoid
+        of_class = source.points[source.labels == source.classes.index(cls)]
+        assert np.abs(np.linalg.norm(of_class / half_axes, axis=2) - 1).mean() < 0.12
+    weights = sum(p.numel() for p in ToyNet(4).parameters())
+    assert 6000 < weights < 8000
+    assert ToyNet(4)(torch.rand(5, 64, 3)).shape == (5, 4)
+
+
+def test_train_leaves_what_the_command_leaves(tmp_path):
+    write_toy(tmp_path)
+    folder = train(*toy_overrides(tmp_path), *SHORT, "seed=3")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert (metrics["seed"], metrics["source"], metrics["simulated"]) == (3, "toy_source", True)
+    assert (metrics["method"], metrics["selftraining"]) == ("source_only", "qbst")  # as typed
+    assert not HydraConfig.initialized()
+    run = read_run(folder)
+    assert run.config["protocol"]["epochs"] == 2
+    assert run.command.startswith("python train.py experiment=quickstart")
+    written = (folder / "metrics.json").stat().st_mtime_ns
+    assert train(*toy_overrides(tmp_path), *SHORT, "seed=3") == folder  # not trained again
+    assert (folder / "metrics.json").stat().st_mtime_ns == written
+    assert qs3.load(folder, packages=("qs3",)).classes == tuple(SHAPES)
+    with pytest.raises(DataError, match="refused"):
+        qs3.load(folder)
+
+
+@pytest.mark.parametrize("word", ["nonsense=1", "model=nothing", "seed", "data.nothing=1"])
+def test_wrong_words_are_errors_for_people(word):
+    with pytest.raises(ConfigError, match=word.split("=")[0].split(".")[-1]):
+        composed("train", word)
+
+
+def test_generate(tmp_path):
+    few = ["classes=[chair]", "catalogue.train=1", "catalogue.test=1", "workers=0"]
+    made = generate("domain=modelnet10", *few, f"paths.data_dir={tmp_path}")
+    assert made.ids == ("chair/train/chair_0000", "chair/test/chair_0000")
+
+
+def test_a_table_of_ones_own(tmp_path):
+    file = tmp_path / "mine.yaml"
+    text = "title: T\nnotes: [{}]\nmetrics: [accuracy]\ncolumns: [c]\nrows:\n"
+    text += "  - {{name: r, c: {{run: {}}}}}\n"
+    file.write_text(text.format("a line", "experiment=quickstart"))
+    table = build_table(str(file), tmp_path / "logs")
+    assert (table.name, list(table.rows)) == ("mine", ["r"])
+    assert "experiment=quickstart" in table.cells[0].command
+    file.write_text(text.format("a: b", "experiment=quickstart"))
+    with pytest.raises(ConfigError, match="quotes"):
+        build_table(str(file), tmp_path / "logs")
+    file.write_text(text.format("a line", "experiment=quickstart nonsense"))
+    with pytest.raises(ConfigError, match="table cell 'r', 'c'"):
+        build_table(str(file), tmp_path / "logs")
+    with pytest.raises(ConfigError, match=r"there is no table .*NAME\.yaml"):
+        build_table(str(tmp_path / "lost.yaml"), tmp_path / "logs")

@@ -1,0 +1,395 @@
+"""Whole runs on the toy problem: seeds, skipping, labels that must stay hidden, errors."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra.errors import ConfigCompositionException
+
+from qs3.data.store import ManifestRow, open_pointset, write_pointset
+from qs3.engine.classifier import Classifier
+from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
+from qs3.runs import folder as runs
+from qs3.runs.checkpoints import copy_weights, load
+from qs3.training.command import train
+from tests.training.conftest import result_of
+from tests.training.toy import CLASSES, toy_config
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def test_metrics_and_files(finished):
+    metrics = runs.read_metrics(finished)
+    assert metrics is not None
+    assert metrics["status"] == "finished"
+    assert (metrics["source"], metrics["target"]) == ("specklenet10", "kinectsim10")
+    assert metrics["simulated"] is True
+    assert metrics["selection"]["student"] == "last"
+    assert metrics["selection"]["teacher"].startswith("source_val, epoch ")
+    assert [r["round"] for r in metrics["rounds"]] == [0, 1]
+    assert [r["theta"] for r in metrics["rounds"]] == [0.4, 0.405]
+    assert metrics["final"]["n"] == 24
+    assert metrics["final"]["majority_rate"] == pytest.approx(1 / 3)
+    rows = table(finished / "history.csv")
+    assert [int(row["epoch"]) for row in rows] == list(range(10))
+    assert [int(row["phase"]) for row in rows] == [0] * 4 + [1] * 3 + [2] * 3
+
+
+def test_it_learns(finished):
+    assert runs.read_metrics(finished)["final"]["accuracy"] > 0.6
+
+
+def test_selected_labels_match_the_table(finished):
+    metrics = runs.read_metrics(finished)
+    rows = table(finished / "round_00" / "pseudo_labels.csv")
+    assert len(rows) == 72
+    kept = [row for row in rows if row["selected"] == "1"]
+    assert len(kept) == metrics["rounds"][0]["total_selected"]
+    assert all(float(row["confidence"]) > 0.4 for row in kept)
+
+
+def test_checkpoint_of_a_phase_holds_the_trained_student(finished):
+    """The reset comes after the checkpoint: the last one equals the student that is reported."""
+    last = load(finished / "last.ckpt")["state_dict"]
+    for name, value in load(finished / "student.pt").items():
+        assert torch.equal(last[f"net.{name}"], value)
+
+
+def test_same_seed_same_result(toy, finished):
+    cfg = toy()
+    train(cfg)
+    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+
+
+def test_seed_1_alone_equals_seed_1_after_seed_0(toy, toy_data, tmp_path):
+    for seed in (0, 1):  # as the basic launcher does: one process
+        torch.manual_seed(123)
+        train(toy(f"seed={seed}"))
+    after = result_of(runs.run_folder(toy("seed=1")))
+    alone = toy("seed=1", f"paths.log_dir={tmp_path / 'alone'}")
+    torch.rand(7)
+    np.random.rand(3)  # noqa: NPY002 (disturbs the global state on purpose)
+    train(alone)
+    assert result_of(runs.run_folder(alone)) == after
+    zero = result_of(runs.run_folder(toy("seed=0")))
+    assert zero["history.csv"] != after["history.csv"]
+
+
+def test_finished_run_is_skipped_and_force_repeats_it(toy, monkeypatch):
+    cfg = toy("selftraining=none", "method=source_only")
+    first = train(cfg)
+    folder = runs.run_folder(cfg)
+    stamp = (folder / "last.ckpt").stat().st_mtime_ns
+    assert train(cfg) == first
+    assert (folder / "last.ckpt").stat().st_mtime_ns == stamp
+    again = train(toy("selftraining=none", "method=source_only", "force=true"))
+    assert (folder / "last.ckpt").stat().st_mtime_ns != stamp
+    assert {**again, "times": 0} == {**first, "times": 0}
+
+
+def test_without_self_training_the_selected_warmup_is_reported(toy):
+    metrics = train(toy("selftraining=none"))
+    assert metrics["rounds"] == []
+    assert metrics["selection"]["student"] == metrics["selection"]["teacher"]
+    selected = {k: v for k, v in metrics["warmup"]["selected"].items() if k != "epoch"}
+    assert metrics["final"] == selected
+
+
+def test_the_warmup_of_self_training_is_the_run_without_it(toy, finished):
+    """So the table row of PCM can be read off the run of PCM + QBST."""
+    metrics = train(toy("selftraining=none"))
+    assert metrics["warmup"] == runs.read_metrics(finished)["warmup"]
+
+
+def test_wandb_offline_beside_csv(toy, finished):
+    import os
+
+    cfg = toy("logger=wandb")
+    train(cfg)
+    folder = runs.run_folder(cfg)
+    assert list((folder / "wandb").glob("offline-run-*"))
+    assert result_of(folder) == result_of(finished)
+    assert "WANDB_MODE" not in os.environ
+
+
+def test_continued_student_with_source_and_pcm(toy):
+    metrics = train(
+        toy("selftraining.init=continue", "selftraining.use_source=true", "selftraining.pcm=true")
+    )
+    assert len(metrics["rounds"]) == 2
+
+
+def test_continue_begins_with_the_teacher_that_labelled(toy, monkeypatch):
+    """Round 0 with the selected weights of the warm-up, round 1 with the student of round 0."""
+    first: dict[int, dict[str, torch.Tensor]] = {}
+    last: dict[int, dict[str, torch.Tensor]] = {}
+
+    def spy(self, batch, batch_idx, real=Classifier.training_step):
+        first.setdefault(self.current_epoch, copy_weights(self.net))
+        return real(self, batch, batch_idx)
+
+    def end(self, real=Classifier.on_validation_epoch_end):
+        last[self.current_epoch] = copy_weights(self.net)
+        real(self)
+
+    def worse_and_worse(self, *args, real=Classifier.log, **kwargs):
+        if args[0] == "source_val/acc":  # so that the selected epoch is not the last
+            args = (args[0], 1.0 / (1 + self.current_epoch))
+        real(self, *args, **kwargs)
+
+    monkeypatch.setattr(Classifier, "training_step", spy)
+    monkeypatch.setattr(Classifier, "on_validation_epoch_end", end)
+    monkeypatch.setattr(Classifier, "log", worse_and_worse)
+    cfg = toy("selftraining.init=continue", "selftraining.theta=0.35")
+    metrics = train(cfg)
+    assert metrics["warmup"]["selected"]["epoch"] == 0
+    selected = load(runs.run_folder(cfg) / "warmup_selected.pt")
+    for name in selected:
+        assert torch.equal(first[4][name], selected[name]), name
+        assert torch.equal(first[7][name], last[6][name]), name
+    assert any(not torch.equal(selected[name], last[3][name]) for name in selected)
+
+
+def test_supervised_is_validated_on_target_training_clouds(toy):
+    metrics = train(toy("method=supervised", "selftraining=none"))
+    assert metrics["selection"]["teacher"].startswith("target_train_val, epoch ")
+    assert metrics["source"] == "kinectsim10"
+
+
+def test_one_domain_as_source_and_target(toy, caplog):
+    same = ("domain@data.source=kinectsim10", "selftraining=none", "protocol.epochs=1")
+    train(toy(*same))
+    assert "the target's training labels are used" in caplog.text
+    caplog.clear()
+    train(toy(*same, "method=supervised"))
+    assert "are the same dataset" not in caplog.text
+
+
+# --- target labels stay hidden ---------------------------------------------------------------
+
+
+def copy_with_other_labels(data: Path, folder: Path) -> None:
+    """The same target clouds and ids under other labels, in both splits."""
+    old = open_pointset(data / "kinectsim10")
+    labels = (old.labels + 1) % 3
+    rows = [
+        ManifestRow(id=i, cls=CLASSES[y], split=s)
+        for i, y, s in zip(old.ids, labels, old.splits, strict=True)
+    ]
+    write_pointset(
+        folder,
+        name="kinectsim10",
+        classes=CLASSES,
+        arrays={"points": old.points},
+        rows=rows,
+        meta={},
+    )
+
+
+def test_other_target_labels_change_the_figures_and_nothing_else(toy, toy_data, tmp_path, finished):
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "specklenet10").symlink_to(toy_data / "specklenet10")
+    copy_with_other_labels(toy_data, tmp_path / "other" / "kinectsim10")
+    cfg = toy(f"paths.data_dir={tmp_path / 'other'}")
+    metrics = train(cfg)
+    ours, theirs = result_of(runs.run_folder(cfg)), result_of(finished)
+    assert ours.pop("metrics") != theirs.pop("metrics")
+    assert ours == theirs  # history and all pseudo-labels
+    assert metrics["final"]["accuracy"] < 0.5
+    student = load(runs.run_folder(cfg) / "student.pt")
+    for name, value in load(finished / "student.pt").items():
+        assert torch.equal(student[name], value)
+
+
+# --- loading and evaluation ------------------------------------------------------------------
+
+
+def test_metrics_say_how_clouds_were_loaded_and_judged(finished):
+    metrics = runs.read_metrics(finished)
+    assert metrics["loading"] == {"points": 32, "fps_starts": 4, "sampler": "shuffled"}
+    assert metrics["selection"]["validation"] == "lineage"
+    assert metrics["evaluation"] == {
+        "split": "test",
+        "labels": True,
+        "rotations": 0,
+        "norms": "trained",
+        "final_over_rotations": None,
+        "warmup_over_rotations": None,
+    }
+    assert 0 <= metrics["final"]["calibration_error"] <= 1
+
+
+def test_turned_figures_stand_beside_the_plain_ones(toy, finished):
+    metrics = train(toy("evaluation.rotations=12"))
+    assert metrics["final"] == runs.read_metrics(finished)["final"]
+    evaluation = metrics["evaluation"]
+    assert evaluation["rotations"] == 12
+    for name in ("final_over_rotations", "warmup_over_rotations"):
+        assert evaluation[name].keys() == metrics["final"].keys()
+        assert evaluation[name]["calibration_error"] != metrics["final"]["calibration_error"]
+
+
+@pytest.mark.parametrize(
+    ("more", "where", "value"),
+    [
+        ("data.val=stratified", ("selection", "validation"), "stratified"),
+        ("data.sampler=balanced", ("loading", "sampler"), "balanced"),
+        ("data.fps_starts=1", ("loading", "fps_starts"), 1),
+        ("data.points=64", ("loading", "fps_starts"), 1),  # all points: nothing to choose
+    ],
+)
+def test_other_loading_is_another_result_and_named(toy, finished, more, where, value):
+    cfg = toy(more, "selftraining=none")
+    metrics = train(cfg)
+    assert metrics[where[0]][where[1]] == value
+    rows = table(runs.run_folder(cfg) / "history.csv")
+    assert rows != table(finished / "history.csv")[: len(rows)]
+
+
+def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
+    cache = tmp_path / "cache"
+    train(toy("selftraining=none", "protocol.epochs=1", f"paths.cache_dir={cache}"))
+    names = sorted(path.name[-12:] for path in cache.glob("*.npy"))
+    assert names == ["-32x1-v2.npy", "-32x4-v2.npy", "-32x4-v2.npy"]
+
+
+# --- errors ----------------------------------------------------------------------------------
+
+
+def test_misspelt_key():
+    with pytest.raises(ConfigCompositionException, match="thetaa"):
+        toy_config(Path(), "selftraining.thetaa=0.9")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("selftraining.theta=1.5", r"selftraining\.theta must lie in \(0, 1\), got 1\.5"),
+        ("seed=null", "seed must be a whole number"),
+        ("protocol.epochs=0", r"protocol\.epochs"),
+        ("protocol.batch_size=1", r"protocol\.batch_size"),
+        ("data.points=65", r"data\.points is 65"),
+        ("data.val=other", r"data\.val"),
+        ("data.sampler=other", r"data\.sampler"),
+        ("data.fps_starts=0", r"data\.fps_starts .* >= 1, got 0"),
+        ("evaluation.rotations=-1", r"evaluation\.rotations .* >= 0, got -1"),
+        ("num_classes=10", r"num_classes is 10.*set num_classes=3"),
+        ("selection.teacher=best", r"selection\.teacher"),
+        ("protocol.epochs=abc", r"protocol\.epochs .* got 'abc'"),
+        ("protocol.batch_size=0", r"protocol\.batch_size .* got 0"),
+        ("protocol.optimizer.lr=abc", r"protocol\.optimizer\.lr must be a number, got 'abc'"),
+        ("protocol.optimizer.lr=-1", r"protocol\.optimizer: Invalid learning rate"),
+        ("selftraining.theta=abc", r"selftraining\.theta must be a number"),
+        ("selftraining.rounds=abc", r"selftraining\.rounds .* got 'abc'"),
+        ("data.points=abc", r"data\.points .* got 'abc'"),
+        ("trainer.threads=abc", r"trainer\.threads"),
+        ("method=supervised", r"method=supervised .* selftraining=none"),
+    ],
+)
+def test_wrong_setting_names_the_key(toy, override, message):
+    with pytest.raises(ConfigError, match=message):
+        train(toy(override))
+
+
+def test_target_classes_are_not_balanced(toy):
+    with pytest.raises(ConfigError, match=r"data\.sampler=balanced draws source clouds only"):
+        train(toy("data.sampler=balanced", "method=supervised", "selftraining=none"))
+
+
+def test_empty_selection(toy):
+    with pytest.raises(SelectionError, match=r"round 0 with theta=0\.9999.*ball 0/0.*lower"):
+        train(toy("selftraining.theta=0.9999", "selftraining.epsilon=0"))
+
+
+def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
+    def only_two(net, points, batch_size, device="cpu"):
+        table = np.full((len(points), 3), 0.02)
+        table[np.arange(len(points)), np.arange(len(points)) % 2] = 0.96
+        return table
+
+    monkeypatch.setattr("qs3.selftraining.callback.predict", only_two)
+    with caplog.at_level(logging.WARNING):
+        metrics = train(toy())
+    assert "no pseudo-label for slab" in caplog.text
+    assert metrics["rounds"][0]["missing_classes"] == ["slab"]
+    with pytest.raises(SelectionError, match="no pseudo-label for slab"):
+        train(toy("selftraining.missing_class=error"))
+
+
+def test_missing_data(toy, tmp_path):
+    with pytest.raises(MissingDataError, match=r"specklenet10.*\n.*meta\.yaml"):
+        train(toy(f"paths.data_dir={tmp_path / 'nowhere'}"))
+
+
+def test_two_runs_in_one_folder(toy):
+    cfg = toy()
+    with (
+        runs.locked(runs.run_folder(cfg)),
+        pytest.raises(Qs3Error, match="another process is training"),
+    ):
+        train(cfg)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_gpu_that_is_not_there(toy):
+    with pytest.raises(ConfigError, match=r"trainer: .*use trainer=cpu"):
+        train(toy("trainer=gpu"))
+
+
+def test_other_config_of_the_same_eight_digits_is_refused(toy):
+    cfg = toy("selftraining=none", "protocol.epochs=1")
+    metrics = train(cfg)
+    folder = runs.run_folder(cfg)
+    assert metrics["config_sha256"] == runs.config_sha256(cfg)
+    for name in ("metrics.json", "started.json"):
+        value = json.loads((folder / name).read_text())
+        value["config_sha256"] = value["config_sha256"][:8] + "0" * 56
+        (folder / name).write_text(json.dumps(value))
+    with pytest.raises(ConfigError, match=r"other settings.*force=true"):
+        train(cfg)
+    (folder / "metrics.json").unlink()
+    with pytest.raises(ConfigError, match=r"other settings.*force=true"):
+        train(cfg)
+
+
+def test_leftovers_of_a_kill_are_removed(toy):
+    cfg = toy("selftraining.rounds=1", "protocol.epochs=1", "selftraining.epochs=1")
+    folder = runs.run_folder(cfg)
+    leftovers = [folder / ".last.ckpt.x.tmp.ckpt", folder / "round_00" / ".p.csv.x.tmp.csv"]
+    for path in leftovers:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+    train(cfg)
+    assert not any(path.exists() for path in leftovers)
+
+
+def test_changed_data_are_refused(toy, toy_data, tmp_path):
+    cfg = toy("selftraining=none")
+    train(cfg)
+    folder = runs.run_folder(cfg)
+    for name in ("metrics.json", "started.json"):
+        value = json.loads((folder / name).read_text())
+        value["data"]["target"] = "0" * 64
+        (folder / name).write_text(json.dumps(value))
+    with pytest.raises(DataError, match=r"another version of kinectsim10.*force=true"):
+        train(cfg)
+    (folder / "metrics.json").unlink()
+    with pytest.raises(DataError, match=r"another version of kinectsim10.*force=true"):
+        train(cfg)
+
+
+def test_damaged_checkpoint(toy, tmp_path):
+    cfg = toy()
+    folder = runs.run_folder(cfg)
+    folder.mkdir(parents=True)
+    (folder / "last.ckpt").write_bytes(b"not a checkpoint")
+    with pytest.raises(DataError, match=r"last\.ckpt cannot be read.*force=true"):
+        train(cfg)

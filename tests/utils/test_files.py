@@ -1,0 +1,144 @@
+"""Atomic writes: old or new, never half; also under kill -9 and on a full disk."""
+
+import errno
+import hashlib
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import Qs3Error
+from qs3.utils import files
+
+
+def test_writes_text_bytes_json_npy(tmp_path):
+    files.write_text(tmp_path / "a" / "b.txt", "grüße\n")
+    assert (tmp_path / "a" / "b.txt").read_bytes() == "grüße\n".encode()
+    files.write_json(tmp_path / "c.json", {"b": 1, "a": [0.5, None]})
+    assert (
+        tmp_path / "c.json"
+    ).read_text() == '{\n  "b": 1,\n  "a": [\n    0.5,\n    null\n  ]\n}\n'
+    files.write_npy(tmp_path / "d.npy", np.arange(6).reshape(2, 3))
+    assert np.load(tmp_path / "d.npy").tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "c.json", "d.npy"]
+
+
+def test_json_refuses_nan_and_keeps_the_old_file(tmp_path):
+    files.write_json(tmp_path / "m.json", 1)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        files.write_json(tmp_path / "m.json", float("nan"))
+    assert (tmp_path / "m.json").read_text() == "1\n"
+
+
+def test_failure_in_the_block_keeps_the_old_file_and_no_leftover(tmp_path):
+    path = tmp_path / "x.txt"
+    files.write_text(path, "old")
+
+    def fail():
+        with files.atomic_path(path) as temporary:
+            assert temporary.parent == tmp_path
+            assert temporary.suffix == ".txt"
+            temporary.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_full_disk_is_a_clear_error(tmp_path, monkeypatch):
+    path = tmp_path / "x.txt"
+    files.write_text(path, "old")
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(Qs3Error, match=r"cannot write .*x\.txt: .*No space left"):
+        files.write_text(path, "new")
+    monkeypatch.undo()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_in_the_way_of_a_folder(tmp_path):
+    (tmp_path / "f").write_text("")
+    with pytest.raises(Qs3Error, match="cannot write"):
+        files.write_text(tmp_path / "f" / "x.txt", "")
+
+
+def test_permissions_follow_the_umask(tmp_path):
+    old = os.umask(0o027)
+    try:
+        files.write_text(tmp_path / "x", "")
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE((tmp_path / "x").stat().st_mode) == 0o640
+
+
+def test_sha256(tmp_path):
+    data = np.random.default_rng(0).bytes(3_000_001)
+    (tmp_path / "x").write_bytes(data)
+    assert files.sha256_file(tmp_path / "x") == hashlib.sha256(data).hexdigest()
+
+
+def test_leftovers_are_found_by_name_and_nothing_else_is_touched(tmp_path):
+    for name in (".a.npy.x1.tmp.npy", ".b.csv.x2.tmp.csv", "a.npy", ".hidden", ".x.lock"):
+        (tmp_path / name).write_text("")
+    assert [p.name for p in files.remove_leftovers(tmp_path, of="b.csv")] == [".b.csv.x2.tmp.csv"]
+    assert [p.name for p in files.remove_leftovers(tmp_path)] == [".a.npy.x1.tmp.npy"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", ".x.lock", "a.npy"]
+    assert files.remove_leftovers(tmp_path / "absent") == []
+
+
+def test_kill_9_leaves_old_or_new(tmp_path):
+    """A writer alternating between two contents is killed at many instants."""
+    code = """
+import sys
+from qs3.utils.files import write_bytes
+n = 0
+while True:
+    n += 1
+    write_bytes(sys.argv[1], bytes([n % 2]) * 300_000)
+    if n == 1:
+        print("go", flush=True)
+"""
+    path = tmp_path / "x.bin"
+    for attempt in range(8):
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, cwd=Path.cwd()
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(0.003 * attempt + 0.001)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        data = path.read_bytes()
+        assert data in (bytes(300_000), b"\1" * 300_000)
+    files.remove_leftovers(tmp_path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_lock_excludes_and_is_released(tmp_path):
+    order = []
+
+    def second():
+        with files.locked(tmp_path / "l"):
+            order.append("second")
+
+    with files.locked(tmp_path / "l"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        time.sleep(0.05)
+        order.append("first")
+    thread.join(5)
+    assert order == ["first", "second"]
