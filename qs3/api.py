@@ -1,9 +1,10 @@
-"""train.py and generate.py as functions, for notebooks: the words are those of the command line.
+"""The commands as functions, for notebooks: the words are those of the command line.
 
-from qs3.api import generate, train
+import qs3
 
-generate("domain=modelnet10", "limit=5", "paths.data_dir=data")
-folder = train("experiment=quickstart", "seed=1", "paths.data_dir=data")
+qs3.generate("domain=modelnet10", "limit=5", "paths.data_dir=data")
+folder = qs3.train("experiment=quickstart", "seed=1", "paths.data_dir=data")
+predictor = qs3.load(folder)
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import torch
     from omegaconf import DictConfig
 
     from qs3.data.store import PointSet
+    from qs3.inference.predictor import Predictor
 
 
 def train(*overrides: str) -> Path:
@@ -32,7 +35,7 @@ def train(*overrides: str) -> Path:
     """
     from omegaconf import OmegaConf
 
-    from qs3.runs.folder import run_folder
+    from qs3.config.hashing import run_folder
     from qs3.training.command import train as run_of
     from qs3.utils.files import write_text
 
@@ -50,9 +53,44 @@ def generate(*overrides: str) -> PointSet:
 
     Workers are processes of their own; workers=0 uses this one.
     """
+    from qs3.config.compose import composed
     from qs3.generation.command import generate as made
 
     return made(composed("generate", *overrides))
+
+
+def load(
+    run: str | Path,
+    *,
+    device: str | torch.device = "cpu",
+    packages: Sequence[str] = ("qs3.models",),
+) -> Predictor:
+    """The classifier that a finished run reports.
+
+        predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
+        probabilities = predictor([cloud_a, cloud_b])  # [2, classes] float64
+        predictor.classes  # their names, in that order
+
+    A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`).
+
+    Args:
+        run: its folder, or the file result.pt of it, which needs nothing beside it.
+        device: where to run it: "cpu", "cuda", "cuda:1".
+        packages: where the net of the file may be defined. For a net of your own add your
+            package, if you trust it to be built with any arguments.
+
+    Returns:
+        See `qs3.inference.predictor.Predictor`.
+
+    Raises:
+        qs3.errors.MissingDataError: no finished run there.
+        qs3.errors.DataError: the file is damaged, or asks for something else than a net of
+            `packages`.
+        qs3.errors.ConfigError: no such device.
+    """
+    from qs3.inference.predictor import load as load_result
+
+    return load_result(run, device=device, packages=packages)
 
 
 @contextlib.contextmanager
@@ -61,7 +99,9 @@ def _as_hydra(command: str, overrides: Sequence[str]) -> Iterator[DictConfig]:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import open_dict
 
-    whole = _composed(command, overrides, return_hydra_config=True)
+    from qs3.config.compose import composed
+
+    whole = composed(command, *overrides, return_hydra_config=True)
     known, before = HydraConfig.instance(), HydraConfig.instance().cfg
     known.set_config(whole)
     cfg = whole.copy()
@@ -71,30 +111,3 @@ def _as_hydra(command: str, overrides: Sequence[str]) -> Iterator[DictConfig]:
         yield cfg
     finally:
         known.cfg = before
-
-
-def composed(command: str, *overrides: str) -> DictConfig:
-    """The config that a command would run with.
-
-    Args:
-        command: "train" or "generate".
-        overrides: words of its command line.
-
-    Raises:
-        ConfigError: no such group, choice or key.
-    """
-    return _composed(command, overrides)
-
-
-def _composed(command: str, overrides: Sequence[str], **more: Any) -> Any:
-    from hydra.errors import ConfigCompositionException, OverrideParseException
-
-    from qs3.errors import ConfigError
-    from qs3.report.tables.table import composing
-
-    with composing() as compose:
-        try:
-            return compose(command, list(overrides), **more)
-        except (ConfigCompositionException, OverrideParseException) as error:
-            lines = str(error).strip().splitlines()
-            raise ConfigError(lines[0] if lines else type(error).__name__) from error

@@ -8,7 +8,8 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 
 import qs3
-from qs3.api import composed, generate, train
+from qs3.api import generate, train
+from qs3.config.compose import composed
 from qs3.errors import ConfigError, DataError
 from qs3.report.runs.data import read_run
 from qs3.report.tables.table import build_table

@@ -20,17 +20,17 @@ from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from qs3.config import hashing
 from qs3.config.location import CONF
 from qs3.errors import ConfigError, Qs3Error
-from qs3.runs import folder as runs
 
 
 def _run_name(*, _root_: DictConfig) -> str:
-    return runs.run_name(_root_)
+    return hashing.run_name(_root_)
 
 
 def _wandb_id(*, _root_: DictConfig) -> str:
-    return runs.run_name(_root_).replace("/", "-")
+    return hashing.run_name(_root_).replace("/", "-")
 
 
 def _tags(*, _root_: DictConfig) -> list[str]:
@@ -69,7 +69,7 @@ def called(cfg: DictConfig) -> dict[str, str]:
         group: str(choices.get(group) or node.get("_target_", "none").rsplit(".", 1)[-1].lower())
         for group, node in nodes.items()
     }
-    return names if runs.has_rounds(cfg) else {**names, "selftraining": "none"}
+    return names if hashing.has_rounds(cfg) else {**names, "selftraining": "none"}
 
 
 def _choices(group: str, indent: int = 0) -> str:

@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
-import qs3
 from qs3.data.manifest import (
     AGAIN,
     MANIFEST,
@@ -39,6 +38,7 @@ from qs3.data.manifest import (
 )
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
+from qs3.utils.version import VERSION
 
 __all__ = [
     "SPLITS",
@@ -201,7 +201,7 @@ def write_pointset(
     document = {
         "format": "qs3 point clouds",
         "format_version": FORMAT_VERSION,
-        "created_by": f"qs3 {qs3.__version__}",
+        "created_by": f"qs3 {VERSION}",
         "name": name,
         "classes": list(classes),
         "clouds": shape[0],

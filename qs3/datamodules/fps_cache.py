@@ -21,7 +21,8 @@ from jaxtyping import Float
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample_all
 from qs3.errors import ConfigError, Qs3Error
-from qs3.utils.files import atomic_path, locked
+from qs3.utils.files import atomic_path
+from qs3.utils.locks import locked
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ from qs3.engine.schedules import Plateau, cosine
 from qs3.errors import ConfigError
 from qs3.methods.base import Method
 from qs3.models.base import Backbone
-from qs3.selftraining.student_loss import Student
 from qs3.utils.seeding import derive
 
 # `qs3.engine.loggers.EpochRows` hands the figures on, before the checkpoint is written.
@@ -49,7 +48,7 @@ class Classifier(LightningModule):
         build_net: Callable[[], nn.Module],
         build_optimizer: Callable[..., torch.optim.Optimizer],
         method: Method,
-        student: Student,
+        student: Method,
         phases: Phases,
         seed: int,
         schedule: str = "cosine",

@@ -15,6 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
+from qs3.data.dataset_folder import CLOUDS, CONFIG, INFRARED, delete_dataset
 from qs3.data.domain import Domain
 from qs3.data.store import ManifestRow, PointSet, is_finished, open_pointset, write_pointset
 from qs3.errors import DataError
@@ -32,11 +33,11 @@ from qs3.generation.plan import (
     stored_config,
 )
 from qs3.generation.provenance import PROVENANCE
-from qs3.generation.shards import CLOUDS, CONFIG, INFRARED, Parts, check_same_recipe, forget
+from qs3.generation.shards import Parts, check_same_recipe
 from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
-from qs3.runs.folder import locked
 from qs3.utils.files import write_text
+from qs3.utils.locks import owned
 from qs3.utils.progress import progress_bar
 
 log = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ def generate(cfg: DictConfig) -> PointSet:
     check_recipe(job.recipe, cfg)
     check_folder(folder, cfg.paths.data_dir)
     with (
-        locked(
+        owned(
             folder,
             doing="making the dataset in",
             advice="wait for it, or give another paths.data_dir",
@@ -82,7 +83,7 @@ def generate(cfg: DictConfig) -> PointSet:
         disk_errors_told(folder, lambda: parts.state(len(items))),
     ):
         if cfg.force:
-            forget(folder)
+            delete_dataset(folder)
         recipe = describe(cfg, items, renderer_provenance(job))
         if is_finished(folder):
             check_same_recipe(folder, recipe)
@@ -155,7 +156,7 @@ def _collect(
             raise DataError(f"the part of {item.id} is gone: run the same command again")
         outcomes.append(outcome)
     if all(outcome.cloud is None for outcome in outcomes):
-        forget(folder)  # nothing is lost, and mended settings are not refused
+        delete_dataset(folder)  # nothing is lost, and mended settings are not refused
         raise DataError(
             f"all {len(items)} objects failed; the first: {items[0].id}: {outcomes[0].reason}"
         )

@@ -15,17 +15,17 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-import qs3
 from qs3.classes import CLASSES, class_list
 from qs3.config.checks import whole
 from qs3.config.hydra import build
+from qs3.data.dataset_folder import VIEWS
 from qs3.errors import ConfigError
 from qs3.generation.provenance import Keep
 from qs3.generation.released.poses import read_poses
-from qs3.generation.shards import VIEWS
 from qs3.meshes.folder import MeshFolder
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import sha256_file
+from qs3.utils.version import VERSION
 
 _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
@@ -146,7 +146,7 @@ def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -
         "objects": [_name_and_content(item) for item in items],
         "versions": {
             **renderer,
-            "qs3": qs3.__version__,
+            "qs3": VERSION,
             "numpy": version("numpy"),
             "opencv": version("opencv-python-headless"),
             "fpsample": version("fpsample"),

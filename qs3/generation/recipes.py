@@ -26,7 +26,7 @@ from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import Placing, UnitCube
 from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Renderer
-from qs3.utils.object_rng import object_rng
+from qs3.utils.seeding import object_rng
 
 _NOTHING = Keep()
 

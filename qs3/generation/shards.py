@@ -16,13 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from qs3.data.dataset_folder import PARTS, RECIPE
 from qs3.errors import ConfigError, DataError
 from qs3.generation.recipes import Cloud
 from qs3.generation.workers import Outcome
 from qs3.utils.files import make_folder, remove_leftovers, write_bytes, write_json
 
-RECIPE = "recipe.json"
-CLOUDS, INFRARED, CONFIG, VIEWS = "clouds.png", "infrared.png", "config.yaml", "views"
 _PREVIEW = "preview_"
 
 
@@ -31,7 +30,7 @@ class Parts:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._parts = folder / "parts"
+        self._parts = folder / PARTS
 
     def begin(self, recipe: dict[str, Any]) -> None:
         """Start, or check that what is there was made with the same recipe.
@@ -153,16 +152,3 @@ def _differences(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 80 else text[:77] + "..."
-
-
-def forget(folder: Path) -> None:
-    """Delete a dataset, finished or not, and its recipe; other files are left alone."""
-    # meta.yaml first: without it the folder counts as unfinished whatever else is left. The
-    # recipe last: as long as a part is left, it says what the part was made with.
-    (folder / "meta.yaml").unlink(missing_ok=True)
-    Parts(folder).clear()
-    if (folder / VIEWS).is_dir():
-        shutil.rmtree(folder / VIEWS)
-    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG)
-    for path in [*(folder / name for name in names), *folder.glob("*.npy"), folder / RECIPE]:
-        path.unlink(missing_ok=True)

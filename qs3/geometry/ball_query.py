@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from qs3.errors import DataError
-from qs3.geometry.exporting import takes_numpy
+from qs3.geometry.neighbours import takes_numpy
 
 _BLOCK = 1 << 26  # distances held at once on a device: 256 MB in float32
 _CPU_BLOCK = 1 << 18  # 1 MB in float32, to stay in the cache

@@ -11,7 +11,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from qs3.geometry.exporting import takes_numpy
 from qs3.geometry.matmul import times
 from qs3.geometry.sampling import farthest_point_sampling_np
 
@@ -142,3 +141,12 @@ def _farthest_points(x: Tensor, n: int, start: Int[Tensor, " b"] | int = 0) -> T
         nearest = torch.minimum(nearest, distance).scatter_(1, last, -1.0)  # never again
         last = nearest.argmax(1, keepdim=True)
     return out
+
+
+def takes_numpy(x: Tensor) -> bool:
+    """On the CPU, and not while `torch.export` writes down what is done to `x`.
+
+    Then the way of other devices is taken, which is plain torch and gives the same.
+    """
+    exporting = getattr(torch.compiler, "is_exporting", None)  # since torch 2.7
+    return x.device.type == "cpu" and not (exporting is not None and exporting())

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-import qs3
 from qs3.clouds.files import SUFFIXES, measured, parse_clouds, printable
 from qs3.config.checks import one_of, whole
 from qs3.data.importers.folders import UP_AXES
@@ -27,6 +26,7 @@ from qs3.inference.predictor import Predictor, Prepared, load
 from qs3.models.norms import norms_for, use_domain
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.progress import progress_bar
+from qs3.utils.version import VERSION
 
 _SHOWN = 10  # failures in the text for the terminal
 
@@ -270,7 +270,7 @@ def _csv(rows: list[Row], predictor: Predictor) -> str:
 
 def _json(rows: list[Row], predictor: Predictor) -> str:
     record = {
-        "qs3": qs3.__version__,
+        "qs3": VERSION,
         "target": predictor.result.target,
         "classes": list(predictor.classes),
         "clouds": [_record(row, predictor) for row in rows],

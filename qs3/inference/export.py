@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-import qs3
 from qs3.clouds.files import measured, parse_clouds
 from qs3.config.checks import whole
 from qs3.errors import ConfigError, DataError, Qs3Error
@@ -27,6 +26,7 @@ from qs3.inference.predictor import Predictor, load
 from qs3.models.base import PointClassifier
 from qs3.models.norms import norms_for, use_domain
 from qs3.utils.files import atomic_path, make_folder
+from qs3.utils.version import VERSION
 
 log = logging.getLogger(__name__)
 
@@ -223,7 +223,7 @@ def metadata(predictor: Predictor) -> dict[str, str]:
     result = predictor.result
     upright = result.gravity == "z"
     return {
-        "qs3": qs3.__version__,
+        "qs3": VERSION,
         "classes": json.dumps(list(predictor.classes)),
         "points": str(predictor.points),
         "any_number_of_points": str(any_points(predictor)).lower(),

@@ -17,10 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-import qs3
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.ood import MEASURES
 from qs3.runs.checkpoints import save
+from qs3.utils.version import VERSION
 
 FILE = "result.pt"
 PACKAGES = ("qs3.models",)
@@ -58,7 +58,7 @@ class Result:
 def write_result(path: Path, result: Result) -> None:
     """Save it, atomically."""
     plain = {
-        "qs3": qs3.__version__,
+        "qs3": VERSION,
         "model": dict(result.model),
         "classes": list(result.classes),
         "points": result.points,

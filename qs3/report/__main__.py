@@ -241,9 +241,10 @@ def _pictures(options: dict[str, str]) -> None:
         return _pictures_of_run(options)
     from hydra.utils import instantiate
 
+    from qs3.config.compose import composing
     from qs3.report.figures.class_balance import class_picture
     from qs3.report.figures.contact_sheets import class_sheet, scan_picture
-    from qs3.report.tables.table import check_domain, composing
+    from qs3.report.tables.table import check_domain
 
     names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]
     if not names:

@@ -117,3 +117,13 @@ def window_of(box_m: np.ndarray, camera: Camera, *, margin_px: int = 0) -> Windo
     if right < left or bottom < top:
         return None
     return Window(left, top, right - left + 1, bottom - top + 1)
+
+
+def on_grid(start: int, count: int, step: int) -> tuple[int, slice]:
+    """Every step-th of `count` pixels from `start`, on a grid that does not depend on them.
+
+    Returns:
+        The first pixel x >= start with x % step == step // 2, and the slice of the pixels.
+    """
+    first = start + (step // 2 - start) % step
+    return first, slice(first - start, count, step)

@@ -1,61 +1,14 @@
-"""Sweepers of our own for Hydra: a list of jobs from a file; searches are in `qs3.sweeps.search`.
-
-Hydra takes sweepers from its list of plugins only, under names that begin with `hydra_plugins`.
-"""
+"""A sweeper that runs the jobs of a file: how tables train what they lack."""
 
 from __future__ import annotations
 
 import json
-from abc import abstractmethod
 from pathlib import Path
-from typing import Any
 
-from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
-from hydra.errors import CompactHydraException
-from hydra.plugins.launcher import Launcher
-from hydra.plugins.sweeper import Sweeper
-from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig
 
-from qs3.errors import ConfigError, DataError, Qs3Error
-
-
-class OverLauncher(Sweeper):
-    """What our sweepers have in common: whichever launcher the user chose runs the jobs."""
-
-    hydra_context: HydraContext
-    config: DictConfig
-    launcher: Launcher
-
-    def setup(
-        self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
-    ) -> None:
-        """Called by Hydra before `sweep`."""
-        self.hydra_context, self.config = hydra_context, config
-        self.launcher = Plugins.instance().instantiate_launcher(
-            hydra_context=hydra_context, task_function=task_function, config=config
-        )
-
-    def sweep(self, arguments: list[str]) -> list[JobReturn]:
-        """Called by Hydra; errors meant for the user are shown without a traceback."""
-        try:
-            return self.run(arguments)
-        except Qs3Error as error:
-            raise CompactHydraException(f"{type(error).__name__}: {error}") from error
-
-    @abstractmethod
-    def run(self, arguments: list[str]) -> list[JobReturn]:
-        """Run the sweep, and raise the first error of a job when all are done.
-
-        Args:
-            arguments: overrides of the command line, without those of Hydra's own settings.
-        """
-
-    def launch(self, jobs: list[list[str]], first: int) -> list[JobReturn]:
-        """Run jobs, each a list of overrides; the first has the number `first`."""
-        self.validate_batch_is_legal(jobs)
-        return list(self.launcher.launch(jobs, initial_job_idx=first))
+from qs3.errors import ConfigError, DataError
+from qs3.sweeps.launching import OverLauncher
 
 
 class ListedJobs(OverLauncher):
@@ -88,13 +41,3 @@ class ListedJobs(OverLauncher):
         for job in done:
             _ = job.return_value  # raises if the job failed
         return done
-
-
-def register() -> None:
-    """Tell Hydra of our sweepers, before it looks for one."""
-    from qs3.sweeps.search import LabelFreeGrid, LabelFreeSearch
-
-    known: dict[str, Any] = Plugins.instance().class_name_to_class
-    known["hydra_plugins.qs3.ListedJobs"] = ListedJobs
-    known["hydra_plugins.qs3.LabelFreeGrid"] = LabelFreeGrid
-    known["hydra_plugins.qs3.LabelFreeSearch"] = LabelFreeSearch

@@ -24,11 +24,11 @@ from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig
 
+from qs3.config import hashing
 from qs3.config.checks import whole
 from qs3.errors import ConfigError
 from qs3.evaluation.selection_rules import check_objective
-from qs3.runs import folder as runs
-from qs3.sweeps.listed_jobs import OverLauncher
+from qs3.sweeps.launching import OverLauncher
 from qs3.sweeps.search_report import FAILED, Tried, report
 from qs3.sweeps.search_space import distribution, overrides, split, words
 
@@ -176,7 +176,7 @@ class LabelFreeSearch(Judged):
         from optuna.storages import JournalStorage
         from optuna.storages.journal import JournalFileBackend
 
-        which = [runs.config_sha256(cfg), cfg.seed, cfg.objective, self.seed, self.random]
+        which = [hashing.config_sha256(cfg), cfg.seed, cfg.objective, self.seed, self.random]
         text = json.dumps([*which, {key: str(one) for key, one in sorted(space.items())}])
         name = f"{cfg.experiment_name}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
         self.file = self.folder / f"{name}.journal"

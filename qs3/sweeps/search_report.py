@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 from hydra.core.utils import JobReturn, JobStatus
 
+from qs3.config import hashing
 from qs3.report.tables.aggregate import align
-from qs3.runs import folder as runs
 from qs3.sweeps.search_space import overrides
 
 FAILED = "failed"
@@ -38,7 +38,7 @@ class Tried:
         """From what Hydra says of a job."""
         if result.status != JobStatus.COMPLETED:
             return Tried(number, params, None, FAILED)
-        name, value = runs.run_name(result.cfg), float(result.return_value)  # type: ignore[arg-type]
+        name, value = hashing.run_name(result.cfg), float(result.return_value)  # type: ignore[arg-type]
         if not math.isfinite(value):  # see `qs3.training.command.objective_of`
             return Tried(number, params, None, f"{DIVERGED}: {name}")
         return Tried(number, params, value, name)

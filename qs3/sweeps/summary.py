@@ -18,7 +18,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from qs3.runs import folder as runs
-from qs3.sweeps import listed_jobs as sweepers
+from qs3.sweeps.plugins import register
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ class SummaryOfSeeds(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Begin a new list."""
-        sweepers.register()
+        register()
         self._main = os.getpid()
         self.journal = _new_file(Path(config.hydra.sweep.dir).resolve())
         # Hydra leaves a sweep by the first failed job's exception, past `on_multirun_end`; the

@@ -12,6 +12,7 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from qs3.config import hashing
 from qs3.config.checks import number, one_of, whole
 from qs3.config.hydra import build, in_multirun
 from qs3.data.domain import check_all
@@ -21,9 +22,10 @@ from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
 from qs3.runs import folder as runs
-from qs3.runs.folder import Run
 from qs3.runs.predictions import OF_FILES
 from qs3.training.ensure_source import make_if_missing
+from qs3.training.run import Run
+from qs3.utils.locks import owned
 
 log = logging.getLogger(__name__)
 
@@ -41,8 +43,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     scheme: Scheme = build(cfg.selftraining)
     run = Run(
         cfg=cfg,
-        seed=runs.check_seed(cfg.seed),
-        folder=runs.run_folder(cfg),
+        seed=whole("seed", cfg.seed, 0),
+        folder=hashing.run_folder(cfg),
         scheme=scheme,
         phases=Phases(cfg.protocol.epochs, scheme.rounds, scheme.epochs),
         source=build(cfg.data.source),
@@ -57,7 +59,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
             return _fit(run)
 
     _warn_of_one_domain(run)
-    with runs.locked(run.folder):
+    with owned(run.folder):
         if cfg.force:
             runs.clear(run.folder)
         metrics = runs.read_metrics(run.folder)
@@ -65,10 +67,9 @@ def train(cfg: DictConfig) -> dict[str, Any]:
             with _wandb_forgotten():
                 metrics = _fit(run)
                 runs.write_metrics(run.folder, metrics)
-                if cfg.report.pictures:
-                    _draw(run)
+                _report(run)
         else:
-            runs.check_config(run.folder, metrics.get("config_sha256"), runs.config_sha256(cfg))
+            runs.check_config(run.folder, metrics.get("config_sha256"), hashing.config_sha256(cfg))
             _refuse_other_data(run, metrics["data"])
             log.info("already finished (force=true repeats it)")
     log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
@@ -140,11 +141,9 @@ def _fit(run: Run) -> dict[str, Any]:
     return fit(run)
 
 
-def _draw(run: Run) -> None:
-    from qs3.report.runs.pictures import after_training  # matplotlib from here on
-
-    config: Any = OmegaConf.to_container(run.cfg, resolve=False)
-    after_training(run.folder, config)
+def _report(run: Run) -> None:
+    """Hand the finished run to what `report` names, e.g. its pictures: training imports none."""
+    build(run.cfg.report)(run.folder, OmegaConf.to_container(run.cfg, resolve=False))
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
 from torch import nn
 
+from qs3.config import hashing
 from qs3.config.hydra import build, called
 from qs3.data.domain import Domain
 from qs3.data.manifest import read_manifest
@@ -43,9 +44,7 @@ from qs3.evaluation.selection_rules import ORACLE
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result
 from qs3.methods.base import Method
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST, AtomicCheckpointIO, SaveLast, copy_weights, load, save
-from qs3.runs.folder import Run
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import (
     OF_FILES,
@@ -61,6 +60,7 @@ from qs3.selftraining.student_selection import Choice, StudentSelection
 from qs3.training.final_scores import learnt_by_heart, without_labels
 from qs3.training.provenance import note_start
 from qs3.training.resume import take_checkpoint
+from qs3.training.run import Run
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
 from qs3.utils.seeding import derive
 
@@ -248,8 +248,8 @@ def fit(run: Run) -> dict[str, Any]:
     reported = teacher if not run.scheme.rounds else choice.in_words if choice else LAST_EPOCH
     return {
         "experiment": cfg.experiment_name,
-        "hash": runs.config_hash(cfg),
-        "config_sha256": runs.config_sha256(cfg),
+        "hash": hashing.config_hash(cfg),
+        "config_sha256": hashing.config_sha256(cfg),
         "seed": run.seed,
         "status": "finished",
         "source": run.target.name if supervised else run.source.name,

@@ -13,14 +13,15 @@ import lightning
 import numpy as np
 import torch
 
-import qs3
+from qs3.config import hashing
 from qs3.data.store import PointSet
 from qs3.datamodules.fps_cache import remove_old_leftovers
 from qs3.errors import ConfigError
 from qs3.runs import folder as runs
-from qs3.runs.folder import Run
 from qs3.selftraining.student_selection import CANDIDATES
+from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
+from qs3.utils.version import VERSION
 
 log = logging.getLogger(__name__)
 
@@ -30,13 +31,13 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
     now: dict[str, Any] = {
         "data": {"source": source.sha256, "target": target.sha256},
         "versions": {
-            "qs3": qs3.__version__,
+            "qs3": VERSION,
             "python": platform.python_version(),
             "torch": torch.__version__,
             "lightning": lightning.__version__,
             "numpy": np.__version__,
         },
-        "config_sha256": runs.config_sha256(run.cfg),
+        "config_sha256": hashing.config_sha256(run.cfg),
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:
         first = runs.read_started(run.folder) or {}

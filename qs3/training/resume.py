@@ -12,9 +12,10 @@ from typing import Any
 from qs3.errors import ConfigError, MissingDataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
-from qs3.runs.folder import Run
 from qs3.training.provenance import warn_of_versions
+from qs3.training.run import Run
 from qs3.utils.files import atomic_path, make_folder
+from qs3.utils.locks import check_idle
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
             "or leave ckpt_path out"
         )
     runs.check_config(other, begun.get("config_sha256"), started["config_sha256"])
-    runs.check_idle(other)
+    check_idle(other)
     warn_of_versions(begun["versions"], started["versions"])
     for role in ("source", "target"):
         runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])

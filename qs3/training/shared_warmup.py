@@ -23,6 +23,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from omegaconf import DictConfig, OmegaConf
 
+from qs3.config import hashing
 from qs3.errors import DataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
@@ -46,7 +47,7 @@ def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
     before = OmegaConf.create(before)
     for key in _AFTERWARDS:
         OmegaConf.update(before, key, None)
-    parts = [runs.config_sha256(before), started["data"], started["versions"]]
+    parts = [hashing.config_sha256(before), started["data"], started["versions"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

@@ -8,7 +8,6 @@ a temporary file, which `remove_leftovers` clears.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import json
 import os
@@ -122,23 +121,6 @@ def remove_leftovers(folder: str | os.PathLike[str], *, of: str | None = None) -
     for path in leftovers:
         path.unlink(missing_ok=True)
     return leftovers
-
-
-@contextlib.contextmanager
-def locked(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold an exclusive lock on the file `path` (created, never deleted); wait for others.
-
-    The lock belongs to the process: it is gone when the process ends, however it ends.
-    """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(path, "ab")  # noqa: SIM115 (closed below)
-    except OSError as error:
-        raise Qs3Error(f"cannot write the lock {path}: {error.strerror or error}") from error
-    with file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _flush(path: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from qs3.api import composed
+from qs3.config.compose import composed
 from qs3.config.quoting import override, quoted
 from qs3.errors import ConfigError
 from qs3.report.__main__ import _built

@@ -14,7 +14,8 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from qs3.report.tables.table import CONF, composing
+from qs3.config.compose import composing
+from qs3.report.tables.table import CONF
 
 SOURCES = {
     "M → D": "modelnet10",

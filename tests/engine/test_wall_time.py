@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from qs3.runs import folder as runs
+from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.test_resume import interrupt
@@ -22,7 +22,7 @@ def wind_forward(checkpoint):
 def test_earlier_starts_count(toy):
     cfg = toy("selftraining=none")
     interrupt(cfg, "on_train_epoch_start", 3)
-    wind_forward(runs.run_folder(cfg) / "last.ckpt")
+    wind_forward(hashing.run_folder(cfg) / "last.ckpt")
     assert LONG < train(cfg)["times"]["seconds"] < 2 * LONG
 
 

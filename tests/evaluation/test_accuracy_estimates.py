@@ -13,12 +13,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from qs3.config import hashing
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.evaluation import accuracy_estimates as quality
 from qs3.evaluation.estimates_text import MEANINGS, in_words, table
 from qs3.report.runs.data import read_run
 from qs3.report.runs.page import page
-from qs3.runs import folder as runs
 from qs3.runs.predictions import OF_FILES, Predictions, write_predictions_of_files
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES, toy_config, write_domain
@@ -225,7 +225,7 @@ def test_a_run_on_one_s_own_scans_says_what_it_can(own):
     assert "accuracy estimated from confidences" in headline(metrics)
     assert set(found["teacher"]) <= set(found)
     assert "before self-training" in headline(metrics)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     assert json.loads((folder / "metrics.json").read_text())["quality"] == found
     html = page(read_run(folder), {}, {})
     assert "Quality without labels" in html
@@ -234,7 +234,7 @@ def test_a_run_on_one_s_own_scans_says_what_it_can(own):
 
 def test_each_file_has_its_class_under_its_own_name(own):
     cfg, metrics = own
-    with open(runs.run_folder(cfg) / OF_FILES, encoding="utf-8", newline="") as file:
+    with open(hashing.run_folder(cfg) / OF_FILES, encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["file"] for row in rows] == sorted(f"room{i % 2}/{i:02d}.xyz" for i in range(30))
     for name, count in metrics["final"]["predicted"].items():
@@ -263,4 +263,4 @@ def test_no_label_of_the_target_has_a_part_in_it(tmp_path, monkeypatch):
     found = [train(toy_config(tmp_path / folder)) for folder in ("a", "b")]
     assert found[0]["quality"] == found[1]["quality"]
     assert found[0]["final"]["accuracy"] != found[1]["final"]["accuracy"]
-    assert not (runs.run_folder(toy_config(tmp_path / "a")) / OF_FILES).exists()  # it has labels
+    assert not (hashing.run_folder(toy_config(tmp_path / "a")) / OF_FILES).exists()  # it has labels

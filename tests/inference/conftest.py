@@ -6,7 +6,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
-from qs3.runs import folder as runs
+from qs3.config import hashing
 from qs3.training.command import train
 from tests.training.toy import CONF, write_toy
 
@@ -32,4 +32,4 @@ def run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", overrides)
     train(cfg)
-    return runs.run_folder(cfg)
+    return hashing.run_folder(cfg)

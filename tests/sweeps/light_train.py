@@ -13,13 +13,13 @@ import os
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
+from qs3.config import hashing
 from qs3.config.hydra import speak_plainly
 from qs3.errors import SelectionError
-from qs3.runs import folder as runs
 
 
 def work(cfg: DictConfig) -> float:
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     folder.mkdir(parents=True, exist_ok=True)
     if cfg.seed == 9:
         raise SelectionError("round 0: nothing is selected\nlower theta")
@@ -28,7 +28,7 @@ def work(cfg: DictConfig) -> float:
     found = {
         "devices": OmegaConf.to_container(cfg.trainer, resolve=True)["devices"],
         "theta": cfg.selftraining.theta,
-        "hash": runs.config_hash(cfg),
+        "hash": hashing.config_hash(cfg),
         "pid": os.getpid(),
         "times": 1,
     }

@@ -8,9 +8,9 @@ import re
 import pytest
 from hydra import compose, initialize_config_dir
 
+from qs3.config import hashing
 from qs3.config.hydra import _gpu_in_turn
 from qs3.errors import ConfigError
-from qs3.runs import folder as runs
 from tests.sweeps.commands import command, light, light_runs
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
 from tests.training.toy import CONF, overrides
@@ -34,7 +34,7 @@ def test_gpus_in_turn_and_a_failure(launcher, tmp_path):
     }  # fmt: skip
     with initialize_config_dir(str(CONF), version_base="1.3"):
         one_gpu = compose("train", ["experiment=qs3_s2d", "trainer=gpu"])
-    assert {run["hash"] for run in found.values()} == {runs.config_hash(one_gpu)}
+    assert {run["hash"] for run in found.values()} == {hashing.config_hash(one_gpu)}
     if launcher == "submitit_local":
         assert len({run["pid"] for run in found.values()}) == 2
         assert len(list(tmp_path.glob("logs/.submitit/*/*_log.out"))) == 3

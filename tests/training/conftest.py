@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
-from qs3.runs import folder as runs
+from qs3.config import hashing
 from qs3.training.command import train
 from tests.training.toy import toy_config, write_toy
 
@@ -35,7 +35,7 @@ def finished(toy_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the toy run with seed 0, never interrupted."""
     cfg = toy_config(tmp_path_factory.mktemp("finished"), f"paths.data_dir={toy_data}")
     train(cfg)
-    return runs.run_folder(cfg)
+    return hashing.run_folder(cfg)
 
 
 def result_of(folder: Path) -> dict[str, Any]:

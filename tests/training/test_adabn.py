@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from qs3.config import hashing
 from qs3.data.store import open_pointset
 from qs3.datamodules.adaptation import load_clouds
 from qs3.evaluation.metrics import adapt_norms, predict
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import load
 from qs3.runs.predictions import read_predictions
 from qs3.training.command import train
@@ -23,8 +23,8 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
         "trained",
         "adabn",
     )
-    before = load(runs.run_folder(plain) / "result.pt")["weights"]
-    after = load(runs.run_folder(adapted) / "result.pt")["weights"]
+    before = load(hashing.run_folder(plain) / "result.pt")["weights"]
+    after = load(hashing.run_folder(adapted) / "result.pt")["weights"]
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed >= {"norm.running_mean", "norm.running_var"}
     assert changed <= {"norm.running_mean", "norm.running_var", "norm.num_batches_tracked"}
@@ -54,9 +54,9 @@ def test_order_of_clouds_is_mixed_and_batches_are_even():
 def test_predictions_are_those_of_the_result(toy, toy_data):
     cfg = toy()
     metrics = train(cfg)
-    found = read_predictions(runs.run_folder(cfg) / "predictions.csv")
+    found = read_predictions(hashing.run_folder(cfg) / "predictions.csv")
     net = TinyNet(3)
-    net.load_state_dict(load(runs.run_folder(cfg) / "result.pt")["weights"])
+    net.load_state_dict(load(hashing.run_folder(cfg) / "result.pt")["weights"])
     test = load_clouds(open_pointset(toy_data / "kinectsim10"), "test", 32)
     np.testing.assert_array_equal(found.probabilities, predict(net, test.points, 64))
     assert found.ids == found.meshes == test.ids  # no meshes are known here

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from omegaconf import open_dict
 
-from qs3.runs import folder as runs
+from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 
@@ -19,9 +19,9 @@ def test_compiled_training_comes_to_the_same(toy):
     # dropout is drawn otherwise, so weights are alike and not equal
     changes = ("selftraining=none", "method=source_only", "protocol.epochs=2")
     plain, compiled = toy(*changes), toy(*changes, "compile=true")
-    assert runs.run_folder(plain) != runs.run_folder(compiled)
+    assert hashing.run_folder(plain) != hashing.run_folder(compiled)
     assert train(plain)["final"]["n"] == train(compiled)["final"]["n"]
-    a, b = (load(runs.run_folder(cfg) / "student.pt") for cfg in (plain, compiled))
+    a, b = (load(hashing.run_folder(cfg) / "student.pt") for cfg in (plain, compiled))
     assert a.keys() == b.keys()  # names of weights stay
     for name in a:
         np.testing.assert_allclose(a[name], b[name], atol=0.3, err_msg=name)
@@ -33,5 +33,5 @@ def test_it_is_off_and_outside_the_hash(toy):
     older = cfg.copy()
     with open_dict(older):
         del older["compile"]
-    assert runs.config_sha256(older) == runs.config_sha256(cfg)
-    assert runs.config_sha256(toy("compile=true")) != runs.config_sha256(cfg)
+    assert hashing.config_sha256(older) == hashing.config_sha256(cfg)
+    assert hashing.config_sha256(toy("compile=true")) != hashing.config_sha256(cfg)

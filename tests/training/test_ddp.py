@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.data.store import open_pointset
 from qs3.datamodules.adaptation import load_clouds
 from qs3.evaluation.metrics import predict
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import load
 from qs3.runs.pseudo_labels import write_pseudo_labels
 from qs3.selftraining.selectors import Qbst, TeacherPredictions
@@ -80,7 +80,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     write_domain(root / "data", "kinectsim10", noise=0.15, train=25)
     cfg = toy_config(root, *SETTINGS)
     interrupt(cfg, "on_train_epoch_start", WARMUP)  # in the last epoch of the warm-up
-    one, two = runs.run_folder(cfg), runs.run_folder(toy_config(root, *SETTINGS, *TWO))
+    one, two = hashing.run_folder(cfg), hashing.run_folder(toy_config(root, *SETTINGS, *TWO))
     selected = load(one / "last.ckpt")["callbacks"]["WarmupSelection"]
     assert selected["accuracy"] == 1.0
     two.mkdir(parents=True)

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
+from qs3.config import hashing
 from qs3.data.store import open_pointset
 from qs3.datamodules.adaptation import few_of_each_split
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
-from qs3.runs import folder as runs
 from qs3.training.command import train
+from qs3.utils.locks import owned
 from tests.training.conftest import result_of
 from tests.training.toy import CONF, write_domain
 from tests.training.watching import Stop
@@ -60,7 +61,7 @@ def test_profiler_writes_into_the_run(profiler, toy):
         f"trainer.profiler._target_=lightning.pytorch.profilers.{profiler}",
     )  # fmt: skip
     train(cfg)
-    text = (runs.run_folder(cfg) / "fit-profile.txt").read_text()
+    text = (hashing.run_folder(cfg) / "fit-profile.txt").read_text()
     assert {"SimpleProfiler": "run_training_epoch", "PyTorchProfiler": "aten::"}[profiler] in text
 
 
@@ -83,7 +84,7 @@ def test_a_run_of_few_clouds_leaves_no_cache(toy, tmp_path):
     cfg = toy("data.clouds_a_split=12", "selftraining=none", f"data.cache_dir={tmp_path / 'cache'}")
     metrics = train(cfg)
     assert metrics["final"]["n"] == 12
-    assert metrics["hash"] != runs.config_hash(toy("selftraining=none"))
+    assert metrics["hash"] != hashing.config_hash(toy("selftraining=none"))
     assert not list((tmp_path / "cache").rglob("*.npy"))
     train(toy("selftraining=none", f"data.cache_dir={tmp_path / 'cache'}"))
     assert list((tmp_path / "cache").rglob("*.npy"))
@@ -98,7 +99,7 @@ def test_ckpt_path_last_insists_on_a_checkpoint(toy, finished):
     with pytest.raises(Stop):
         train(toy(stop_in(5)))
     train(cfg)
-    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
     assert train(toy("ckpt_path=last"))["status"] == "finished"  # nothing is left to do
 
 
@@ -107,7 +108,7 @@ def begun(toy) -> Path:
     """A run that was interrupted, moved to another place."""
     with pytest.raises(Stop):
         train(toy(stop_in(6)))
-    folder = runs.run_folder(toy())
+    folder = hashing.run_folder(toy())
     moved = folder.parents[1] / "elsewhere" / folder.name
     moved.parent.mkdir()
     shutil.move(folder, moved)
@@ -128,8 +129,8 @@ def test_ckpt_path_brings_a_run_from_elsewhere(file, toy, begun, finished, monke
     cfg = toy(f"ckpt_path={begun}{file}", "paths.warmup_dir=null")
     train(cfg)
     assert began[0] == 6  # the one that was not finished there
-    assert not (runs.run_folder(cfg) / ".hydra").exists()
-    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert not (hashing.run_folder(cfg) / ".hydra").exists()
+    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
     assert begun.joinpath("last.ckpt").is_file()
 
 
@@ -153,7 +154,7 @@ def test_ckpt_path_of_another_run(toy, toy_data, begun, tmp_path):
 
 
 def test_ckpt_path_of_a_run_that_is_being_trained(toy, begun):
-    with runs.locked(begun), pytest.raises(Qs3Error, match="another process is training in"):
+    with owned(begun), pytest.raises(Qs3Error, match="another process is training in"):
         train(toy(f"ckpt_path={begun}", "paths.warmup_dir=null"))
 
 
@@ -174,8 +175,8 @@ def test_ckpt_path_and_force_contradict_each_other(toy, begun):
 
 
 def test_neither_changes_the_name_of_a_run(toy):
-    plain = runs.run_name(toy())
+    plain = hashing.run_name(toy())
     nulls = ("data.clouds_a_class=null", "data.clouds_a_split=null")
     for word in ("ckpt_path=last", "objective=snd", *nulls):
-        assert runs.run_name(toy(word)) == plain
-    assert runs.run_name(toy("data.clouds_a_class=4")) != plain
+        assert hashing.run_name(toy(word)) == plain
+    assert hashing.run_name(toy("data.clouds_a_class=4")) != plain

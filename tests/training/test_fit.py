@@ -12,12 +12,14 @@ import pytest
 import torch
 from hydra.errors import ConfigCompositionException
 
+from qs3.config import hashing
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import copy_weights, load
 from qs3.training.command import train
+from qs3.utils.locks import owned
 from tests.training.conftest import result_of
 from tests.training.toy import CLASSES, toy_config
 
@@ -66,27 +68,27 @@ def test_checkpoint_of_a_phase_holds_the_trained_student(finished):
 def test_same_seed_same_result(toy, finished):
     cfg = toy()
     train(cfg)
-    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
 
 
 def test_seed_1_alone_equals_seed_1_after_seed_0(toy, toy_data, tmp_path):
     for seed in (0, 1):  # as the basic launcher does: one process
         torch.manual_seed(123)
         train(toy(f"seed={seed}"))
-    after = result_of(runs.run_folder(toy("seed=1")))
+    after = result_of(hashing.run_folder(toy("seed=1")))
     alone = toy("seed=1", f"paths.log_dir={tmp_path / 'alone'}")
     torch.rand(7)
     np.random.rand(3)  # noqa: NPY002 (disturbs the global state on purpose)
     train(alone)
-    assert result_of(runs.run_folder(alone)) == after
-    zero = result_of(runs.run_folder(toy("seed=0")))
+    assert result_of(hashing.run_folder(alone)) == after
+    zero = result_of(hashing.run_folder(toy("seed=0")))
     assert zero["history.csv"] != after["history.csv"]
 
 
 def test_finished_run_is_skipped_and_force_repeats_it(toy, monkeypatch):
     cfg = toy("selftraining=none", "method=source_only")
     first = train(cfg)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     stamp = (folder / "last.ckpt").stat().st_mtime_ns
     assert train(cfg) == first
     assert (folder / "last.ckpt").stat().st_mtime_ns == stamp
@@ -114,7 +116,7 @@ def test_wandb_offline_beside_csv(toy, finished):
 
     cfg = toy("logger=wandb")
     train(cfg)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     assert list((folder / "wandb").glob("offline-run-*"))
     assert result_of(folder) == result_of(finished)
     assert "WANDB_MODE" not in os.environ
@@ -151,7 +153,7 @@ def test_continue_begins_with_the_teacher_that_labelled(toy, monkeypatch):
     cfg = toy("selftraining.init=continue", "selftraining.theta=0.35")
     metrics = train(cfg)
     assert metrics["warmup"]["selected"]["epoch"] == 0
-    selected = load(runs.run_folder(cfg) / "warmup_selected.pt")
+    selected = load(hashing.run_folder(cfg) / "warmup_selected.pt")
     for name in selected:
         assert torch.equal(first[4][name], selected[name]), name
         assert torch.equal(first[7][name], last[6][name]), name
@@ -200,11 +202,11 @@ def test_other_target_labels_change_the_figures_and_nothing_else(toy, toy_data, 
     copy_with_other_labels(toy_data, tmp_path / "other" / "kinectsim10")
     cfg = toy(f"paths.data_dir={tmp_path / 'other'}")
     metrics = train(cfg)
-    ours, theirs = result_of(runs.run_folder(cfg)), result_of(finished)
+    ours, theirs = result_of(hashing.run_folder(cfg)), result_of(finished)
     assert ours.pop("metrics") != theirs.pop("metrics")
     assert ours == theirs  # history and all pseudo-labels
     assert metrics["final"]["accuracy"] < 0.5
-    student = load(runs.run_folder(cfg) / "student.pt")
+    student = load(hashing.run_folder(cfg) / "student.pt")
     for name, value in load(finished / "student.pt").items():
         assert torch.equal(student[name], value)
 
@@ -250,7 +252,7 @@ def test_other_loading_is_another_result_and_named(toy, finished, more, where, v
     cfg = toy(more, "selftraining=none")
     metrics = train(cfg)
     assert metrics[where[0]][where[1]] == value
-    rows = table(runs.run_folder(cfg) / "history.csv")
+    rows = table(hashing.run_folder(cfg) / "history.csv")
     assert rows != table(finished / "history.csv")[: len(rows)]
 
 
@@ -332,7 +334,7 @@ def test_missing_data(toy, tmp_path):
 def test_two_runs_in_one_folder(toy):
     cfg = toy()
     with (
-        runs.locked(runs.run_folder(cfg)),
+        owned(hashing.run_folder(cfg)),
         pytest.raises(Qs3Error, match="another process is training"),
     ):
         train(cfg)
@@ -347,8 +349,8 @@ def test_gpu_that_is_not_there(toy):
 def test_other_config_of_the_same_eight_digits_is_refused(toy):
     cfg = toy("selftraining=none", "protocol.epochs=1")
     metrics = train(cfg)
-    folder = runs.run_folder(cfg)
-    assert metrics["config_sha256"] == runs.config_sha256(cfg)
+    folder = hashing.run_folder(cfg)
+    assert metrics["config_sha256"] == hashing.config_sha256(cfg)
     for name in ("metrics.json", "started.json"):
         value = json.loads((folder / name).read_text())
         value["config_sha256"] = value["config_sha256"][:8] + "0" * 56
@@ -362,7 +364,7 @@ def test_other_config_of_the_same_eight_digits_is_refused(toy):
 
 def test_leftovers_of_a_kill_are_removed(toy):
     cfg = toy("selftraining.rounds=1", "protocol.epochs=1", "selftraining.epochs=1")
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     leftovers = [folder / ".last.ckpt.x.tmp.ckpt", folder / "round_00" / ".p.csv.x.tmp.csv"]
     for path in leftovers:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -374,7 +376,7 @@ def test_leftovers_of_a_kill_are_removed(toy):
 def test_changed_data_are_refused(toy, toy_data, tmp_path):
     cfg = toy("selftraining=none")
     train(cfg)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     for name in ("metrics.json", "started.json"):
         value = json.loads((folder / name).read_text())
         value["data"]["target"] = "0" * 64
@@ -388,7 +390,7 @@ def test_changed_data_are_refused(toy, toy_data, tmp_path):
 
 def test_damaged_checkpoint(toy, tmp_path):
     cfg = toy()
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     folder.mkdir(parents=True)
     (folder / "last.ckpt").write_bytes(b"not a checkpoint")
     with pytest.raises(DataError, match=r"last\.ckpt cannot be read.*force=true"):

@@ -10,8 +10,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
+from qs3.config import hashing
 from qs3.errors import ConfigError
-from qs3.runs import folder as runs
 from qs3.training.command import train
 from tests.training.toy import _SHAPES, CONF, overrides
 
@@ -53,7 +53,7 @@ def root(tmp_path: Path) -> Path:
 def test_pseudo_labels_for_own_scans(root: Path) -> None:
     cfg = config(root)
     train(cfg)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["status"] == "finished"
     assert metrics["final"]["accuracy"] is None
@@ -71,6 +71,6 @@ def test_own_labels_are_an_upper_bound_or_refused(root: Path) -> None:
     name = "experiment_name=bound"
     cfg = config(root, "method=supervised", "selftraining=none", labelled, other, name)
     train(cfg)
-    metrics = json.loads((runs.run_folder(cfg) / "metrics.json").read_text())
+    metrics = json.loads((hashing.run_folder(cfg) / "metrics.json").read_text())
     assert metrics["final"]["n"] == 12  # every fifth of 3 times 20
     assert metrics["final"]["accuracy"] > metrics["final"]["majority_rate"]

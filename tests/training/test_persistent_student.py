@@ -6,9 +6,9 @@ import contextlib
 
 import torch
 
+from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.engine.classifier import Classifier
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST, copy_weights
 from qs3.training.command import train
 from qs3.utils.seeding import derive
@@ -47,7 +47,7 @@ def test_it_is_new_in_round_0_and_kept_afterwards(toy, monkeypatch):
 
 def _init_of(cfg, phase):
     """A file with the weights that a phase begins with if it begins anew."""
-    path = runs.run_folder(cfg) / f"init_{phase}.pt"
+    path = hashing.run_folder(cfg) / f"init_{phase}.pt"
     torch.manual_seed(derive(cfg.seed, "init", phase))
     torch.save(build(cfg.model).state_dict(), path)
     return path
@@ -67,6 +67,6 @@ def test_an_interrupted_run_ends_the_same(toy, tmp_path, monkeypatch):
         patch.setattr(Classifier, "training_step", stop)
         with contextlib.suppress(KeyError):
             train(cut)
-    assert (runs.run_folder(cut) / LAST).is_file()
+    assert (hashing.run_folder(cut) / LAST).is_file()
     train(cut)
-    assert result_of(runs.run_folder(cut)) == result_of(runs.run_folder(whole))
+    assert result_of(hashing.run_folder(cut)) == result_of(hashing.run_folder(whole))

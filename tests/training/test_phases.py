@@ -10,11 +10,11 @@ import pytest
 import torch
 from omegaconf import open_dict
 
+from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.data.store import open_pointset
 from qs3.datamodules.adaptation import Unlabelled, load_clouds
 from qs3.evaluation.metrics import predict
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import load
 from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
@@ -54,7 +54,7 @@ def kept_run(root: Path, toy_data: Path, *settings: str) -> Kept:
         cfg.callbacks.progress = {"_target_": target, "folder": str(root / "kept")}
     metrics = train(cfg)
     clouds = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32)
-    return Kept(cfg, runs.run_folder(cfg), root / "kept", metrics, clouds)
+    return Kept(cfg, hashing.run_folder(cfg), root / "kept", metrics, clouds)
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from qs3.config import hashing
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.engine.schedules import Plateau
@@ -18,7 +19,6 @@ from qs3.errors import ConfigError
 from qs3.methods.base import class_loss
 from qs3.methods.source_only import SourceOnly
 from qs3.models.pointnet import pointnet, transform_regulariser
-from qs3.runs import folder as runs
 from qs3.selftraining.student_loss import Student
 from qs3.training.command import train
 from tests.training.conftest import result_of
@@ -63,14 +63,14 @@ def lrs(folder) -> list[float]:
 def test_a_run_with_a_plateau_resumes_exactly(toy):
     cfg = toy(*SIMPLEVIEW)
     train(cfg)
-    rates, expected = lrs(runs.run_folder(cfg)), result_of(runs.run_folder(cfg))
+    rates, expected = lrs(hashing.run_folder(cfg)), result_of(hashing.run_folder(cfg))
     assert rates[0] == 4.0
     assert rates[39] < 4.0  # it came to a plateau
     assert rates[40:] == [4.0] * 6  # each round begins anew
     again = toy(*SIMPLEVIEW, "force=true")
     interrupt(again, "on_train_batch_end", 78)  # in the warm-up
     train(toy(*SIMPLEVIEW))
-    assert result_of(runs.run_folder(cfg)) == expected
+    assert result_of(hashing.run_folder(cfg)) == expected
 
 
 def test_smoothing_reaches_warmup_and_students(toy):
@@ -82,7 +82,7 @@ def test_smoothing_reaches_warmup_and_students(toy):
 
 def open_history(cfg):
     train(cfg)
-    return open(runs.run_folder(cfg) / "history.csv", newline="")
+    return open(hashing.run_folder(cfg) / "history.csv", newline="")
 
 
 def test_the_nets_regulariser_is_added():

@@ -18,7 +18,7 @@ from omegaconf import open_dict
 import qs3.runs.checkpoints
 import qs3.runs.folder
 import qs3.selftraining.callback
-from qs3.runs import folder as runs
+from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
@@ -59,7 +59,7 @@ def interrupt(cfg, hook: str, count: int) -> None:
             "hook": hook,
             "count": count,
         }
-    assert runs.config_hash(stopping) == runs.config_hash(cfg)
+    assert hashing.config_hash(stopping) == hashing.config_hash(cfg)
     with pytest.raises(Stop):
         train(stopping)
 
@@ -84,8 +84,8 @@ def test_interrupted_in_a_hook(toy, finished, hook, count):
     cfg = toy()
     interrupt(cfg, hook, count)
     train(cfg)
-    assert result_of(runs.run_folder(cfg)) == result_of(finished)
-    ours = load(runs.run_folder(cfg) / "last.ckpt")
+    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
+    ours = load(hashing.run_folder(cfg) / "last.ckpt")
     theirs = load(finished / "last.ckpt")
     assert ours["state_dict"].keys() == theirs["state_dict"].keys()
     for name, value in theirs["state_dict"].items():
@@ -103,7 +103,7 @@ def test_interrupted_again_and_again(toy, finished):
     ]:
         interrupt(cfg, hook, count)
     train(cfg)
-    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
 
 
 @pytest.mark.parametrize("call", [1, 4, 5, 6, 10])
@@ -125,7 +125,7 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
         with pytest.raises(Stop):
             train(cfg)
     train(cfg)
-    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, cal
         with pytest.raises(Stop):
             train(cfg)
     train(cfg)
-    assert result_of(runs.run_folder(cfg)) == result_of(finished)
+    assert result_of(hashing.run_folder(cfg)) == result_of(finished)
 
 
 @pytest.mark.slow

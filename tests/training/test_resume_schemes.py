@@ -12,7 +12,7 @@ import pytest
 import torch
 from omegaconf import open_dict
 
-from qs3.runs import folder as runs
+from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
@@ -58,9 +58,9 @@ def check(toy: Any, tmp_path: Path, settings: tuple[str, ...], *epochs: int) -> 
             }
         with pytest.raises(Stop):
             train(stopping)
-        assert load(runs.run_folder(broken) / "last.ckpt")["epoch"] == epoch - 1
+        assert load(hashing.run_folder(broken) / "last.ckpt")["epoch"] == epoch - 1
     train(broken)
-    ours, theirs = runs.run_folder(broken), runs.run_folder(whole)
+    ours, theirs = hashing.run_folder(broken), hashing.run_folder(whole)
     assert result_of(ours) == result_of(theirs)
     for name in ("warmup_selected.pt", "student.pt"):
         weights = load(theirs / name)

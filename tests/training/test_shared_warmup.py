@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from qs3.runs import folder as runs
+from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
@@ -33,9 +33,9 @@ def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
     more = [f"selftraining={selftraining}", "selftraining.missing_class=warn"]
     alone = toy(*more, "paths.warmup_dir=null")
     train(alone)
-    expected = result_of(runs.run_folder(alone))
-    weights = load(runs.run_folder(alone) / "student.pt")
-    shutil.rmtree(runs.run_folder(alone))
+    expected = result_of(hashing.run_folder(alone))
+    weights = load(hashing.run_folder(alone) / "student.pt")
+    shutil.rmtree(hashing.run_folder(alone))
     assert not shared_folders(tmp_path)
 
     train(toy("selftraining=none", "experiment_name=other"))
@@ -43,8 +43,8 @@ def test_same_result_to_the_bit(toy, tmp_path, caplog, selftraining):
     assert not taken(caplog)
     train(toy(*more))
     assert taken(caplog)
-    assert result_of(runs.run_folder(alone)) == expected
-    again = load(runs.run_folder(alone) / "student.pt")
+    assert result_of(hashing.run_folder(alone)) == expected
+    again = load(hashing.run_folder(alone) / "student.pt")
     assert all(torch.equal(weights[name], again[name]) for name in weights)
 
 

@@ -18,6 +18,7 @@ from omegaconf import open_dict
 
 import qs3.selftraining.oracle
 import qs3.selftraining.student_selection
+from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.data.store import open_pointset
 from qs3.engine.classifier import Classifier
@@ -61,7 +62,7 @@ def by_rule(toy_data: Path, finished: Path, tmp_path_factory: pytest.TempPathFac
             root = tmp_path_factory.mktemp(rule)
             cfg = toy_config(root, f"paths.data_dir={toy_data}", f"selection.student={rule}")
             train(cfg)
-            folders[rule] = runs.run_folder(cfg)
+            folders[rule] = hashing.run_folder(cfg)
         return folders[rule]
 
     return trained
@@ -109,9 +110,9 @@ def test_runs_from_before_there_was_a_choice_are_found(toy):
     old = cfg.copy()
     with open_dict(old):
         del old.selection["student"]
-    assert runs.config_sha256(old) == runs.config_sha256(cfg)
-    hashes = {runs.config_sha256(toy(f"selection.student={rule}")) for rule in RULES}
-    assert len(hashes | {runs.config_sha256(cfg)}) == 6
+    assert hashing.config_sha256(old) == hashing.config_sha256(cfg)
+    hashes = {hashing.config_sha256(toy(f"selection.student={rule}")) for rule in RULES}
+    assert len(hashes | {hashing.config_sha256(cfg)}) == 6
 
 
 @pytest.mark.parametrize("rule", [*LABEL_FREE, "oracle"])
@@ -175,7 +176,7 @@ def test_another_epoch_than_the_last_is_reported(toy, monkeypatch):
     monkeypatch.setattr(StudentSelection, "_score", falling)
     cfg = toy("selection.student=snd")
     metrics = train(cfg)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     assert metrics["student"]["epoch"] == LAST_ROUND[0]
     for file in ("student_selected.pt", "result.pt"):
         found = weights_of(folder / file)
@@ -210,7 +211,7 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
     cfg = toy("selection.student=pseudo_val")
     metrics = train(cfg)
     held, held_labels = selection[0].held_out
-    rows = read_pseudo_labels(runs.run_folder(cfg) / "round_01" / "pseudo_labels.csv")
+    rows = read_pseudo_labels(hashing.run_folder(cfg) / "round_01" / "pseudo_labels.csv")
     selected = [i for i, row in enumerate(rows) if row.selected]
     for epoch in LAST_ROUND:
         index, labels = sets[epoch]
@@ -317,7 +318,7 @@ def test_other_target_labels_change_no_weights(by_rule, toy, toy_data, tmp_path,
     copy_with_other_labels(toy_data, other / "kinectsim10")
     cfg = toy(f"paths.data_dir={other}", f"selection.student={rule}")
     metrics = train(cfg)
-    folder, theirs = runs.run_folder(cfg), metrics_of(by_rule(rule))
+    folder, theirs = hashing.run_folder(cfg), metrics_of(by_rule(rule))
     for name in WEIGHTS:
         assert same_weights(folder / name, by_rule(rule) / name)
     if rule == "oracle":
@@ -389,7 +390,7 @@ def test_interrupted_in_a_hook(by_rule, toy, rule, hook, count):
     cfg = toy(f"selection.student={rule}")
     interrupt(cfg, hook, count)
     train(cfg)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     assert result_of(folder) == result_of(by_rule(rule))
     assert same_weights(folder / "result.pt", by_rule(rule) / "result.pt")
 
@@ -420,7 +421,7 @@ def test_interrupted_in_a_function(by_rule, toy, monkeypatch, rule, module, name
         with pytest.raises(Stop):
             train(cfg)
     train(cfg)
-    assert result_of(runs.run_folder(cfg)) == result_of(by_rule(rule))
+    assert result_of(hashing.run_folder(cfg)) == result_of(by_rule(rule))
 
 
 @pytest.mark.slow
@@ -440,7 +441,7 @@ def test_two_processes_choose_one_student(toy_data, tmp_path, rule):
     )
     assert done.returncode == 0, done.stderr
     cfg = toy_config(tmp_path, *more)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     student = metrics_of(folder)["student"]
     if rule in LABEL_FREE:
         from qs3.datamodules.adaptation import load_clouds
@@ -489,4 +490,4 @@ def test_an_oracle_needs_labels(toy, toy_data, tmp_path):
     cfg = toy(f"paths.data_dir={other}", "selection.student=oracle")
     with pytest.raises(ConfigError, match=r"no labelled test split; set selection\.student=last"):
         train(cfg)
-    assert not (runs.run_folder(cfg) / "last.ckpt").exists()
+    assert not (hashing.run_folder(cfg) / "last.ckpt").exists()

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qs3.config import hashing
 from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.errors import ConfigError
 from qs3.report.tables.aggregate import summarise
@@ -80,13 +81,13 @@ def test_own_scans_without_labels(toy, unlabelled, finished, more):
         assert final["predicted"] == theirs["final"]["predicted"]
         assert metrics["evaluation"]["final_over_rotations"]["accuracy"] is None
     assert "no labels to judge kinectsim10 (simulated) by; predicted " in headline(metrics)
-    assert train(cfg) == json.loads((runs.run_folder(cfg) / "metrics.json").read_text())
+    assert train(cfg) == json.loads((hashing.run_folder(cfg) / "metrics.json").read_text())
 
 
 def test_reports_of_such_runs(toy, unlabelled):
     cfg = toy("selftraining=none")
     train(cfg)
-    text = summarise([runs.run_folder(cfg)])
+    text = summarise([hashing.run_folder(cfg)])
     assert "no target labels, so no accuracy" in text
     assert "simulated" in text
 

@@ -16,6 +16,7 @@ import pytest
 
 from qs3.errors import Qs3Error
 from qs3.utils import files
+from qs3.utils.locks import locked
 
 
 def test_writes_text_bytes_json_npy(tmp_path):
@@ -132,10 +133,10 @@ def test_lock_excludes_and_is_released(tmp_path):
     order = []
 
     def second():
-        with files.locked(tmp_path / "l"):
+        with locked(tmp_path / "l"):
             order.append("second")
 
-    with files.locked(tmp_path / "l"):
+    with locked(tmp_path / "l"):
         thread = threading.Thread(target=second)
         thread.start()
         time.sleep(0.05)

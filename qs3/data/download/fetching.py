@@ -15,7 +15,8 @@ from qs3.data.download import drive, layouts, transfer, unpack
 from qs3.data.download.catalogue import AGREEMENTS, Part, Source
 from qs3.data.download.receipts import Receipt, read_json
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.utils.files import locked, make_folder, sha256_file, write_json
+from qs3.utils.files import make_folder, sha256_file, write_json
+from qs3.utils.locks import locked
 
 log = logging.getLogger(__name__)
 

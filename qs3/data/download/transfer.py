@@ -34,7 +34,8 @@ from qs3.data.download.answers import (
 )
 from qs3.data.download.receipts import Receipt, beside, md5_file, read_json, read_receipt
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.utils.files import locked, make_folder, sha256_file, write_json
+from qs3.utils.files import make_folder, sha256_file, write_json
+from qs3.utils.locks import locked
 
 log = logging.getLogger(__name__)
 

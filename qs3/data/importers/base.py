@@ -18,7 +18,7 @@ from qs3.classes import ALIASES, known_as
 from qs3.data.manifest import ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
 from qs3.errors import ConfigError, DataError
-from qs3.utils.files import locked
+from qs3.utils.locks import locked
 
 log = logging.getLogger(__name__)
 

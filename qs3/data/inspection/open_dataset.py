@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from qs3.config.location import CONF
+from qs3.config.compose import choices, composed
 from qs3.data.domain import Domain
 from qs3.data.manifest import ManifestRow, read_manifest
 from qs3.data.store import PointSet, is_finished, open_pointset
@@ -79,9 +78,7 @@ def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
     Raises:
         ConfigError: there is no such domain, or no such key.
     """
-    from hydra.errors import HydraException
-
-    known = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
+    known = choices("domain")
     if name not in known:
         raise ConfigError(
             f"domain={name} is unknown; there are {', '.join(known)}, or give the folder of a "
@@ -91,15 +88,10 @@ def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
         f"{key if key.startswith('paths.') else f'domain.{key}'}={value}"
         for key, value in overrides.items()
     ]
-    with _composing() as compose:
-        from qs3.config.hydra import build
+    from qs3.config.hydra import build
 
-        try:
-            cfg = compose(overrides=[f"+domain={name}", "+paths=default", *words])
-        except HydraException as error:
-            first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            raise ConfigError(f"domain={name}: {first}") from error
-        domain: Domain = build(cfg.domain)
+    cfg = composed(None, f"+domain={name}", "+paths=default", *words, place=f"domain={name}: ")
+    domain: Domain = build(cfg.domain)
     return domain
 
 
@@ -145,19 +137,3 @@ def parse(
 def _opened(name: str, label: str, folder: Path, variant: str, data: PointSet) -> Opened:
     rows = tuple(read_manifest(folder, data.classes))
     return Opened(name, label, folder, variant, data, rows)
-
-
-@contextmanager
-def _composing() -> Iterator:
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-
-    import qs3.config.hydra  # noqa: F401  registers the resolvers that configs use
-
-    running = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            yield compose
-    finally:
-        GlobalHydra.instance().hydra = running

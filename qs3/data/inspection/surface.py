@@ -22,7 +22,7 @@ from qs3.meshes.folder import MeshFolder
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import Placing, RealSize, UnitCube
 from qs3.meshes.source import MeshItem
-from qs3.utils.object_rng import object_rng
+from qs3.utils.seeding import object_rng
 
 _SAMPLES = 8192  # of a surface
 _PAIRS = 1 << 18  # of points and triangles at once

@@ -19,22 +19,23 @@ from typing import Any
 import cv2
 import numpy as np
 
-import qs3
 from qs3.classes import CLASSES
 from qs3.config.checks import whole
+from qs3.data.dataset_folder import RECIPE, delete_dataset
 from qs3.data.manifest import ManifestRow
 from qs3.data.scannet.files import Found, SceneFiles, find_scenes
 from qs3.data.scannet.labels import read_label_map, read_scene_list
 from qs3.data.scannet.objects import ObjectCloud
 from qs3.data.scannet.pool import Job, all_scenes
 from qs3.data.scannet.scene import SceneResult
-from qs3.data.scannet.scene_parts import RECIPE, SceneParts
+from qs3.data.scannet.scene_parts import SceneParts
 from qs3.data.scannet.settings import Extraction
 from qs3.data.store import PointSet, is_finished, open_pointset, read_meta, write_pointset
 from qs3.errors import DataError
-from qs3.generation.shards import forget
-from qs3.utils.files import locked, make_folder, sha256_file, write_text
+from qs3.utils.files import make_folder, sha256_file, write_text
+from qs3.utils.locks import locked
 from qs3.utils.progress import progress_bar
+from qs3.utils.version import VERSION
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +94,7 @@ def extract(
     with locked(out / ".lock"):
         if force and (is_finished(out) or (out / RECIPE).is_file()):
             (out / SCENES).unlink(missing_ok=True)
-            forget(out)
+            delete_dataset(out)
         parts = SceneParts(out)
         parts.check(recipe)
         if is_finished(out) and not parts.are_there:
@@ -205,7 +206,7 @@ def _scenes_csv(results: Sequence[SceneResult], scans: Path) -> str:
 def _versions() -> dict[str, str]:
     """What may change a number in a cloud."""
     return {
-        "qs3": qs3.__version__,
+        "qs3": VERSION,
         "numpy": np.__version__,
         "opencv": cv2.__version__,
         "fpsample": version("fpsample"),

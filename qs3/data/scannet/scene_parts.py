@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from qs3.data.dataset_folder import PARTS, RECIPE
 from qs3.data.scannet.files import SceneFiles
 from qs3.data.scannet.labels import Labelled
 from qs3.data.scannet.objects import ObjectCloud
@@ -25,7 +26,6 @@ from qs3.data.scannet.scene import SceneResult
 from qs3.errors import ConfigError, DataError
 from qs3.utils.files import make_folder, remove_leftovers, write_bytes, write_json
 
-RECIPE, PARTS = "recipe.json", "parts"
 _COUNTS = ("frames", "frames_used", "frames_lost", "frames_unmasked")
 
 

@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from qs3.data.dataset_folder import VIEWS
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.data.manifest import read_manifest
 from qs3.data.store import open_pointset, read_meta
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.provenance import Keep
-from qs3.generation.shards import VIEWS
 from qs3.generation.view_files import KeptView, load_views
 from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
-from qs3.utils.object_rng import object_rng
+from qs3.utils.seeding import object_rng
 
 _OFTEN_THERE = "chair/train/chair_0000"
 
@@ -215,7 +215,7 @@ def kept_object(
 
 
 def _composed(overrides: Sequence[str]) -> Any:
-    from qs3.api import composed
+    from qs3.config.compose import composed
 
     try:
         return composed("generate", *overrides)

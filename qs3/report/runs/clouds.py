@@ -141,7 +141,7 @@ class _Domains:
 
     def pipeline(self, path: Path) -> None:
         """The first object of whichever dataset kept its views."""
-        from qs3.generation.shards import VIEWS
+        from qs3.data.dataset_folder import VIEWS
         from qs3.report.figures.pipeline import kept_object
         from qs3.report.figures.pipeline_figure import save_pipeline
 

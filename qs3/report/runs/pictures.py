@@ -131,27 +131,34 @@ def _save(make: Callable[[], Figure], path: Path) -> None:
         figure.savefig(temporary, format="png", metadata={"Software": None})
 
 
-def after_training(folder: Path, config: Mapping[str, Any] | None = None) -> None:
-    """Draw a finished run's pictures, and log them to wandb's active run, if there is one.
+@dataclass(frozen=True)
+class AfterTraining:
+    """Draws a finished run's pictures, and logs them to wandb's active run, if there is one.
 
     A picture that cannot be made is a warning: the result is saved already.
 
-    Args:
-        folder: of the run.
-        config: as composed; None: what Hydra wrote into the folder.
+    Attributes:
+        pictures: False draws nothing.
     """
-    try:
-        drawn = draw(folder, embed=False, config=config)
-        _log_to_wandb(drawn, runs.read_metrics(folder) or {})
-        log.info("pictures: %s", drawn.page)
-    except Exception as error:
-        log.warning(
-            "the run is finished, but its pictures failed (%s: %s); python -m qs3.report "
-            "run=%s draws them again",
-            type(error).__name__,
-            error,
-            folder,
-        )
+
+    pictures: bool = True
+
+    def __call__(self, folder: Path, config: Mapping[str, Any] | None = None) -> None:
+        """Draw those of the run in `folder`, by its composed config or the one that lies there."""
+        if not self.pictures:
+            return
+        try:
+            drawn = draw(folder, embed=False, config=config)
+            _log_to_wandb(drawn, runs.read_metrics(folder) or {})
+            log.info("pictures: %s", drawn.page)
+        except Exception as error:
+            log.warning(
+                "the run is finished, but its pictures failed (%s: %s); python -m qs3.report "
+                "run=%s draws them again",
+                type(error).__name__,
+                error,
+                folder,
+            )
 
 
 def _log_to_wandb(drawn: Drawn, metrics: Mapping[str, Any]) -> None:

@@ -7,16 +7,16 @@ file and finds the runs; `formats` and `table_page` print.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
+from qs3.config.compose import composing, first_line
 from qs3.config.location import CONF
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
@@ -195,7 +195,7 @@ def _fill(
         OverrideParseException,
     )
 
-    from qs3.runs.folder import config_hash
+    from qs3.config.hashing import config_hash
 
     filled = []
     with composing() as compose:
@@ -210,11 +210,11 @@ def _fill(
                     words = (*cell.overrides, f"domain@data.source={target}")
                     cell, cfg = replace(cell, overrides=words), compose("train", list(words))
             except MissingConfigException as error:
-                filled.append(replace(cell, missing=_first_line(error)))
+                filled.append(replace(cell, missing=first_line(error)))
                 continue
             except (ConfigCompositionException, OverrideParseException) as error:
                 raise ConfigError(
-                    f"table cell {cell.row!r}, {cell.column!r}: {_first_line(error)}"
+                    f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}"
                 ) from error
             _refuse_oracle(cell, cfg)
             key = (str(cfg.experiment_name), config_hash(cfg))
@@ -237,24 +237,3 @@ def _refuse_oracle(cell: Cell, cfg: Any) -> None:
             "target's test labels. That is a diagnostic and enters no table; take it out of the "
             "cell's line, of its experiment, or of overrides="
         )
-
-
-@contextlib.contextmanager
-def composing() -> Iterator[Callable[..., Any]]:
-    """Hydra's compose on the repository's conf/, also inside a running Hydra application."""
-    from hydra import compose, initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-
-    import qs3.config.hydra  # noqa: F401  registers the resolvers that the configs use
-
-    running = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            yield compose
-    finally:
-        GlobalHydra.instance().hydra = running
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)

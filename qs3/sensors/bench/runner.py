@@ -10,13 +10,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
+from qs3.config.compose import choices, composed
 from qs3.config.hydra import build
-from qs3.config.location import CONF
 from qs3.errors import ConfigError
 from qs3.sensors.bench import edges, planar
 from qs3.sensors.bench.subject import Subject
@@ -126,15 +123,10 @@ def load(name: str, overrides: Sequence[str] = ()) -> tuple[Subject, dict[str, A
     Raises:
         ConfigError: there is no such sensor, or it cannot be put on the bench.
     """
-    known = sorted(path.stem for path in (CONF / "sensor").glob("*.yaml") if path.stem != "none")
+    known = [choice for choice in choices("sensor") if choice != "none"]
     if name not in known:
         raise ConfigError(f"sensor={name} is unknown; there are {', '.join(known)}")
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            cfg = compose(overrides=[f"+sensor={name}", *overrides])
-    except ConfigCompositionException as error:
-        raise ConfigError(f"sensor={name}: {str(error).splitlines()[0]}") from error
+    cfg = composed(None, f"+sensor={name}", *overrides, place=f"sensor={name}: ")
     settings = OmegaConf.to_container(cfg.sensor, resolve=True)
     assert isinstance(settings, dict)
     return Subject(name, build(cfg.sensor)), {str(k): v for k, v in settings.items()}

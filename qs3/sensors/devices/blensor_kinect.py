@@ -23,8 +23,7 @@ import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, window_of
-from qs3.sensors.grids import on_grid
+from qs3.sensors.base import DepthFrame, on_grid, window_of
 from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.matching.triangulation import Triangulation

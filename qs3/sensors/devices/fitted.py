@@ -14,8 +14,7 @@ import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics
-from qs3.sensors.base import DepthFrame, window_of
-from qs3.sensors.grids import on_grid
+from qs3.sensors.base import DepthFrame, on_grid, window_of
 from qs3.sensors.optics.visibility import reached_from
 from qs3.sensors.pixel_status import Reason
 from qs3.sensors.renderers.base import Body, Renderer, Scene

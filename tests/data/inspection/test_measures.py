@@ -16,7 +16,7 @@ from qs3.generation.recipes import SurfaceSamples
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
-from qs3.utils.object_rng import object_rng
+from qs3.utils.seeding import object_rng
 from tests.fixtures import published as fixtures
 
 

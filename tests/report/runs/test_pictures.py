@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from qs3.config import hashing
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.metrics import CALIBRATION_BINS, calibration_error
 from qs3.inference.model_file import Result, write_result
@@ -20,7 +21,7 @@ from qs3.report.__main__ import main
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
 from qs3.report.runs.data import BINS, read_run, reliability
-from qs3.report.runs.pictures import after_training, draw
+from qs3.report.runs.pictures import AfterTraining, draw
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import save
 from qs3.runs.predictions import Predictions, read_predictions
@@ -321,9 +322,9 @@ def test_command_line_refuses_two_things_at_once(run, capsys):
 
 def test_training_draws_and_its_hash_does_not_know(toy):
     cfg = toy("report.pictures=true", "selftraining=none")
-    assert runs.config_sha256(cfg) == runs.config_sha256(toy("selftraining=none"))
+    assert hashing.config_sha256(cfg) == hashing.config_sha256(toy("selftraining=none"))
     train(cfg)
-    pictures = runs.run_folder(cfg) / "pictures"
+    pictures = hashing.run_folder(cfg) / "pictures"
     assert {p.name for p in pictures.iterdir()} == {
         *(f"{name}.png" for name in ALL if name != "pseudo_labels"), "index.html",
     }  # fmt: skip
@@ -334,7 +335,7 @@ def test_training_draws_and_its_hash_does_not_know(toy):
 def test_a_failed_picture_is_a_warning(run, caplog):
     (run / "pictures").write_text("in the way")
     with caplog.at_level(logging.WARNING):
-        after_training(run)
+        AfterTraining()(run)
     assert "the run is finished, but its pictures failed" in caplog.text
     assert "python -m qs3.report run=" in caplog.text
 
@@ -342,11 +343,11 @@ def test_a_failed_picture_is_a_warning(run, caplog):
 def test_offline_wandb_holds_config_curves_pictures_and_table(toy):
     cfg = toy("logger=wandb", "report.pictures=true")
     metrics = train(cfg)
-    folder = runs.run_folder(cfg)
+    folder = hashing.run_folder(cfg)
     config, rows, summary, record = read(folder)
     assert (record.run_group, record.job_type) == ("quickstart", "train")
     assert (record.project, record.display_name) == ("qs3", "quickstart-seed0")
-    assert record.run_id == runs.run_name(cfg).replace("/", "-")
+    assert record.run_id == hashing.run_name(cfg).replace("/", "-")
     assert list(record.tags) == list(cfg.logger.wandb.tags)
     assert {"specklenet10 -> kinectsim10", "qbst", "simulated"} <= set(record.tags)
     assert config["protocol"]["epochs"] == 4

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from qs3.config.compose import composing
+from qs3.config.hashing import config_hash
 from qs3.errors import ConfigError
 from qs3.report.__main__ import main
 from qs3.report.tables import table as tables
@@ -18,8 +20,7 @@ from qs3.report.tables.cells import Cell, Published, Table
 from qs3.report.tables.formats import csv_text, details, grid, latex, latex_text, markdown, to_run
 from qs3.report.tables.page import page
 from qs3.report.tables.running import missing
-from qs3.report.tables.table import build_table, composing
-from qs3.runs.folder import config_hash
+from qs3.report.tables.table import build_table
 from tests.report.made_runs import write_run
 from tests.report.tables.test_tables import run_cell
 

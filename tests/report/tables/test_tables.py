@@ -9,13 +9,14 @@ from dataclasses import replace
 import pytest
 from omegaconf import OmegaConf
 
+from qs3.config.compose import composing
+from qs3.config.hashing import config_hash, run_folder
 from qs3.errors import ConfigError
 from qs3.report.__main__ import main
 from qs3.report.tables import table as tables
 from qs3.report.tables.cells import Published
 from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
-from qs3.report.tables.table import build_table, composing
-from qs3.runs.folder import config_hash, run_folder
+from qs3.report.tables.table import build_table
 from tests.report.made_runs import write_run
 
 EXPECTED = ("ablation", "noise", "quickstart", "self_training", "uda")

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import look_at
+from qs3.sensors.base import on_grid
 from qs3.sensors.devices.gaussian_time_of_flight import GaussianTimeOfFlight
 from qs3.sensors.devices.time_of_flight import SPEED_OF_LIGHT, TimeOfFlight, unwrapped
-from qs3.sensors.grids import on_grid
 from qs3.sensors.pixel_status import Reason
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.sensors.scenery import POSE, box_of, middle, rectangle, scan, square

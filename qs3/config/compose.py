@@ -1,0 +1,61 @@
+"""Hydra's compose on the project's conf/, in any process and inside a Hydra application too."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from qs3.config.location import CONF
+from qs3.errors import ConfigError
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+@contextlib.contextmanager
+def composing() -> Iterator[Callable[..., Any]]:
+    """`hydra.compose` for the block; a running application's state is put back after it."""
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    import qs3.config.hydra  # noqa: F401  registers the resolvers that the configs use
+
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            yield compose
+    finally:
+        GlobalHydra.instance().hydra = running
+
+
+def composed(command: str | None, *overrides: str, place: str = "", **more: Any) -> DictConfig:
+    """The config that a command would run with.
+
+    Args:
+        command: "train" or "generate"; None composes the overrides alone (`+sensor=NAME`).
+        overrides: words of its command line.
+        place: prefix of the message of an error, such as "domain=modelnet10: ".
+        more: for `hydra.compose`, such as `return_hydra_config`.
+
+    Raises:
+        ConfigError: no such group, choice or key.
+    """
+    from hydra.errors import HydraException
+
+    with composing() as compose:
+        try:
+            return compose(command, list(overrides), **more)
+        except HydraException as error:
+            raise ConfigError(f"{place}{first_line(error)}") from error
+
+
+def choices(group: str) -> list[str]:
+    """Names of the files of a config group, sorted: `choices("domain")`."""
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message; its kind if it has none."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

@@ -1,0 +1,87 @@
+"""The hash of a config, which names a run's folder: the same command always finds its own run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+# Keys that do not change a result: where things lie, what is shown, how data would be made, and the
+# seed, which is in the folder's name. Everything else is hashed, so two different runs never share
+# a folder. (Other data, wherever they lie, have another hash, which `started.json` guards.)
+_UNHASHED = (
+    "seed",
+    "paths",
+    "logger",
+    "hydra",
+    "force",
+    "callbacks.progress",
+    "report",
+    "ckpt_path",
+    "objective",
+    "trainer.gpus",  # which of several GPUs trains a run
+    "data.cache_dir",
+    "data.make_source",
+    *(
+        f"data.{domain}.{key}"
+        for domain in ("source", "target")
+        for key in (
+            *("path", "published.folder", "title", "symbol"),
+            *("synthesis", "how_to_get", "make", "stand_in"),
+        )
+    ),
+)
+_NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
+
+
+def config_sha256(cfg: DictConfig) -> str:
+    """64 hex digits over the composed config, without the keys that do not change a result.
+
+    Interpolations are hashed as they are written: what they point to is hashed at its own place,
+    or does not matter (`${paths.data_dir}/...`).
+    """
+    plain: Any = OmegaConf.to_container(cfg, resolve=False)
+    for key in _UNHASHED:
+        *parents, leaf = key.split(".")
+        node = plain
+        for parent in parents:
+            node = node.get(parent) if isinstance(node, dict) else None
+        if isinstance(node, dict):
+            node.pop(leaf, None)
+    if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
+        plain["selftraining"] = None
+    trainer = plain.get("trainer")
+    devices = trainer.get("devices") if isinstance(trainer, dict) else None
+    if isinstance(devices, list) and len(devices) == 1:
+        trainer["devices"] = 1
+    text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def config_hash(cfg: DictConfig) -> str:
+    """The first 8 digits of `config_sha256`, for names (`check_config` compares all 64)."""
+    return config_sha256(cfg)[:8]
+
+
+def has_rounds(cfg: DictConfig) -> bool:
+    """Whether the config has self-training that does something."""
+    return not _without_rounds(OmegaConf.to_container(cfg.selftraining, resolve=False))
+
+
+def run_name(cfg: DictConfig) -> str:
+    """`<experiment_name>/seed<seed>-<hash>`, relative to `paths.log_dir`."""
+    return f"{cfg.experiment_name}/seed{cfg.seed}-{config_hash(cfg)}"
+
+
+def run_folder(cfg: DictConfig) -> Path:
+    """The folder of the run that `cfg` describes, whether it exists or not."""
+    return Path(cfg.paths.log_dir).resolve() / run_name(cfg)
+
+
+def _without_rounds(selftraining: Any) -> bool:
+    if not isinstance(selftraining, dict):
+        return True
+    return selftraining.get("_target_") == _NO_ROUNDS or selftraining.get("rounds") == 0

@@ -1,0 +1,24 @@
+"""One run, its settings checked: what every stage of the train command is given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from qs3.data.domain import Domain
+from qs3.datamodules.phases import Phases, Scheme
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run, its settings checked and the light parts of its config built."""
+
+    cfg: DictConfig
+    folder: Path
+    seed: int
+    phases: Phases
+    scheme: Scheme
+    source: Domain
+    target: Domain
