@@ -38,8 +38,8 @@ def test_train_leaves_what_the_command_leaves(tmp_path):
     write_toy(tmp_path)
     folder = train(*toy_overrides(tmp_path), *SHORT, "seed=3")
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert (metrics["seed"], metrics["source"], metrics["simulated"]) == (3, "toy_source", True)
-    assert (metrics["method"], metrics["selftraining"]) == ("source_only", "qbst")  # as typed
+    assert (metrics.seed, metrics.source, metrics.simulated) == (3, "toy_source", True)
+    assert (metrics.method, metrics.selftraining) == ("source_only", "qbst")  # as typed
     assert not HydraConfig.initialized()
     run = read_run(folder)
     assert run.config["protocol"]["epochs"] == 2

@@ -36,11 +36,11 @@ def test_experiment_runs(experiment, data_dir, tmp_path):
         if rounds:
             cfg = compose("train", [*overrides, "selftraining.rounds=2"])
     metrics = train(cfg)
-    assert metrics["experiment"] == experiment
+    assert metrics.experiment == experiment
     assert metrics == json.loads((hashing.run_folder(cfg) / "metrics.json").read_text())
-    assert len(metrics["rounds"]) == min(rounds, 2)
+    assert len(metrics.rounds) == min(rounds, 2)
     if experiment == "own_scans":  # its folders are no labels, so all clouds are the user's
-        assert (metrics["final"]["n"], metrics["final"]["accuracy"]) == (60, None)
+        assert (metrics.final.n, metrics.final.accuracy) == (60, None)
     else:
-        assert metrics["final"]["n"] == 20  # two test clouds of each of ten classes
-    assert metrics["simulated"] == (metrics["target"] == "kinectsim10")
+        assert metrics.final.n == 20  # two test clouds of each of ten classes
+    assert metrics.simulated == (metrics.target == "kinectsim10")

@@ -1,145 +1,58 @@
 """What training may see: labelled clouds of one domain, and the target's clouds without labels.
 
-Labels have owners. `Labelled` clouds may be trained on; `Unlabelled` ones have no labels to give.
-The target's test clouds do not come here at all: only `qs3.evaluation.metrics` holds them.
+Two `DomainData` and which of them a batch is taken from. The target's test clouds do not come here
+at all: only `qs3.evaluation.metrics` holds them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from jaxtyping import Float, Int
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
-from qs3.config.checks import one_of
-from qs3.data.store import PointSet
+from qs3.data.domain import Domain
+from qs3.data.ensure_source import check_or_make
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
-from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.fps_cache import prepare
+from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, Scheme
-from qs3.datamodules.validation_split import RULES
+from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.errors import ConfigError
 
-SAMPLERS = ("shuffled", "balanced")
 
-
-@dataclass(frozen=True, eq=False)
-class Unlabelled:
-    """n clouds with their ids."""
-
-    clouds: Clouds
-    ids: tuple[str, ...]
-
-    @property
-    def points(self) -> Float[Tensor, "n m 3"]:
-        """The clouds in memory as evaluation sees them; made anew each time."""
-        return self.clouds.all()
-
-
-@dataclass(frozen=True, eq=False)
-class Labelled:
-    """n clouds with their ids and labels [n] int64."""
-
-    clouds: Clouds
-    ids: tuple[str, ...]
-    labels: Int[Tensor, " n"]
-
-    def at(self, index: np.ndarray) -> Labelled:
-        """A part."""
-        ids = tuple(self.ids[i] for i in index)
-        return Labelled(self.clouds.at(index), ids, self.labels[torch.from_numpy(index)])
-
-
-def load_clouds(
-    dataset: PointSet, split: str, points: int, starts: int = 1, cache_dir: Path | None = None
-) -> Unlabelled:
-    """A split's clouds, prepared (see `prepare`), without their labels."""
-    part = dataset.split(split)
-    key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
-    clouds = prepare(part.points, points, starts=starts, cache_dir=cache_dir, key=key)
-    return Unlabelled(clouds, part.ids)
-
-
-def labels_of(dataset: PointSet, split: str) -> Int[Tensor, " n"] | None:
-    """A split's labels, for those who may have them; None if the dataset has none."""
-    if not dataset.labelled:
-        return None
-    return torch.from_numpy(np.array(dataset.labels[dataset.indices(split)]))
-
-
-def with_labels(clouds: Unlabelled, dataset: PointSet, split: str, what: str) -> Labelled:
-    """The clouds of `load_clouds` with their labels.
-
-    Args:
-        clouds: of this split.
-        dataset: theirs.
-        split: theirs.
-        what: who asks for labels, for the message.
-
-    Raises:
-        ConfigError: the dataset has no labels.
-    """
-    labels = labels_of(dataset, split)
-    if labels is None:
-        raise ConfigError(
-            f"{what} needs labels, but the clouds of {dataset.name} have none; label them, or "
-            "choose another dataset or method"
-        )
-    return Labelled(clouds.clouds, clouds.ids, labels)
-
-
-def few_of_each_split(dataset: PointSet, count: int) -> PointSet:
-    """At most `count` clouds of each split, at even steps; for `debug=fast`.
-
-    They keep their order and ids, and the hash is still that of the whole dataset.
-    """
-    chosen: list[int] = []
-    for split in dataset.counts():
-        members = dataset.indices(split)
-        few = min(count, len(members))
-        chosen += [int(members[i * len(members) // few]) for i in range(few)]
-    return dataset.at(np.sort(chosen))
-
-
-def first_of_each_class(labelled: Labelled, count: int) -> Labelled:
-    """The first `count` clouds of each class, in their order; for `debug=overfit`."""
-    chosen = np.zeros(len(labelled.ids), dtype=bool)
-    for k in labelled.labels.unique().tolist():
-        chosen[np.flatnonzero(labelled.labels.numpy() == k)[:count]] = True
-    return labelled.at(np.flatnonzero(chosen))
-
-
-class UdaData(LightningDataModule):
+class AdaptationData(LightningDataModule):
     """Batches of each phase: labelled ones in the warm-up, pseudo-labelled ones in the rounds.
 
     Args:
-        labelled: training clouds with labels.
-        owner: whose labels these are: "source", or "target_train" for the upper bound
-            (`method=supervised`), which alone asks for them.
-        target: the target's training clouds.
+        source: labelled domain.
+        target: the other one.
         phases: which epoch belongs to which phase.
         scheme: settings of the rounds.
         augment: applied to every training batch, on its device.
         batch_size: of the warm-up, at least 2 (batch norm).
         seed: of the run.
-        val: rule that takes a validation set from `labelled` (see
-            `qs3.datamodules.validation_split`).
-        sampler: "shuffled" trains on each labelled cloud once an epoch; "balanced" on as many
-            clouds of each class (see `qs3.datamodules.batches.balanced`). For the source alone: how
-            often the target's classes occur is not known.
+        owner: whose labels are trained on: "source", or "target_train" for the upper bound
+            (`method=supervised`), which alone asks for them.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
+        sampler: "shuffled" trains on each labelled cloud once an epoch; "balanced" on as many
+            clouds of each class (see `batches.balanced`). For the source alone: how often the
+            target's classes occur is not known.
+        make_source: a generated source that is not there is made first.
+        points, fps_starts, val, eval_batch_size, cache_dir, clouds_a_split: see `DomainData`.
+        clouds_a_class: of the labelled domain; see `DomainData`.
+
+    Attributes:
+        labelled_domain, target_domain: what it is composed of.
+        pseudo: positions in `target` [m] and their labels [m], or class probabilities [m, C],
+            which the rounds train on; None in the warm-up.
     """
 
     def __init__(
         self,
-        labelled: Labelled,
-        target: Unlabelled,
+        source: Domain,
+        target: Domain,
         *,
         phases: Phases,
         scheme: Scheme,
@@ -147,27 +60,83 @@ class UdaData(LightningDataModule):
         batch_size: int,
         seed: int,
         owner: str = "source",
+        uses_target: bool = False,
+        points: int = 1024,
+        fps_starts: int = 4,
         val: str = "lineage",
         sampler: str = "shuffled",
         eval_batch_size: int = 64,
-        uses_target: bool = False,
+        cache_dir: str | Path | None = None,
+        make_source: bool = False,
+        clouds_a_split: int | None = None,
+        clouds_a_class: int | None = None,
     ) -> None:
         super().__init__()
-        rule = RULES[one_of("data.val", val, sorted(RULES))]
-        train, validation = rule(labelled.ids, labelled.labels.numpy())
-        self.labelled, self.validation = labelled.at(train), labelled.at(validation)
-        self.target = target
-        self.sampler = one_of("data.sampler", sampler, SAMPLERS)
         if sampler == "balanced" and owner != "source":
             raise ConfigError(
                 "data.sampler=balanced draws source clouds only. Balancing the target's classes "
                 "takes its true labels, which one released code does and which makes its figures "
                 "incomparable; set data.sampler=shuffled"
             )
+        shared: dict[str, Any] = {
+            "points": points,
+            "fps_starts": fps_starts,
+            "eval_batch_size": eval_batch_size,
+            "cache_dir": cache_dir,
+            "clouds_a_split": clouds_a_split,
+        }
+        self.source, self.make_source = source, make_source
+        self.labelled_domain = DomainData(
+            source if owner == "source" else target,
+            val=val,
+            sampler=sampler,
+            clouds_a_class=clouds_a_class,
+            **shared,
+        )
+        self.target_domain = DomainData(target, labels=False, **shared)
         self.owner, self.uses_target = owner, uses_target
         self.phases, self.scheme, self.augment = phases, scheme, augment
         self.batch_size, self.eval_batch_size, self.seed = batch_size, eval_batch_size, seed
-        self.pseudo: tuple[Tensor, Tensor] | None = None  # indices into target, labels
+        self.pseudo: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def labelled(self) -> Labelled:
+        """The clouds of the warm-up, after `setup`."""
+        assert isinstance(self.labelled_domain.train, Labelled)
+        return self.labelled_domain.train
+
+    @property
+    def all_labelled(self) -> Labelled:
+        """The clouds of the warm-up and the held-out ones, after `setup`."""
+        assert isinstance(self.labelled_domain.whole, Labelled)
+        return self.labelled_domain.whole
+
+    @property
+    def validation(self) -> Labelled:
+        """Held-out labelled clouds, after `setup`."""
+        assert self.labelled_domain.validation is not None
+        return self.labelled_domain.validation
+
+    @property
+    def target(self) -> Unlabelled:
+        """The target's training clouds, after `setup`."""
+        assert isinstance(self.target_domain.train, Unlabelled)
+        return self.target_domain.train
+
+    def prepare_data(self) -> None:
+        """Make the source if it is to be made, bring published files into the stores, check them.
+
+        Raises:
+            MissingDataError: one or both are not there; says how to get them.
+        """
+        check_or_make(self.source, self.target_domain.domain, self.make_source)
+        for part in (self.labelled_domain, self.target_domain):
+            part.prepare_data()
+
+    def setup(self, stage: str | None = None) -> None:
+        """Load the training clouds of both; for evaluation see `qs3.evaluation.metrics`."""
+        for part in (self.labelled_domain, self.target_domain):
+            part.setup("fit")
 
     def set_pseudo_labels(self, index: Tensor, labels: Tensor) -> None:
         """What the next round trains on: positions in `target` [m], and their labels [m]."""
@@ -198,6 +167,13 @@ class UdaData(LightningDataModule):
             {"source": table}, self.eval_batch_size, seed=self.seed, epoch=0, shuffle=False
         )
 
+    def predict_dataloader(self) -> Batches:
+        """The target's training clouds, in order and without labels."""
+        table = Table(self.target.clouds, {})
+        return Batches(
+            {"target": table}, self.eval_batch_size, seed=self.seed, epoch=0, shuffle=False
+        )
+
     def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
         """Augment training batches, each domain with its own randomness."""
         if self.trainer is None or not self.trainer.training:
@@ -220,7 +196,7 @@ class UdaData(LightningDataModule):
 
     def _labelled(self) -> Table:
         y = f"y_{self.owner}"
-        balance = y if self.sampler == "balanced" else None
+        balance = y if self.labelled_domain.sampler == "balanced" else None
         return Table(self.labelled.clouds, {y: self.labelled.labels}, balance)
 
     def _pseudo_labelled(self) -> Table:

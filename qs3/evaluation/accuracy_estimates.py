@@ -19,18 +19,18 @@ from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
-from qs3.datamodules.adaptation import Labelled, Unlabelled
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import enough, limits, strange_clouds
+from qs3.runs.metrics import AccuracyEstimates, Estimates
 
 TURNS = 3
 """Turns about gravity besides none: by 90, 180 and 270 degrees."""
 
 _LEAST_T, _MOST_T, _TINY = 0.05, 20.0, 1e-300
 _LOOKED_AT = 300  # clouds of a domain, 3 ms each
-_ESTIMATES = ("temperature", "mean_confidence", "calibrated", "thresholded", "difference")
 
 
 def temperature(probabilities: Float[np.ndarray, "v c"], labels: Int[np.ndarray, " v"]) -> float:
@@ -168,7 +168,7 @@ def quality_of(
     teacher: nn.Module | None = None,
     unadapted: tuple[nn.Module, nn.Module | None] | None = None,
     upright: bool = True,
-) -> dict[str, Any]:
+) -> AccuracyEstimates:
     """What `metrics.json` has under `quality`, in words in `qs3.evaluation.estimates_text`.
 
     Looks at no label of the target.
@@ -196,32 +196,29 @@ def quality_of(
     known = predict(as_trained, validation.clouds.all(), batch_size, device, domain=domain)
     judged = predict(net, points, batch_size, device)
     counts = np.bincount(judged.argmax(axis=1), minlength=len(classes))
-    found: dict[str, Any] = {
+    about: dict[str, Any] = {
         "clouds": len(judged),
         "validated_on": f"{owner}_val",
         "validation_clouds": len(labels),
         "validation_accuracy": agreement(known, np.eye(len(classes))[labels]),
-        **dict.fromkeys(_ESTIMATES),
-        "turns_agree": None,
-        "teacher_agrees": None,
-        "teacher": None,
         "unlike_source": unlike(target.clouds, source),
         "never_predicted": [name for name, n in zip(classes, counts, strict=True) if not n],
     }
     if not (np.isfinite(known).all() and np.isfinite(judged).all()):
-        return found
-    found |= estimates(known, labels, judged)
+        return AccuracyEstimates(**about)
+    about |= estimates(known, labels, judged)
     if upright:
-        found["turns_agree"] = turns_agree(judged, _turned(net, points, batch_size, device))
+        about["turns_agree"] = turns_agree(judged, _turned(net, points, batch_size, device))
     if teacher is not None:
         assert taught is not None
         theirs = predict(teacher, points, batch_size, device)
-        found["teacher_agrees"] = agreement(judged, theirs)
+        about["teacher_agrees"] = agreement(judged, theirs)
         known = predict(taught, validation.clouds.all(), batch_size, device, domain=domain)
         if np.isfinite(known).all() and np.isfinite(theirs).all():
             accuracy = agreement(known, np.eye(len(classes))[labels])
-            found["teacher"] = {"validation_accuracy": accuracy, **estimates(known, labels, theirs)}
-    return found
+            found = estimates(known, labels, theirs)
+            about["teacher"] = Estimates(validation_accuracy=accuracy, **found)
+    return AccuracyEstimates(**about)
 
 
 def _turned(net: nn.Module, points: Tensor, batch_size: int, device: Any) -> list[np.ndarray]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+
+from qs3.runs.metrics import AccuracyEstimates, Estimates
 
 MEANINGS: Mapping[str, str] = {
     "validation_accuracy": "accuracy on held-out labelled clouds. On others it will be lower",
@@ -27,30 +28,30 @@ MEANINGS: Mapping[str, str] = {
 """What each figure tells, and what it does not."""
 
 
-def in_words(quality: Mapping[str, Any]) -> str:
+def in_words(quality: AccuracyEstimates) -> str:
     """The estimates in a few words, for the end of a headline; "" without any."""
-    if quality.get("calibrated") is None:
+    if quality.calibrated is None:
         return ""
-    teacher = quality.get("teacher")
-    before = f" (before self-training {_range(teacher)})" if teacher else ""
+    before = f" (before self-training {_range(quality.teacher)})" if quality.teacher else ""
     return f"accuracy estimated from confidences {_range(quality)}{before}, too high as a rule"
 
 
-def _range(quality: Mapping[str, Any]) -> str:
-    found = [quality[name] for name in ("calibrated", "thresholded", "difference")]
+def _range(quality: Estimates) -> str:
+    figures = (quality.calibrated, quality.thresholded, quality.difference)
+    found = [value for value in figures if value is not None]
     low, high = f"{min(found):.0%}", f"{max(found):.0%}"
     return low if low == high else f"{low} to {high}"
 
 
-def table(quality: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def table(quality: AccuracyEstimates) -> list[tuple[str, str, str]]:
     """Name, value and meaning of each figure that there is, for people."""
     rows = []
     for key, meaning in MEANINGS.items():
-        value = quality.get(key)
+        value = getattr(quality, key)
         if value is None:
             continue
         shown = f"{value:.1%}" if isinstance(value, float) else ", ".join(value) or "none"
-        before = (quality.get("teacher") or {}).get(key)
+        before = getattr(quality.teacher, key, None)
         if before is not None:
             shown += f" (before self-training {before:.1%})"
         rows.append((key.replace("_", " "), shown, f"{meaning}."))

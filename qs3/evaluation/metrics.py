@@ -15,9 +15,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from qs3.datamodules.adaptation import Unlabelled
 from qs3.datamodules.augment import rotate_z
+from qs3.datamodules.splits import Unlabelled
 from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
+from qs3.runs.metrics import PseudoLabelScores, Scores
 from qs3.runs.predictions import Predictions
 from qs3.runs.pseudo_labels import read_pseudo_labels
 
@@ -91,42 +92,35 @@ def predict_turned(
     return total / rotations
 
 
-def figures(
-    predicted: Int[np.ndarray, " n"], labels: Int[np.ndarray, " n"], classes: Sequence[str]
-) -> dict[str, Any]:
-    """Accuracy, balanced accuracy, recalls, confusion matrix and majority rate, all plain values.
+def scores(
+    probabilities: Float[np.ndarray, "n c"],
+    labels: Int[np.ndarray, " n"] | None,
+    classes: Sequence[str],
+) -> Scores:
+    """Accuracy, balanced accuracy, recalls, confusion matrix, majority and calibration error.
 
-    `confusion[i][j]` counts clouds of class i predicted as j. A class without clouds has recall
-    None and is left out of the balanced accuracy. `majority_rate` is what always naming the
-    commonest class would reach. `predicted` counts the predictions of each class.
+    A class without clouds has recall None and is left out of the balanced accuracy. The majority
+    rate is what always naming the commonest class would reach. Without labels there are counts of
+    the predictions alone; of a net that has diverged there is no calibration error.
     """
-    k = len(classes)
+    predicted, k = probabilities.argmax(axis=1), len(classes)
+    if labels is None:
+        counts = np.bincount(predicted, minlength=k).tolist()
+        return Scores(n=len(predicted), predicted=dict(zip(classes, counts, strict=True)))
     confusion = np.bincount(labels * k + predicted, minlength=k * k).reshape(k, k)
     support, hits = confusion.sum(axis=1), confusion.diagonal()
     recall = [float(h / s) if s else None for h, s in zip(hits, support, strict=True)]
-    return {
-        "accuracy": float(hits.sum() / support.sum()),
-        "balanced_accuracy": float(np.mean([r for r in recall if r is not None])),
-        "per_class_recall": dict(zip(classes, recall, strict=True)),
-        "confusion": confusion.tolist(),
-        "majority_rate": float(support.max() / support.sum()),
-        "n": int(support.sum()),
-        "predicted": dict(zip(classes, confusion.sum(axis=0).tolist(), strict=True)),
-    }
-
-
-def figures_without_labels(
-    predicted: Int[np.ndarray, " n"], classes: Sequence[str]
-) -> dict[str, Any]:
-    """The same keys for clouds whose labels nobody knows: the counts, and None for the rest."""
-    counts = np.bincount(predicted, minlength=len(classes)).tolist()
-    unknown = ("accuracy", "balanced_accuracy", "per_class_recall", "confusion", "majority_rate")
-    return {
-        **dict.fromkeys(unknown),
-        "n": len(predicted),
-        "predicted": dict(zip(classes, counts, strict=True)),
-        "calibration_error": None,
-    }
+    finite = bool(np.isfinite(probabilities).all())
+    return Scores(
+        n=int(support.sum()),
+        predicted=dict(zip(classes, confusion.sum(axis=0).tolist(), strict=True)),
+        accuracy=float(hits.sum() / support.sum()),
+        balanced_accuracy=float(np.mean([r for r in recall if r is not None])),
+        majority_rate=float(support.max() / support.sum()),
+        per_class_recall=dict(zip(classes, recall, strict=True)),
+        confusion=confusion.tolist(),
+        calibration_error=calibration_error(probabilities, labels) if finite else None,
+    )
 
 
 def calibration_error(
@@ -169,46 +163,44 @@ class Evaluation:
         rotations: int = 0,
         meshes: Mapping[str, str] | None = None,
     ) -> None:
-        self.points, self.classes, self.batch_size = test.points, tuple(classes), batch_size
+        self.test, self.classes, self.batch_size = test, tuple(classes), batch_size
         self.y_target_eval = None if labels is None else labels.numpy()
         self.rotations = rotations
-        self._train = train_labels
-        self._ids, self._meshes = test.ids, meshes or {}
+        self._train, self._meshes = train_labels, meshes or {}
+
+    @property
+    def labelled(self) -> bool:
+        """Whether anybody knows the classes of the evaluated clouds."""
+        return self.y_target_eval is not None
 
     def predictions(self, net: nn.Module, device: Any = "cpu") -> Predictions:
-        """What `net` says of each cloud."""
-        labels = self.y_target_eval
+        """What `net` predicts for each cloud, as it is and in one fixed sample."""
+        labels, ids = self.y_target_eval, self.test.ids
         return Predictions(
             self.classes,
-            self._ids,
-            tuple(self._meshes.get(id_) or id_ for id_ in self._ids),
-            np.full(len(self._ids), -1) if labels is None else labels,
-            predict(net, self.points, self.batch_size, device),
+            ids,
+            tuple(self._meshes.get(id_) or id_ for id_ in ids),
+            np.full(len(ids), -1) if labels is None else labels,
+            predict(net, self.test.points, self.batch_size, device),
         )
 
-    def figures(self, net: nn.Module, device: Any = "cpu") -> dict[str, Any]:
-        """What `net` is worth on the target's test clouds: each as it is, in one fixed sample."""
-        return self._figures(predict(net, self.points, self.batch_size, device))
+    def scores(self, net: nn.Module, device: Any = "cpu") -> Scores:
+        """What `net` is worth on the target's test clouds."""
+        return self.scores_of(predict(net, self.test.points, self.batch_size, device))
 
-    def turned(self, net: nn.Module, device: Any = "cpu") -> dict[str, Any] | None:
+    def scores_of(self, probabilities: Float[np.ndarray, "n c"]) -> Scores:
+        """What these predictions of the test clouds are worth."""
+        return scores(probabilities, self.y_target_eval, self.classes)
+
+    def turned(self, net: nn.Module, device: Any = "cpu") -> Scores | None:
         """The same for probabilities averaged over turns; None if that was not asked for."""
         if not self.rotations:
             return None
-        return self._figures(
-            predict_turned(net, self.points, self.rotations, self.batch_size, device)
+        return self.scores_of(
+            predict_turned(net, self.test.points, self.rotations, self.batch_size, device)
         )
 
-    def _figures(self, probabilities: np.ndarray) -> dict[str, Any]:
-        predicted, labels = probabilities.argmax(axis=1), self.y_target_eval
-        if labels is None:
-            return figures_without_labels(predicted, self.classes)
-        confident = bool(np.isfinite(probabilities).all())  # of anything: else it has diverged
-        return {
-            **figures(predicted, labels, self.classes),
-            "calibration_error": calibration_error(probabilities, labels) if confident else None,
-        }
-
-    def pseudo_labels(self, path: Path) -> dict[str, float] | None:
+    def pseudo_labels(self, path: Path) -> PseudoLabelScores | None:
         """How right a round's pseudo-labels were: a diagnostic, computed when training is over.
 
         `precision`: right among the selected; `recall`: selected and right among all; `accuracy`:
@@ -219,8 +211,8 @@ class Evaluation:
         rows = read_pseudo_labels(path)
         right = np.array([self.classes[self._train[row.id]] == row.label for row in rows])
         kept = np.array([row.selected for row in rows])
-        return {
-            "precision": float(right[kept].mean()),
-            "recall": float((right & kept).mean()),
-            "accuracy": float(right.mean()),
-        }
+        return PseudoLabelScores(
+            precision=float(right[kept].mean()),
+            recall=float((right & kept).mean()),
+            accuracy=float(right.mean()),
+        )

@@ -15,7 +15,6 @@ The earliest epoch wins a tie.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from qs3.errors import ConfigError
@@ -60,8 +59,10 @@ def check_objective(objective: Any, student: Any) -> None:
         )
 
 
-def took_target_labels(metrics: Mapping[str, Any]) -> bool:
-    """Whether a run's result was chosen by the target's test labels: no table may have it."""
-    selection = metrics.get("selection")
-    student = selection.get("student") if isinstance(selection, Mapping) else None
-    return str(student).startswith(ORACLE)
+def took_target_labels(student: str) -> bool:
+    """Whether a result was chosen by the target's test labels: no table may have it.
+
+    Args:
+        student: of `qs3.runs.metrics.Selection`.
+    """
+    return student.startswith(ORACLE)

@@ -29,22 +29,12 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import ConfigError, DataError
+from qs3.runs.metrics import METRICS
 from qs3.utils.files import write_json
 
-METRICS = "metrics.json"
 STARTED = "started.json"
 
 _KEPT_WHEN_CLEARED = (".hydra", ".lock")
-
-
-def read_metrics(folder: str | Path) -> dict[str, Any] | None:
-    """The result of a finished run; None if the run is not finished."""
-    return _read_json(Path(folder) / METRICS)
-
-
-def write_metrics(folder: str | Path, metrics: Mapping[str, Any]) -> None:
-    """Save the result, which also marks the run as finished."""
-    write_json(Path(folder) / METRICS, metrics)
 
 
 def read_started(folder: str | Path) -> dict[str, Any] | None:

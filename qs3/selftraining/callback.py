@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from qs3.datamodules.adaptation import UdaData
+from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import Phases, Scheme
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import predict
@@ -130,7 +130,7 @@ class SelfTraining(Callback):
 
     def _select(self, trainer: Trainer, pl_module: Classifier, round_: int) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
-        assert isinstance(data, UdaData)
+        assert isinstance(data, AdaptationData)
         teacher = pl_module.net
         if round_ == 0:  # the warm-up's selected weights, not its last ones
             teacher = pl_module.fresh_net(phase=0).to(pl_module.device)

@@ -56,7 +56,7 @@ def choose(
     best = -1
     for epoch in range(*phases.span(phases.rounds)):
         net = trained(candidate_path(folder, epoch))
-        scores[epoch] = evaluation.figures(net, device)["accuracy"]
+        scores[epoch] = evaluation.scores(net, device).accuracy or 0.0
         if is_better(ORACLE, scores[epoch], scores.get(best)):
             best = epoch
     log.warning("%s: epoch %d of %s", ORACLE_IN_WORDS, best, folder)

@@ -24,7 +24,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor, nn
 
-from qs3.datamodules.adaptation import UdaData
+from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
@@ -121,7 +121,7 @@ class StudentSelection(Callback):
             return
         phase, ends = self.phases.phase(epoch), self.phases.ends(epoch)
         data = trainer.datamodule  # type: ignore[attr-defined]
-        assert isinstance(data, UdaData)
+        assert isinstance(data, AdaptationData)
         if self.rule == PSEUDO_VAL and phase == last_phase - 1 and ends:
             self._hold_out(data)
         if phase != last_phase:
@@ -137,7 +137,9 @@ class StudentSelection(Callback):
                 self._weights = None
         trainer.strategy.barrier("epoch of the student kept")
 
-    def _compare(self, trainer: Trainer, classifier: Classifier, data: UdaData, epoch: int) -> None:
+    def _compare(
+        self, trainer: Trainer, classifier: Classifier, data: AdaptationData, epoch: int
+    ) -> None:
         # One process scores for all: batch norm's statistics differ between processes.
         mine = self._score(classifier.net, data, classifier) if trainer.is_global_zero else 0.0
         score = float(trainer.strategy.broadcast(mine))
@@ -146,7 +148,7 @@ class StudentSelection(Callback):
             self.epoch, self.score = epoch, score
             self._weights = copy_weights(classifier.net)
 
-    def _score(self, net: nn.Module, data: UdaData, classifier: Classifier) -> float:
+    def _score(self, net: nn.Module, data: AdaptationData, classifier: Classifier) -> float:
         clouds = data.target.clouds
         if self.rule != PSEUDO_VAL:
             table = predict(net, clouds.all(), data.eval_batch_size, classifier.device)
@@ -158,7 +160,7 @@ class StudentSelection(Callback):
         )
         return float((table.argmax(axis=1) == labels.numpy()).mean())
 
-    def _hold_out(self, data: UdaData) -> None:
+    def _hold_out(self, data: AdaptationData) -> None:
         """Move a part of the set that the last round would train on aside."""
         assert data.pseudo is not None
         index, labels = data.pseudo

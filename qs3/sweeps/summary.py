@@ -17,7 +17,7 @@ from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
-from qs3.runs import folder as runs
+from qs3.runs.metrics import METRICS
 from qs3.sweeps.plugins import register
 
 log = logging.getLogger(__name__)
@@ -89,7 +89,7 @@ class SummaryOfSeeds(Callback):
         self.journal.unlink(missing_ok=True)
         self.journal = None
         folders = sorted({Path(job["folder"]) for job in jobs})
-        if self.table and any((folder / runs.METRICS).is_file() for folder in folders):
+        if self.table and any((folder / METRICS).is_file() for folder in folders):
             sys.stdout.write(summarise(folders, differences(jobs)) + "\n")
         sys.stdout.write(failures(jobs))
         if unreadable:

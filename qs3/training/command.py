@@ -8,22 +8,21 @@ import math
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config import hashing
 from qs3.config.checks import number, one_of, whole
 from qs3.config.hydra import build, in_multirun
-from qs3.data.domain import check_all
+from qs3.data.ensure_source import check_or_make
 from qs3.data.store import is_finished
 from qs3.datamodules.phases import Phases, Scheme
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
 from qs3.runs import folder as runs
+from qs3.runs.metrics import METRICS, DataHashes, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
-from qs3.training.ensure_source import make_if_missing
 from qs3.training.run import Run
 from qs3.utils.locks import owned
 
@@ -34,7 +33,7 @@ SCHEDULES = ("cosine", "plateau")
 _SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
 
 
-def train(cfg: DictConfig) -> dict[str, Any]:
+def train(cfg: DictConfig) -> RunMetrics:
     """Train, continue or skip the run that `cfg` describes; returns what `metrics.json` holds.
 
     Everything that can be wrong with the settings or the data is found before torch is imported.
@@ -62,24 +61,24 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     with owned(run.folder):
         if cfg.force:
             runs.clear(run.folder)
-        metrics = runs.read_metrics(run.folder)
+        metrics = read_metrics(run.folder)
         if metrics is None:
             with _wandb_forgotten():
                 metrics = _fit(run)
-                runs.write_metrics(run.folder, metrics)
+                write_metrics(run.folder, metrics)
                 _report(run)
         else:
-            runs.check_config(run.folder, metrics.get("config_sha256"), hashing.config_sha256(cfg))
-            _refuse_other_data(run, metrics["data"])
+            runs.check_config(run.folder, metrics.config_sha256, hashing.config_sha256(cfg))
+            _refuse_other_data(run, metrics.data)
             log.info("already finished (force=true repeats it)")
     log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
     if (run.folder / OF_FILES).is_file():
         log.info("the class of each file: %s", run.folder / OF_FILES)
-    log.info("see %s", run.folder / runs.METRICS)
+    log.info("see %s", run.folder / METRICS)
     return metrics
 
 
-def objective_of(cfg: DictConfig, metrics: dict[str, Any]) -> float | None:
+def objective_of(cfg: DictConfig, metrics: RunMetrics) -> float | None:
     """What a search over hyper-parameters looks at; None if there is no search.
 
     NaN for a run that has diverged: it is finished, and would diverge again.
@@ -89,53 +88,48 @@ def objective_of(cfg: DictConfig, metrics: dict[str, Any]) -> float | None:
     """
     if cfg.objective is None:
         return None
-    validators = metrics.get("validators", {})
-    if cfg.objective not in validators:
+    if cfg.objective not in metrics.validators:
         raise ConfigError(
-            f"the run's metrics.json has no {cfg.objective} under validators: it was finished by "
-            "an earlier version, which force=true repeats, or (snd) its target has a single cloud"
+            f"the run has no score {cfg.objective}: its target has a single training cloud"
         )
-    value = validators[cfg.objective]
-    return math.nan if value is None else float(value)
+    value = metrics.validators[cfg.objective]
+    return math.nan if value is None else value
 
 
-def judged(cfg: DictConfig, metrics: dict[str, Any]) -> str:
+def judged(cfg: DictConfig, metrics: RunMetrics) -> str:
     """The result of a search's trial in one line: no accuracy, it would be nothing to choose by."""
-    value = metrics.get("validators", {}).get(cfg.objective)
+    value = metrics.validators.get(cfg.objective)
     text = "none: the net has diverged" if value is None else f"{value:.4f}"
-    return f"{metrics['experiment']}, seed {metrics['seed']}: objective={cfg.objective} {text}"
+    return f"{metrics.experiment}, seed {metrics.seed}: objective={cfg.objective} {text}"
 
 
-def headline(metrics: dict[str, Any]) -> str:
+def headline(metrics: RunMetrics) -> str:
     """The result in one line; says when the target is simulated."""
-    final, run = metrics["final"], f"{metrics['experiment']}, seed {metrics['seed']}"
-    target = f"{metrics['target']}{' (simulated)' if metrics['simulated'] else ''}"
-    if final["accuracy"] is None:
-        counts = ", ".join(f"{name} {count}" for name, count in final["predicted"].items() if count)
-        estimate = in_words(metrics.get("quality", {}))
+    final, run = metrics.final, f"{metrics.experiment}, seed {metrics.seed}"
+    target = metrics.target_text
+    if final.accuracy is None:
+        counts = ", ".join(f"{name} {count}" for name, count in final.predicted.items() if count)
+        estimate = in_words(metrics.quality)
         return (
             f"{run}: no labels to judge {target} by; predicted {counts}"
             f"{f'; {estimate}' if estimate else ''}{_chosen(metrics)}"
         )
     return (
-        f"{run}: accuracy {final['accuracy']:.1%}, balanced {final['balanced_accuracy']:.1%} "
-        f"on {target}, majority rate {final['majority_rate']:.1%}{_chosen(metrics)}"
+        f"{run}: accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
+        f"on {target}, majority rate {final.majority_rate:.1%}{_chosen(metrics)}"
     )
 
 
-def _chosen(metrics: dict[str, Any]) -> str:
+def _chosen(metrics: RunMetrics) -> str:
     """How teacher and student were selected, for the end of the headline."""
-    teacher, student = metrics["selection"]["teacher"], metrics["selection"]["student"]
+    teacher, student = metrics.selection.teacher, metrics.selection.student
     if teacher == student:  # no rounds
         return f"; selected by {teacher}"
     return f"; teacher selected by {teacher}; student by {student}"
 
 
-def _fit(run: Run) -> dict[str, Any]:
-    if run.cfg.data.make_source:
-        run.target.check()  # before minutes are spent on the source
-        make_if_missing(run.source)
-    check_all(run.source, run.target)
+def _fit(run: Run) -> RunMetrics:
+    check_or_make(run.source, run.target, run.cfg.data.make_source)
     from qs3.training.fit import fit  # torch and Lightning from here on
 
     return fit(run)
@@ -226,11 +220,13 @@ def _warn_of_one_domain(run: Run) -> None:
         )
 
 
-def _refuse_other_data(run: Run, hashes: dict[str, str]) -> None:
+def _refuse_other_data(run: Run, hashes: DataHashes) -> None:
     """Raise if a dataset is there and is not the one that the finished run used."""
     for role, domain in (("source", run.source), ("target", run.target)):
         if is_finished(domain.folder):  # else it was put away since, and the result stands
-            runs.check_data(run.folder, domain.name, hashes[role], domain.open(verify=False).sha256)
+            runs.check_data(
+                run.folder, domain.name, getattr(hashes, role), domain.open(verify=False).sha256
+            )
 
 
 def _refuse_ddp_in_multirun(cfg: DictConfig) -> None:

@@ -1,4 +1,4 @@
-"""More about the net that a run reports: scores without labels, and whether it learnt by heart."""
+"""More about the reported net: scores without labels, and its accuracy on training clouds."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any
 
 from torch import nn
 
-from qs3.datamodules.adaptation import Labelled, Unlabelled
+from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import PSEUDO_VAL
 from qs3.evaluation.validators import LABEL_FREE
+from qs3.runs.metrics import TrainingAccuracy
 from qs3.selftraining.student_selection import Choice
 
 log = logging.getLogger(__name__)
@@ -43,9 +44,9 @@ def without_labels(
     return {name: score if math.isfinite(score) else None for name, score in scores.items()}
 
 
-def learnt_by_heart(
+def training_accuracy(
     net: nn.Module, labelled: Labelled, owner: str, batch_size: int, device: Any
-) -> dict[str, Any]:
+) -> TrainingAccuracy:
     """How many there are of the clouds that the net was trained on, and the share that is right.
 
     Args:
@@ -58,4 +59,4 @@ def learnt_by_heart(
     table = predict(net, labelled.clouds.all(), batch_size, device, domain=domain)
     right = float((table.argmax(axis=1) == labelled.labels.numpy()).mean())
     log.info("%.1f %% of the %d training clouds are right", 100 * right, len(table))
-    return {"n": len(table), "accuracy": right}
+    return TrainingAccuracy(n=len(table), accuracy=right)

@@ -12,6 +12,7 @@ from typing import Any
 from qs3.errors import ConfigError, MissingDataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
+from qs3.runs.metrics import METRICS
 from qs3.training.provenance import warn_of_versions
 from qs3.training.run import Run
 from qs3.utils.files import atomic_path, make_folder
@@ -20,7 +21,7 @@ from qs3.utils.locks import check_idle
 log = logging.getLogger(__name__)
 
 _LAST = "last"
-_STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, runs.METRICS)
+_STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, METRICS)
 
 
 def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:

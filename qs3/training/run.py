@@ -10,6 +10,9 @@ from omegaconf import DictConfig
 from qs3.data.domain import Domain
 from qs3.datamodules.phases import Phases, Scheme
 
+STUDENT = "student.pt"
+"""Weights at the end of the last round."""
+
 
 @dataclass(frozen=True)
 class Run:

@@ -23,11 +23,11 @@ def test_earlier_starts_count(toy):
     cfg = toy("selftraining=none")
     interrupt(cfg, "on_train_epoch_start", 3)
     wind_forward(hashing.run_folder(cfg) / "last.ckpt")
-    assert LONG < train(cfg)["times"]["seconds"] < 2 * LONG
+    assert LONG < train(cfg).times.seconds < 2 * LONG
 
 
 def test_a_shared_warmup_counts(toy, tmp_path):
-    assert 0 < train(toy("selftraining=none"))["times"]["seconds"] < LONG
+    assert 0 < train(toy("selftraining=none")).times.seconds < LONG
     (shared,) = (tmp_path / "logs" / "warmups").rglob("*.ckpt")
     wind_forward(shared)
-    assert LONG < train(toy())["times"]["seconds"] < 2 * LONG
+    assert LONG < train(toy()).times.seconds < 2 * LONG

@@ -214,7 +214,7 @@ def own(toy):
 
 def test_a_run_on_one_s_own_scans_says_what_it_can(own):
     cfg, metrics = own
-    found = metrics["quality"]
+    found = metrics.quality
     assert found["clouds"] == 30
     assert found["validated_on"] == "source_val"
     assert found["validation_clouds"] > 5
@@ -237,7 +237,7 @@ def test_each_file_has_its_class_under_its_own_name(own):
     with open(hashing.run_folder(cfg) / OF_FILES, encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["file"] for row in rows] == sorted(f"room{i % 2}/{i:02d}.xyz" for i in range(30))
-    for name, count in metrics["final"]["predicted"].items():
+    for name, count in metrics.final.predicted.items():
         assert sum(row["class"] == name for row in rows) == count
     for row in rows:
         assert sum(float(row[f"p_{name}"]) for name in CLASSES) == pytest.approx(1, abs=2e-4)

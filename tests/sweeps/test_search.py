@@ -176,21 +176,21 @@ def test_a_run_refuses_the_objective_by_itself(toy):  # noqa: F811
 def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
     """With rounds and without; by `selection.student` the last epoch's score is the same one."""
     metrics = train(toy("selection.student=infomax", "selftraining.epochs=1"))
-    only = metrics["student"]["score"]  # one epoch to choose from, and it is reported
-    assert metrics["validators"]["infomax"] == only
-    assert set(metrics["validators"]) == set(LABEL_FREE)
+    only = metrics.student.score  # one epoch to choose from, and it is reported
+    assert metrics.validators["infomax"] == only
+    assert set(metrics.validators) == set(LABEL_FREE)
     assert objective_of(toy("objective=infomax"), metrics) == only
     assert objective_of(toy(), metrics) is None
 
     metrics = train(toy("selection.student=pseudo_val"))
-    assert metrics["validators"]["pseudo_val"] == metrics["student"]["score"]
+    assert metrics.validators["pseudo_val"] == metrics.student.score
     cfg = toy("selftraining=none", "objective=entropy")
     metrics = train(cfg)
-    assert 0 <= objective_of(cfg, metrics) == metrics["validators"]["entropy"] <= 1.0987
-    metrics["validators"]["entropy"] = None  # as `qs3.training.final_scores.without_labels` says it
+    assert 0 <= objective_of(cfg, metrics) == metrics.validators["entropy"] <= 1.0987
+    metrics.validators["entropy"] = None  # as `qs3.training.final_scores.without_labels` says it
     assert math.isnan(objective_of(cfg, metrics))
     assert judged(cfg, metrics).endswith(": objective=entropy none: the net has diverged")
-    del metrics["validators"]
+    del metrics.validators
     with pytest.raises(ConfigError, match=r"no entropy under validators.*force=true"):
         objective_of(cfg, metrics)
 
@@ -202,8 +202,8 @@ def test_a_run_that_really_diverges_is_finished_and_has_none(objective, toy):  #
         f"objective={objective}",
     )  # fmt: skip
     metrics = train(cfg)
-    assert metrics["validators"] == dict.fromkeys(OBJECTIVES)
-    assert metrics["final"]["calibration_error"] is None
+    assert metrics.validators == dict.fromkeys(OBJECTIVES)
+    assert metrics.final.calibration_error is None
     assert math.isnan(objective_of(cfg, metrics))
     assert judged(cfg, train(cfg)).endswith("none: the net has diverged")
 
@@ -214,10 +214,10 @@ def test_a_trial_says_its_objective_and_no_accuracy(toy, caplog):  # noqa: F811
     with caplog.at_level(logging.INFO):
         metrics = train(toy(*words, "objective=infomax"))
         train(toy(*words, "objective=entropy"))
-    assert 0 <= metrics["final"]["accuracy"] <= 1
+    assert 0 <= metrics.final.accuracy <= 1
     assert "accuracy" not in caplog.text.lower()
     for name in ("infomax", "entropy"):
-        score = metrics["validators"][name]
+        score = metrics.validators[name]
         assert f"quickstart, seed 0: objective={name} {score:.4f}" in caplog.messages
     caplog.clear()
     with caplog.at_level(logging.INFO):

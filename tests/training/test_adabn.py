@@ -19,7 +19,7 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
     changes = ("method=source_only", "selftraining=none")
     plain, adapted = toy(*changes), toy(*changes, "evaluation.norms=adabn")
     plain_metrics, metrics = train(plain), train(adapted)
-    assert (plain_metrics["evaluation"]["norms"], metrics["evaluation"]["norms"]) == (
+    assert (plain_metrics["evaluation"]["norms"], metrics.evaluation.norms) == (
         "trained",
         "adabn",
     )
@@ -61,4 +61,4 @@ def test_predictions_are_those_of_the_result(toy, toy_data):
     np.testing.assert_array_equal(found.probabilities, predict(net, test.points, 64))
     assert found.ids == found.meshes == test.ids  # no meshes are known here
     accuracy = float((found.predicted == found.labels).mean())
-    assert accuracy == metrics["final"]["accuracy"]
+    assert accuracy == metrics.final.accuracy

@@ -20,7 +20,7 @@ def test_compiled_training_comes_to_the_same(toy):
     changes = ("selftraining=none", "method=source_only", "protocol.epochs=2")
     plain, compiled = toy(*changes), toy(*changes, "compile=true")
     assert hashing.run_folder(plain) != hashing.run_folder(compiled)
-    assert train(plain)["final"]["n"] == train(compiled)["final"]["n"]
+    assert train(plain).final.n == train(compiled).final.n
     a, b = (load(hashing.run_folder(cfg) / "student.pt") for cfg in (plain, compiled))
     assert a.keys() == b.keys()  # names of weights stay
     for name in a:

@@ -30,8 +30,8 @@ def stop_in(epoch: int) -> str:
 def test_overfit_learns_a_few_clouds_by_heart(toy):
     cfg = toy("debug=overfit", "protocol.epochs=100", "selftraining.rounds=0")
     metrics = train(cfg)
-    assert metrics["training"] == {"n": 10, "accuracy": 1.0}  # 12 clouds less 2 for validation
-    assert metrics["selftraining"] == "none"
+    assert metrics.training == {"n": 10, "accuracy": 1.0}  # 12 clouds less 2 for validation
+    assert metrics.selftraining == "none"
     lr = "protocol.optimizer.lr=1e-9"
     cannot = train(toy("debug=overfit", "protocol.epochs=3", "selftraining.rounds=0", lr))
     assert cannot["training"]["accuracy"] < 1
@@ -50,7 +50,7 @@ def test_overfit_works_for_real_nets(model, toy_data, tmp_path):
             f"paths.data_dir={toy_data}", f"paths.log_dir={tmp_path}", "data.points=64",
             "trainer.threads=1", "callbacks=none", "logger=csv",
         ])  # fmt: skip
-    assert train(cfg)["training"]["accuracy"] == 1.0
+    assert train(cfg).training.accuracy == 1.0
 
 
 @pytest.mark.parametrize("profiler", ["SimpleProfiler", "PyTorchProfiler"])
@@ -83,8 +83,8 @@ def test_few_of_each_split(tmp_path):
 def test_a_run_of_few_clouds_leaves_no_cache(toy, tmp_path):
     cfg = toy("data.clouds_a_split=12", "selftraining=none", f"data.cache_dir={tmp_path / 'cache'}")
     metrics = train(cfg)
-    assert metrics["final"]["n"] == 12
-    assert metrics["hash"] != hashing.config_hash(toy("selftraining=none"))
+    assert metrics.final.n == 12
+    assert metrics.hash != hashing.config_hash(toy("selftraining=none"))
     assert not list((tmp_path / "cache").rglob("*.npy"))
     train(toy("selftraining=none", f"data.cache_dir={tmp_path / 'cache'}"))
     assert list((tmp_path / "cache").rglob("*.npy"))
@@ -100,7 +100,7 @@ def test_ckpt_path_last_insists_on_a_checkpoint(toy, finished):
         train(toy(stop_in(5)))
     train(cfg)
     assert result_of(hashing.run_folder(cfg)) == result_of(finished)
-    assert train(toy("ckpt_path=last"))["status"] == "finished"  # nothing is left to do
+    assert train(toy("ckpt_path=last")).status == "finished"  # nothing is left to do
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from qs3.config import hashing
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import copy_weights, load
+from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
 from qs3.utils.locks import owned
 from tests.training.conftest import result_of
@@ -29,32 +29,32 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 def test_metrics_and_files(finished):
-    metrics = runs.read_metrics(finished)
+    metrics = read_metrics(finished)
     assert metrics is not None
-    assert metrics["status"] == "finished"
-    assert (metrics["source"], metrics["target"]) == ("specklenet10", "kinectsim10")
-    assert metrics["simulated"] is True
-    assert metrics["selection"]["student"] == "last"
-    assert metrics["selection"]["teacher"].startswith("source_val, epoch ")
-    assert [r["round"] for r in metrics["rounds"]] == [0, 1]
-    assert [r["theta"] for r in metrics["rounds"]] == [0.4, 0.405]
-    assert metrics["final"]["n"] == 24
-    assert metrics["final"]["majority_rate"] == pytest.approx(1 / 3)
+    assert metrics.status == "finished"
+    assert (metrics.source, metrics.target) == ("specklenet10", "kinectsim10")
+    assert metrics.simulated is True
+    assert metrics.selection.student == "last"
+    assert metrics.selection.teacher.startswith("source_val, epoch ")
+    assert [r["round"] for r in metrics.rounds] == [0, 1]
+    assert [r["theta"] for r in metrics.rounds] == [0.4, 0.405]
+    assert metrics.final.n == 24
+    assert metrics.final.majority_rate == pytest.approx(1 / 3)
     rows = table(finished / "history.csv")
     assert [int(row["epoch"]) for row in rows] == list(range(10))
     assert [int(row["phase"]) for row in rows] == [0] * 4 + [1] * 3 + [2] * 3
 
 
 def test_it_learns(finished):
-    assert runs.read_metrics(finished)["final"]["accuracy"] > 0.6
+    assert read_metrics(finished).final.accuracy > 0.6
 
 
 def test_selected_labels_match_the_table(finished):
-    metrics = runs.read_metrics(finished)
+    metrics = read_metrics(finished)
     rows = table(finished / "round_00" / "pseudo_labels.csv")
     assert len(rows) == 72
     kept = [row for row in rows if row["selected"] == "1"]
-    assert len(kept) == metrics["rounds"][0]["total_selected"]
+    assert len(kept) == metrics.rounds[0]["total_selected"]
     assert all(float(row["confidence"]) > 0.4 for row in kept)
 
 
@@ -99,16 +99,16 @@ def test_finished_run_is_skipped_and_force_repeats_it(toy, monkeypatch):
 
 def test_without_self_training_the_selected_warmup_is_reported(toy):
     metrics = train(toy("selftraining=none"))
-    assert metrics["rounds"] == []
-    assert metrics["selection"]["student"] == metrics["selection"]["teacher"]
-    selected = {k: v for k, v in metrics["warmup"]["selected"].items() if k != "epoch"}
-    assert metrics["final"] == selected
+    assert metrics.rounds == []
+    assert metrics.selection.student == metrics.selection.teacher
+    selected = {k: v for k, v in metrics.warmup.selected.items() if k != "epoch"}
+    assert metrics.final == selected
 
 
 def test_the_warmup_of_self_training_is_the_run_without_it(toy, finished):
     """So the table row of PCM can be read off the run of PCM + QBST."""
     metrics = train(toy("selftraining=none"))
-    assert metrics["warmup"] == runs.read_metrics(finished)["warmup"]
+    assert metrics.warmup == read_metrics(finished).warmup
 
 
 def test_wandb_offline_beside_csv(toy, finished):
@@ -126,7 +126,7 @@ def test_continued_student_with_source_and_pcm(toy):
     metrics = train(
         toy("selftraining.init=continue", "selftraining.use_source=true", "selftraining.pcm=true")
     )
-    assert len(metrics["rounds"]) == 2
+    assert len(metrics.rounds) == 2
 
 
 def test_continue_begins_with_the_teacher_that_labelled(toy, monkeypatch):
@@ -152,7 +152,7 @@ def test_continue_begins_with_the_teacher_that_labelled(toy, monkeypatch):
     monkeypatch.setattr(Classifier, "log", worse_and_worse)
     cfg = toy("selftraining.init=continue", "selftraining.theta=0.35")
     metrics = train(cfg)
-    assert metrics["warmup"]["selected"]["epoch"] == 0
+    assert metrics.warmup.selected.epoch == 0
     selected = load(hashing.run_folder(cfg) / "warmup_selected.pt")
     for name in selected:
         assert torch.equal(first[4][name], selected[name]), name
@@ -162,8 +162,8 @@ def test_continue_begins_with_the_teacher_that_labelled(toy, monkeypatch):
 
 def test_supervised_is_validated_on_target_training_clouds(toy):
     metrics = train(toy("method=supervised", "selftraining=none"))
-    assert metrics["selection"]["teacher"].startswith("target_train_val, epoch ")
-    assert metrics["source"] == "kinectsim10"
+    assert metrics.selection.teacher.startswith("target_train_val, epoch ")
+    assert metrics.source == "kinectsim10"
 
 
 def test_one_domain_as_source_and_target(toy, caplog):
@@ -205,7 +205,7 @@ def test_other_target_labels_change_the_figures_and_nothing_else(toy, toy_data, 
     ours, theirs = result_of(hashing.run_folder(cfg)), result_of(finished)
     assert ours.pop("metrics") != theirs.pop("metrics")
     assert ours == theirs  # history and all pseudo-labels
-    assert metrics["final"]["accuracy"] < 0.5
+    assert metrics.final.accuracy < 0.5
     student = load(hashing.run_folder(cfg) / "student.pt")
     for name, value in load(finished / "student.pt").items():
         assert torch.equal(student[name], value)
@@ -215,10 +215,10 @@ def test_other_target_labels_change_the_figures_and_nothing_else(toy, toy_data, 
 
 
 def test_metrics_say_how_clouds_were_loaded_and_judged(finished):
-    metrics = runs.read_metrics(finished)
-    assert metrics["loading"] == {"points": 32, "fps_starts": 4, "sampler": "shuffled"}
-    assert metrics["selection"]["validation"] == "lineage"
-    assert metrics["evaluation"] == {
+    metrics = read_metrics(finished)
+    assert metrics.loading == {"points": 32, "fps_starts": 4, "sampler": "shuffled"}
+    assert metrics.selection.validation == "lineage"
+    assert metrics.evaluation == {
         "split": "test",
         "labels": True,
         "rotations": 0,
@@ -226,17 +226,17 @@ def test_metrics_say_how_clouds_were_loaded_and_judged(finished):
         "final_over_rotations": None,
         "warmup_over_rotations": None,
     }
-    assert 0 <= metrics["final"]["calibration_error"] <= 1
+    assert 0 <= metrics.final.calibration_error <= 1
 
 
 def test_turned_figures_stand_beside_the_plain_ones(toy, finished):
     metrics = train(toy("evaluation.rotations=12"))
-    assert metrics["final"] == runs.read_metrics(finished)["final"]
-    evaluation = metrics["evaluation"]
+    assert metrics.final == read_metrics(finished).final
+    evaluation = metrics.evaluation
     assert evaluation["rotations"] == 12
     for name in ("final_over_rotations", "warmup_over_rotations"):
-        assert evaluation[name].keys() == metrics["final"].keys()
-        assert evaluation[name]["calibration_error"] != metrics["final"]["calibration_error"]
+        assert evaluation[name].keys() == metrics.final.keys()
+        assert evaluation[name]["calibration_error"] != metrics.final.calibration_error
 
 
 @pytest.mark.parametrize(
@@ -321,7 +321,7 @@ def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
     with caplog.at_level(logging.WARNING):
         metrics = train(toy())
     assert "no pseudo-label for slab" in caplog.text
-    assert metrics["rounds"][0]["missing_classes"] == ["slab"]
+    assert metrics.rounds[0]["missing_classes"] == ["slab"]
     with pytest.raises(SelectionError, match="no pseudo-label for slab"):
         train(toy("selftraining.missing_class=error"))
 
@@ -350,7 +350,7 @@ def test_other_config_of_the_same_eight_digits_is_refused(toy):
     cfg = toy("selftraining=none", "protocol.epochs=1")
     metrics = train(cfg)
     folder = hashing.run_folder(cfg)
-    assert metrics["config_sha256"] == hashing.config_sha256(cfg)
+    assert metrics.config_sha256 == hashing.config_sha256(cfg)
     for name in ("metrics.json", "started.json"):
         value = json.loads((folder / name).read_text())
         value["config_sha256"] = value["config_sha256"][:8] + "0" * 56

@@ -55,12 +55,12 @@ def test_pseudo_labels_for_own_scans(root: Path) -> None:
     train(cfg)
     folder = hashing.run_folder(cfg)
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["status"] == "finished"
-    assert metrics["final"]["accuracy"] is None
-    assert sum(metrics["final"]["predicted"].values()) == 36
-    assert metrics["evaluation"]["labels"] is False
-    assert len(metrics["rounds"]) == 2
-    assert all("mu" in record for record in metrics["rounds"])
+    assert metrics.status == "finished"
+    assert metrics.final.accuracy is None
+    assert sum(metrics.final.predicted.values()) == 36
+    assert metrics.evaluation.labels is False
+    assert len(metrics.rounds) == 2
+    assert all("mu" in record for record in metrics.rounds)
 
 
 def test_own_labels_are_an_upper_bound_or_refused(root: Path) -> None:
@@ -72,5 +72,5 @@ def test_own_labels_are_an_upper_bound_or_refused(root: Path) -> None:
     cfg = config(root, "method=supervised", "selftraining=none", labelled, other, name)
     train(cfg)
     metrics = json.loads((hashing.run_folder(cfg) / "metrics.json").read_text())
-    assert metrics["final"]["n"] == 12  # every fifth of 3 times 20
-    assert metrics["final"]["accuracy"] > metrics["final"]["majority_rate"]
+    assert metrics.final.n == 12  # every fifth of 3 times 20
+    assert metrics.final.accuracy > metrics.final.majority_rate

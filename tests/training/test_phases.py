@@ -137,7 +137,7 @@ def test_each_round_is_labelled_by_its_teacher(name: str, request: pytest.Fixtur
     """Round 0 by the warm-up's selected epoch, although the last one stands in the trainer."""
     run: Kept = request.getfixturevalue(name)
     selected = load(run.folder / "warmup_selected.pt")
-    epoch = run.metrics["warmup"]["selected"]["epoch"]
+    epoch = run.metrics.warmup.selected.epoch
     assert epoch < ENDS[0]
     assert same(selected, run.net(epoch))
     for round_, teacher in ((0, selected), (1, run.net(ENDS[1]))):

@@ -28,8 +28,8 @@ from qs3.evaluation.selection_rules import ORACLE_IN_WORDS, STUDENT_RULES
 from qs3.evaluation.validators import LABEL_FREE, hold_out
 from qs3.report.tables.aggregate import group, load_runs, summarise
 from qs3.report.tables.table import build_table, markdown
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import copy_weights, load
+from qs3.runs.metrics import read_metrics
 from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.student_selection import StudentSelection, candidate_path
 from qs3.training.command import headline, train
@@ -69,7 +69,7 @@ def by_rule(toy_data: Path, finished: Path, tmp_path_factory: pytest.TempPathFac
 
 
 def metrics_of(folder: Path) -> dict[str, Any]:
-    metrics = runs.read_metrics(folder)
+    metrics = read_metrics(folder)
     assert metrics is not None
     return metrics
 
@@ -95,7 +95,7 @@ def table_of(cfg: Any, weights: Path, points: torch.Tensor) -> np.ndarray:
 
 def test_last_is_the_default_and_leaves_nothing_behind(finished):
     metrics = metrics_of(finished)
-    assert metrics["selection"]["student"] == "last"
+    assert metrics.selection.student == "last"
     assert "student" not in metrics
     assert not (finished / "student_selected.pt").exists()
     assert not (finished / "candidates").exists()
@@ -127,7 +127,7 @@ def test_a_rule_without_held_out_clouds_only_looks(by_rule, finished, rule):
 @pytest.mark.parametrize("rule", RULES)
 def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
     metrics = metrics_of(by_rule(rule))
-    student = metrics["student"]
+    student = metrics.student
     assert list(student["scores"]) == [str(epoch) for epoch in LAST_ROUND]
     scores = {int(epoch): score for epoch, score in student["scores"].items()}
     best = (min if rule == "entropy" else max)(scores.values())
@@ -135,10 +135,10 @@ def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
     assert student["epoch"] == min(epoch for epoch in scores if scores[epoch] == best)
     name = ORACLE_IN_WORDS if rule == "oracle" else rule
     said = f"{name}, epoch {student['epoch']}, score {best:.6g}"
-    assert metrics["selection"]["student"] == said
+    assert metrics.selection.student == said
     assert headline(metrics).endswith(f"; student by {said}")
     assert student["rule"] == name
-    assert metrics["final"] == student["selected"]
+    assert metrics.final == student["selected"]
     assert student["last"]["epoch"] == 9
     if rule != "pseudo_val":  # there the last round was trained on fewer clouds
         last = {k: v for k, v in student["last"].items() if k != "epoch"}
@@ -177,7 +177,7 @@ def test_another_epoch_than_the_last_is_reported(toy, monkeypatch):
     cfg = toy("selection.student=snd")
     metrics = train(cfg)
     folder = hashing.run_folder(cfg)
-    assert metrics["student"]["epoch"] == LAST_ROUND[0]
+    assert metrics.student.epoch == LAST_ROUND[0]
     for file in ("student_selected.pt", "result.pt"):
         found = weights_of(folder / file)
         assert all(torch.equal(found[name], first[name]) for name in first)
@@ -187,9 +187,9 @@ def test_another_epoch_than_the_last_is_reported(toy, monkeypatch):
 def test_a_score_that_is_no_number_is_no_number_in_the_result(toy, monkeypatch):
     monkeypatch.setattr(StudentSelection, "_score", lambda *args: math.nan)
     metrics = train(toy("selection.student=snd"))
-    assert metrics["student"]["score"] is None
-    assert metrics["student"]["epoch"] == LAST_ROUND[0]
-    assert metrics["final"]["n"] == 24
+    assert metrics.student.score is None
+    assert metrics.student.epoch == LAST_ROUND[0]
+    assert metrics.final.n == 24
 
 
 # --- held-out pseudo-labels --------------------------------------------------------------------
@@ -219,9 +219,9 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
         both = [*zip(index.tolist(), labels.tolist(), strict=True)]
         both += zip(held.tolist(), held_labels.tolist(), strict=True)
         assert all(CLASSES[label] == rows[i].label for i, label in both)
-    assert len(sets[4][0]) == metrics["rounds"][0]["total_selected"]  # round 0 holds nothing out
-    assert metrics["student"]["held_out"] == len(held)
-    assert metrics["rounds"][1]["total_selected"] == len(selected)
+    assert len(sets[4][0]) == metrics.rounds[0]["total_selected"]  # round 0 holds nothing out
+    assert metrics.student.held_out == len(held)
+    assert metrics.rounds[1]["total_selected"] == len(selected)
     assert len(held) == pytest.approx(len(selected) / 5, abs=1.5)
 
 
@@ -262,8 +262,8 @@ def test_soft_pseudo_labels_are_held_out_by_their_likeliest_class(toy):
             "selection.student=pseudo_val",
         )
     )
-    assert metrics["student"]["held_out"] > 0
-    assert 0 <= metrics["student"]["score"] <= 1
+    assert metrics.student.held_out > 0
+    assert 0 <= metrics.student.score <= 1
 
 
 def test_too_few_to_hold_out(toy, monkeypatch):
@@ -307,7 +307,7 @@ def test_the_oracle_is_loud(toy, caplog):
 
 def test_the_oracle_judges_with_the_norms_that_are_reported(toy):
     metrics = train(toy("selection.student=oracle", "evaluation.norms=adabn"))
-    assert metrics["final"]["accuracy"] == metrics["student"]["score"]
+    assert metrics.final.accuracy == metrics.student.score
 
 
 @pytest.mark.parametrize("rule", SOME_RULES)
@@ -322,11 +322,11 @@ def test_other_target_labels_change_no_weights(by_rule, toy, toy_data, tmp_path,
     for name in WEIGHTS:
         assert same_weights(folder / name, by_rule(rule) / name)
     if rule == "oracle":
-        assert metrics["student"]["scores"] != theirs["student"]["scores"]
+        assert metrics.student.scores != theirs.student.scores
         for epoch in LAST_ROUND:
             assert same_weights(candidate_path(folder, epoch), candidate_path(by_rule(rule), epoch))
     else:
-        assert metrics["selection"] == theirs["selection"]
+        assert metrics.selection == theirs.selection
         assert same_weights(folder / "student_selected.pt", by_rule(rule) / "student_selected.pt")
 
 
@@ -337,7 +337,7 @@ def test_no_target_label_within_reach(toy, tmp_path, request, rule):
     write_shuffled_target(tmp_path / "data", class_in_id=False)
     watching.truth = truth_of(tmp_path / "data")
     metrics = train(toy(f"paths.data_dir={tmp_path / 'data'}", f"selection.student={rule}"))
-    assert metrics["final"]["accuracy"] < 1  # else pseudo-labels would be the labels
+    assert metrics.final.accuracy < 1  # else pseudo-labels would be the labels
     assert watching.planted == [True]
     assert watching.found == set()
     assert watching.keys == {"points", "y_source", "y_pseudo"}

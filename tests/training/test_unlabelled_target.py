@@ -15,7 +15,7 @@ from qs3.config import hashing
 from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.errors import ConfigError
 from qs3.report.tables.aggregate import summarise
-from qs3.runs import folder as runs
+from qs3.runs.metrics import read_metrics
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES
 
@@ -68,18 +68,18 @@ def only(toy_data: Path, folder: Path, keep) -> Path:
 def test_own_scans_without_labels(toy, unlabelled, finished, more):
     cfg = toy(*more)
     metrics = train(cfg)
-    final = metrics["final"]
+    final = metrics.final
     assert final["accuracy"] is final["balanced_accuracy"] is final["majority_rate"] is None
     assert final["per_class_recall"] is final["confusion"] is final["calibration_error"] is None
     assert final["n"] == sum(final["predicted"].values()) == 24
     assert set(final["predicted"]) == set(CLASSES)
-    assert metrics["evaluation"]["labels"] is False
-    assert metrics["evaluation"]["split"] == "test"
-    assert all(record["with_target_labels"] is None for record in metrics["rounds"])
+    assert metrics.evaluation.labels is False
+    assert metrics.evaluation.split == "test"
+    assert all(record["with_target_labels"] is None for record in metrics.rounds)
     if "selftraining=none" not in more:  # labels or not, training does the same
-        theirs = runs.read_metrics(finished)
-        assert final["predicted"] == theirs["final"]["predicted"]
-        assert metrics["evaluation"]["final_over_rotations"]["accuracy"] is None
+        theirs = read_metrics(finished)
+        assert final["predicted"] == theirs.final.predicted
+        assert metrics.evaluation.final_over_rotations.accuracy is None
     assert "no labels to judge kinectsim10 (simulated) by; predicted " in headline(metrics)
     assert train(cfg) == json.loads((hashing.run_folder(cfg) / "metrics.json").read_text())
 
@@ -137,11 +137,11 @@ def test_without_a_test_split_predictions_of_the_training_clouds_are_counted(
     if not labelled:
         request.getfixturevalue("unlabelled")
     metrics = train(toy(f"paths.data_dir={data}", "selftraining.rounds=1"))
-    assert metrics["evaluation"]["split"] == "train"
-    assert metrics["final"]["accuracy"] is None
-    assert metrics["final"]["n"] == 72
+    assert metrics.evaluation.split == "train"
+    assert metrics.final.accuracy is None
+    assert metrics.final.n == 72
     assert "no test split" in caplog.text
-    known = metrics["rounds"][0]["with_target_labels"]  # they judge pseudo-labels only
+    known = metrics.rounds[0]["with_target_labels"]  # they judge pseudo-labels only
     assert (known is not None) == labelled
 
 
@@ -149,7 +149,7 @@ def test_labels_of_some_classes_only(toy, toy_data, tmp_path):
     """As ScanObjectNN has seven of the ten: the others are left out of the balanced accuracy."""
     data = only(toy_data, tmp_path / "cut", lambda row: row.cls != "rod")
     metrics = train(toy(f"paths.data_dir={data}", "selftraining=none"))
-    final = metrics["final"]
+    final = metrics.final
     recall = final["per_class_recall"]
     assert recall["rod"] is None
     assert final["balanced_accuracy"] == pytest.approx((recall["ball"] + recall["slab"]) / 2)

@@ -1,7 +1,7 @@
 """What a run's folder says about the run, read for its pictures. Needs neither torch nor data.
 
 Everything is read from the files that training writes (see `qs3.runs.folder`); what an unfinished
-or older run does not have is None, and what is damaged is refused by the name of its file.
+run does not have is None, and what is damaged is refused by the name of its file.
 """
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from qs3.errors import DataError, MissingDataError
 from qs3.runs import folder as runs
+from qs3.runs.metrics import METRICS, RoundRecord, RunMetrics, Scores, read_metrics
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.runs.pseudo_labels import PseudoLabel, path_of, read_pseudo_labels
@@ -64,12 +65,12 @@ class Round:
 
     Attributes:
         number: from 0.
-        record: what metrics.json says; empty in an unfinished run.
+        record: what metrics.json says; None in an unfinished run.
         labels: its pseudo_labels.csv; None if that is gone.
     """
 
     number: int
-    record: Mapping[str, Any]
+    record: RoundRecord | None
     labels: list[PseudoLabel] | None
 
     def named(self, classes: tuple[str, ...]) -> Int[np.ndarray, " c"] | None:
@@ -80,15 +81,16 @@ class Round:
         """How many of them are trained on: from the table, else from metrics.json."""
         if self.labels is not None:
             return _count([row.label for row in self.labels if row.selected], classes)
-        return _by_class(self.record.get("selected"), classes, int)
+        return self.of_class("selected", classes)
 
     def confident(self, classes: tuple[str, ...]) -> Int[np.ndarray, " c"] | None:
         """How many were sure enough to be candidates."""
-        return _by_class(self.record.get("confident"), classes, int)
+        return self.of_class("confident", classes)
 
-    def of_class(self, key: str, classes: tuple[str, ...]) -> Float[np.ndarray, " c"] | None:
-        """What the record says under "mu" or "thresholds"."""
-        return _by_class(self.record.get(key), classes, float)
+    def of_class(self, key: str, classes: tuple[str, ...]) -> Shaped[np.ndarray, " c"] | None:
+        """What the record says by class: "confident", "selected", "mu" or "thresholds"."""
+        values = None if self.record is None else getattr(self.record, key)
+        return None if values is None else np.array([values.get(name, 0) for name in classes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,7 @@ class RunFiles:
         metrics: contents of metrics.json; None if the run is not finished.
         history: None if not one epoch is done.
         rounds: in order.
-        predictions: None if there are none (yet, or of an older run).
+        predictions: None if there are none (yet).
         classes: names in label order.
         config: as composed, not resolved; None if Hydra did not write it.
         command: that started the run; None likewise.
@@ -108,7 +110,7 @@ class RunFiles:
     """
 
     folder: Path
-    metrics: Mapping[str, Any] | None
+    metrics: RunMetrics | None
     history: History | None
     rounds: tuple[Round, ...]
     predictions: Predictions | None
@@ -122,19 +124,17 @@ class RunFiles:
         """Such as "qs3_s2d, seed 0"."""
         if self.metrics is None:
             return f"{self.folder.parent.name}/{self.folder.name} (not finished)"
-        return f"{self.metrics['experiment']}, seed {self.metrics['seed']}"
+        return f"{self.metrics.experiment}, seed {self.metrics.seed}"
 
     @property
     def target(self) -> str:
         """The target's name, with "(simulated)" where that is so."""
-        if self.metrics is None:
-            return "the target"
-        return f"{self.metrics['target']}{' (simulated)' if self.metrics['simulated'] else ''}"
+        return "the target" if self.metrics is None else self.metrics.target_text
 
     @property
-    def final(self) -> Mapping[str, Any]:
-        """The reported figures; empty in an unfinished run."""
-        return {} if self.metrics is None else self.metrics["final"]
+    def final(self) -> Scores | None:
+        """The reported figures; None in an unfinished run."""
+        return None if self.metrics is None else self.metrics.final
 
 
 def read_run(folder: str | Path) -> RunFiles:
@@ -145,19 +145,19 @@ def read_run(folder: str | Path) -> RunFiles:
         DataError: one of its files is damaged.
     """
     folder = Path(folder).expanduser()
-    if not any((folder / name).exists() for name in (runs.METRICS, runs.STARTED, HISTORY)):
+    if not any((folder / name).exists() for name in (METRICS, runs.STARTED, HISTORY)):
         raise MissingDataError(
-            f"{folder} is not the folder of a run: it has no {runs.METRICS} and no {HISTORY}; give "
+            f"{folder} is not the folder of a run: it has no {METRICS} and no {HISTORY}; give "
             "<paths.log_dir>/<experiment_name>/seed<seed>-<hash>"
         )
-    metrics, notes = _metrics(folder), []
+    metrics, notes = read_metrics(folder), []
     if metrics is None:
         notes.append("the run is not finished: the same command continues it")
     predictions = None
     if (folder / PREDICTIONS).is_file():
         predictions = read_predictions(folder / PREDICTIONS)
     elif metrics is not None:
-        notes.append(f"{PREDICTIONS} is not there: the run is of an older version")
+        notes.append(f"{PREDICTIONS} is gone")
     rounds = _rounds(folder, metrics, notes)
     return RunFiles(
         folder=folder,
@@ -207,21 +207,6 @@ def reliability(predictions: Predictions, bins: int = BINS) -> Reliability | Non
     return Reliability(count, means[0], means[1], error)
 
 
-def _metrics(folder: Path) -> dict[str, Any] | None:
-    metrics = runs.read_metrics(folder)
-    if metrics is None:
-        return None
-    path = folder / runs.METRICS
-    needed = ("experiment", "seed", "target", "simulated", "final")
-    missing = [key for key in needed if not isinstance(metrics, dict) or key not in metrics]
-    if missing or not isinstance(metrics["final"], dict):
-        raise DataError(
-            f"{path} is damaged: it lacks {', '.join(missing) or 'figures under final'}; delete it "
-            "and repeat the run's command, which trains nothing again"
-        )
-    return metrics
-
-
 def _history(path: Path) -> History | None:
     if not path.is_file():
         return None
@@ -247,8 +232,8 @@ def _history(path: Path) -> History | None:
         raise _damaged(path, error) from error
 
 
-def _rounds(folder: Path, metrics: Mapping[str, Any] | None, notes: list[str]) -> tuple[Round, ...]:
-    records = {record["round"]: record for record in (metrics or {}).get("rounds", [])}
+def _rounds(folder: Path, metrics: RunMetrics | None, notes: list[str]) -> tuple[Round, ...]:
+    records = {record.round: record for record in (metrics.rounds if metrics else [])}
     there = {
         int(match[1])
         for path in folder.glob("round_*")
@@ -265,19 +250,19 @@ def _rounds(folder: Path, metrics: Mapping[str, Any] | None, notes: list[str]) -
             except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
                 raise _damaged(path, error) from error
         else:
-            notes.append(f"{path.relative_to(folder)} is gone: counts are those of {runs.METRICS}")
-        found.append(Round(number, records.get(number, {}), labels))
+            notes.append(f"{path.relative_to(folder)} is gone: counts are those of {METRICS}")
+        found.append(Round(number, records.get(number), labels))
     return tuple(found)
 
 
 def _classes(
-    metrics: Mapping[str, Any] | None, predictions: Predictions | None, rounds: tuple[Round, ...]
+    metrics: RunMetrics | None, predictions: Predictions | None, rounds: tuple[Round, ...]
 ) -> tuple[str, ...]:
     """In label order, where anything says what that is; else the names found, sorted."""
     if predictions is not None:
         return predictions.classes
     if metrics is not None:
-        return tuple(metrics["final"].get("predicted", {}))
+        return tuple(metrics.final.predicted)
     return tuple(sorted({row.label for round_ in rounds for row in round_.labels or []}))
 
 
@@ -299,14 +284,6 @@ def _command(folder: Path) -> str | None:
         return None
     words = [line[2:] for line in path.read_text("utf-8").splitlines() if line.startswith("- ")]
     return shlex.join(["python", "train.py", *(word.strip("'") for word in words)])
-
-
-def _by_class(
-    values: Mapping[str, Any] | None, classes: tuple[str, ...], kind: Callable[[Any], Any]
-) -> np.ndarray | None:
-    if values is None:
-        return None
-    return np.array([kind(values.get(name, 0)) for name in classes])
 
 
 def _count(names: list[str], classes: tuple[str, ...]) -> np.ndarray:

@@ -67,7 +67,7 @@ def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) ->
             f"its {role}, {domain.name}, is not at {domain.folder}; give data_dir="
         )
     data = domain.open(verify=False)
-    if data.sha256 != run.metrics.get("data", {}).get(role, data.sha256):
+    if data.sha256 != getattr(run.metrics.data, role):
         raise NothingToDrawError(
             f"{domain.folder} holds another version of {domain.name} than the run used; give "
             "data_dir="

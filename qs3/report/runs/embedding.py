@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.data.store import PointSet
-from qs3.datamodules.adaptation import load_clouds
+from qs3.datamodules.splits import load_clouds
 from qs3.errors import Qs3Error
 from qs3.inference.model_file import build_net, read_result
 from qs3.models.norms import norms_for, use_domain
@@ -68,7 +68,7 @@ def draw_embedding(
     for role, data in zip(("source", "target"), sets, strict=True):
         split = "test" if "test" in data.counts() else "train"
         points = load_clouds(data, split, points=result.points).points
-        chosen = sample(len(points), clouds, derive(run.metrics["seed"], "embedding", role))
+        chosen = sample(len(points), clouds, derive(run.metrics.seed, "embedding", role))
         parts.append(points[chosen])
         labels.append(_labels(data, split)[chosen])
         names.append(f"{role}: {data.name}, {split}" + ("" if split == "test" else " split"))

@@ -78,25 +78,25 @@ def curves(run: RunFiles) -> Figure:
 
 def _marks(run: RunFiles) -> list[tuple[int, str, str]]:
     """Epochs whose weights were chosen."""
-    metrics = run.metrics or {}
+    if run.metrics is None:
+        return []
     found = []
-    teacher = metrics.get("warmup", {}).get("selected", {}).get("epoch")
-    if teacher is not None and teacher >= 0:
+    teacher, student = run.metrics.warmup.selected.epoch, run.metrics.student
+    if teacher >= 0:
         found.append((teacher, f"teacher: epoch {teacher}", RED))
-    student = metrics.get("student", {}).get("epoch")
     if student is not None:
-        found.append((student, f"student: epoch {student}", GREEN))
+        found.append((student.epoch, f"student: epoch {student.epoch}", GREEN))
     return found
 
 
 def confusion(run: RunFiles) -> Figure:
     """Counts, and percent of each true class, of the reported result."""
-    counts = run.final.get("confusion")
-    if counts is None:
+    f = run.final
+    if f is None or f.confusion is None:
         raise NothingToDrawError(
             "the run is not finished" if run.metrics is None else "the target has no labels"
         )
-    matrix, names = np.array(counts), run.classes
+    matrix, names = np.array(f.confusion), run.classes
     support = matrix.sum(axis=1)
     share = matrix / np.where(support, support, 1)[:, None]
     side = max(4.6, 0.62 * len(names)) if len(names) <= 20 else 0.3 * len(names)
@@ -113,10 +113,9 @@ def confusion(run: RunFiles) -> Figure:
     bar = figure.colorbar(image, ax=ax, fraction=0.04, pad=0.02)
     bar.set_label("share of the true class in %")
     bar.set_ticks([0, 0.25, 0.5, 0.75, 1.0], labels=["0", "25", "50", "75", "100"])
-    f = run.final
     figure.suptitle(
-        f"{run.title}, on {run.target}\naccuracy {f['accuracy']:.1%}, balanced "
-        f"{f['balanced_accuracy']:.1%}, majority rate {f['majority_rate']:.1%}, {f['n']} clouds",
+        f"{run.title}, on {run.target}\naccuracy {f.accuracy:.1%}, balanced "
+        f"{f.balanced_accuracy:.1%}, majority rate {f.majority_rate:.1%}, {f.n} clouds",
         fontsize=11,
     )
     return figure
@@ -198,15 +197,15 @@ def _worth(run: RunFiles) -> list[tuple[list[float], str, str, str]]:
     """Values, style, colour and label of the lines over the rounds."""
     records = [r.record for r in run.rounds]
     lines = [
-        ([_number(record.get(key)) for record in records], style, colour, label)
+        ([_number(getattr(record, key, None)) for record in records], style, colour, label)
         for key, style, colour, label in (
             ("theta", "o-", INK, "theta, the confidence asked for"),
             ("agreement", "s-", GREEN, "same label as in the round before"),
         )
     ]
-    judged = [record.get("with_target_labels") or {} for record in records]
+    judged = [record and record.with_target_labels for record in records]
     for key, style, colour in (("precision", "o--", ORANGE), ("recall", "s--", RED)):
-        values = [_number(figures.get(key)) for figures in judged]
+        values = [_number(getattr(figures, key, None)) for figures in judged]
         lines.append((values, style, colour, f"{key} ({EVALUATION_ONLY})"))
     return [line for line in lines if np.isfinite(line[0]).any()]
 
@@ -266,7 +265,7 @@ def class_counts(
         if (p.labels >= 0).any():
             test[f"true ({EVALUATION_ONLY})"] = np.bincount(p.labels[p.labels >= 0], minlength=c)
         test["predicted by the result"] = np.bincount(p.predicted, minlength=c)
-        split = (run.metrics or {}).get("evaluation", {}).get("split", "test")
+        split = run.metrics.evaluation.split if run.metrics else "test"
         panels[f"{split} split{', evaluated' if split == 'train' else ''}"] = test
     return panels
 

@@ -72,10 +72,10 @@ def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]
 
 
 def _quality(run: RunFiles) -> list[str]:
-    """What can be said without the target's labels; nothing for runs of older versions."""
-    rows = quality_table((run.metrics or {}).get("quality") or {})
-    if not rows:
+    """What can be said without the target's labels."""
+    if run.metrics is None:
         return []
+    rows = quality_table(run.metrics.quality)
     cells = (
         f"<tr><th>{escape(name)}</th><td>{escape(value)}</td><td>{escape(meaning)}</td></tr>"
         for name, value, meaning in rows
@@ -88,38 +88,33 @@ def key_figures(run: RunFiles) -> dict[str, str]:
     if run.metrics is None:
         done = 0 if run.history is None else len(run.history.epoch)
         return {"status": "not finished", "epochs done": str(done)}
-    m, final = run.metrics, run.final
+    m, final = run.metrics, run.metrics.final
     found = {
-        "source": str(m.get("source", "")),
+        "source": m.source,
         "target": run.target,
-        "method": str(m.get("method", "")),
-        "self-training": str(m.get("selftraining", "")),
-        "model": str(m.get("model", "")),
+        "method": m.method,
+        "self-training": m.selftraining,
+        "model": m.model,
     }
-    if final.get("accuracy") is None:
+    if final.accuracy is None:
         found["accuracy"] = "not known: the target has no labels"
     else:
-        found["accuracy"] = f"{final['accuracy']:.1%}"
-        found["balanced accuracy"] = f"{final['balanced_accuracy']:.1%}"
-        found["majority rate"] = f"{final['majority_rate']:.1%}"
-    if final.get("calibration_error") is not None:
-        found["expected calibration error"] = (
-            f"{final['calibration_error']:.1%} ({EVALUATION_ONLY})"
-        )
-    found["clouds evaluated"] = str(final.get("n", ""))
-    before = (m.get("warmup") or {}).get("selected") or {}
-    if run.rounds and before.get("accuracy") is not None:
-        found["accuracy before self-training"] = f"{before['accuracy']:.1%}"
-    chosen = m.get("selection", {})
-    found["teacher selected by"] = str(chosen.get("teacher", ""))
+        found["accuracy"] = f"{final.accuracy:.1%}"
+        found["balanced accuracy"] = f"{final.balanced_accuracy:.1%}"
+        found["majority rate"] = f"{final.majority_rate:.1%}"
+    if final.calibration_error is not None:
+        found["expected calibration error"] = f"{final.calibration_error:.1%} ({EVALUATION_ONLY})"
+    found["clouds evaluated"] = str(final.n)
+    before = m.warmup.selected.scores.accuracy
+    if run.rounds and before is not None:
+        found["accuracy before self-training"] = f"{before:.1%}"
+    found["teacher selected by"] = m.selection.teacher
     if run.rounds:
-        found["student selected by"] = str(chosen.get("student", ""))
-    seconds = m.get("times", {}).get("seconds")
-    if seconds is not None:
-        found["time"] = f"{seconds:.0f} s"
-    found["hash of the settings"] = str(m.get("hash", ""))
-    found["versions"] = ", ".join(f"{k} {v}" for k, v in m.get("versions", {}).items())
-    return {key: value for key, value in found.items() if value}
+        found["student selected by"] = m.selection.student
+    found["time"] = f"{m.times.seconds:.0f} s"
+    found["hash of the settings"] = m.hash
+    found["versions"] = ", ".join(f"{k} {v}" for k, v in m.versions.items())
+    return found
 
 
 def _table(rows: Mapping[str, str]) -> str:

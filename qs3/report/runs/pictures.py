@@ -21,7 +21,7 @@ from qs3.report.runs import figures as run_figures
 from qs3.report.runs.clouds import cloud_pictures
 from qs3.report.runs.data import RunFiles, read_run
 from qs3.report.runs.page import page
-from qs3.runs import folder as runs
+from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.utils.files import atomic_path, write_text
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class AfterTraining:
             return
         try:
             drawn = draw(folder, embed=False, config=config)
-            _log_to_wandb(drawn, runs.read_metrics(folder) or {})
+            _log_to_wandb(drawn, read_metrics(folder))
             log.info("pictures: %s", drawn.page)
         except Exception as error:
             log.warning(
@@ -161,27 +161,27 @@ class AfterTraining:
             )
 
 
-def _log_to_wandb(drawn: Drawn, metrics: Mapping[str, Any]) -> None:
+def _log_to_wandb(drawn: Drawn, metrics: RunMetrics | None) -> None:
     import sys
 
     wandb: Any = sys.modules.get("wandb")  # not imported: there is no such logger
-    if wandb is None or wandb.run is None:
+    if wandb is None or wandb.run is None or metrics is None:
         return
     content: dict[str, Any] = {
         f"pictures/{name}": wandb.Image(str(path)) for name, path in drawn.pictures.items()
     }
-    final = metrics["final"]
-    if final["confusion"] is not None:
-        names = list(final["predicted"])
+    final = metrics.final
+    if final.confusion is not None:
+        names = list(final.predicted)
         content["confusion"] = wandb.Table(
             columns=["true class", *names],
-            data=[[name, *row] for name, row in zip(names, final["confusion"], strict=True)],
+            data=[[name, *row] for name, row in zip(names, final.confusion, strict=True)],
         )
     wandb.run.log(content)
     wandb.run.summary.update(
         {
             f"final/{key}": value
-            for key, value in final.items()
+            for key, value in vars(final).items()
             if isinstance(value, int | float) and not isinstance(value, bool)
         }
     )

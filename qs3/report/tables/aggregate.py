@@ -7,25 +7,23 @@ saw different datasets has no mean at all.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from qs3.errors import DataError
 from qs3.evaluation.selection_rules import ORACLE_IN_WORDS, took_target_labels
+from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, Scores, read_metrics
 
-FINISHED = "finished"
 DIAGNOSTIC = "diagnostic"
 FEW_SEEDS = 3
 """Below this number of seeds a mean is marked."""
 
 _FOLDER = re.compile(r"seed(\d+)-([0-9a-f]+)")
 _BEGUN = ("started.json", "last.ckpt", ".hydra")
-_KEYS = ("experiment", "hash", "seed", "status", "source", "target", "final", "data")
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Run:
         seed: None if not known.
         status: "finished", "unfinished", "damaged", or "diagnostic": finished, but its epoch was
             chosen by the target's test labels, so that it is no result.
-        metrics: contents of metrics.json; empty unless finished.
+        metrics: contents of metrics.json; None unless finished.
         problem: why it is not finished, or no result.
     """
 
@@ -48,7 +46,7 @@ class Run:
     hash: str
     seed: int | None
     status: str
-    metrics: Mapping[str, Any]
+    metrics: RunMetrics | None
     problem: str = ""
 
 
@@ -104,9 +102,14 @@ class Group:
     diagnostic: bool = False
 
     @property
-    def first(self) -> Mapping[str, Any]:
+    def results(self) -> list[RunMetrics]:
+        """Metrics of the finished runs, by seed."""
+        return [run.metrics for run in self.finished if run.metrics is not None]
+
+    @property
+    def first(self) -> RunMetrics | None:
         """Metrics of the first finished run, for what all seeds have in common."""
-        return self.finished[0].metrics if self.finished else {}
+        return next(iter(self.results), None)
 
     @property
     def seeds(self) -> list[int]:
@@ -116,28 +119,30 @@ class Group:
     @property
     def unlabelled(self) -> bool:
         """Whether it was finished on a target without labels, so that there is no accuracy."""
-        final = self.first.get("final")
-        return isinstance(final, Mapping) and final.get("accuracy", 0.0) is None
+        return self.first is not None and self.first.final.accuracy is None
 
-    def stat(self, *path: str) -> Stat | None:
-        """Mean of `metrics[path[0]][path[1]]...`; None if there is nothing that may be averaged."""
-        if not self.finished or not self.comparable:
+    def stat(self, score: str, take: str = "final") -> Stat | None:
+        """Mean of a score over seeds; None if there is nothing that may be averaged.
+
+        Args:
+            score: of `qs3.runs.metrics.Scores`, such as "accuracy".
+            take: "final", or "warmup" for the teacher of round 0.
+        """
+        if not self.results or not self.comparable:
             return None
-        values: list[Any] = []
-        for run in self.finished:
-            value: Any = run.metrics
-            for key in path:
-                value = value.get(key) if isinstance(value, Mapping) else None
-            values.append(value)
-        if any(not isinstance(v, int | float) or not math.isfinite(v) for v in values):
-            return None
-        return Stat.of(values)
+        values = [getattr(scores_of(result, take), score) for result in self.results]
+        return None if None in values else Stat.of(values)
+
+
+def scores_of(metrics: RunMetrics, take: str = "final") -> Scores:
+    """The reported scores, or ("warmup") those of the teacher of round 0."""
+    return metrics.final if take == "final" else metrics.warmup.selected.scores
 
 
 def load_runs(log_dir: str | Path) -> list[Run]:
     """All runs below a folder, however deep, unfinished and damaged ones included."""
     root = Path(log_dir)
-    folders = {path.parent for path in root.rglob("metrics.json")}
+    folders = {path.parent for path in root.rglob(METRICS)}
     folders |= {
         path for path in root.rglob("seed*-*") if path.is_dir() and _FOLDER.fullmatch(path.name)
     }
@@ -151,28 +156,21 @@ def load_run(folder: str | Path) -> Run:
     seed, config = (int(match[1]), match[2]) if match else (None, "")
     experiment = folder.parent.name
 
-    def broken(status: str, problem: str) -> Run:
-        return Run(folder, experiment, config, seed, status, {}, problem)
+    def without(status: str, problem: str) -> Run:
+        return Run(folder, experiment, config, seed, status, None, problem)
 
-    path = folder / "metrics.json"
-    if not path.is_file():
-        begun = any((folder / name).exists() for name in _BEGUN)
-        return broken("unfinished", "unfinished" if begun else "no result")
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        return broken("damaged", f"{path.name} is not readable ({error})")
-    missing = [key for key in _KEYS if not isinstance(metrics, dict) or key not in metrics]
-    if missing:
-        return broken("damaged", f"{path.name} has no {', '.join(missing)}")
-    if metrics["status"] != FINISHED:
-        return broken("unfinished", str(metrics["status"]))
-    if took_target_labels(metrics):
-        why = f"left out, because its student was chosen by the {ORACLE_IN_WORDS}"
-        return Run(
-            folder, metrics["experiment"], metrics["hash"], metrics["seed"], DIAGNOSTIC, {}, why
-        )
-    return Run(folder, metrics["experiment"], metrics["hash"], metrics["seed"], FINISHED, metrics)
+        metrics = read_metrics(folder)
+    except DataError as error:
+        return without("damaged", str(error))
+    if metrics is None:
+        begun = any((folder / name).exists() for name in _BEGUN)
+        return without("unfinished", "unfinished" if begun else "no result")
+    status, problem = FINISHED, ""
+    if took_target_labels(metrics.selection.student):
+        status = DIAGNOSTIC
+        problem = f"left out, because its student was chosen by the {ORACLE_IN_WORDS}"
+    return Run(folder, metrics.experiment, metrics.hash, metrics.seed, status, metrics, problem)
 
 
 def group(runs: Iterable[Run]) -> list[Group]:
@@ -198,7 +196,7 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
     for role in ("source", "target"):
         hashes = defaultdict(list)
         for run in finished:
-            hashes[str(run.metrics["data"].get(role))].append(run.seed)
+            hashes[getattr(run.metrics.data, role) if run.metrics else ""].append(run.seed)
         if len(hashes) > 1:
             comparable = False
             seen = "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in hashes.items())
@@ -211,10 +209,10 @@ def _list(seeds: Sequence[int | None]) -> str:
     return ", ".join(str(seed) for seed in seeds)
 
 
-def task(metrics: Mapping[str, Any]) -> str:
+def task(metrics: RunMetrics) -> str:
     """Such as "specklenet10 -> kinectsim10 (simulated target)"."""
-    simulated = " (simulated target)" if metrics.get("simulated") else ""
-    return f"{metrics.get('source', '?')} -> {metrics.get('target', '?')}{simulated}"
+    simulated = " (simulated target)" if metrics.simulated else ""
+    return f"{metrics.source} -> {metrics.target}{simulated}"
 
 
 def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:
@@ -238,8 +236,8 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
     )  # fmt: skip
     lines, notes = [header], []
     for g in groups:
-        accuracy, balanced = g.stat("final", "accuracy"), g.stat("final", "balanced_accuracy")
-        majority = g.stat("final", "majority_rate")
+        accuracy, balanced = g.stat("accuracy"), g.stat("balanced_accuracy")
+        majority = g.stat("majority_rate")
         few = 0 < len(g.finished) < FEW_SEEDS
         problems = [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
         if g.diagnostic and not g.finished:
@@ -250,8 +248,8 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
                 g.experiment,
                 *([differs[g.experiment, g.hash] or "-"] if several else []),
                 task(g.first) if g.first else "?",
-                str(g.first.get("method", "?")),
-                str(g.first.get("selftraining", "?")),
+                g.first.method if g.first else "?",
+                g.first.selftraining if g.first else "?",
                 accuracy.percent() if accuracy else "-",
                 balanced.percent() if balanced else "-",
                 f"{len(g.finished)}{' (!)' if few else ''}",

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from qs3.errors import ConfigError
-from qs3.report.tables.aggregate import FEW_SEEDS, Group, Stat
+from qs3.report.tables.aggregate import FEW_SEEDS, Group, Stat, scores_of
 
 SEEDS = "0,1,2"
 METRICS = {"accuracy": "accuracy %", "balanced_accuracy": "balanced accuracy %"}
@@ -84,8 +84,7 @@ class Cell:
 
     def ours(self, metric: str) -> Stat | None:
         """Our mean of a metric; None if there is none."""
-        where = ("warmup", "selected") if self.take == "warmup" else ("final",)
-        return self.group.stat(*where, metric) if self.group else None
+        return self.group.stat(metric, self.take) if self.group else None
 
     def text(self, metric: str) -> str:
         """What the table shows: the number, or why there is none."""
@@ -146,12 +145,9 @@ class Table:
             stat = cell.ours(metric) if cell else None
             if cell is None or cell.group is None or stat is None:
                 return None
-            for run in cell.group.finished:
-                if run.seed is not None:
-                    found = run.metrics["final"]
-                    if cell.take == "warmup":
-                        found = run.metrics["warmup"]["selected"]
-                    values.setdefault(run.seed, []).append(found[metric])
+            for result in cell.group.results:
+                found = getattr(scores_of(result, cell.take), metric)
+                values.setdefault(result.seed, []).append(found)
         if any(len(v) != len(self.columns) for v in values.values()):
             return None
         return Stat.of([sum(v) / len(v) for v in values.values()])

@@ -112,7 +112,8 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
     for cell in cells:
         if cell.group and not cell.group.comparable:
             return Compared(name, None, f"{cell.row}, {cell.column}: not averaged, see the table")
-    targets = {runs[seed].metrics["data"].get("target") for runs in finished for seed in seeds}
+    results = [runs[seed].metrics for runs in finished for seed in seeds]
+    targets = {result.data.target for result in results if result}
     if len(targets) > 1:
         return Compared(name, None, "the runs saw different versions of the target")
     try:

@@ -86,10 +86,10 @@ def _has_paper(table: Table, column: int) -> bool:
 
 def _rule(cell: Cell, role: str) -> str:
     """How the epochs of a cell's runs were chosen: "source_val", without the epoch."""
-    runs = cell.group.finished if cell.group else ()
+    results = cell.group.results if cell.group else ()
     role = "teacher" if cell.take == "warmup" else role
-    rules = (run.metrics.get("selection", {}).get(role) for run in runs)
-    return " or ".join(sorted({str(rule).split(", epoch")[0] for rule in rules if rule}))
+    rules = {getattr(result.selection, role).split(", epoch")[0] for result in results}
+    return " or ".join(sorted(rules))
 
 
 def details(table: Table) -> list[list[str]]:
@@ -119,9 +119,8 @@ def details(table: Table) -> list[list[str]]:
 
 
 def seconds(group: Group) -> list[float]:
-    """Wall time of each finished run over all of its starts, where it is known."""
-    found = (run.metrics.get("times", {}).get("seconds") for run in group.finished)
-    return [float(value) for value in found if isinstance(value, int | float)]
+    """Wall time of each finished run over all of its starts."""
+    return [result.times.seconds for result in group.results]
 
 
 def _time(group: Group) -> str:
@@ -149,13 +148,12 @@ def marks(table: Table) -> list[str]:
 def remarks(table: Table) -> list[str]:
     """The lines below a table: what it is measured on, how models were chosen, what is missing."""
     found = [g for cell in table.cells if (g := cell.group) and g.finished]
+    targets = {g.first.target: g.first.simulated for g in found if g.first}
     lines = [*marks(table), *table.notes]
-    for target in dict.fromkeys(str(g.first["target"]) for g in found):
-        of = [g for g in found if str(g.first["target"]) == target]
-        simulated = "simulated target" if of[0].first.get("simulated") else "target"
-        rates = sorted(
-            {f"{100 * s.mean:.1f} %" for g in of if (s := g.stat("final", "majority_rate"))}
-        )
+    for target, simulated_ in targets.items():
+        of = [g for g in found if g.first and g.first.target == target]
+        simulated = "simulated target" if simulated_ else "target"
+        rates = sorted({f"{100 * s.mean:.1f} %" for g in of if (s := g.stat("majority_rate"))})
         lines.append(
             f"majority rate of the {simulated} {target}: {' or '.join(rates) or 'unknown'}"
         )
@@ -163,11 +161,7 @@ def remarks(table: Table) -> list[str]:
         rules = {rule for cell in table.cells if (rule := _rule(cell, role))}
         if rules:
             lines.append(f"{role} selected by: {', '.join(sorted(rules))}")
-    splits = {
-        str(run.metrics.get("selection", {}).get("validation", "lineage"))
-        for g in found
-        for run in g.finished
-    }
+    splits = {result.selection.validation for g in found for result in g.results}
     if splits - {"lineage"}:
         lines.append(f"validation split: {', '.join(sorted(splits))}")
     if found:
@@ -261,7 +255,7 @@ def csv_text(table: Table) -> str:
          "student_selected", "seconds", "problems", "hash", "command"]
     )  # fmt: skip
     for cell in table.cells:
-        known = cell.group.first if cell.group else {}
+        known = cell.group.first if cell.group else None
         times = seconds(cell.group) if cell.group else []
         for metric in table.metrics:
             stat, paper = cell.ours(metric), cell.paper if metric == _ACCURACY else None

@@ -22,8 +22,8 @@ from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
 from qs3.report.runs.data import BINS, read_run, reliability
 from qs3.report.runs.pictures import AfterTraining, draw
-from qs3.runs import folder as runs
 from qs3.runs.checkpoints import save
+from qs3.runs.metrics import read_metrics
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.training.command import train
 from tests.report.made_runs import change, not_blank, table
@@ -73,7 +73,7 @@ def check_page(run, drawn):
     assert [base64.b64decode(i) for i in images] == [
         p.read_bytes() for p in drawn.pictures.values()
     ]
-    metrics = runs.read_metrics(run)
+    metrics = read_metrics(run)
     assert f"<td>{metrics['final']['accuracy']:.1%}</td>" in page
     assert "kinectsim10 (simulated)" in page
     assert "python train.py experiment=quickstart" in page
@@ -90,7 +90,7 @@ def test_curves_are_the_history(run):
     np.testing.assert_array_equal(line(axes[2], "lr")[1], [float(row["lr"]) for row in rows])
     assert texts(axes[0]) == ["warm-up", "round 0", "round 1"]
     assert [p.get_x() for p in axes[0].patches] == [-0.5, 6.5]  # warm-up and every other round
-    teacher = runs.read_metrics(run)["warmup"]["selected"]["epoch"]
+    teacher = read_metrics(run).warmup.selected.epoch
     assert line(axes[0], f"teacher: epoch {teacher}")[0].tolist() == [teacher, teacher]
 
 
@@ -111,7 +111,7 @@ def test_confusion_is_that_of_the_predictions(run):
             assert drawn[i, j] == pytest.approx(counts[true, predicted] / per_class[true])
     words = [t.split("\n") for t in texts(figure.axes[0])]
     assert sorted(int(n) for n, _ in words) == sorted(counts.values())
-    final, title = runs.read_metrics(run)["final"], figure.get_suptitle()
+    final, title = read_metrics(run).final, figure.get_suptitle()
     assert "kinectsim10 (simulated)" in title
     for key in ("accuracy", "balanced_accuracy", "majority_rate"):
         assert f"{final[key]:.1%}" in title
@@ -121,7 +121,7 @@ def test_confusion_is_that_of_the_predictions(run):
 
 def test_pseudo_labels_are_those_of_the_tables(run):
     axes = run_figures.pseudo_labels(read_run(run)).axes
-    records = runs.read_metrics(run)["rounds"]
+    records = read_metrics(run).rounds
     for r, record in enumerate(records):
         rows = table(run / f"round_{r:02d}" / "pseudo_labels.csv")
         kept = Counter(row["label"] for row in rows if row["selected"] == "1")
@@ -155,7 +155,7 @@ def test_calibration_is_the_reported_error(run):
     p = read_predictions(run / "predictions.csv")
     found = reliability(p)
     assert found.error == pytest.approx(calibration_error(p.probabilities, p.labels))
-    assert found.error == pytest.approx(runs.read_metrics(run)["final"]["calibration_error"])
+    assert found.error == pytest.approx(read_metrics(run).final.calibration_error)
     axes = run_figures.calibration(read_run(run)).axes
     assert axes[1].containers[0].datavalues.sum() == 24
     assert heights(axes[0], "accuracy") == pytest.approx(found.accuracy[found.count > 0])
@@ -182,16 +182,16 @@ def test_missing_round_folders(run):
     assert list(drawn.pictures) == ALL
     assert "round_00/pseudo_labels.csv is gone" in " ".join(drawn.notes)
     assert "round_00/pseudo_labels.csv is gone" in drawn.page.read_text()
-    kept = runs.read_metrics(run)["rounds"][0]["selected"]
+    kept = read_metrics(run).rounds[0]["selected"]
     axes = run_figures.pseudo_labels(read_run(run)).axes
     assert np.array(axes[0].images[0].get_array())[:, 0].tolist() == [kept[c] for c in CLASSES]
 
 
 def test_unlabelled_target(run):
-    metrics = runs.read_metrics(run)
+    metrics = read_metrics(run)
     unknown = dict.fromkeys(("accuracy", "balanced_accuracy", "confusion", "majority_rate"))
-    rounds = [{**record, "with_target_labels": None} for record in metrics["rounds"]]
-    final = {**metrics["final"], **unknown, "calibration_error": None}
+    rounds = [{**record, "with_target_labels": None} for record in metrics.rounds]
+    final = {**metrics.final, **unknown, "calibration_error": None}
     change(run, final=final, rounds=rounds)
     rows = table(run / "predictions.csv")
     with open(run / "predictions.csv", "w", newline="") as file:
@@ -365,9 +365,9 @@ def test_offline_wandb_holds_config_curves_pictures_and_table(toy):
     (confusion,) = [row["confusion"] for row in rows if "confusion" in row]
     content = json.loads((files / confusion["path"]).read_text())
     assert content["columns"] == ["true class", *CLASSES]
-    expected = metrics["final"]["confusion"]
+    expected = metrics.final.confusion
     assert content["data"] == [[c, *row] for c, row in zip(CLASSES, expected, strict=True)]
-    assert summary["final/accuracy"] == metrics["final"]["accuracy"]
+    assert summary["final/accuracy"] == metrics.final.accuracy
 
 
 def test_nothing_to_draw_is_said(run):

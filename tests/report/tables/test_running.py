@@ -195,7 +195,7 @@ def test_what_a_table_does_not_average_is_not_compared(tmp_path):
 
     def compared(path, target):
         metrics = json.loads(path.read_text())
-        metrics["data"]["target"] = target
+        metrics.data.target = target
         path.write_text(json.dumps(metrics))
         again = build_table("cad10", tmp_path)
         (one,) = (one for one in against(again, "source only") if one.name == "DANN")

@@ -5,12 +5,12 @@ import sys
 import numpy as np
 import pytest
 
+from qs3.data import ensure_source as making
 from qs3.data.domain import Domain
+from qs3.data.ensure_source import make_if_missing
 from qs3.data.store import is_finished
 from qs3.errors import ConfigError, MissingDataError, Qs3Error
-from qs3.training import ensure_source as making
 from qs3.training.command import train
-from qs3.training.ensure_source import make_if_missing
 from tests.training.toy import toy_config
 
 FEW = "catalogue.train=2 catalogue.test=1 workers=0"
@@ -67,7 +67,7 @@ def test_a_run_makes_its_source_but_only_if_the_target_is_there(tmp_path, monkey
     for i in range(8):
         cloud = np.random.default_rng(i).normal(size=(50, 3))
         np.save(tmp_path / "scans" / f"{i}.npy", cloud)
-    assert train(cfg)["source"] == "modelnet10"
+    assert train(cfg).source == "modelnet10"
     assert is_finished(data / "modelnet10")
 
 

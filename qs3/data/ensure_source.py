@@ -9,12 +9,25 @@ import subprocess
 import sys
 
 from qs3.config.location import ROOT
-from qs3.data.domain import Domain
+from qs3.data.domain import Domain, check_all
 from qs3.errors import ConfigError, MissingDataError, Qs3Error
 
 log = logging.getLogger(__name__)
 
 _GENERATE = ["python", "generate.py"]
+
+
+def check_or_make(source: Domain, target: Domain, make_source: bool) -> None:
+    """Find out, in milliseconds, whether both domains are there; make the source if that is asked.
+
+    Raises:
+        MissingDataError: lists what is missing and how to get it.
+        ConfigError, Qs3Error: see `make_if_missing`.
+    """
+    if make_source:
+        target.check()  # before minutes are spent on the source
+        make_if_missing(source)
+    check_all(source, target)
 
 
 def make_if_missing(domain: Domain) -> None:

@@ -1,0 +1,239 @@
+"""One domain as a LightningDataModule, for any LightningModule.
+
+    data = SpeckleNetData(points=256, batch_size=32)
+    Trainer(max_epochs=10).fit(my_module, data)
+
+A batch is `{"points": [B, N, 3] float32, "labels": [B] int64, "index": i, "epoch": e}`: clouds in
+the unit ball, z up, sampled by farthest points. Without labels the key "labels" is not there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+from lightning.pytorch import LightningDataModule
+
+from qs3.config.checks import one_of
+from qs3.data.domain import Domain
+from qs3.data.inspection.open_dataset import compose_domain
+from qs3.data.store import PointSet
+from qs3.datamodules.augment import Augment
+from qs3.datamodules.batches import Batches, Table, generator_of
+from qs3.datamodules.splits import (
+    Labelled,
+    Unlabelled,
+    few_of_each_split,
+    first_of_each_class,
+    load_clouds,
+    with_labels,
+)
+from qs3.datamodules.validation_split import RULES
+
+SAMPLERS = ("shuffled", "balanced")
+
+
+class DomainData(LightningDataModule):
+    """Clouds of one domain, loaded from its store.
+
+    Args:
+        domain: a `Domain`, or the name of one of conf/domain, such as "modelnet10".
+        points: of a cloud as a net sees it.
+        fps_starts: samples of each training cloud, from other first points; an epoch draws one.
+        batch_size: of training batches, at least 2 (batch norm).
+        eval_batch_size: of all others.
+        augment: applied to training batches on their device; None leaves them as they are.
+        val: rule that takes validation clouds from the training split (`validation_split.RULES`).
+        sampler: "shuffled" trains on each cloud once an epoch, "balanced" on as many of each class.
+        seed: of order, samples and augmentation, each a function of (seed, epoch).
+        labels: False reads no label and keeps none; then there are no validation clouds.
+        cache_dir: where farthest points are kept for the next time; None keeps none.
+        clouds_a_split: only so many clouds of each split, at even steps.
+        clouds_a_class: only the first so many training clouds of each class.
+        data_dir: where the dataset of a named domain lies.
+
+    Attributes:
+        train, validation, test: clouds of each part, after `setup`.
+        whole: the training split before it was divided.
+        classes: names in label order, after `setup`.
+        sha256: of the dataset, after `setup`.
+
+    Raises:
+        ConfigError: no such domain, rule or sampler; labels are asked for and there are none.
+        MissingDataError: from `prepare_data`, if there are no files; says how to get them.
+    """
+
+    def __init__(
+        self,
+        domain: Domain | str,
+        *,
+        points: int = 1024,
+        fps_starts: int = 4,
+        batch_size: int = 16,
+        eval_batch_size: int = 64,
+        augment: Augment | None = None,
+        val: str = "lineage",
+        sampler: str = "shuffled",
+        seed: int = 0,
+        labels: bool = True,
+        cache_dir: str | Path | None = None,
+        clouds_a_split: int | None = None,
+        clouds_a_class: int | None = None,
+        data_dir: str | Path = "data",
+    ) -> None:
+        super().__init__()
+        if isinstance(domain, str):
+            domain = compose_domain(domain, {"paths.data_dir": str(data_dir)})
+        self.domain = domain
+        self.points, self.fps_starts = points, fps_starts
+        self.batch_size, self.eval_batch_size = batch_size, eval_batch_size
+        self.augment, self.seed, self.has_labels = augment, seed, labels
+        self.val = one_of("data.val", val, sorted(RULES))
+        self.sampler = one_of("data.sampler", sampler, SAMPLERS)
+        self.clouds_a_split, self.clouds_a_class = clouds_a_split, clouds_a_class
+        # Indices that are cached are those of whole splits.
+        self.cache_dir = Path(cache_dir) if cache_dir and clouds_a_split is None else None
+        self.whole: Labelled | Unlabelled | None = None
+        self.train: Labelled | Unlabelled | None = None
+        self.validation: Labelled | None = None
+        self.test: Labelled | Unlabelled | None = None
+        self.classes: tuple[str, ...] = ()
+        self.sha256 = ""
+        self._checked = False
+        self._epochs = 0  # that have begun without a trainer
+
+    def prepare_data(self) -> None:
+        """Bring published files into the store if that has not been done; check it, once."""
+        if not self._checked:
+            self.domain.open()
+            self._checked = True
+
+    def setup(self, stage: str | None = None) -> None:
+        """Load what a stage needs, once: "fit" training and validation clouds, "test" the others.
+
+        The dataset itself is not kept: it holds all labels.
+        """
+        dataset = self.domain.open(verify=False)
+        self.classes, self.sha256 = tuple(dataset.classes), dataset.sha256
+        if self.clouds_a_split is not None:
+            dataset = few_of_each_split(dataset, self.clouds_a_split)
+        if stage in (None, "fit", "validate") and self.train is None:
+            self._setup_training(dataset)
+        if stage in (None, "test", "predict") and self.test is None and "test" in dataset.counts():
+            self.test = self._load(dataset, "test", starts=1)
+
+    def train_dataloader(self) -> Loader:
+        """Training batches; each pass is the next epoch, or the trainer's."""
+        return self._loader(self.train, self.batch_size, shuffle=True)
+
+    def val_dataloader(self) -> Loader | list:
+        """Held-out training clouds; nothing without labels."""
+        if self.validation is None:
+            return []
+        return self._loader(self.validation, self.eval_batch_size)
+
+    def test_dataloader(self) -> Loader:
+        """The test split, in order."""
+        return self._loader(self.test, self.eval_batch_size)
+
+    def predict_dataloader(self) -> Loader:
+        """The same."""
+        return self.test_dataloader()
+
+    def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
+        """Augment training batches, on their device."""
+        if self.augment is None or self.trainer is None or not self.trainer.training:
+            return batch
+        points = batch["points"]
+        rank = self.trainer.global_rank
+        generator = generator_of(batch, "augment", self.seed, rank, points.device)
+        return {**batch, "points": self.augment(points, generator)}
+
+    def _setup_training(self, dataset: PointSet) -> None:
+        train = self._load(dataset, "train", starts=self.fps_starts)
+        if isinstance(train, Unlabelled):
+            self.whole = self.train = train
+            return
+        if self.clouds_a_class is not None:
+            train = first_of_each_class(train, self.clouds_a_class)
+        self.whole = train
+        chosen, held_out = RULES[self.val](train.ids, train.labels.numpy())
+        self.train, self.validation = train.at(chosen), train.at(held_out)
+
+    def _load(self, dataset: PointSet, split: str, starts: int) -> Labelled | Unlabelled:
+        clouds = load_clouds(dataset, split, self.points, starts, self.cache_dir)
+        if not self.has_labels:
+            return clouds
+        return with_labels(clouds, dataset, split, f"domain {self.domain.name}")
+
+    def _loader(
+        self, part: Labelled | Unlabelled | None, batch_size: int, shuffle: bool = False
+    ) -> Loader:
+        if part is None:
+            raise RuntimeError(f"{self.domain.name}: no such clouds; call setup() first")
+        labels = {"labels": part.labels} if isinstance(part, Labelled) else {}
+        balance = "labels" if labels and shuffle and self.sampler == "balanced" else None
+        trainer = self.trainer
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
+
+        def batches() -> Batches:
+            return Batches(
+                {Loader.KEY: Table(part.clouds, labels, balance)},
+                batch_size,
+                seed=self.seed,
+                epoch=self._epoch() if shuffle else 0,
+                shuffle=shuffle,
+                rank=rank if shuffle else 0,
+                world=world if shuffle else 1,
+            )
+
+        return Loader(batches)
+
+    def _epoch(self) -> int:
+        if self.trainer is not None:
+            return self.trainer.current_epoch
+        self._epochs += 1
+        return self._epochs - 1
+
+
+class Loader:
+    """Batches of one domain, made anew for each pass.
+
+    Args:
+        make: the batches of the next pass, of a table called `KEY`.
+    """
+
+    KEY: ClassVar[str] = "domain"
+
+    def __init__(self, make: Callable[[], Batches]) -> None:
+        self._make = make
+        self._batches = make()
+
+    def __len__(self) -> int:
+        return len(self._batches)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for batch in self._make():
+            yield {**batch[self.KEY], "index": batch["index"], "epoch": batch["epoch"]}
+
+
+class SpeckleNetData(DomainData):
+    """SpeckleNet10: CAD meshes as a simulated speckle-stereo sensor sees them; see `DomainData`."""
+
+    def __init__(self, domain: Domain | str = "specklenet10", **settings: Any) -> None:
+        super().__init__(domain, **settings)
+
+
+class ModelNetData(DomainData):
+    """ModelNet10: samples of the meshes' surfaces; see `DomainData`."""
+
+    def __init__(self, domain: Domain | str = "modelnet10", **settings: Any) -> None:
+        super().__init__(domain, **settings)
+
+
+class DepthScanNetData(DomainData):
+    """DepthScanNet10: objects of ScanNet's depth images, the real target; see `DomainData`."""
+
+    def __init__(self, domain: Domain | str = "depthscannet10", **settings: Any) -> None:
+        super().__init__(domain, **settings)

@@ -1,0 +1,105 @@
+"""A split's clouds as training may see them: with labels, or without any that it could reach.
+
+Labels have owners. `Labelled` clouds may be trained on; `Unlabelled` ones have no labels to give.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from qs3.data.store import PointSet
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.fps_cache import prepare
+from qs3.errors import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class Unlabelled:
+    """n clouds with their ids."""
+
+    clouds: Clouds
+    ids: tuple[str, ...]
+
+    @property
+    def points(self) -> Float[Tensor, "n m 3"]:
+        """The clouds in memory as evaluation sees them; made anew each time."""
+        return self.clouds.all()
+
+
+@dataclass(frozen=True, eq=False)
+class Labelled:
+    """n clouds with their ids and labels [n] int64."""
+
+    clouds: Clouds
+    ids: tuple[str, ...]
+    labels: Int[Tensor, " n"]
+
+    def at(self, index: np.ndarray) -> Labelled:
+        """A part."""
+        ids = tuple(self.ids[i] for i in index)
+        return Labelled(self.clouds.at(index), ids, self.labels[torch.from_numpy(index)])
+
+
+def load_clouds(
+    dataset: PointSet, split: str, points: int, starts: int = 1, cache_dir: Path | None = None
+) -> Unlabelled:
+    """A split's clouds, prepared (see `prepare`), without their labels."""
+    part = dataset.split(split)
+    key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
+    clouds = prepare(part.points, points, starts=starts, cache_dir=cache_dir, key=key)
+    return Unlabelled(clouds, part.ids)
+
+
+def labels_of(dataset: PointSet, split: str) -> Int[Tensor, " n"] | None:
+    """A split's labels, for those who may have them; None if the dataset has none."""
+    if not dataset.labelled:
+        return None
+    return torch.from_numpy(np.array(dataset.labels[dataset.indices(split)]))
+
+
+def with_labels(clouds: Unlabelled, dataset: PointSet, split: str, what: str) -> Labelled:
+    """The clouds of `load_clouds` with their labels.
+
+    Args:
+        clouds: of this split.
+        dataset: theirs.
+        split: theirs.
+        what: who asks for labels, for the message.
+
+    Raises:
+        ConfigError: the dataset has no labels.
+    """
+    labels = labels_of(dataset, split)
+    if labels is None:
+        raise ConfigError(
+            f"{what} needs labels, but the clouds of {dataset.name} have none; label them, or "
+            "choose another dataset or method"
+        )
+    return Labelled(clouds.clouds, clouds.ids, labels)
+
+
+def few_of_each_split(dataset: PointSet, count: int) -> PointSet:
+    """At most `count` clouds of each split, at even steps; for `debug=fast`.
+
+    They keep their order and ids, and the hash is still that of the whole dataset.
+    """
+    chosen: list[int] = []
+    for split in dataset.counts():
+        members = dataset.indices(split)
+        few = min(count, len(members))
+        chosen += [int(members[i * len(members) // few]) for i in range(few)]
+    return dataset.at(np.sort(chosen))
+
+
+def first_of_each_class(labelled: Labelled, count: int) -> Labelled:
+    """The first `count` clouds of each class, in their order; for `debug=overfit`."""
+    chosen = np.zeros(len(labelled.ids), dtype=bool)
+    for k in labelled.labels.unique().tolist():
+        chosen[np.flatnonzero(labelled.labels.numpy() == k)[:count]] = True
+    return labelled.at(np.flatnonzero(chosen))

@@ -1,0 +1,299 @@
+"""The schema of `metrics.json`: what a finished run reports. Training writes it, all else reads it.
+
+Shares and accuracies are in [0, 1]. A figure that does not exist is null: without labels of the
+target there is no accuracy, and of a net that has diverged there is no finite score.
+"""
+
+from __future__ import annotations
+
+from dataclasses import field
+from pathlib import Path
+from typing import Any
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from qs3.errors import DataError
+from qs3.utils.files import write_text
+
+METRICS = "metrics.json"
+FINISHED = "finished"
+
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Scores:
+    """What a net is worth on the target's evaluated clouds; see `qs3.evaluation.metrics.scores`.
+
+    Attributes:
+        n: clouds.
+        predicted: how many were given to each class, in label order.
+        accuracy, balanced_accuracy, majority_rate: None without labels.
+        per_class_recall: None for a class without clouds.
+        confusion: [i][j] counts clouds of class i predicted as j.
+        calibration_error: expected calibration error; None for a net that has diverged.
+    """
+
+    n: int
+    predicted: dict[str, int]
+    accuracy: float | None = None
+    balanced_accuracy: float | None = None
+    majority_rate: float | None = None
+    per_class_recall: dict[str, float | None] | None = None
+    confusion: list[list[int]] | None = None
+    calibration_error: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class EpochScores:
+    """Scores of the weights at the end of an epoch (from 0)."""
+
+    epoch: int
+    scores: Scores
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Warmup:
+    """The teacher of round 0, and the warm-up's last epoch."""
+
+    selected: EpochScores
+    last: EpochScores
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Selection:
+    """By which rule teacher and student were chosen, with the epoch, and the validation split."""
+
+    teacher: str
+    student: str
+    validation: str
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Loading:
+    """Points of a cloud, samples of each, and how source clouds are drawn."""
+
+    points: int
+    fps_starts: int
+    sampler: str
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Evaluated:
+    """On what, and how, the scores were taken.
+
+    Attributes:
+        split: "test"; "train" where there is no other.
+        labels: whether anybody knows the clouds' classes.
+        rotations: turns about gravity over which the further scores average; 0: none.
+        norms: "trained" or "adabn".
+        final_over_rotations, warmup_over_rotations: those scores.
+    """
+
+    split: str
+    labels: bool
+    rotations: int
+    norms: str
+    final_over_rotations: Scores | None = None
+    warmup_over_rotations: Scores | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class PseudoLabelScores:
+    """How right a round's pseudo-labels were; computed after training, nothing is chosen by it."""
+
+    precision: float
+    recall: float
+    accuracy: float
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RoundRecord:
+    """One round of self-training.
+
+    Attributes:
+        round: from 0.
+        theta: threshold of the round.
+        confident, selected: target clouds by class.
+        mu, thresholds: by class, where the selector has them.
+        total_confident, total_selected: of all classes.
+        missing_classes: without a pseudo-label.
+        agreement: share of labels as in the round before; None in round 0.
+        with_target_labels: None where nobody knows these.
+    """
+
+    round: int
+    theta: float
+    confident: dict[str, int]
+    selected: dict[str, int]
+    mu: dict[str, float] | None = None
+    thresholds: dict[str, float] | None = None
+    total_confident: int
+    total_selected: int
+    missing_classes: list[str]
+    agreement: float | None
+    with_target_labels: PseudoLabelScores | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class StudentChoice:
+    """How the reported epoch of the last round was chosen, where it is not the last one.
+
+    Attributes:
+        rule: of `selection.student`.
+        epoch, score: the chosen one.
+        scores: by epoch.
+        held_out: clouds that were held out of the last round for it.
+        last: the last epoch's student, for comparison.
+    """
+
+    rule: str
+    epoch: int
+    score: float | None
+    scores: dict[str, float | None]
+    held_out: int
+    last: EpochScores
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Estimates:
+    """Estimates of accuracy without labels; see `qs3.evaluation.accuracy_estimates`."""
+
+    validation_accuracy: float
+    temperature: float | None = None
+    mean_confidence: float | None = None
+    calibrated: float | None = None
+    thresholded: float | None = None
+    difference: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class AccuracyEstimates(Estimates):
+    """The reported net's, on the evaluated clouds.
+
+    Attributes:
+        clouds: that were judged.
+        validated_on: whose held-out labelled clouds calibrate, such as "source_val".
+        validation_clouds: how many.
+        turns_agree: share of clouds with the same class after turns about gravity.
+        teacher_agrees: share on which the net before self-training says the same.
+        teacher: the same estimates for that net.
+        unlike_source: share of clouds outside the usual range of the labelled ones.
+        never_predicted: classes.
+    """
+
+    clouds: int
+    validated_on: str
+    validation_clouds: int
+    turns_agree: float | None = None
+    teacher_agrees: float | None = None
+    teacher: Estimates | None = None
+    unlike_source: float
+    never_predicted: list[str]
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class TrainingAccuracy:
+    """The share that is right of the n clouds that the net was trained on (`debug=overfit`)."""
+
+    n: int
+    accuracy: float
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class DataHashes:
+    """`PointSet.sha256` of both datasets."""
+
+    source: str
+    target: str
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Times:
+    """Wall time over all starts of the run."""
+
+    seconds: float
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RunMetrics:
+    """`metrics.json`.
+
+    Attributes:
+        experiment: name; with the hash of the config and the seed it names the run's folder.
+        source, target: names of the domains; source is the target for `method=supervised`.
+        simulated: whether the target's reality is.
+        method, selftraining, model: as on the command line.
+        final: the reported scores: the student's, without rounds the warm-up's.
+        validators: label-free scores by name.
+        quality: estimates of accuracy that need no label of the target.
+        training: with `data.clouds_a_class` alone.
+        versions: of the software that began the run.
+    """
+
+    experiment: str
+    hash: str
+    config_sha256: str
+    seed: int
+    status: str = FINISHED
+    source: str
+    target: str
+    simulated: bool
+    method: str
+    selftraining: str
+    model: str
+    selection: Selection
+    loading: Loading
+    final: Scores
+    evaluation: Evaluated
+    warmup: Warmup
+    rounds: list[RoundRecord] = field(default_factory=list)
+    student: StudentChoice | None = None
+    validators: dict[str, float | None]
+    quality: AccuracyEstimates
+    training: TrainingAccuracy | None = None
+    data: DataHashes
+    times: Times
+    versions: dict[str, str]
+
+    @property
+    def target_text(self) -> str:
+        """The target's name, with "(simulated)" where that is so."""
+        return f"{self.target}{' (simulated)' if self.simulated else ''}"
+
+
+_SCHEMA: TypeAdapter[RunMetrics] = TypeAdapter(RunMetrics)
+
+
+def read_metrics(folder: str | Path) -> RunMetrics | None:
+    """The result of a finished run; None if the run is not finished.
+
+    Raises:
+        DataError: the file is damaged; names the first key that is wrong.
+    """
+    path = Path(folder) / METRICS
+    try:
+        return _SCHEMA.validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise DataError(f"{path} is damaged: {place}: {first['msg']}; {_REMEDY}") from error
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error}); {_REMEDY}") from error
+
+
+_REMEDY = "delete it and repeat the run's command, which trains nothing again"
+
+
+def write_metrics(folder: str | Path, metrics: RunMetrics) -> None:
+    """Save the result, atomically, which also marks the run as finished."""
+    write_text(Path(folder) / METRICS, _SCHEMA.dump_json(metrics, indent=2).decode() + "\n")
+
+
+def as_dict(metrics: RunMetrics) -> dict[str, Any]:
+    """The contents of the file as plain values."""
+    found: dict[str, Any] = _SCHEMA.dump_python(metrics)
+    return found

@@ -1,0 +1,92 @@
+"""Second stage: classifier, callbacks and trainer from the run's config."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from lightning.pytorch import Callback, Trainer
+from omegaconf import OmegaConf
+
+from qs3.config.hydra import build
+from qs3.engine.checkpointing import AtomicCheckpointIO, SaveLast
+from qs3.engine.classifier import Classifier
+from qs3.engine.loggers import CsvHistory, EpochRows
+from qs3.engine.trainer import build_each, make_trainer
+from qs3.engine.wall_time import Clock
+from qs3.methods.base import Method
+from qs3.selftraining.callback import SelfTraining, WarmupSelection
+from qs3.selftraining.student_loss import Student
+from qs3.selftraining.student_selection import StudentSelection
+from qs3.training.load import Loaded
+from qs3.training.run import Run
+from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """The trainer, and the callbacks that evaluation asks afterwards."""
+
+    trainer: Trainer
+    classifier: Classifier
+    warmup: WarmupSelection
+    rounds: SelfTraining
+    student: StudentSelection
+    shared_warmup: SharedWarmup
+    clock: Clock
+
+
+def build_training(run: Run, method: Method, loaded: Loaded, began: float) -> Built:
+    """Everything that `Trainer.fit` needs but the data.
+
+    Args:
+        run: its settings.
+        method: loss of the warm-up.
+        loaded: for class names, and the hash of what the warm-up depends on.
+        began: `time.time()` when the run started.
+    """
+    cfg, folder, phases = run.cfg, run.folder, run.phases
+    classifier = _classifier(run, method)
+    classes = loaded.evaluation.classes
+    warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
+    rounds = SelfTraining(folder, phases, run.scheme, classes)
+    student = StudentSelection(folder, phases, cfg.selection.student, classes)
+    shared = SharedWarmup(
+        folder, cfg.paths.warmup_dir, warmup_sha256(cfg, loaded.started), run.seed, phases.warmup
+    )
+    clock = Clock(began)
+    # In this order: rounds select before the student is scored, and all is done before it is saved.
+    callbacks: list[Callback] = [
+        *(warmup, rounds, student, EpochRows(phases), clock),
+        *(SaveLast(folder), shared),
+    ]
+    trainer = make_trainer(
+        cfg,
+        max_epochs=phases.total,
+        callbacks=[*build_each(cfg.callbacks), *callbacks],
+        logger=[CsvHistory(folder), *build_each(cfg.logger)],
+        plugins=[AtomicCheckpointIO()],
+        default_root_dir=folder,
+    )
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    for logger in trainer.loggers:
+        logger.log_hyperparams(settings)
+    return Built(trainer, classifier, warmup, rounds, student, shared, clock)
+
+
+def _classifier(run: Run, method: Method) -> Classifier:
+    cfg, scheme = run.cfg, run.scheme
+    classifier = Classifier(
+        build_net=lambda: build(cfg.model),
+        build_optimizer=build(cfg.protocol.optimizer),
+        method=method,
+        student=Student(scheme.pcm, scheme.weight_step, scheme.mrkld, run.phases.warmup),
+        phases=run.phases,
+        seed=run.seed,
+        schedule=cfg.protocol.schedule,
+        smoothing=cfg.protocol.smoothing,
+        regulariser_weight=cfg.protocol.regulariser,
+    )
+    if cfg.compile:
+        classifier.net.compile()  # in place; nets that are only evaluated stay as they are
+    return classifier

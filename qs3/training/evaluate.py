@@ -1,0 +1,148 @@
+"""Fourth stage: what the nets of a run are worth, from the weights that it saved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from qs3.evaluation.accuracy_estimates import quality_of
+from qs3.evaluation.metrics import adapt_norms
+from qs3.evaluation.selection_rules import LAST, ORACLE
+from qs3.runs.checkpoints import load
+from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
+from qs3.runs.predictions import Predictions
+from qs3.selftraining import oracle
+from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
+from qs3.selftraining.student_selection import Choice
+from qs3.training.build import Built
+from qs3.training.final_scores import training_accuracy, without_labels
+from qs3.training.load import Loaded
+from qs3.training.run import STUDENT, Run
+from qs3.utils.seeding import derive
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What came of a run.
+
+    Attributes:
+        net: the reported one.
+        predictions: its, for each evaluated cloud.
+        choice: how its epoch was chosen; None: the last one's, or the warm-up's.
+        final: its scores.
+        scores: of "selected" and "last", the warm-up's epochs, and "student", the last round's.
+        turned: scores of the reported net and of "selected", averaged over rotations.
+        validators: its label-free scores.
+        quality: estimates of its accuracy.
+        training: its accuracy on training clouds, with `data.clouds_a_class` alone.
+    """
+
+    net: nn.Module
+    predictions: Predictions
+    choice: Choice | None
+    final: Scores
+    scores: Mapping[str, Scores]
+    turned: tuple[Scores | None, Scores | None]
+    validators: dict[str, float | None]
+    quality: AccuracyEstimates
+    training: TrainingAccuracy | None
+
+
+class SavedNets:
+    """Nets with the weights in a run's files.
+
+    Args:
+        run: whose they are.
+        loaded: the target's training clouds, for norms that adapt to them.
+        built: how a net is made, and where it runs.
+    """
+
+    def __init__(self, run: Run, loaded: Loaded, built: Built) -> None:
+        self.run, self.target = run, loaded.data.target
+        self.classifier, self.device = built.classifier, built.classifier.device
+
+    def __call__(self, file: Path) -> nn.Module:
+        """As it is evaluated: with the target's norms if `evaluation.norms=adabn`."""
+        net, cfg = self.as_trained(file), self.run.cfg
+        if cfg.evaluation.norms == "adabn":
+            seed = derive(self.run.seed, "adabn")
+            adapt_norms(net, self.target.points, cfg.protocol.batch_size, seed, self.device)
+        return net
+
+    def as_trained(self, file: Path) -> nn.Module:
+        """With the norms that it was trained with."""
+        net = self.classifier.fresh_net(phase=0).to(self.device)
+        net.load_state_dict(load(file, self.device))
+        return net
+
+
+def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
+    """Score the warm-up's and the student's weights; of the reported ones say more."""
+    nets, evaluation = SavedNets(run, loaded, built), loaded.evaluation
+    device = nets.device
+    names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
+    files = {name: run.folder / file for name, file in names.items()}
+    choice = _choice(run, loaded, built, nets)
+    reported = "student" if run.scheme.rounds else "selected"
+    file = choice.file if choice else files[reported]
+    net = nets(file)
+    predictions = evaluation.predictions(net, device)
+    final = evaluation.scores_of(predictions.probabilities)
+    scores = {
+        name: final if path == file else evaluation.scores(nets(path), device)
+        for name, path in files.items()
+    }
+    turned = evaluation.turned(net, device)
+    before = turned if file == files["selected"] else None
+    if before is None:
+        before = evaluation.turned(nets(files["selected"]), device)
+    batch_size, data = run.cfg.data.eval_batch_size, loaded.data
+    return Outcome(
+        net=net,
+        predictions=predictions,
+        choice=choice,
+        final=final,
+        scores=scores,
+        turned=(turned, before),
+        validators=without_labels(net, data.target, choice, batch_size, device),
+        quality=_quality(run, loaded, nets, file, net),
+        training=(
+            training_accuracy(net, data.labelled, data.owner, batch_size, device)
+            if run.cfg.data.clouds_a_class is not None
+            else None
+        ),
+    )
+
+
+def _choice(run: Run, loaded: Loaded, built: Built, nets: SavedNets) -> Choice | None:
+    """Which epoch of the last round is reported; None: the last one."""
+    if built.student.rule == ORACLE:
+        return oracle.choose(run.folder, run.phases, loaded.evaluation, nets, nets.device)
+    return None if built.student.rule == LAST else built.student.choice()
+
+
+def _quality(
+    run: Run, loaded: Loaded, nets: SavedNets, file: Path, net: nn.Module
+) -> AccuracyEstimates:
+    taught = run.folder / WARMUP_SELECTED if run.scheme.rounds else None
+    unadapted = None
+    if run.cfg.evaluation.norms == "adabn":
+        unadapted = nets.as_trained(file), nets.as_trained(taught) if taught else None
+    data = loaded.data
+    more: dict[str, Any] = {"batch_size": data.eval_batch_size, "device": nets.device}
+    return quality_of(
+        net,
+        loaded.evaluation.test,
+        data.validation,
+        data.all_labelled.clouds,
+        owner=data.owner,
+        classes=loaded.evaluation.classes,
+        teacher=nets(taught) if taught else None,
+        unadapted=unadapted,
+        upright=run.target.gravity == "z",
+        **more,
+    )

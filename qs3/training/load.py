@@ -1,0 +1,124 @@
+"""First stage: the datasets, what training may see of them, and what evaluation holds."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+from qs3.config.hydra import build
+from qs3.data.domain import Domain
+from qs3.data.manifest import read_manifest
+from qs3.data.store import PointSet
+from qs3.datamodules.adaptation import AdaptationData
+from qs3.datamodules.splits import few_of_each_split, labels_of, load_clouds
+from qs3.errors import ConfigError, DataError
+from qs3.evaluation.metrics import Evaluation
+from qs3.evaluation.selection_rules import ORACLE
+from qs3.methods.base import Method
+from qs3.selftraining import oracle
+from qs3.training.provenance import note_start
+from qs3.training.run import Run
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """What the later stages need to know about the data.
+
+    Attributes:
+        data: what training may see.
+        evaluation: the target's evaluated clouds with their labels, which nothing else holds.
+        split: which split of the target is evaluated.
+        stored_points: of a cloud on disk.
+        started: what `started.json` says: hashes of data and config, versions.
+    """
+
+    data: AdaptationData
+    evaluation: Evaluation
+    split: str
+    stored_points: int
+    started: dict[str, Any]
+
+
+def load_data(run: Run, method: Method) -> Loaded:
+    """Open both domains, compare them with what the run was begun with, and load their clouds.
+
+    Target labels go to the method that asks for them by name, and to the evaluation.
+
+    Raises:
+        DataError, ConfigError: data and settings do not fit, or are not those of an earlier start.
+    """
+    cfg = run.cfg
+    data: AdaptationData = build(cfg.data, _partial_=True)(
+        phases=run.phases,
+        scheme=run.scheme,
+        augment=build(cfg.protocol.augment),
+        batch_size=cfg.protocol.batch_size,
+        seed=run.seed,
+        owner=method.labels,
+        uses_target=method.uses_target,
+    )
+    data.prepare_data()
+    source, target = run.source.open(verify=False), run.target.open(verify=False)
+    _check_classes(source, target, cfg.num_classes)
+    started = note_start(run, source, target)
+    data.setup("fit")
+    if (few := cfg.data.clouds_a_split) is not None:
+        target = few_of_each_split(target, few)
+    split = _evaluated_split(target)
+    evaluation = Evaluation(
+        load_clouds(target, split, cfg.data.points, cache_dir=data.target_domain.cache_dir),
+        labels_of(target, split) if split == "test" else None,
+        _labels_by_id(target, "train"),
+        target.classes,
+        cfg.data.eval_batch_size,
+        cfg.evaluation.rotations,
+        _objects_by_id(target, run.target),
+    )
+    if cfg.selection.student == ORACLE:
+        oracle.check(evaluation)
+    return Loaded(data, evaluation, split, target.points.shape[1], started)
+
+
+def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:
+    if source.classes != target.classes:
+        raise DataError(
+            f"{source.name} has the classes {source.classes}, {target.name} {target.classes}; "
+            "they must be the same, in the same order"
+        )
+    if len(source.classes) != num_classes:
+        raise ConfigError(
+            f"num_classes is {num_classes}, but {source.name} has {len(source.classes)} classes; "
+            f"set num_classes={len(source.classes)}"
+        )
+
+
+def _evaluated_split(target: PointSet) -> str:
+    """The test split; the training split if there is no other, e.g. of somebody's own scans."""
+    if "test" in target.counts():
+        if labels_of(target, "test") is None:
+            log.warning("%s has no labels: no accuracy, only counts of predictions", target.name)
+        return "test"
+    log.warning(
+        "%s has no test split: no accuracy, only counts of predictions for its training clouds",
+        target.name,
+    )
+    return "train"
+
+
+def _labels_by_id(dataset: PointSet, split: str) -> dict[str, int] | None:
+    labels = labels_of(dataset, split)
+    if labels is None:
+        return None
+    return dict(zip(dataset.split(split).ids, labels.tolist(), strict=True))
+
+
+def _objects_by_id(dataset: PointSet, domain: Domain) -> dict[str, str]:
+    """What each cloud shows: its mesh, or what the publisher's ids tell; where that is known."""
+    importer = domain.importer()
+    of_id = importer.object_of if importer else lambda _: ""
+    rows = read_manifest(domain.folder, dataset.classes)
+    known = {row.id: row.mesh_sha256 or of_id(row.id) for row in rows}
+    return {id_: name for id_, name in known.items() if name}

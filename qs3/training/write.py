@@ -1,0 +1,147 @@
+"""Last stage: the files of a finished run, and the contents of its `metrics.json`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from qs3.config import hashing
+from qs3.config.hydra import called
+from qs3.data.manifest import read_manifest
+from qs3.evaluation.accuracy_estimates import usual_of
+from qs3.evaluation.ood import limits, strange_clouds
+from qs3.evaluation.selection_rules import LAST
+from qs3.inference.model_file import FILE as RESULT
+from qs3.inference.model_file import Result, write_result
+from qs3.runs.checkpoints import copy_weights
+from qs3.runs.metrics import (
+    DataHashes,
+    EpochScores,
+    Evaluated,
+    Loading,
+    RoundRecord,
+    RunMetrics,
+    Selection,
+    StudentChoice,
+    Times,
+    Warmup,
+)
+from qs3.runs.predictions import FILE as PREDICTIONS
+from qs3.runs.predictions import OF_FILES, write_predictions, write_predictions_of_files
+from qs3.runs.pseudo_labels import path_of
+from qs3.training.build import Built
+from qs3.training.evaluate import Outcome
+from qs3.training.load import Loaded
+from qs3.training.run import Run
+
+
+def write_outcome(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMetrics:
+    """Write the model file and the predictions; returns what `metrics.json` is to hold.
+
+    That file is written last, by the caller: it marks the run as finished.
+    """
+    if built.trainer.is_global_zero:
+        write_result(run.folder / RESULT, _result(run, loaded, outcome))
+        write_predictions(run.folder / PREDICTIONS, outcome.predictions)
+        if not loaded.evaluation.labelled:
+            _write_of_files(run, loaded, outcome)
+    return _metrics(run, loaded, built, outcome)
+
+
+def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMetrics:
+    cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
+    over, before = outcome.turned
+    return RunMetrics(
+        experiment=cfg.experiment_name,
+        hash=hashing.config_hash(cfg),
+        config_sha256=hashing.config_sha256(cfg),
+        seed=run.seed,
+        source=data.labelled_domain.domain.name,
+        target=run.target.name,
+        simulated=bool(run.target.simulated),
+        **called(cfg),
+        selection=_selection(run, loaded, built, outcome),
+        loading=Loading(
+            points=cfg.data.points,
+            fps_starts=data.labelled.clouds.starts,
+            sampler=cfg.data.sampler,
+        ),
+        final=outcome.final,
+        evaluation=Evaluated(
+            split=loaded.split,
+            labels=evaluation.labelled,
+            rotations=evaluation.rotations,
+            norms=cfg.evaluation.norms,
+            final_over_rotations=over,
+            warmup_over_rotations=before,
+        ),
+        warmup=Warmup(
+            selected=EpochScores(epoch=built.warmup.epoch, scores=outcome.scores["selected"]),
+            last=EpochScores(epoch=run.phases.warmup - 1, scores=outcome.scores["last"]),
+        ),
+        rounds=[
+            RoundRecord(
+                **record,
+                with_target_labels=evaluation.pseudo_labels(path_of(run.folder, record["round"])),
+            )
+            for record in built.rounds.records
+        ],
+        student=_student(run, outcome),
+        validators=outcome.validators,
+        quality=outcome.quality,
+        training=outcome.training,
+        data=DataHashes(**loaded.started["data"]),
+        times=Times(seconds=round(built.clock.seconds(), 1)),
+        versions=loaded.started["versions"],
+    )
+
+
+def _selection(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> Selection:
+    """In words, which weights labelled the target first and which are reported."""
+    rule = built.warmup.rule
+    if rule == "source_val":
+        rule = f"{loaded.data.owner}_val"
+    teacher = f"{rule}, epoch {built.warmup.epoch}"
+    student = outcome.choice.in_words if outcome.choice else LAST
+    return Selection(
+        teacher=teacher,
+        student=student if run.scheme.rounds else teacher,
+        validation=run.cfg.data.val,
+    )
+
+
+def _student(run: Run, outcome: Outcome) -> StudentChoice | None:
+    if outcome.choice is None:
+        return None
+    last = EpochScores(epoch=run.phases.total - 1, scores=outcome.scores["student"])
+    return StudentChoice(**outcome.choice.record(), last=last)
+
+
+def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
+    """What is reported, with all that using it elsewhere takes."""
+    model: Any = OmegaConf.to_container(run.cfg.model, resolve=True)
+    return Result(
+        model=model,
+        classes=loaded.evaluation.classes,
+        points=run.cfg.data.points,
+        stored_points=loaded.stored_points,
+        target=run.target.name,
+        gravity=run.target.gravity,
+        usual=limits(loaded.data.all_labelled.clouds, loaded.data.target.clouds),
+        weights=copy_weights(outcome.net),
+    )
+
+
+def _write_of_files(run: Run, loaded: Loaded, outcome: Outcome) -> None:
+    """The predictions by the names of the user's files, with what is odd about each cloud."""
+    rows = read_manifest(run.target.folder, loaded.evaluation.classes)
+    origins = {row.id: row.origin for row in rows if row.origin}
+    test = loaded.evaluation.test
+    strange = strange_clouds(test.clouds, usual_of(loaded.data.all_labelled.clouds))
+    write_predictions_of_files(
+        run.folder / OF_FILES,
+        [origins.get(id_, id_) for id_ in test.ids],
+        ["; ".join(each) for each in strange],
+        outcome.predictions,
+    )
