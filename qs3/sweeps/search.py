@@ -55,7 +55,7 @@ class Judged(OverLauncher):
         loader = self.hydra_context.config_loader
         fixed, searched = split(arguments, self.params, loader)
         cfg = loader.load_sweep_config(self.config, list(fixed))
-        check_objective(cfg.objective, cfg.selection.student)
+        check_objective(cfg.objective)
         if cfg.objective is None:
             raise ConfigError("a search needs an objective; set objective=infomax, say")
         done = self.search(cfg, fixed, searched)

@@ -52,7 +52,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     )
     _refuse_rounds_of_upper_bound(run)
     _refuse_choice_without_rounds(run)
-    check_objective(cfg.objective, cfg.selection.student)
+    check_objective(cfg.objective)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
         with _wandb_forgotten():

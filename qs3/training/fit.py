@@ -40,7 +40,6 @@ from qs3.evaluation.accuracy_estimates import quality_of, usual_of
 from qs3.evaluation.metrics import Evaluation, adapt_norms
 from qs3.evaluation.ood import limits, strange_clouds
 from qs3.evaluation.selection_rules import LAST as LAST_EPOCH
-from qs3.evaluation.selection_rules import ORACLE
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result
 from qs3.methods.base import Method
@@ -53,7 +52,6 @@ from qs3.runs.predictions import (
     write_predictions_of_files,
 )
 from qs3.runs.pseudo_labels import path_of
-from qs3.selftraining import oracle
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED, SelfTraining, WarmupSelection
 from qs3.selftraining.student_loss import Student
 from qs3.selftraining.student_selection import Choice, StudentSelection
@@ -127,8 +125,6 @@ def fit(run: Run) -> dict[str, Any]:
         cfg.evaluation.rotations,
         _objects_by_id(target_set, run.target),
     )
-    if cfg.selection.student == ORACLE:
-        oracle.check(evaluation)
     if not cfg.force:
         take_checkpoint(run, started)
 
@@ -198,9 +194,7 @@ def fit(run: Run) -> dict[str, Any]:
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
     choice = None  # the last epoch's student
-    if student.rule == ORACLE:
-        choice = oracle.choose(run.folder, run.phases, evaluation, trained, classifier.device)
-    elif student.rule != LAST_EPOCH:
+    if student.rule != LAST_EPOCH:
         choice = student.choice()
     if choice is not None:
         final, files["chosen"] = "chosen", choice.file

@@ -16,10 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from qs3.evaluation.selection_rules import ORACLE_IN_WORDS, took_target_labels
-
 FINISHED = "finished"
-DIAGNOSTIC = "diagnostic"
 FEW_SEEDS = 3
 """Below this number of seeds a mean is marked."""
 
@@ -37,10 +34,9 @@ class Run:
         experiment: name.
         hash: of the config without its seed.
         seed: None if not known.
-        status: "finished", "unfinished", "damaged", or "diagnostic": finished, but its epoch was
-            chosen by the target's test labels, so that it is no result.
+        status: "finished", "unfinished" or "damaged".
         metrics: contents of metrics.json; empty unless finished.
-        problem: why it is not finished, or no result.
+        problem: why it is not finished.
     """
 
     folder: Path
@@ -92,8 +88,6 @@ class Group:
         finished: runs with a result, by seed.
         problems: for the reader: unfinished seeds, different datasets, a seed twice.
         comparable: whether the finished runs may be averaged.
-        diagnostic: whether a run of it was chosen by the target's test labels; none of these is
-            among the finished ones.
     """
 
     experiment: str
@@ -101,7 +95,6 @@ class Group:
     finished: tuple[Run, ...]
     problems: tuple[str, ...]
     comparable: bool
-    diagnostic: bool = False
 
     @property
     def first(self) -> Mapping[str, Any]:
@@ -167,11 +160,6 @@ def load_run(folder: str | Path) -> Run:
         return broken("damaged", f"{path.name} has no {', '.join(missing)}")
     if metrics["status"] != FINISHED:
         return broken("unfinished", str(metrics["status"]))
-    if took_target_labels(metrics):
-        why = f"left out, because its student was chosen by the {ORACLE_IN_WORDS}"
-        return Run(
-            folder, metrics["experiment"], metrics["hash"], metrics["seed"], DIAGNOSTIC, {}, why
-        )
     return Run(folder, metrics["experiment"], metrics["hash"], metrics["seed"], FINISHED, metrics)
 
 
@@ -203,8 +191,7 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
             comparable = False
             seen = "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in hashes.items())
             problems.append(f"the {role} dataset differs ({seen}): not averaged")
-    diagnostic = any(run.status == DIAGNOSTIC for run in runs)
-    return Group(*key, tuple(finished), tuple(problems), comparable, diagnostic)
+    return Group(*key, tuple(finished), tuple(problems), comparable)
 
 
 def _list(seeds: Sequence[int | None]) -> str:
@@ -241,10 +228,6 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
         accuracy, balanced = g.stat("final", "accuracy"), g.stat("final", "balanced_accuracy")
         majority = g.stat("final", "majority_rate")
         few = 0 < len(g.finished) < FEW_SEEDS
-        problems = [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
-        if g.diagnostic and not g.finished:
-            notes += problems
-            continue
         lines.append(
             (
                 g.experiment,
@@ -260,7 +243,7 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
         )
         if g.unlabelled:
             notes.append(f"{g.experiment} {g.hash}: no target labels, so no accuracy")
-        notes += problems
+        notes += [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
     if any("(!)" in line[-2] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
