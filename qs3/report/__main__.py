@@ -15,7 +15,7 @@
                                   [out=pipeline.png] [renderer=mitsuba sensor=kinect_v1 ...]
     python -m qs3.report pipeline dataset=FOLDER object=ID [meshes=PATH] [view=0] [out=...]
 
-A table is printed as Markdown and saved as .md, .csv, .tex and .html. `overrides` are those that
+A table is printed as Markdown and saved as .md, .csv and .tex. `overrides` are those that
 the runs had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time;
 called again it goes on. `compare` prints the difference of each row to the row `base`, with its
 interval; `effects` those between columns averaged over rows, and between rows over columns.
@@ -189,16 +189,15 @@ def _effects(options: dict[str, str]) -> None:
 
 def _table(options: dict[str, str]) -> None:
     from qs3.report.tables.formats import csv_text, latex, markdown
-    from qs3.report.tables.page import page
     from qs3.utils.files import write_text
 
     table = _built(options)
     text, at = markdown(table), _saved_at(table, options)
     write_text(f"{at}.md", text)
-    for suffix, write in ((".csv", csv_text), (".tex", latex), (".html", page)):
+    for suffix, write in ((".csv", csv_text), (".tex", latex)):
         write_text(f"{at}{suffix}", write(table))
     print(text)
-    print(f"saved {at}.md, .csv, .tex, .html")
+    print(f"saved {at}.md, .csv, .tex")
 
 
 def _pictures_of_run(options: dict[str, str]) -> None:

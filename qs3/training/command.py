@@ -89,19 +89,15 @@ def objective_of(cfg: DictConfig, metrics: dict[str, Any]) -> float | None:
     """
     if cfg.objective is None:
         return None
-    validators = metrics.get("validators", {})
-    if cfg.objective not in validators:
-        raise ConfigError(
-            f"the run's metrics.json has no {cfg.objective} under validators: it was finished by "
-            "an earlier version, which force=true repeats, or (snd) its target has a single cloud"
-        )
-    value = validators[cfg.objective]
+    if cfg.objective not in metrics["validators"]:
+        raise ConfigError("objective=snd needs a target with two training clouds or more")
+    value = metrics["validators"][cfg.objective]
     return math.nan if value is None else float(value)
 
 
 def judged(cfg: DictConfig, metrics: dict[str, Any]) -> str:
     """The result of a search's trial in one line: no accuracy, it would be nothing to choose by."""
-    value = metrics.get("validators", {}).get(cfg.objective)
+    value = metrics["validators"].get(cfg.objective)
     text = "none: the net has diverged" if value is None else f"{value:.4f}"
     return f"{metrics['experiment']}, seed {metrics['seed']}: objective={cfg.objective} {text}"
 
@@ -112,7 +108,7 @@ def headline(metrics: dict[str, Any]) -> str:
     target = f"{metrics['target']}{' (simulated)' if metrics['simulated'] else ''}"
     if final["accuracy"] is None:
         counts = ", ".join(f"{name} {count}" for name, count in final["predicted"].items() if count)
-        estimate = in_words(metrics.get("quality", {}))
+        estimate = in_words(metrics["quality"])
         return (
             f"{run}: no labels to judge {target} by; predicted {counts}"
             f"{f'; {estimate}' if estimate else ''}{_chosen(metrics)}"

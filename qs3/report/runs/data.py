@@ -1,7 +1,7 @@
 """What a run's folder says about the run, read for its pictures. Needs neither torch nor data.
 
 Everything is read from the files that training writes (see `qs3.runs.folder`); what an unfinished
-or older run does not have is None, and what is damaged is refused by the name of its file.
+run does not have is None, and what is damaged is refused by the name of its file.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class RunFiles:
         metrics: contents of metrics.json; None if the run is not finished.
         history: None if not one epoch is done.
         rounds: in order.
-        predictions: None if there are none (yet, or of an older run).
+        predictions: None if there are none yet.
         classes: names in label order.
         config: as composed, not resolved; None if Hydra did not write it.
         command: that started the run; None likewise.
@@ -157,7 +157,7 @@ def read_run(folder: str | Path) -> RunFiles:
     if (folder / PREDICTIONS).is_file():
         predictions = read_predictions(folder / PREDICTIONS)
     elif metrics is not None:
-        notes.append(f"{PREDICTIONS} is not there: the run is of an older version")
+        notes.append(f"{PREDICTIONS} is gone")
     rounds = _rounds(folder, metrics, notes)
     return RunFiles(
         folder=folder,

@@ -2,7 +2,7 @@
 
 A table is a file of conf/table/. Each cell names a run by its command line; composing it gives the
 config hash by which the runs of its seeds are found under the log folder. This module reads the
-file and finds the runs; `formats` and `table_page` print.
+file and finds the runs; `formats` prints.
 """
 
 from __future__ import annotations
