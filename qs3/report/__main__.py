@@ -241,8 +241,8 @@ def _pictures(options: dict[str, str]) -> None:
     from hydra.utils import instantiate
 
     from qs3.config.compose import composing
+    from qs3.data.contact_sheets import class_sheet, scan_picture
     from qs3.report.figures.class_balance import class_picture
-    from qs3.report.figures.contact_sheets import class_sheet, scan_picture
     from qs3.report.tables.table import check_domain
 
     names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]
