@@ -120,7 +120,7 @@ def _saved_at(table: Table, options: dict[str, str]) -> Path:
 
 
 def _run(options: dict[str, str]) -> int:
-    from qs3.report.tables.running import LAUNCHERS, launch, missing, run_all
+    from qs3.report.tables.running import LAUNCHERS, launch, missing
 
     seeds = [_whole("seeds", word) for word in options.get("seeds", "0,1,2").split(",")]
     rows, columns = (
@@ -138,17 +138,12 @@ def _run(options: dict[str, str]) -> int:
     table = _built(options, runs=False)
     jobs = missing(table, seeds, rows, columns)
     print(f"table {table.name}: {len(jobs)} runs to do", flush=True)
-    if launcher:
-        several = at_once if "jobs" in options else None
-        return launch(jobs, launcher, several, options.get("log_dir", "logs"), settings)
-    failed = run_all(jobs, at_once, lambda line: print(line, flush=True))
-    if failed:
-        print(f"{len(failed)} of {len(jobs)} runs failed:")
-        for job in failed:
-            print(f"  {job.command}")
-        return 1
-    print(f"next: python -m qs3.report table={table.name}")
-    return 0
+    several = at_once if "jobs" in options else None
+    launcher = launcher or ("joblib" if at_once > 1 else "basic")
+    status = launch(jobs, launcher, several, options.get("log_dir", "logs"), settings)
+    if not status:
+        print(f"next: python -m qs3.report table={table.name}")
+    return status
 
 
 def _whole(key: str, word: str) -> int:
