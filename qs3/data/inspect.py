@@ -8,8 +8,8 @@ What the words mean:
                which way is up by the shape, spacing, density, coverage, copies, leaks from train to
                test, odd objects; a contact sheet. Published files are imported first
   compare      class frequencies, spacing, density, coverage, distance to the true surface and how
-               much of it was measured (of generated datasets), Chamfer distances by class, distance
-               of the distributions; both contact sheets beside each other
+               much of it was measured (of generated datasets), how well clouds tell their domain;
+               one object of each class from both, as a picture
   key=value    of the domain's config: variant=points_clean, path=..., published.folder=...; and
                paths.data_dir=data. In a comparison for both, or for one: a.variant=points_clean
   sample=3000  clouds that are measured one by one; larger sets are drawn from

@@ -6,9 +6,6 @@
     entropy     three scores that need no labels at all, of the predictions for the target's
     infomax     training clouds (see `validators`).
     snd
-    oracle      accuracy on the target's test clouds. This is no rule that anybody could follow:
-                a diagnostic of how much the others leave on the table. It never enters a table
-                of results, and training cannot reach what it takes (see `qs3.selftraining.oracle`).
 
 The earliest epoch wins a tie.
 """
@@ -21,19 +18,16 @@ from qs3.errors import ConfigError
 
 LAST = "last"
 PSEUDO_VAL = "pseudo_val"
-ORACLE = "oracle"
-ORACLE_IN_WORDS = "oracle (target test labels: diagnostic only)"
-STUDENT_RULES = (LAST, PSEUDO_VAL, "entropy", "infomax", "snd", ORACLE)
+STUDENT_RULES = (LAST, PSEUDO_VAL, "entropy", "infomax", "snd")
 OBJECTIVES = ("entropy", "infomax", "snd")
 """What a search may ask for: none looks at a label of the target, all judge on the same clouds."""
 
 
-def check_objective(objective: Any, student: Any) -> None:
+def check_objective(objective: Any) -> None:
     """Refuse what a search must not or cannot look at.
 
     Args:
         objective: of the search; None: there is none.
-        student: `selection.student`.
 
     Raises:
         ConfigError: it is no label-free score, or one that differs between trials for no merit.
@@ -49,20 +43,6 @@ def check_objective(objective: Any, student: Any) -> None:
     if objective not in OBJECTIVES:
         raise ConfigError(
             f"objective={objective} is refused: a search chooses hyper-parameters, and on a new "
-            "target there are no labels to choose them by (accuracy and oracle look at those of "
-            f"the test set); set objective={'|'.join(OBJECTIVES)}"
+            "target there are no labels to choose them by (accuracy looks at those of the test "
+            f"set); set objective={'|'.join(OBJECTIVES)}"
         )
-    if student == ORACLE:
-        raise ConfigError(
-            f"selection.student={ORACLE} looks at the target's test labels: no search may use it; "
-            f"set selection.student={LAST}"
-        )
-
-
-def took_target_labels(student: str) -> bool:
-    """Whether a result was chosen by the target's test labels: no table may have it.
-
-    Args:
-        student: of `qs3.runs.metrics.Selection`.
-    """
-    return student.startswith(ORACLE)

@@ -2,7 +2,7 @@
 
 Each of `LABEL_FREE` takes the predictions for the target's training clouds, [n, K] probabilities,
 to one number in nats. `hold_out` draws the pseudo-labelled clouds that `pseudo_val` counts hits on.
-The rules by name: `student_rules`.
+The rules by name: `selection_rules`.
 """
 
 from __future__ import annotations

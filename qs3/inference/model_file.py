@@ -9,8 +9,8 @@ from __future__ import annotations
 import importlib
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -57,18 +57,8 @@ class Result:
 
 def write_result(path: Path, result: Result) -> None:
     """Save it, atomically."""
-    plain = {
-        "qs3": VERSION,
-        "model": dict(result.model),
-        "classes": list(result.classes),
-        "points": result.points,
-        "stored_points": result.stored_points,
-        "target": result.target,
-        "gravity": result.gravity,
-        "usual": {name: list(ends) for name, ends in result.usual.items()},
-        "weights": dict(result.weights),
-    }
-    save(plain, path)
+    values = {field.name: getattr(result, field.name) for field in fields(result)}
+    save({"qs3": VERSION, **values, "classes": list(result.classes)}, path)
 
 
 def find_result(path: str | Path) -> Path:
@@ -89,11 +79,9 @@ def find_result(path: str | Path) -> Path:
             f"{path} is the folder of a run that is not finished: it has no {FILE}; repeat its "
             "command, which goes on where it stopped"
         )
-    inside = sorted(file.parent for file in path.glob(f"*/{FILE}"))
-    if inside:
-        names = ", ".join(str(folder) for folder in inside[:5]) + ", ..." * (len(inside) > 5)
-        raise MissingDataError(f"{path} is no run; it holds {len(inside)} of them: {names}")
-    raise MissingDataError(f"{path} has no {FILE}; give the folder of a finished run")
+    inside = sorted(str(file.parent) for file in path.glob(f"*/{FILE}"))
+    there = f", e.g. {inside[0]}" if inside else ""
+    raise MissingDataError(f"{path} has no {FILE}; give the folder of a finished run{there}")
 
 
 def read_result(path: str | Path) -> Result:
@@ -104,7 +92,7 @@ def read_result(path: str | Path) -> Result:
 
     Raises:
         MissingDataError: no such file.
-        DataError: damaged, not a result, or of an older version.
+        DataError: damaged, or not a result.
     """
     file = find_result(path)
     try:
@@ -114,12 +102,7 @@ def read_result(path: str | Path) -> Result:
             f"{file} is damaged, or holds more than weights and plain values "
             f"({type(error).__name__}); nothing in it was run"
         ) from error
-    if _are_weights(found):
-        raise DataError(
-            f"{file} holds weights alone, as an older version wrote it; delete metrics.json beside "
-            "it and repeat the run's command: it trains nothing again and writes the file anew"
-        )
-    return _Checked(file, found).result()
+    return _checked(file, found)
 
 
 def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
@@ -168,63 +151,33 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
     return make
 
 
-class _Checked:
-    """Takes the values out of a file's dict, naming the one that is not as it should be."""
+def _names(value: Any) -> bool:
+    named = isinstance(value, list) and all(isinstance(name, str) and name for name in value)
+    return named and len(value) >= 2 and len(set(value)) == len(value)
 
-    def __init__(self, file: Path, found: Any) -> None:
-        self.file = file
-        self.found = found if isinstance(found, dict) else {}
 
-    def result(self) -> Result:
-        classes = self._of("classes", list)
-        unique = len({name for name in classes if isinstance(name, str) and name})
-        if len(classes) < 2 or unique != len(classes):
-            raise self._wrong("classes", "names, all different")
-        model = self._of("model", dict)
-        target = model.get("_target_")
-        if not isinstance(target, str) or not _TARGET.fullmatch(target):
-            raise self._wrong("model", "a dict with a `_target_`")
-        if not all(_plain(value) for key, value in model.items() if key != "_target_") or not all(
-            isinstance(key, str) and (key == "_target_" or not key.startswith("_")) for key in model
-        ):
-            raise self._wrong("model", "arguments that are plain values")
-        weights = self._of("weights", dict)
-        if not _are_weights(weights):
-            raise self._wrong("weights", "names and tensors")
-        points, stored = self._points("points"), self._points("stored_points")
-        if points > stored:
-            raise self._wrong("points", f"at most stored_points, {stored}")
-        gravity = self._of("gravity", str)
-        if gravity not in ("z", "none"):
-            raise self._wrong("gravity", "'z' or 'none'")
-        target_name = self._of("target", str)
-        usual = self._usual()
-        return Result(model, tuple(classes), points, stored, target_name, gravity, usual, weights)
+def _is_model(value: Any) -> bool:
+    """A `_target_` and arguments that are plain values; no other key of Hydra's."""
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        return False
+    arguments = {key: one for key, one in value.items() if key != "_target_"}
+    target = value.get("_target_")
+    plain = all(not key.startswith("_") and _plain(one) for key, one in arguments.items())
+    return plain and isinstance(target, str) and bool(_TARGET.fullmatch(target))
 
-    def _usual(self) -> dict[str, list[float]]:
-        usual = self._of("usual", dict)
-        for name, ends in usual.items():
-            known = name in MEASURES and isinstance(ends, list) and len(ends) == 2
-            if not known or not all(isinstance(e, float) and not math.isnan(e) for e in ends):
-                raise self._wrong("usual", f"[low, high] of {', '.join(MEASURES)}")
-        return usual
 
-    def _points(self, key: str) -> int:
-        value = self._of(key, int)
-        if isinstance(value, bool) or not 1 <= value <= _MOST_POINTS:
-            raise self._wrong(key, f"1 to {_MOST_POINTS}")
-        return value
+def _number_of_points(value: Any) -> bool:
+    return type(value) is int and 1 <= value <= _MOST_POINTS
 
-    def _of(self, key: str, kind: type) -> Any:
-        value = self.found.get(key)
-        if not isinstance(value, kind):
-            raise self._wrong(key, f"a {kind.__name__}")
-        return value
 
-    def _wrong(self, key: str, expected: str) -> DataError:
-        return DataError(
-            f"{self.file} is not a result that qs3 wrote, or damaged: {key!r} should be {expected}"
-        )
+def _ranges(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        name in MEASURES
+        and isinstance(ends, list)
+        and len(ends) == 2
+        and all(isinstance(end, float) and not math.isnan(end) for end in ends)
+        for name, ends in value.items()
+    )
 
 
 def _are_weights(found: Any) -> bool:
@@ -240,3 +193,34 @@ def _plain(value: Any) -> bool:
     if isinstance(value, list):
         return all(_plain(each) for each in value)
     return value is None or isinstance(value, bool | int | float | str)
+
+
+_EXPECTED: Mapping[str, tuple[Callable[[Any], bool], str]] = {
+    "model": (_is_model, "a dict with a `_target_` and plain arguments"),
+    "classes": (_names, "a list of names, all different"),
+    "points": (_number_of_points, f"from 1 to {_MOST_POINTS}"),
+    "stored_points": (_number_of_points, f"from 1 to {_MOST_POINTS}"),
+    "target": (lambda value: isinstance(value, str), "a name"),
+    "gravity": (lambda value: value in ("z", "none"), "'z' or 'none'"),
+    "usual": (_ranges, f"[low, high] of {', '.join(MEASURES)}"),
+    "weights": (_are_weights, "names and tensors"),
+}
+"""Of each value of a file what it must be, and that in words."""
+
+
+def _checked(file: Path, found: Any) -> Result:
+    """The file's values as a `Result`.
+
+    Raises:
+        DataError: names the first one that is not as it should be.
+    """
+    found = found if isinstance(found, dict) else {}
+    values = {key: found.get(key) for key in _EXPECTED}
+    wrong = {key: words for key, (fits, words) in _EXPECTED.items() if not fits(values[key])}
+    if not wrong and values["points"] > values["stored_points"]:
+        wrong = {"points": "at most stored_points"}
+    for key, words in wrong.items():
+        raise DataError(
+            f"{file} is not a result that qs3 wrote, or damaged: {key!r} should be {words}"
+        )
+    return Result(**{**values, "classes": tuple(values["classes"])})

@@ -15,7 +15,7 @@
                                   [out=pipeline.png] [renderer=mitsuba sensor=kinect_v1 ...]
     python -m qs3.report pipeline dataset=FOLDER object=ID [meshes=PATH] [view=0] [out=...]
 
-A table is printed as Markdown and saved as .md, .csv, .tex and .html. `overrides` are those that
+A table is printed as Markdown and saved as .md, .csv and .tex. `overrides` are those that
 the runs had beyond the table's. `run` trains what a table lacks, seed by seed, `jobs` at a time;
 called again it goes on. `compare` prints the difference of each row to the row `base`, with its
 interval; `effects` those between columns averaged over rows, and between rows over columns.
@@ -120,7 +120,7 @@ def _saved_at(table: Table, options: dict[str, str]) -> Path:
 
 
 def _run(options: dict[str, str]) -> int:
-    from qs3.report.tables.running import LAUNCHERS, launch, missing, run_all
+    from qs3.report.tables.running import LAUNCHERS, launch, missing
 
     seeds = [_whole("seeds", word) for word in options.get("seeds", "0,1,2").split(",")]
     rows, columns = (
@@ -138,17 +138,12 @@ def _run(options: dict[str, str]) -> int:
     table = _built(options, runs=False)
     jobs = missing(table, seeds, rows, columns)
     print(f"table {table.name}: {len(jobs)} runs to do", flush=True)
-    if launcher:
-        several = at_once if "jobs" in options else None
-        return launch(jobs, launcher, several, options.get("log_dir", "logs"), settings)
-    failed = run_all(jobs, at_once, lambda line: print(line, flush=True))
-    if failed:
-        print(f"{len(failed)} of {len(jobs)} runs failed:")
-        for job in failed:
-            print(f"  {job.command}")
-        return 1
-    print(f"next: python -m qs3.report table={table.name}")
-    return 0
+    several = at_once if "jobs" in options else None
+    launcher = launcher or ("joblib" if at_once > 1 else "basic")
+    status = launch(jobs, launcher, several, options.get("log_dir", "logs"), settings)
+    if not status:
+        print(f"next: python -m qs3.report table={table.name}")
+    return status
 
 
 def _whole(key: str, word: str) -> int:
@@ -189,16 +184,15 @@ def _effects(options: dict[str, str]) -> None:
 
 def _table(options: dict[str, str]) -> None:
     from qs3.report.tables.formats import csv_text, latex, markdown
-    from qs3.report.tables.page import page
     from qs3.utils.files import write_text
 
     table = _built(options)
     text, at = markdown(table), _saved_at(table, options)
     write_text(f"{at}.md", text)
-    for suffix, write in ((".csv", csv_text), (".tex", latex), (".html", page)):
+    for suffix, write in ((".csv", csv_text), (".tex", latex)):
         write_text(f"{at}{suffix}", write(table))
     print(text)
-    print(f"saved {at}.md, .csv, .tex, .html")
+    print(f"saved {at}.md, .csv, .tex")
 
 
 def _pictures_of_run(options: dict[str, str]) -> None:
@@ -242,8 +236,8 @@ def _pictures(options: dict[str, str]) -> None:
     from hydra.utils import instantiate
 
     from qs3.config.compose import composing
+    from qs3.data.contact_sheets import class_sheet, scan_picture
     from qs3.report.figures.class_balance import class_picture
-    from qs3.report.figures.contact_sheets import class_sheet, scan_picture
     from qs3.report.tables.table import check_domain
 
     names = [n.strip() for n in options.get("domains", "").strip("[]").split(",") if n.strip()]

@@ -6,8 +6,7 @@
                   hold out a fifth (pseudo_val)
 
 It only looks: with every rule but `pseudo_val` the run trains as with `last`, to the bit, and with
-`pseudo_val` as far as the last round. Target labels cannot be reached from here. For `oracle` the
-weights of all these epochs are kept, and `qs3.selftraining.oracle` chooses when training is over.
+`pseudo_val` as far as the last round. Target labels cannot be reached from here.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.selection_rules import LAST, ORACLE, ORACLE_IN_WORDS, PSEUDO_VAL
+from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
 from qs3.runs.checkpoints import copy_weights, save
 from qs3.utils.seeding import derive
@@ -37,7 +36,6 @@ from qs3.utils.seeding import derive
 log = logging.getLogger(__name__)
 
 STUDENT_SELECTED = "student_selected.pt"
-CANDIDATES = "candidates"
 
 
 @dataclass(frozen=True)
@@ -63,13 +61,12 @@ class Choice:
     @property
     def in_words(self) -> str:
         """Such as "snd, epoch 57, score 4.2"; what `metrics.json` has as `selection.student`."""
-        name = ORACLE_IN_WORDS if self.rule == ORACLE else self.rule
-        return f"{name}, epoch {self.epoch}, score {self.score:.6g}"
+        return f"{self.rule}, epoch {self.epoch}, score {self.score:.6g}"
 
     def record(self) -> dict[str, Any]:
         """What `metrics.json` has under `student`."""
         return {
-            "rule": ORACLE_IN_WORDS if self.rule == ORACLE else self.rule,
+            "rule": self.rule,
             "epoch": self.epoch,
             "score": _finite(self.score),
             "scores": {str(epoch): _finite(score) for epoch, score in self.scores.items()},
@@ -81,11 +78,6 @@ def _finite(score: float) -> float | None:
     return score if math.isfinite(score) else None  # of a net that has diverged
 
 
-def candidate_path(folder: Path, epoch: int) -> Path:
-    """Where the weights of an epoch of the last round lie, for the oracle."""
-    return folder / CANDIDATES / f"epoch_{epoch:03d}.pt"
-
-
 class StudentSelection(Callback):
     """Scores each epoch of the last round; saves the best weights as `student_selected.pt`.
 
@@ -95,11 +87,11 @@ class StudentSelection(Callback):
     Args:
         folder: of the run.
         phases: of the run.
-        rule: one of `student_rules.STUDENT_RULES`.
+        rule: one of `selection_rules.STUDENT_RULES`.
         classes: names in label order.
 
     Attributes:
-        scores: by epoch, of those of the last round so far; none with `last` and `oracle`.
+        scores: by epoch, of those of the last round so far; none with `last`.
         epoch, score: the best so far; None before there is one.
         held_out: positions in the target's training clouds [h], and their pseudo-labels [h].
     """
@@ -126,15 +118,11 @@ class StudentSelection(Callback):
             self._hold_out(data)
         if phase != last_phase:
             return
-        if self.rule == ORACLE:
+        self._compare(trainer, pl_module, data, epoch)
+        if ends:
             if trainer.is_global_zero:
-                save(copy_weights(pl_module.net), candidate_path(self.folder, epoch))
-        else:
-            self._compare(trainer, pl_module, data, epoch)
-            if ends:
-                if trainer.is_global_zero:
-                    save(self._weights, self.folder / STUDENT_SELECTED)
-                self._weights = None
+                save(self._weights, self.folder / STUDENT_SELECTED)
+            self._weights = None
         trainer.strategy.barrier("epoch of the student kept")
 
     def _compare(
@@ -200,7 +188,7 @@ class StudentSelection(Callback):
         self.held_out, self._weights = state_dict["held_out"], state_dict["weights"]
 
     def choice(self) -> Choice:
-        """What was chosen, when training is over; not for `last` and `oracle`."""
+        """What was chosen, when training is over; not for `last`."""
         assert self.epoch is not None
         assert self.score is not None
         held = 0 if self.held_out is None else len(self.held_out[0])

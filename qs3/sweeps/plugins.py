@@ -11,11 +11,11 @@ from typing import Any
 from hydra.core.plugins import Plugins
 
 from qs3.sweeps.listed_jobs import ListedJobs
-from qs3.sweeps.search import LabelFreeGrid, LabelFreeSearch
+from qs3.sweeps.search import LabelFreeSearch
 
 
 def register() -> None:
     """Tell Hydra of our sweepers, before it looks for one."""
     known: dict[str, Any] = Plugins.instance().class_name_to_class
-    for sweeper in (ListedJobs, LabelFreeGrid, LabelFreeSearch):
+    for sweeper in (ListedJobs, LabelFreeSearch):
         known[f"hydra_plugins.qs3.{sweeper.__name__}"] = sweeper

@@ -1,4 +1,4 @@
-"""What a search prints at its end: every trial, the best one, and the command that repeats it."""
+"""What a search or grid prints at its end: each trial, the best, the command that repeats it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from hydra.core.utils import JobReturn, JobStatus
-
-from qs3.config import hashing
+from qs3.evaluation.validators import LABEL_FREE
 from qs3.report.tables.aggregate import align
 from qs3.sweeps.search_space import overrides
 
 FAILED = "failed"
-DIVERGED = "diverged"
 
 
 @dataclass(frozen=True)
@@ -34,25 +31,21 @@ class Tried:
     run: str
 
     @staticmethod
-    def of(number: int, params: Mapping[str, str], result: JobReturn) -> Tried:
-        """From what Hydra says of a job."""
-        if result.status != JobStatus.COMPLETED:
+    def of(number: int, params: Mapping[str, str], value: float | None, run: str) -> Tried:
+        """A trial with what `objective_of` said of its run: None if that failed, NaN: diverged."""
+        if value is None:
             return Tried(number, params, None, FAILED)
-        name, value = hashing.run_name(result.cfg), float(result.return_value)  # type: ignore[arg-type]
-        if not math.isfinite(value):  # see `qs3.training.command.objective_of`
-            return Tried(number, params, None, f"{DIVERGED}: {name}")
-        return Tried(number, params, value, name)
+        if not math.isfinite(value):
+            return Tried(number, params, None, f"diverged: {run}")
+        return Tried(number, params, value, run)
 
 
-def report(
-    headline: str, objective: str, lower: bool, tried: Sequence[Tried], fixed: Sequence[str]
-) -> str:
+def report(headline: str, objective: str, tried: Sequence[Tried], fixed: Sequence[str]) -> str:
     """A table of all trials, without a look at any accuracy.
 
     Args:
         headline: first line.
-        objective: name.
-        lower: whether low values are the good ones.
+        objective: one of `LABEL_FREE`.
         tried: in the order of their numbers.
         fixed: overrides that all of them share.
     """
@@ -62,16 +55,16 @@ def report(
         value = "-" if one.value is None else f"{one.value:.4f}"
         values = (one.params.get(key, "-") for key in keys)
         rows.append((str(one.number), value, *values, one.run))
-    words = [headline, *align(rows)]
-    judged = [(one.value, one) for one in tried if one.value is not None]
+    lines = [headline, *align(rows)]
+    judged = [one for one in tried if one.value is not None]
     if judged:
-        pick = min if lower else max
-        best = pick(judged, key=lambda pair: pair[0])[1]  # the first one wins a tie
+        sign = 1 if LABEL_FREE[objective].higher_is_better else -1
+        best = max(judged, key=lambda one: sign * (one.value or 0.0))  # the first one wins a tie
         search = ("hparams_search=", "objective=", "seed=")
         kept = [word for word in fixed if not word.startswith(search)]
         command = shlex.join([*kept, *overrides(best.params), "seed=0,1,2"])
-        words.append(f"Best: trial {best.number}. With several seeds:")
-        words.append(f"  python train.py -m {command}")
+        lines.append(f"Best: trial {best.number}. With several seeds:")
+        lines.append(f"  python train.py -m {command}")
     elif tried:
-        words.append(f"No trial has a finite {objective}, so there is no best one")
-    return "\n".join(words)
+        lines.append(f"No trial has a finite {objective}, so there is no best one")
+    return "\n".join(lines)

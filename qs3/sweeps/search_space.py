@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import (
     ChoiceSweep,
@@ -22,64 +21,41 @@ from qs3.errors import ConfigError
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
 
-_JUDGES = "all trials have to be judged in the same way, which is settled before the search"
-_PROBLEM = "scores on other data, or of another problem, say nothing about which setting is better"
-_NO_MATTER = "it changes no result, so that there is nothing to choose"
-_REFUSED = {
-    **dict.fromkeys(("objective", "selection"), _JUDGES),
-    **dict.fromkeys(("data", "domain", "experiment", "num_classes", "evaluation"), _PROBLEM),
-    "debug": "it belongs to single runs",
-    **dict.fromkeys(
-        (
-            *("paths", "logger", "report", "force", "ckpt_path", "experiment_name"),
-            *("hparams_search", "hydra"),
-        ),
-        _NO_MATTER,
-    ),
-}
-"""By the first word of a key: why no search varies it."""
+VARIED = ("method", "model", "protocol", "selftraining")
+"""First words of the keys that may differ between runs of which an objective chooses one."""
 
 
 def split(
-    arguments: Sequence[str], params: Mapping[str, Any], loader: ConfigLoader
+    arguments: Sequence[str], params: Mapping[str, Any], parser: OverridesParser | None = None
 ) -> tuple[list[str], dict[str, Override]]:
-    """Overrides that all trials share, and what is searched, by key.
+    """Overrides that all runs share, and what is varied, by key.
 
     Args:
         arguments: of the command line; they replace `params` of the same key.
-        params: by key a value, or what to search in Hydra's grammar for sweeps.
-        loader: Hydra's.
+        params: by key a value, or what to vary in Hydra's grammar for sweeps.
+        parser: Hydra's.
+    """
+    parser = parser or OverridesParser.create()
+    by_key = {one.get_key_element(): one for one in parser.parse_overrides(list(arguments))}
+    for one in parser.parse_overrides([f"{key}={value}" for key, value in params.items()]):
+        by_key.setdefault(one.get_key_element(), one)
+    varied = {key: one for key, one in by_key.items() if one.is_sweep_override()}
+    return [str(one.input_line) for key, one in by_key.items() if key not in varied], varied
+
+
+def check_varied(varied: Iterable[Override]) -> None:
+    """Refuse to vary what says how runs are judged, on which data, or what changes no result.
 
     Raises:
-        ConfigError: there is nothing to search, or something that no search may vary.
+        ConfigError: a key is not below `VARIED`, or a group is put at a place that is not.
     """
-    parse = OverridesParser.create(config_loader=loader)
-    by_key = {o.get_key_element(): o for o in parse.parse_overrides(list(arguments))}
-    for one in parse.parse_overrides([f"{key}={value}" for key, value in params.items()]):
-        by_key.setdefault(one.get_key_element(), one)  # what was typed counts
-    searched = {key: one for key, one in by_key.items() if one.is_sweep_override()}
-    for one in searched.values():
-        _refuse(one)
-    if not searched:
-        raise ConfigError(
-            "there is nothing to search; set hydra.sweeper.params, or key='interval(low,high)'"
-        )
-    return [str(o.input_line) for o in by_key.values() if not o.is_sweep_override()], searched
-
-
-def _refuse(one: Override) -> None:
-    """Raise for a key that no search varies, also for a group that is put at such a place."""
-    for place in (one.key_or_group, one.package or ""):
-        root = place.replace("/", ".").split(".")[0]
-        if root == "seed":
+    for one in varied:
+        places = [one.key_or_group, *([one.package] if one.package else [])]
+        if any(place.replace("/", ".").split(".")[0] not in VARIED for place in places):
             raise ConfigError(
-                "a search tries each setting with one seed, because seeds are nothing to choose "
-                "by; give one seed, and repeat the best setting with several afterwards"
-            )
-        if root in _REFUSED:
-            raise ConfigError(
-                f"{one.input_line} cannot be searched: {_REFUSED[root]}; give "
-                f"{one.get_key_element()} one value"
+                f"{one.input_line}: where objective= chooses among runs, they differ in "
+                f"{', '.join(f'{root}.*' for root in VARIED)} alone, so that all are judged in the "
+                f"same way; give {one.get_key_element()} one value"
             )
 
 
@@ -95,7 +71,7 @@ def distribution(one: Override) -> BaseDistribution:
         if isinstance(sweep, ChoiceSweep):
             return _choice(sweep)
         if isinstance(sweep, IntervalSweep):
-            return _interval(sweep, log_scale)
+            return _numbers(sweep.start, sweep.end, log=log_scale)
         if isinstance(sweep, RangeSweep) and not log_scale:
             return _range(sweep)
     except ValueError as error:
@@ -115,36 +91,33 @@ def _choice(sweep: ChoiceSweep) -> BaseDistribution:
 
     plain = [one.text if isinstance(one, QuotedString) else one for one in sweep.list]
     if odd := [one for one in plain if isinstance(one, list | dict)]:
-        raise ValueError(f"{odd[0]} is no word, number, true, false or null")
+        raise ValueError(f"{odd[0]} is not a word, number, true, false or null")
     return CategoricalDistribution(plain)  # type: ignore[arg-type]
 
 
-def _interval(sweep: IntervalSweep, log_scale: bool) -> BaseDistribution:
-    from optuna.distributions import FloatDistribution, IntDistribution
-
-    low, high = sweep.start, sweep.end
-    assert low is not None
-    assert high is not None
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"{low} to {high} is no interval")
-    if log_scale and low <= 0:
-        raise ValueError(f"{low} has no logarithm")
-    if isinstance(low, int) and isinstance(high, int):
-        return IntDistribution(low, high, log=log_scale)
-    return FloatDistribution(float(low), float(high), log=log_scale)
-
-
 def _range(sweep: RangeSweep) -> BaseDistribution:
+    ends = (sweep.start, sweep.stop, sweep.step)
+    if not all(math.isfinite(value or 0) for value in ends) or sweep.step <= 0:
+        raise ValueError(f"{ends[0]} to {ends[1]} in steps of {ends[2]} does not run up to an end")
+    values = list(sweep.range())  # without its end
+    if not values:
+        raise ValueError(f"{ends[0]} to {ends[1]} is empty")
+    return _numbers(values[0], round(values[-1], 10), step=sweep.step)
+
+
+def _numbers(low: Any, high: Any, **more: Any) -> BaseDistribution:
+    """From low to high, whole numbers if both ends are.
+
+    Raises:
+        ValueError: an end is not finite, low > high, or a logarithm does not exist.
+    """
     from optuna.distributions import FloatDistribution, IntDistribution
 
-    ends = (sweep.start, sweep.stop, sweep.step)
-    start, stop, step = (float(value or 0) for value in ends)
-    if not (all(map(math.isfinite, (start, stop, step))) and start < stop and step > 0):
-        raise ValueError(f"{ends[0]} to {ends[1]} in steps of {ends[2]} is empty, or runs down")
-    values = list(sweep.range())  # without its end
-    if all(isinstance(value, int) for value in values):
-        return IntDistribution(int(values[0]), int(values[-1]), step=int(sweep.step))
-    return FloatDistribution(float(values[0]), round(float(values[-1]), 10), step=float(sweep.step))
+    if isinstance(low, int) and isinstance(high, int):
+        return IntDistribution(low, high, **more)
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError(f"{low} to {high} is not an interval")
+    return FloatDistribution(float(low), float(high), **more)
 
 
 def words(params: Mapping[str, Any]) -> dict[str, str]:

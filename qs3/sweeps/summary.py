@@ -1,4 +1,8 @@
-"""What a multirun says at its end: mean and SEM over seeds, then every job that failed."""
+"""What a multirun says at its end: mean and SEM over seeds, then every job that failed.
+
+With `objective=`, by which the runs of a grid or a search are compared without labels, it says the
+objective of each instead of accuracies, and refuses beforehand to vary how runs are judged.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,11 @@ from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from qs3.errors import ConfigError
+from qs3.evaluation.selection_rules import check_objective
 from qs3.runs.metrics import METRICS
 from qs3.sweeps.plugins import register
+from qs3.sweeps.search_space import check_varied, split
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +33,7 @@ _NO_END = "did not end: killed, interrupted or still running; the same command g
 
 
 class SummaryOfSeeds(Callback):
-    """After a multirun: mean and SEM over the seeds of each config, and what failed.
+    """After a multirun: mean and SEM over the seeds of each config, or objectives; what failed.
 
     Jobs may run in other processes and on other machines (joblib, submitit), so what becomes of
     them is noted in a file beside the runs; its name travels to the jobs inside this object.
@@ -39,10 +46,14 @@ class SummaryOfSeeds(Callback):
         self.table = table
         self.journal: Path | None = None
         self._main = 0
+        self.objective: str | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Begin a new list."""
+        """Begin a new list; leave if an objective could not compare the runs."""
         register()
+        self.objective = config.get("objective")
+        if self.objective is not None:
+            _check_fair(config)
         self._main = os.getpid()
         self.journal = _new_file(Path(config.hydra.sweep.dir).resolve())
         # Hydra leaves a sweep by the first failed job's exception, past `on_multirun_end`; the
@@ -60,11 +71,12 @@ class SummaryOfSeeds(Callback):
         """
         if self.journal is None:
             return
-        error = getattr(job_return, "_return_value", None)
-        text = in_words(error) if isinstance(error, Exception) else ""
+        returned = getattr(job_return, "_return_value", None)
+        text = in_words(returned) if isinstance(returned, Exception) else ""
         if text and text not in (entry.get("error") for entry in self._read()[0]):
             log.error("%s failed: %s", " ".join(job_return.overrides), text)
-        self._note(config, overrides=list(job_return.overrides), error=text)
+        value = returned if isinstance(returned, float) else None
+        self._note(config, overrides=list(job_return.overrides), error=text, value=value)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Print the summary."""
@@ -73,7 +85,8 @@ class SummaryOfSeeds(Callback):
     def _note(self, config: DictConfig, **more: Any) -> None:
         if self.journal is None:
             return
-        entry = {"folder": str(config.hydra.runtime.output_dir), **more}
+        hydra = config.hydra
+        entry = {"folder": str(hydra.runtime.output_dir), "job": hydra.job.get("num", 0), **more}
         try:  # never made here: a job that ends after the summary leaves nothing behind
             handle = os.open(self.journal, os.O_WRONLY | os.O_APPEND)
         except FileNotFoundError:
@@ -89,7 +102,9 @@ class SummaryOfSeeds(Callback):
         self.journal.unlink(missing_ok=True)
         self.journal = None
         folders = sorted({Path(job["folder"]) for job in jobs})
-        if self.table and any((folder / METRICS).is_file() for folder in folders):
+        if self.table and self.objective is not None:
+            sys.stdout.write(objectives(jobs, self.objective) + "\n")
+        elif self.table and any((folder / METRICS).is_file() for folder in folders):
             sys.stdout.write(summarise(folders, differences(jobs)) + "\n")
         sys.stdout.write(failures(jobs))
         if unreadable:
@@ -164,6 +179,37 @@ def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
         Path(job["folder"]): " ".join(f"{key}={one[key]}" for key in several if key in one)
         for job, one in zip(jobs, words, strict=True)
     }
+
+
+def objectives(jobs: Sequence[Mapping[str, Any]], name: str) -> str:
+    """A table of the runs' objectives and the best of them, without a look at any accuracy.
+
+    Args:
+        jobs: with "folder", "job" (its number), "overrides", and "value" if it ended.
+        name: of the objective.
+    """
+    from qs3.sweeps.search_report import Tried, report
+
+    jobs = sorted(jobs, key=lambda job: job["job"])
+    words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
+    varied = [key for key in words[0] if len({one.get(key) for one in words}) > 1]
+    tried = []
+    for job, one in zip(jobs, words, strict=True):
+        run = "/".join(Path(job["folder"]).parts[-2:])
+        params = {key: one[key] for key in varied}
+        tried.append(Tried.of(job["job"], params, job.get("value"), run))
+    fixed = [word for word in jobs[0]["overrides"] if word.partition("=")[0] not in varied]
+    return report(f"{name}, which needs no labels, of each run", name, tried, fixed)
+
+
+def _check_fair(config: DictConfig) -> None:
+    """Leave, with a message, unless the runs differ in nothing that says how they are judged."""
+    params = config.hydra.sweeper.get("params") or {}
+    try:
+        check_objective(config.objective)
+        check_varied(split(config.hydra.overrides.task, params)[1].values())
+    except ConfigError as error:  # Hydra makes a warning of a callback's exception
+        raise SystemExit(f"{type(error).__name__}: {error}") from error
 
 
 def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:

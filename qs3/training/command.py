@@ -51,7 +51,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     )
     _refuse_rounds_of_upper_bound(run)
     _refuse_choice_without_rounds(run)
-    check_objective(cfg.objective, cfg.selection.student)
+    check_objective(cfg.objective)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
         with _wandb_forgotten():
@@ -90,7 +90,7 @@ def objective_of(cfg: DictConfig, metrics: RunMetrics) -> float | None:
         return None
     if cfg.objective not in metrics.validators:
         raise ConfigError(
-            f"the run has no score {cfg.objective}: its target has a single training cloud"
+            f"objective={cfg.objective} needs a target with two training clouds or more"
         )
     value = metrics.validators[cfg.objective]
     return math.nan if value is None else value

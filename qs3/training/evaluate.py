@@ -11,11 +11,10 @@ from torch import nn
 
 from qs3.evaluation.accuracy_estimates import quality_of
 from qs3.evaluation.metrics import adapt_norms
-from qs3.evaluation.selection_rules import LAST, ORACLE
+from qs3.evaluation.selection_rules import LAST
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
-from qs3.selftraining import oracle
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
 from qs3.selftraining.student_selection import Choice
 from qs3.training.build import Built
@@ -86,7 +85,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     device = nets.device
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
-    choice = _choice(run, loaded, built, nets)
+    choice = None if built.student.rule == LAST else built.student.choice()
     reported = "student" if run.scheme.rounds else "selected"
     file = choice.file if choice else files[reported]
     net = nets(file)
@@ -116,13 +115,6 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
             else None
         ),
     )
-
-
-def _choice(run: Run, loaded: Loaded, built: Built, nets: SavedNets) -> Choice | None:
-    """Which epoch of the last round is reported; None: the last one."""
-    if built.student.rule == ORACLE:
-        return oracle.choose(run.folder, run.phases, loaded.evaluation, nets, nets.device)
-    return None if built.student.rule == LAST else built.student.choice()
 
 
 def _quality(

@@ -14,9 +14,7 @@ from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.splits import few_of_each_split, labels_of, load_clouds
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
-from qs3.evaluation.selection_rules import ORACLE
 from qs3.methods.base import Method
-from qs3.selftraining import oracle
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
 
@@ -77,8 +75,6 @@ def load_data(run: Run, method: Method) -> Loaded:
         cfg.evaluation.rotations,
         _objects_by_id(target, run.target),
     )
-    if cfg.selection.student == ORACLE:
-        oracle.check(evaluation)
     return Loaded(data, evaluation, split, target.points.shape[1], started)
 
 

@@ -18,7 +18,6 @@ from qs3.data.store import PointSet
 from qs3.datamodules.fps_cache import remove_old_leftovers
 from qs3.errors import ConfigError
 from qs3.runs import folder as runs
-from qs3.selftraining.student_selection import CANDIDATES
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
 from qs3.utils.version import VERSION
@@ -47,7 +46,7 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
                 "while they started?); start it again"
             )
         return now
-    for folder in (run.folder, run.folder / CANDIDATES, *run.folder.glob("round_*")):
+    for folder in (run.folder, *run.folder.glob("round_*")):
         remove_leftovers(folder)
     if run.cfg.data.cache_dir:
         remove_old_leftovers(Path(run.cfg.data.cache_dir))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.evaluation.selection_rules import STUDENT_RULES, took_target_labels
+from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.evaluation.validators import (
     LABEL_FREE,
     entropy,
@@ -152,7 +152,6 @@ def test_many_clouds_do_not_need_all_similarities_at_once():
         ("infomax", [0.5, 0.7, 0.7, 0.6], 1),
         ("snd", [2.0, 1.0], 0),
         ("pseudo_val", [0.5, 0.5, 0.9], 2),
-        ("oracle", [0.5, 0.4], 0),
         ("entropy", [math.nan, 0.6, math.nan, 0.5], 3),
         ("snd", [math.nan, math.nan], 0),
     ],
@@ -198,19 +197,4 @@ def test_another_seed_holds_others_out():
 
 
 def test_every_rule_has_a_name_and_every_score_a_rule():
-    assert ("last", "pseudo_val", *LABEL_FREE, "oracle") == STUDENT_RULES
-
-
-@pytest.mark.parametrize(
-    ("selection", "answer"),
-    [
-        ({"student": "oracle (target test labels: diagnostic only), epoch 3, score 0.5"}, True),
-        ({"student": "oracle"}, True),
-        ({"student": "last"}, False),
-        ({"student": "snd, epoch 3, score 2"}, False),
-        ({}, False),
-        (None, False),
-    ],
-)
-def test_who_looked_at_target_labels(selection, answer):
-    assert took_target_labels({"selection": selection}) is answer
+    assert ("last", "pseudo_val", *LABEL_FREE) == STUDENT_RULES

@@ -288,12 +288,6 @@ def test_truncated_files_are_damaged(run, tmp_path):
             qs3.load(tmp_path / "cut.pt")
 
 
-def test_weights_alone_say_what_to_do(run, tmp_path):
-    torch.save(plain(run)["weights"], tmp_path / "result.pt")
-    with pytest.raises(DataError, match=r"older version.*metrics\.json"):
-        qs3.load(tmp_path)
-
-
 def test_domain_norms_are_those_of_the_target(run, tmp_path):
     torch.manual_seed(0)
     net = dgcnn(3, k=6, norm="domain")

@@ -16,8 +16,13 @@ from tests.report.made_runs import write_run
 
 
 def config(folder: Path, *overrides: str):
-    hydra = {"runtime": {"output_dir": str(folder)}, "overrides": {"task": list(overrides)}}
-    return OmegaConf.create({"hydra": {**hydra, "sweep": {"dir": str(folder)}}})
+    hydra = {
+        "runtime": {"output_dir": str(folder)},
+        "overrides": {"task": list(overrides)},
+        "sweep": {"dir": str(folder)},
+        "job": {},
+    }
+    return OmegaConf.create({"hydra": hydra})
 
 
 def ended(summary: SummaryOfSeeds, folder, error: Exception | None = None, seed: int = 0) -> None:

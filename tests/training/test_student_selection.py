@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import subprocess
@@ -14,9 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from omegaconf import open_dict
 
-import qs3.selftraining.oracle
 import qs3.selftraining.student_selection
 from qs3.config import hashing
 from qs3.config.hydra import build
@@ -24,14 +21,12 @@ from qs3.data.store import open_pointset
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, SelectionError
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.selection_rules import ORACLE_IN_WORDS, STUDENT_RULES
+from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.evaluation.validators import LABEL_FREE, hold_out
-from qs3.report.tables.aggregate import group, load_runs, summarise
-from qs3.report.tables.table import build_table, markdown
 from qs3.runs.checkpoints import copy_weights, load
 from qs3.runs.metrics import read_metrics
 from qs3.runs.pseudo_labels import read_pseudo_labels
-from qs3.selftraining.student_selection import StudentSelection, candidate_path
+from qs3.selftraining.student_selection import StudentSelection
 from qs3.training.command import headline, train
 from tests.training.conftest import result_of
 from tests.training.test_fit import copy_with_other_labels
@@ -44,8 +39,10 @@ from tests.training.test_target_labels import (  # noqa: F401 (watch is a fixtur
 from tests.training.toy import CLASSES, overrides, toy_config, write_domain
 
 RULES = STUDENT_RULES[1:]
-FAST = ("pseudo_val", "oracle")  # beside these, `make test-all` runs the rules without labels
-SOME_RULES = (*FAST, *(pytest.param(rule, marks=pytest.mark.slow) for rule in LABEL_FREE))
+FAST = ("pseudo_val", "snd")  # `make test-all` runs the others, too
+SOME_RULES = tuple(
+    pytest.param(rule, marks=[] if rule in FAST else pytest.mark.slow) for rule in RULES
+)
 LAST_ROUND = range(7, 10)  # epochs; 0 to 3 are the warm-up, 4 to 6 round 0
 WEIGHTS = ("warmup_selected.pt", "warmup_last.pt", "student.pt")
 
@@ -54,18 +51,30 @@ Trained = Callable[[str], Path]
 
 @pytest.fixture(scope="module")
 def by_rule(toy_data: Path, finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """Folder of the toy run with a rule, trained when first asked for."""
+    """Folder of the toy run with a rule, trained when first asked for; see also `epoch_file`."""
     folders = {"last": finished}
 
     def trained(rule: str) -> Path:
         if rule not in folders:
             root = tmp_path_factory.mktemp(rule)
             cfg = toy_config(root, f"paths.data_dir={toy_data}", f"selection.student={rule}")
-            train(cfg)
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(StudentSelection, "_score", keep_and_score)
+                train(cfg)
             folders[rule] = hashing.run_folder(cfg)
         return folders[rule]
 
     return trained
+
+
+def epoch_file(run: Path, epoch: int) -> Path:
+    """Weights of an epoch of the last round, of a run of `by_rule`."""
+    return run.parent / f"epoch_{epoch}.pt"
+
+
+def keep_and_score(self, net, data, classifier, score=StudentSelection._score):
+    torch.save(copy_weights(net), epoch_file(self.folder, classifier.current_epoch))
+    return score(self, net, data, classifier)
 
 
 def metrics_of(folder: Path) -> dict[str, Any]:
@@ -98,24 +107,17 @@ def test_last_is_the_default_and_leaves_nothing_behind(finished):
     assert metrics.selection.student == "last"
     assert "student" not in metrics
     assert not (finished / "student_selected.pt").exists()
-    assert not (finished / "candidates").exists()
     assert "StudentSelection" not in load(finished / "last.ckpt")["callbacks"]
     assert headline(metrics).endswith(
         f"; teacher selected by {metrics['selection']['teacher']}; student by last"
     )
 
 
-def test_runs_from_before_there_was_a_choice_are_found(toy):
-    cfg = toy()
-    old = cfg.copy()
-    with open_dict(old):
-        del old.selection["student"]
-    assert hashing.config_sha256(old) == hashing.config_sha256(cfg)
-    hashes = {hashing.config_sha256(toy(f"selection.student={rule}")) for rule in RULES}
-    assert len(hashes | {hashing.config_sha256(cfg)}) == 6
+def test_each_rule_is_a_run_of_its_own(toy):
+    assert len({hashing.config_sha256(toy(f"selection.student={r}")) for r in STUDENT_RULES}) == 5
 
 
-@pytest.mark.parametrize("rule", [*LABEL_FREE, "oracle"])
+@pytest.mark.parametrize("rule", LABEL_FREE)
 def test_a_rule_without_held_out_clouds_only_looks(by_rule, finished, rule):
     ours, theirs = result_of(by_rule(rule)), result_of(finished)
     ours, theirs = ({k: v for k, v in r.items() if k != "metrics"} for r in (ours, theirs))
@@ -133,12 +135,11 @@ def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
     best = (min if rule == "entropy" else max)(scores.values())
     assert student["score"] == best
     assert student["epoch"] == min(epoch for epoch in scores if scores[epoch] == best)
-    name = ORACLE_IN_WORDS if rule == "oracle" else rule
-    said = f"{name}, epoch {student['epoch']}, score {best:.6g}"
-    assert metrics.selection.student == said
+    said = f"{rule}, epoch {student['epoch']}, score {best:.6g}"
+    assert metrics["selection"]["student"] == said
     assert headline(metrics).endswith(f"; student by {said}")
-    assert student["rule"] == name
-    assert metrics.final == student["selected"]
+    assert student["rule"] == rule
+    assert metrics["final"] == student["selected"]
     assert student["last"]["epoch"] == 9
     if rule != "pseudo_val":  # there the last round was trained on fewer clouds
         last = {k: v for k, v in student["last"].items() if k != "epoch"}
@@ -149,19 +150,19 @@ def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
 def test_scores_are_those_of_each_epoch_on_the_targets_training_clouds(
     by_rule, toy, toy_data, rule
 ):
-    """Again from the weights of each epoch, which the run with the oracle has kept."""
+    """Again from the weights of each epoch."""
     from qs3.datamodules.adaptation import load_clouds
 
-    kept, cfg = by_rule("oracle"), toy()
+    folder, cfg = by_rule(rule), toy()
     points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
-    student = metrics_of(by_rule(rule))["student"]
+    student = metrics_of(folder)["student"]
     for epoch in LAST_ROUND:
-        table = table_of(cfg, candidate_path(kept, epoch), points)
+        table = table_of(cfg, epoch_file(folder, epoch), points)
         score = LABEL_FREE[rule].score(table)
         assert student["scores"][str(epoch)] == pytest.approx(score, abs=1e-6)
-    chosen = by_rule(rule) / "student_selected.pt"
-    assert same_weights(chosen, candidate_path(kept, student["epoch"]))
-    assert same_weights(by_rule(rule) / "result.pt", chosen)
+    chosen = folder / "student_selected.pt"
+    assert same_weights(chosen, epoch_file(folder, student["epoch"]))
+    assert same_weights(folder / "result.pt", chosen)
 
 
 def test_another_epoch_than_the_last_is_reported(toy, monkeypatch):
@@ -278,36 +279,7 @@ def test_too_few_to_hold_out(toy, monkeypatch):
         train(toy("selection.student=pseudo_val"))
 
 
-# --- the oracle --------------------------------------------------------------------------------
-
-
-def test_the_oracle_is_the_best_epoch_on_the_test_set(by_rule, toy, toy_data):
-    from qs3.datamodules.adaptation import load_clouds
-
-    folder, cfg = by_rule("oracle"), toy()
-    target = open_pointset(toy_data / "kinectsim10")
-    points = load_clouds(target, "test", points=32).points
-    labels = target.labels[target.indices("test")]
-    student = metrics_of(folder)["student"]
-    files = sorted((folder / "candidates").iterdir())
-    assert [file.name for file in files] == [f"epoch_{epoch:03d}.pt" for epoch in LAST_ROUND]
-    for file, score in zip(files, student["scores"].values(), strict=True):
-        assert score == (table_of(cfg, file, points).argmax(axis=1) == labels).mean()
-    assert metrics_of(folder)["final"]["accuracy"] == max(student["scores"].values())
-    assert same_weights(folder / "result.pt", candidate_path(folder, student["epoch"]))
-
-
-def test_the_oracle_is_loud(toy, caplog):
-    with caplog.at_level(logging.INFO):
-        train(toy("selection.student=oracle"))
-    said = [line for line in caplog.text.splitlines() if ORACLE_IN_WORDS in line]
-    assert len(said) == 2  # a warning when it chooses, and the headline
-    assert "accuracy" in said[1]
-
-
-def test_the_oracle_judges_with_the_norms_that_are_reported(toy):
-    metrics = train(toy("selection.student=oracle", "evaluation.norms=adabn"))
-    assert metrics.final.accuracy == metrics.student.score
+# --- the target's labels ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rule", SOME_RULES)
@@ -321,13 +293,8 @@ def test_other_target_labels_change_no_weights(by_rule, toy, toy_data, tmp_path,
     folder, theirs = hashing.run_folder(cfg), metrics_of(by_rule(rule))
     for name in WEIGHTS:
         assert same_weights(folder / name, by_rule(rule) / name)
-    if rule == "oracle":
-        assert metrics.student.scores != theirs.student.scores
-        for epoch in LAST_ROUND:
-            assert same_weights(candidate_path(folder, epoch), candidate_path(by_rule(rule), epoch))
-    else:
-        assert metrics.selection == theirs.selection
-        assert same_weights(folder / "student_selected.pt", by_rule(rule) / "student_selected.pt")
+    assert metrics["selection"] == theirs["selection"]
+    assert same_weights(folder / "student_selected.pt", by_rule(rule) / "student_selected.pt")
 
 
 @pytest.mark.parametrize("rule", SOME_RULES)
@@ -343,31 +310,6 @@ def test_no_target_label_within_reach(toy, tmp_path, request, rule):
     assert watching.keys == {"points", "y_source", "y_pseudo"}
 
 
-# --- tables ------------------------------------------------------------------------------------
-
-
-def test_no_table_has_the_oracle(by_rule, finished):
-    folder = by_rule("oracle")
-    (found,) = group(load_runs(folder.parent))
-    assert found.finished == ()
-    assert found.stat("final", "accuracy") is None
-    text = summarise([folder, finished])
-    said = f"seed 0: left out, because its student was chosen by the {ORACLE_IN_WORDS} ({folder})"
-    assert text.endswith(said) or f"{said}\n" in text
-    rows = [line for line in text.splitlines() if line.startswith("quickstart  ")]
-    assert len(rows) == 1
-    assert f"{100 * metrics_of(finished)['final']['accuracy']:.1f}" in rows[0]
-    assert summarise([folder]).count("quickstart  ") == 0
-    table = build_table("quickstart", folder.parents[1])
-    assert f"- runs left out: 1, chosen by the {ORACLE_IN_WORDS}\n" in markdown(table)
-
-
-def test_a_cell_may_not_ask_for_it(tmp_path):
-    with pytest.raises(ConfigError, match=r"table cell '.*', '.*': selection\.student=oracle.*out"):
-        build_table("quickstart", tmp_path, extra=["selection.student=oracle"])
-    build_table("quickstart", tmp_path, extra=["selection.student=snd"])
-
-
 # --- interruptions -----------------------------------------------------------------------------
 
 
@@ -380,7 +322,7 @@ def everywhere() -> list[Any]:
         ("on_train_epoch_end", 10),
         ("on_train_end", 1),
     ]
-    fast = [("pseudo_val", *places[1]), ("snd", *places[2]), ("oracle", *places[3])]
+    fast = [("pseudo_val", *places[1]), ("snd", *places[2]), ("infomax", *places[3])]
     every = [(rule, *place) for rule in RULES for place in places]
     return [pytest.param(*p, marks=[] if p in fast else pytest.mark.slow) for p in every]
 
@@ -395,33 +337,20 @@ def test_interrupted_in_a_hook(by_rule, toy, rule, hook, count):
     assert same_weights(folder / "result.pt", by_rule(rule) / "result.pt")
 
 
-@pytest.mark.parametrize(
-    ("rule", "module", "name", "call"),
-    [
-        ("pseudo_val", qs3.selftraining.student_selection, "hold_out", 1),
-        ("oracle", qs3.selftraining.student_selection, "save", 2),
-        ("oracle", qs3.selftraining.oracle, "is_better", 2),  # training is over
-    ],
-)
-def test_interrupted_in_a_function(by_rule, toy, monkeypatch, rule, module, name, call):
-    cfg, calls, real = toy(f"selection.student={rule}"), 0, getattr(module, name)
-
+def test_interrupted_while_holding_out(by_rule, toy, monkeypatch):
     class Stop(Exception):
         pass
 
-    def stop(*args, **kwargs):
-        nonlocal calls
-        calls += 1
-        if calls == call:
-            raise Stop
-        return real(*args, **kwargs)
+    def stop(*args):
+        raise Stop
 
+    cfg = toy("selection.student=pseudo_val")
     with monkeypatch.context() as patch:
-        patch.setattr(module, name, stop)
+        patch.setattr(qs3.selftraining.student_selection, "hold_out", stop)
         with pytest.raises(Stop):
             train(cfg)
     train(cfg)
-    assert result_of(hashing.run_folder(cfg)) == result_of(by_rule(rule))
+    assert result_of(hashing.run_folder(cfg)) == result_of(by_rule("pseudo_val"))
 
 
 @pytest.mark.slow
@@ -466,28 +395,3 @@ def test_no_choice_without_rounds(toy, rule):
     more = ["selftraining=none", f"selection.student={rule}"]
     with pytest.raises(ConfigError, match=rf"selection\.student={rule} .*set selection\.student="):
         train(toy(*more))
-
-
-def test_an_oracle_needs_labels(toy, toy_data, tmp_path):
-    import shutil
-
-    from qs3.data.store import ManifestRow, write_pointset
-
-    old, other = open_pointset(toy_data / "kinectsim10"), tmp_path / "other"
-    shutil.copytree(toy_data / "specklenet10", other / "specklenet10")
-    train_only = old.indices("train")
-    rows = [
-        ManifestRow(id=old.ids[i], cls=CLASSES[old.labels[i]], split="train") for i in train_only
-    ]
-    write_pointset(
-        other / "kinectsim10",
-        name="kinectsim10",
-        classes=CLASSES,
-        arrays={"points": np.array(old.points)[train_only]},
-        rows=rows,
-        meta={},
-    )
-    cfg = toy(f"paths.data_dir={other}", "selection.student=oracle")
-    with pytest.raises(ConfigError, match=r"no labelled test split; set selection\.student=last"):
-        train(cfg)
-    assert not (hashing.run_folder(cfg) / "last.ckpt").exists()

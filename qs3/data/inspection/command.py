@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from qs3.data.contact_sheets import class_sheet, scan_picture
 from qs3.data.inspection.measure import COMPARE_STEPS, Bounds, compare, inspect
 from qs3.data.inspection.open_dataset import Opened, open_named, parse
 from qs3.data.inspection.text import of_domain, of_pair
@@ -18,7 +17,6 @@ from qs3.utils.files import make_folder, write_json, write_text
 
 OUT = Path("out/inspection")
 _OWN = {"domain": str, "out": str, "sample": int, "seed": int, "meshes": str}
-_SHOWN = 6  # clouds a class
 
 
 def inspect_command(argv: Sequence[str]) -> str:
@@ -43,7 +41,8 @@ def inspect_command(argv: Sequence[str]) -> str:
     write_json(out / "inspection.json", facts)
     text = of_domain(facts)
     write_text(out / "inspection.txt", text + "\n")
-    _sheet(opened, out / "clouds.png", bounds.seed)
+    split = next(iter(opened.data.counts()))
+    class_sheet(opened.data, out / "clouds.png", split=split, heading=f"{opened.label}, {split}")
     return f"{text}\n\nsaved inspection.json, inspection.txt and clouds.png in {out}"
 
 
@@ -60,9 +59,13 @@ def compare_command(argv: Sequence[str]) -> str:
     out = make_folder(str(values.get("out", default)))
     write_json(out / "comparison.json", facts)
     write_text(out / "comparison.md", of_pair(facts))
-    _side_by_side(a, b, out / "clouds.png", bounds.seed)
+    split = next((name for name in a.data.counts() if name in b.data.counts()), None)
+    if split:
+        both = {f"A: {a.label}": a.data, f"B: {b.label}": b.data}
+        scan_picture(both, out / "clouds.png", split=split)
     text = of_pair(facts, markdown=False)
-    return f"{text}\nsaved comparison.json, comparison.md and clouds.png in {out}"
+    picture = " and clouds.png" if split else ""
+    return f"{text}\nsaved comparison.json, comparison.md{picture} in {out}"
 
 
 def _got(argv: Sequence[str]) -> str:
@@ -92,32 +95,3 @@ def _bar(label: str, total: int) -> Any:
 
     with progress_bar(label, total=total) as advance:
         yield advance
-
-
-def _drawn(opened: Opened, cls: str, count: int, seed: int) -> list[np.ndarray]:
-    data = opened.data
-    if cls not in data.classes and cls != "unlabelled":
-        return []
-    label = data.classes.index(cls) if cls in data.classes else -1
-    members = (
-        np.flatnonzero(data.labels == label) if label >= 0 else np.flatnonzero(data.labels < 0)
-    )
-    chosen = np.random.default_rng([seed, 3, label + 1]).permutation(members)[:count]
-    return [np.asarray(data.points[i]) for i in np.sort(chosen)]
-
-
-def _sheet(opened: Opened, path: Path, seed: int) -> None:
-    from qs3.data.inspection.sheets import sheet
-
-    names = [*opened.data.classes, *(["unlabelled"] if (opened.data.labels < 0).any() else [])]
-    rows = {cls: [_drawn(opened, cls, _SHOWN, seed)] for cls in names}
-    sheet(path, {cls: of for cls, of in rows.items() if of[0]}, [""], opened.label)
-
-
-def _side_by_side(a: Opened, b: Opened, path: Path, seed: int) -> None:
-    from qs3.data.inspection.sheets import sheet
-
-    names = dict.fromkeys([*a.data.classes, *b.data.classes])
-    rows = {cls: [_drawn(o, cls, _SHOWN // 2, seed) for o in (a, b)] for cls in names}
-    kept = {cls: of for cls, of in rows.items() if any(of)}
-    sheet(path, kept, [a.label, b.label], "one view, each cloud scaled to its panel")

@@ -24,7 +24,6 @@ NET_POINTS = 1024
 WITHIN = 0.1
 """A point of the surface counts as measured with a point so near, in units of the unit ball."""
 
-_PAIRED = 10  # clouds a class for the Chamfer distances
 _FEATURED = 60  # clouds a class for the distance of the distributions
 _SURFACE_POINTS = 512  # of each of them, at random
 _SURFACES = 20  # objects a class whose distance to the surface is measured
@@ -117,21 +116,12 @@ def compare(a: Opened, b: Opened, bounds: Bounds, advance: Advance = lambda: Non
         advance()
         found[f"surface_{side}"] = surface(opened, common, bounds)
         advance()
-    few_a, few_b = (
-        {
-            cls: [clouds[side][i] for i in np.flatnonzero(labels[side] == k)[:_PAIRED]]
-            for k, cls in enumerate(common)
-        }
-        for side in "ab"
-    )
-    found["chamfer"] = gap.chamfer_by_class(few_a, few_b, WITHIN)
-    advance()
-    found["distributions"] = _distributions(clouds, labels, values, len(common), bounds.seed)
+    found["told_apart"] = _told_apart(clouds, labels, values, len(common))
     advance()
     return found
 
 
-COMPARE_STEPS = 8
+COMPARE_STEPS = 7
 
 
 def surface(opened: Opened, classes: list[str], bounds: Bounds) -> Numbers:
@@ -193,14 +183,13 @@ def _quantiles(off: np.ndarray) -> Numbers:
     }
 
 
-def _distributions(
+def _told_apart(
     clouds: dict[str, list[np.ndarray]],
     labels: dict[str, np.ndarray],
     values: dict[str, dict[str, np.ndarray]],
     classes: int,
-    seed: int,
 ) -> Numbers:
-    """`gap.two_samples` of equally many clouds of each class from both sides."""
+    """`gap.nearest_neighbour` of equally many clouds of each class from both sides."""
     named = ("nn_median", "nn_variation", "voxel_variation", "directions", "below", "lonely")
     sides = []
     for side in "ab":
@@ -214,9 +203,10 @@ def _distributions(
         sides.append((gap.features(stacked, more), len(named)))
     (a, extra), (b, _) = sides
     return {
-        "all": gap.two_samples(a, b, seed),
-        "shape": gap.two_samples(a[:, :-extra], b[:, :-extra], seed),
-        "density": gap.two_samples(a[:, -extra:], b[:, -extra:], seed),
+        "clouds": len(a),
+        "all": gap.nearest_neighbour(a, b),
+        "shape": gap.nearest_neighbour(a[:, :-extra], b[:, :-extra]),
+        "density": gap.nearest_neighbour(a[:, -extra:], b[:, -extra:]),
     }
 
 

@@ -77,12 +77,10 @@ def extents(data: PointSet, chosen: np.ndarray) -> Numbers:
             "size_median": np.median(size[rows], axis=0).tolist(),
             "largest_side_min": float(largest[rows].min()),
             "largest_side_max": float(largest[rows].max()),
-            "floor_median": float(np.median(low[rows, 2])),
         }
     return {
         "by_class": by_class,
         "size_median": np.median(size, axis=0).tolist(),
-        "radius_median": float(np.median(radius)),
         "in_unit_ball": bool((np.abs(radius - 1) < 1e-3).mean() > 0.99),
         "centroid_offset_median": float(np.median(np.linalg.norm(centroid, axis=1))),
         "floor_median": float(np.median(low[:, 2])),
@@ -115,7 +113,6 @@ def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
         lonely: share of points whose 4th neighbour is over five times as far as the median's.
         directions: share of 72 equal bins of direction, from the centroid, with a point in it.
         below: the same for the lowest third of the bins (what a scan from above misses).
-        azimuth_gap_deg: widest sector about the vertical axis without a point.
         radius: of the cloud as given.
     """
     distinct = np.unique(np.ascontiguousarray(cloud), axis=0)
@@ -126,8 +123,7 @@ def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
         zeros = dict.fromkeys(
             ("nn_median", "nn_low", "nn_high", "nn_variation", "voxel_variation", "lonely"), 0.0
         )
-        nothing = {"directions": 0.0, "below": 0.0, "azimuth_gap_deg": 360.0}
-        return {**zeros, "copies": copies, **nothing, "radius": radius}
+        return {**zeros, "copies": copies, "directions": 0.0, "below": 0.0, "radius": radius}
     distance = cKDTree(ball).query(ball, k=[2, 5])[0]
     nearest, fourth = distance.T
     low, middle, high = np.percentile(nearest, [5, 50, 95])
@@ -153,13 +149,7 @@ def _directions(ball: np.ndarray) -> dict[str, float]:
     ring = np.minimum(((unit[:, 2] + 1) / 2 * RINGS).astype(int), RINGS - 1)
     hit = np.zeros((RINGS, AZIMUTHS), dtype=bool)
     hit[ring, column] = True
-    edges = np.sort(azimuth)
-    gap = np.diff(edges, append=edges[:1] + 2 * np.pi).max() if len(edges) else 2 * np.pi
-    return {
-        "directions": float(hit.mean()),
-        "below": float(hit[: RINGS // 3].mean()),
-        "azimuth_gap_deg": float(np.rad2deg(gap)),
-    }
+    return {"directions": float(hit.mean()), "below": float(hit[: RINGS // 3].mean())}
 
 
 def summary(values: Mapping[str, np.ndarray], members: Mapping[str, np.ndarray]) -> Numbers:

@@ -94,29 +94,12 @@ def of_pair(facts: Numbers, markdown: bool = True) -> str:
     parts += section(
         "By class", _by_class(facts), "Medians; up is by the shape, `?` where it is open."
     )
-    rows = [["class", "within A", "within B", "A to B", "A found in B", "B found in A"]]
-    for cls, of in facts["chamfer"].items():
-        rows.append(
-            [cls, *(_number(of[k]) for k in ("within_a", "within_b", "a_to_b")),
-             *(f"{of[k]:.0%}" for k in ("a_found_in_b", "b_found_in_a"))]
-        )  # fmt: skip
+    apart = facts["told_apart"]
     parts += section(
-        "Chamfer distance",
-        rows,
-        "Mean distance to the nearest point, both ways, unit ball, best of twelve yaws, means over "
-        "pairs of up to 10 clouds a class. Found: share of the points that have one of the nearest "
-        f"other cloud within {facts['within']}.",
-    )
-    rows = [["by", "nearest neighbour", "MMD²", "by chance under"]]
-    for name, of in facts["distributions"].items():
-        words = [f"{of['nearest_neighbour']:.1%}", f"{of['mmd']:.4f}", f"{of['mmd_chance']:.4f}"]
-        rows.append([name, *words])
-    clouds = facts["distributions"]["all"]["clouds"]
-    parts += section(
-        "Distance of the distributions",
-        rows,
-        "Nearest neighbour: share of clouds whose most similar cloud is of their own domain (50 %: "
-        f"cannot be told apart, 100 %: two worlds). {clouds} clouds of each, equally many a class.",
+        "Told apart by their nearest neighbours",
+        [["by", "own domain"], *([by, f"{apart[by]:.1%}"] for by in ("all", "shape", "density"))],
+        "Share of clouds whose most similar cloud is of their own domain (50 %: cannot be told "
+        f"apart, 100 %: two worlds). {apart['clouds']} clouds of each, equally many a class.",
     )
     return "\n".join(parts).rstrip() + "\n"
 

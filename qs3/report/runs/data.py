@@ -102,7 +102,7 @@ class RunFiles:
         metrics: contents of metrics.json; None if the run is not finished.
         history: None if not one epoch is done.
         rounds: in order.
-        predictions: None if there are none (yet).
+        predictions: None if there are none yet.
         classes: names in label order.
         config: as composed, not resolved; None if Hydra did not write it.
         command: that started the run; None likewise.

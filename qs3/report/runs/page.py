@@ -8,7 +8,6 @@ from html import escape
 from pathlib import Path
 
 from qs3.evaluation.estimates_text import table as quality_table
-from qs3.report.figures.html_page import html
 from qs3.report.runs.data import RunFiles, settings_of
 from qs3.report.runs.figures import EVALUATION_ONLY
 
@@ -28,9 +27,15 @@ _TITLES = {
     "pipeline": "From mesh to cloud",
 }
 _STYLE = """
-body { max-width: 62rem; }
+body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; margin: 2rem auto; padding: 0 1rem;
+  max-width: 62rem; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
 img { max-width: 100%; height: auto; }
-th, td { padding: .2rem .9rem .2rem 0; border-bottom: 1px solid #e3e6eb; }
+table { border-collapse: collapse; }
+th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0;
+  border-bottom: 1px solid #e3e6eb; }
+th { font-weight: 500; color: #6b7482; }
+pre { background: #f7f8fa; padding: .8rem; overflow-x: auto; font-size: 13px; }
 .note { color: #8a5a12; }
 """
 
@@ -68,7 +73,19 @@ def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]
             f"<h2>Settings</h2><details><summary>all of them</summary>"
             f"<pre>{escape(settings)}</pre></details>"
         )
-    return html(run.title, parts, _STYLE)
+    title = escape(run.title)
+    return "\n".join(
+        [
+            "<!doctype html>",
+            '<html lang="en"><head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>{title}</title><style>{_STYLE}</style></head><body>",
+            f"<h1>{title}</h1>",
+            *parts,
+            "</body></html>",
+            "",
+        ]
+    )
 
 
 def _quality(run: RunFiles) -> list[str]:

@@ -15,10 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.errors import DataError
-from qs3.evaluation.selection_rules import ORACLE_IN_WORDS, took_target_labels
 from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, Scores, read_metrics
 
-DIAGNOSTIC = "diagnostic"
 FEW_SEEDS = 3
 """Below this number of seeds a mean is marked."""
 
@@ -35,10 +33,9 @@ class Run:
         experiment: name.
         hash: of the config without its seed.
         seed: None if not known.
-        status: "finished", "unfinished", "damaged", or "diagnostic": finished, but its epoch was
-            chosen by the target's test labels, so that it is no result.
+        status: "finished", "unfinished" or "damaged".
         metrics: contents of metrics.json; None unless finished.
-        problem: why it is not finished, or no result.
+        problem: why it is not finished.
     """
 
     folder: Path
@@ -90,8 +87,6 @@ class Group:
         finished: runs with a result, by seed.
         problems: for the reader: unfinished seeds, different datasets, a seed twice.
         comparable: whether the finished runs may be averaged.
-        diagnostic: whether a run of it was chosen by the target's test labels; none of these is
-            among the finished ones.
     """
 
     experiment: str
@@ -99,7 +94,6 @@ class Group:
     finished: tuple[Run, ...]
     problems: tuple[str, ...]
     comparable: bool
-    diagnostic: bool = False
 
     @property
     def results(self) -> list[RunMetrics]:
@@ -166,11 +160,7 @@ def load_run(folder: str | Path) -> Run:
     if metrics is None:
         begun = any((folder / name).exists() for name in _BEGUN)
         return without("unfinished", "unfinished" if begun else "no result")
-    status, problem = FINISHED, ""
-    if took_target_labels(metrics.selection.student):
-        status = DIAGNOSTIC
-        problem = f"left out, because its student was chosen by the {ORACLE_IN_WORDS}"
-    return Run(folder, metrics.experiment, metrics.hash, metrics.seed, status, metrics, problem)
+    return Run(folder, metrics.experiment, metrics.hash, metrics.seed, FINISHED, metrics)
 
 
 def group(runs: Iterable[Run]) -> list[Group]:
@@ -201,8 +191,7 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
             comparable = False
             seen = "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in hashes.items())
             problems.append(f"the {role} dataset differs ({seen}): not averaged")
-    diagnostic = any(run.status == DIAGNOSTIC for run in runs)
-    return Group(*key, tuple(finished), tuple(problems), comparable, diagnostic)
+    return Group(*key, tuple(finished), tuple(problems), comparable)
 
 
 def _list(seeds: Sequence[int | None]) -> str:
@@ -239,10 +228,6 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
         accuracy, balanced = g.stat("accuracy"), g.stat("balanced_accuracy")
         majority = g.stat("majority_rate")
         few = 0 < len(g.finished) < FEW_SEEDS
-        problems = [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
-        if g.diagnostic and not g.finished:
-            notes += problems
-            continue
         lines.append(
             (
                 g.experiment,
@@ -258,7 +243,7 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
         )
         if g.unlabelled:
             notes.append(f"{g.experiment} {g.hash}: no target labels, so no accuracy")
-        notes += problems
+        notes += [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
     if any("(!)" in line[-2] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."

@@ -1,4 +1,4 @@
-"""A table and its cells: plain values that `tables` fills and `formats` and `table_page` print."""
+"""A table and its cells: plain values that `table` fills and `formats` prints."""
 
 from __future__ import annotations
 

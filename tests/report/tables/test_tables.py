@@ -164,7 +164,7 @@ def test_command_line(tmp_path, capsys):
     printed = capsys.readouterr().out
     saved = (tmp_path / "tables" / "quickstart.md").read_text()
     assert saved in printed
-    assert {p.suffix for p in (tmp_path / "tables").iterdir()} == {".md", ".csv", ".tex", ".html"}
+    assert {p.suffix for p in (tmp_path / "tables").iterdir()} == {".md", ".csv", ".tex"}
     argv = ["table=quickstart", f"paths.log_dir={tmp_path}", f"paths.data_dir={tmp_path}/data"]
     assert main(argv) == 0
     assert f"paths.data_dir={tmp_path}/data paths.log_dir={tmp_path}" in capsys.readouterr().out

@@ -4,11 +4,11 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from qs3.data.contact_sheets import contact_sheet, scan_picture
 from qs3.data.store import ManifestRow, write_pointset
 from qs3.errors import DataError
 from qs3.geometry.orthographic import project
 from qs3.report.__main__ import main
-from qs3.report.figures.contact_sheets import contact_sheet, scan_picture
 from tests.fixtures.published import CLASSES, cloud, write_domain
 
 
@@ -65,7 +65,7 @@ def store(folder, ids):
 
 
 def test_same_object_in_all_domains_where_possible(tmp_path):
-    from qs3.report.figures.contact_sheets import _same_object
+    from qs3.data.contact_sheets import _same_object
 
     a = store(tmp_path / "a", ["bed/1", "bed/2", "chair/1"])
     b = store(tmp_path / "b", ["bed/2", "bed/3"])

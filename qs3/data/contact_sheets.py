@@ -185,7 +185,8 @@ def _same_object(sets: Sequence[PointSet], cls: str) -> list[np.ndarray | None]:
 
 
 def _members(data: PointSet, cls: str) -> np.ndarray:
-    return np.flatnonzero(data.labels == data.classes.index(cls))
+    known = cls in data.classes
+    return np.flatnonzero(data.labels == data.classes.index(cls)) if known else np.array([], int)
 
 
 class _Figure:
