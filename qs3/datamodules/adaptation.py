@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
-from qs3.config.checks import one_of
+from qs3.config.checks import check_choice
 from qs3.data.store import PointSet
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
@@ -153,11 +153,11 @@ class UdaData(LightningDataModule):
         uses_target: bool = False,
     ) -> None:
         super().__init__()
-        rule = RULES[one_of("data.val", val, sorted(RULES))]
+        rule = RULES[check_choice("data.val", val, sorted(RULES))]
         train, validation = rule(labelled.ids, labelled.labels.numpy())
         self.labelled, self.validation = labelled.at(train), labelled.at(validation)
         self.target = target
-        self.sampler = one_of("data.sampler", sampler, SAMPLERS)
+        self.sampler = check_choice("data.sampler", sampler, SAMPLERS)
         if sampler == "balanced" and owner != "source":
             raise ConfigError(
                 "data.sampler=balanced draws source clouds only. Balancing the target's classes "

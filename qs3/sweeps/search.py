@@ -25,7 +25,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig
 
 from qs3.config import hashing
-from qs3.config.checks import whole
+from qs3.config.checks import check_int
 from qs3.errors import ConfigError
 from qs3.evaluation.selection_rules import check_objective
 from qs3.sweeps.launching import OverLauncher
@@ -94,7 +94,7 @@ class LabelFreeGrid(Judged):
 
     def __init__(self, params: Mapping[str, Any], at_once: int | None = None) -> None:
         super().__init__(params)
-        self.at_once = None if at_once is None else whole("hydra.sweeper.at_once", at_once, 1)
+        self.at_once = None if at_once is None else check_int("hydra.sweeper.at_once", at_once, 1)
 
     def search(
         self, cfg: DictConfig, fixed: list[str], searched: Mapping[str, Override]
@@ -140,10 +140,10 @@ class LabelFreeSearch(Judged):
         folder: str,
     ) -> None:  # fmt: skip
         super().__init__(params)
-        self.trials = whole("hydra.sweeper.trials", trials, 1)
-        self.at_once = whole("hydra.sweeper.at_once", at_once, 1)
-        self.seed = whole("hydra.sweeper.seed", seed, 0)
-        self.random = whole("hydra.sweeper.random", random, 1)
+        self.trials = check_int("hydra.sweeper.trials", trials, 1)
+        self.at_once = check_int("hydra.sweeper.at_once", at_once, 1)
+        self.seed = check_int("hydra.sweeper.seed", seed, 0)
+        self.random = check_int("hydra.sweeper.random", random, 1)
         self.folder = Path(folder)
 
     def search(

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from hydra.core.utils import JobReturn, JobStatus
 
 from qs3.config import hashing
-from qs3.report.tables.aggregate import align
 from qs3.sweeps.search_space import overrides
+from qs3.utils.text_table import aligned
 
 FAILED = "failed"
 DIVERGED = "diverged"
@@ -62,7 +62,7 @@ def report(
         value = "-" if one.value is None else f"{one.value:.4f}"
         values = (one.params.get(key, "-") for key in keys)
         rows.append((str(one.number), value, *values, one.run))
-    words = [headline, *align(rows)]
+    words = [headline, *aligned(rows)]
     judged = [(one.value, one) for one in tried if one.value is not None]
     if judged:
         pick = min if lower else max

@@ -34,7 +34,7 @@ from qs3.clouds.files import (
     read_clouds,
     split_prefix,
 )
-from qs3.config.checks import one_of, whole
+from qs3.config.checks import check_choice, check_int
 from qs3.data.importers.base import Importer, Item, class_of, split_of
 from qs3.data.importers.trees import _visible
 from qs3.data.manifest import SPLITS, ManifestRow
@@ -82,9 +82,9 @@ class CloudFolder(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of("published.layout", self.layout, LAYOUTS)
-        one_of("published.up", self.up, tuple(_UP))
-        whole("published.test_every", self.test_every, 0)
+        check_choice("published.layout", self.layout, LAYOUTS)
+        check_choice("published.up", self.up, tuple(_UP))
+        check_int("published.test_every", self.test_every, 0)
         if self.test_every == 1:
             raise ConfigError("published.test_every=1 leaves nothing for training; 0 tests nothing")
 

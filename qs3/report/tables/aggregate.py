@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.evaluation.selection_rules import ORACLE_IN_WORDS, took_target_labels
+from qs3.utils.text_table import aligned
 
 FINISHED = "finished"
 DIAGNOSTIC = "diagnostic"
@@ -264,15 +265,4 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
     if any("(!)" in line[-2] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
-    return "\n".join([caption, *align(lines), *notes])
-
-
-def align(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Columns padded to their widest entry, with a rule under the first line."""
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-
-    def row(cells: Sequence[str]) -> str:
-        return "  ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)).rstrip()
-
-    rule = "  ".join("-" * width for width in widths)
-    return [row(lines[0]), rule, *(row(line) for line in lines[1:])]
+    return "\n".join([caption, *aligned(lines), *notes])
