@@ -117,11 +117,8 @@ class Scheme:
         if check_float("selftraining.mrkld", self.mrkld) < 0:
             raise ConfigError(f"selftraining.mrkld must be >= 0, got {self.mrkld}")
         epochs = self.rounds * self.epochs
-        if (
-            not 0.0
-            <= check_float("selftraining.weight_step", self.weight_step) * (epochs - 1)
-            < 1.0
-        ):
+        step = check_float("selftraining.weight_step", self.weight_step)
+        if not 0.0 <= step * (epochs - 1) < 1.0:
             raise ConfigError(
                 f"selftraining.weight_step must be >= 0, and below 1 after {epochs - 1} epochs, "
                 f"got {self.weight_step}"

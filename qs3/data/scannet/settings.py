@@ -40,10 +40,8 @@ class Extraction:
             ("points", 1), ("min_points", 0), ("views", 1), ("stride", 1), ("margin_px", 0),
         ):  # fmt: skip
             check_int(key, getattr(self, key), least)
-        near, far = (
-            check_float("depth_min_m", self.depth_min_m),
-            check_float("depth_max_m", self.depth_max_m),
-        )
+        near = check_float("depth_min_m", self.depth_min_m)
+        far = check_float("depth_max_m", self.depth_max_m)
         if not 0 < near < far < float("inf"):
             raise ConfigError(
                 f"0 < depth_min_m < depth_max_m must hold, got {self.depth_min_m} and "
