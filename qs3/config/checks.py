@@ -66,7 +66,7 @@ def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
 
 
 def _inside(value: Any, allowed: str) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+    if type(value) is bool or not np.isscalar(value) or isinstance(value, str):
         return False
     if allowed.startswith("odd "):
         return bool(value % 2 == 1) and _inside(value, allowed.removeprefix("odd "))

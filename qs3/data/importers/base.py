@@ -219,6 +219,25 @@ def inside(path: Path, root: Path) -> Path:
     return path
 
 
+def visible(folder: Path, root: Path) -> list[Path]:
+    """What is in a folder in order of its names, hidden things left out.
+
+    Raises:
+        DataError: it cannot be read, a name is not printable text, or a link leads out of `root`.
+    """
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError as error:
+        raise DataError(f"{folder} cannot be read ({error.strerror})") from error
+    clear = [name for name in names if not name.startswith(".") and name != "__MACOSX"]
+    for name in clear:
+        if not name.isprintable():
+            raise DataError(
+                f"{folder / name!r}: a name with control or broken characters; rename it"
+            )
+    return [inside(folder / name, root) for name in clear]
+
+
 def check_cloud(cloud: np.ndarray, points: int, where: str) -> np.ndarray:
     """[P, 3] float32 from [n, 3] with 1 <= n <= P, filled up by repeating from the first point.
 
