@@ -134,6 +134,18 @@ def parse_clouds(path: str | Path) -> CloudFile:
     return found
 
 
+def parse_cloud(path: str | Path) -> np.ndarray:
+    """[n, 3] as they are in the file: the one cloud in it; see `parse_clouds`.
+
+    Raises:
+        DataError: names the file, and the line; or it holds several clouds.
+    """
+    clouds = parse_clouds(path).clouds
+    if len(clouds) != 1:
+        raise DataError(f"{path} holds {len(clouds)} clouds, expected one")
+    return clouds[0]
+
+
 def _text(path: Path) -> CloudFile:
     data = path.read_bytes()
     rows = data.replace(b"//", b"#")

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from qs3.errors import ConfigError
 
+_COMPARE = {">": operator.gt, ">=": operator.ge}
 
-def whole(key: str, value: Any, least: int) -> int:
+
+def check_int(key: str, value: Any, least: int) -> int:
     """The value, if it is a whole number not below `least`.
 
     Raises:
@@ -19,7 +24,7 @@ def whole(key: str, value: Any, least: int) -> int:
     return value
 
 
-def number(key: str, value: Any) -> float:
+def check_float(key: str, value: Any) -> float:
     """The value, if it is a number.
 
     Raises:
@@ -30,7 +35,7 @@ def number(key: str, value: Any) -> float:
     return value
 
 
-def one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
+def check_choice(key: str, value: Any, allowed: Sequence[str]) -> str:
     """The value, if it is one of the allowed ones.
 
     Raises:
@@ -39,3 +44,37 @@ def one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
     if value not in allowed:
         raise ConfigError(f"{key} must be one of {tuple(allowed)}, got {value!r}")
     return value
+
+
+def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
+    """Check numbers of an object, e.g. `check_ranges(self, "sensor.", fill_px=">= 0")`.
+
+    Args:
+        settings: has the numbers as attributes.
+        prefix: goes before their names in a message.
+        ranges: by attribute, as a message says it: "> 0", ">= 1", "odd >= 3", an interval such as
+            "[0, 1)", or "odd [3, 15]". None passes; NaN and what is not a number do not.
+
+    Raises:
+        ConfigError: names the first that is outside.
+    """
+    for name, allowed in ranges.items():
+        value = getattr(settings, name)
+        if value is not None and not _inside(value, allowed):
+            word = "in " if allowed[0] in "[(" else ""
+            raise ConfigError(f"{prefix}{name} must be {word}{allowed}, got {value!r}")
+
+
+def _inside(value: Any, allowed: str) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    value = float(value)
+    if allowed.startswith("odd "):
+        return bool(value % 2 == 1) and _inside(value, allowed.removeprefix("odd "))
+    if allowed[0] in "[(":
+        low, high = (float(end) for end in allowed[1:-1].split(","))
+        above = value >= low if allowed[0] == "[" else value > low
+        below = value <= high if allowed[-1] == "]" else value < high
+        return bool(above and below)
+    sign, bound = allowed.split()
+    return bool(_COMPARE[sign](value, float(bound)))

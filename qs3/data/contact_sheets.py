@@ -16,11 +16,10 @@ from qs3.data.store import PointSet
 from qs3.errors import DataError
 from qs3.geometry.orthographic import project
 from qs3.utils.files import atomic_path
+from qs3.utils.plotting import GRID, INK, PANEL, SOFT, blank, cloud_colours
 
 _PANEL = 1.45  # inches
 _DPI = 130
-_PALE = np.array([0.93, 0.94, 0.96])  # what colours fade to with distance
-_INK, _SOFT, _PAPER = "#1d2430", "#6b7482", "#ffffff"
 
 
 def contact_sheet(
@@ -58,7 +57,7 @@ def contact_sheet(
             figure.text(left - 0.1, y + _PANEL / 2, rows[row], size=9, align="right")
         if cloud is not None:
             figure.panel(x, y, cloud)
-            figure.text(x + _PANEL / 2, y - 0.06, title, size=7, color=_SOFT)
+            figure.text(x + _PANEL / 2, y - 0.06, title, size=7, color=SOFT)
     if heading:
         figure.text(figure.width / 2, figure.height - 0.24, heading, size=11, weight="bold")
     return figure.save(path)
@@ -156,7 +155,7 @@ def scan_picture(
         figure.text(x + left - 0.1, y + _PANEL / 2, cls, size=10, align="right")
         for j, cloud in enumerate(_same_object(list(sets.values()), cls)):
             if cloud is None:
-                figure.text(x + left + (j + 0.5) * _PANEL, y + _PANEL / 2, "none", color=_SOFT)
+                figure.text(x + left + (j + 0.5) * _PANEL, y + _PANEL / 2, "none", color=SOFT)
             else:
                 figure.panel(x + left + j * _PANEL, y, cloud)
     for k in range(blocks):
@@ -164,11 +163,11 @@ def scan_picture(
             x = k * block + left + (j + 0.5) * _PANEL
             symbol, _, words = title.rpartition(": ")
             figure.text(x, figure.height - top + 0.29, symbol, size=10, weight="bold")
-            figure.text(x, figure.height - top + 0.12, words, size=7.5, color=_SOFT)
+            figure.text(x, figure.height - top + 0.12, words, size=7.5, color=SOFT)
     if heading:
         figure.text(figure.width / 2, figure.height - 0.26, heading, size=12, weight="bold")
     if note:
-        figure.text(figure.width / 2, 0.18, note, size=8, color=_SOFT)
+        figure.text(figure.width / 2, 0.18, note, size=8, color=SOFT)
     return figure.save(path)
 
 
@@ -193,33 +192,26 @@ class _Figure:
     """A matplotlib figure measured in inches from its lower left corner."""
 
     def __init__(self, width: float, height: float) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
         self.width, self.height = width, height
-        self._figure = Figure(figsize=(width, height), dpi=_DPI, facecolor=_PAPER)
-        FigureCanvasAgg(self._figure)
+        self._figure = blank(width, height, _DPI)
 
     def panel(self, x: float, y: float, cloud: np.ndarray) -> None:
         """Draw a cloud into the square of one panel whose lower left corner is at x, y."""
-        from matplotlib import colormaps
-
         pad = 0.04
         side = _PANEL - 2 * pad
         w, h = self.width, self.height
         box = ((x + pad) / w, (y + pad) / h, side / w, side / h)
-        axes: Any = self._figure.add_axes(box, facecolor="#f7f8fa")
+        axes: Any = self._figure.add_axes(box, facecolor=PANEL)
         seen, depth, height = project(cloud)
-        colour = colormaps["viridis"](0.02 + 0.86 * height)[:, :3]
-        near = (0.35 + 0.65 * depth)[:, None]
+        colour = cloud_colours(height, depth)
         size = float(np.clip(2600 / len(cloud), 0.9, 9.0))
-        axes.scatter(*seen.T, s=size, c=near * colour + (1 - near) * _PALE, linewidths=0)
+        axes.scatter(*seen.T, s=size, c=colour, linewidths=0)
         axes.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), xticks=[], yticks=[])
         for spine in axes.spines.values():
-            spine.set(color="#e3e6eb", linewidth=0.6)
+            spine.set(color=GRID, linewidth=0.6)
 
     def text(
-        self, x: float, y: float, text: str, *, size: float = 9, color: str = _INK,
+        self, x: float, y: float, text: str, *, size: float = 9, color: str = INK,
         weight: str = "normal", align: str = "center",
     ) -> None:  # fmt: skip
         """Write a line, vertically centred at y."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import DataError
+from qs3.utils.text_table import csv_text
 
 MANIFEST = "manifest.csv"
 OK = "ok"
@@ -136,13 +137,11 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
 
 def to_csv(rows: Sequence[ManifestRow]) -> str:
     """The text of manifest.csv; line breaks inside a value become spaces."""
-    file = io.StringIO(newline="")
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([header for header, _ in _COLUMNS])
+    lines = [[header for header, _ in _COLUMNS]]
     for row in rows:
         values = [getattr(row, field) for _, field in _COLUMNS]
-        writer.writerow(["" if v is None else " ".join(str(v).splitlines()) for v in values])
-    return file.getvalue()
+        lines.append(["" if v is None else " ".join(str(v).splitlines()) for v in values])
+    return csv_text(lines)
 
 
 def _from_csv(text: str, path: Path) -> list[ManifestRow]:

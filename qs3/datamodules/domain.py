@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 from lightning.pytorch import LightningDataModule
 
-from qs3.config.checks import one_of
+from qs3.config.checks import check_choice
 from qs3.data.domain import Domain
 from qs3.data.inspection.open_dataset import compose_domain
 from qs3.data.store import PointSet
@@ -89,8 +89,8 @@ class DomainData(LightningDataModule):
         self.points, self.fps_starts = points, fps_starts
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size
         self.augment, self.seed, self.has_labels = augment, seed, labels
-        self.val = one_of("data.val", val, sorted(RULES))
-        self.sampler = one_of("data.sampler", sampler, SAMPLERS)
+        self.val = check_choice("data.val", val, sorted(RULES))
+        self.sampler = check_choice("data.sampler", sampler, SAMPLERS)
         self.clouds_a_split, self.clouds_a_class = clouds_a_split, clouds_a_class
         # Indices that are cached are those of whole splits.
         self.cache_dir = Path(cache_dir) if cache_dir and clouds_a_split is None else None

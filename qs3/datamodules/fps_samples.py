@@ -1,7 +1,6 @@
-"""Several farthest point samples of each cloud, by several processes. Imports no torch: they don't.
+"""Several farthest point samples of each cloud, by several processes.
 
-A process writes what it has sampled to a file and sends back nothing: one that is killed in the
-middle of a large message leaves half of it in the pool's pipe, and the pool waits for the rest.
+Imports no torch, so that they need not.
 """
 
 from __future__ import annotations
@@ -9,21 +8,15 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import signal
-import sys
-import tempfile
-import threading
-import time
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
+from qs3.utils.pool import engine
+from qs3.utils.progress import shown
 from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
@@ -81,70 +74,27 @@ def sample_all(
     begins = range(0, len(points), _CHUNK)
     if processes > 1:  # fpsample holds the interpreter's lock, so threads would not help
         try:
-            for begin, part in _shown(_by_processes(points, count, starts, processes), len(begins)):
-                result[begin : begin + len(part)] = part
+            _fill(result, points, begins, processes)
             return result
-        except (BrokenProcessPool, OSError) as error:  # out of memory; no room for the files
+        except OSError as error:  # out of memory, or no more processes
             log.warning("sampling in one process, because several failed (%s)", error)
-    here = ((i, sample(points[i : i + _CHUNK], count, starts)) for i in begins)
-    for begin, part in _shown(here, len(begins)):
-        result[begin : begin + len(part)] = part
+    _fill(result, points, begins, 0)
     return result
 
 
-def _by_processes(
-    points: np.ndarray, count: int, starts: int, processes: int
-) -> Iterator[tuple[int, np.ndarray]]:
-    """The sampled chunks with their first positions, in the order in which they are done."""
-    with tempfile.TemporaryDirectory(prefix="qs3-samples-") as folder:
-        pool = ProcessPoolExecutor(
-            processes,
-            mp_context=get_context("spawn"),  # torch's threads do not survive a fork
-            initializer=_start_worker,
-            initargs=(os.getpid(),),
-        )
-        try:
-            files = {}
-            for i in range(0, len(points), _CHUNK):
-                chunk, file = np.asarray(points[i : i + _CHUNK]), Path(folder) / f"{i}.npy"
-                files[pool.submit(_sample_to, file, chunk, count, starts)] = (i, file)
-            for future in as_completed(files):
-                future.result()
-                begin, file = files[future]
-                yield begin, np.load(file, allow_pickle=False)
-                file.unlink()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+def _fill(result: np.ndarray, points: np.ndarray, begins: Sequence[int], processes: int) -> None:
+    chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
+    _, starts, count = result.shape
+    outcomes = engine(processes).run(partial(_sampler, count, starts), chunks)
+    for outcome in shown(outcomes, "sampling points", total=len(begins)):
+        if outcome.result is None:
+            raise ChildProcessError("a process died twice")
+        begin = int(outcome.name)
+        result[begin : begin + len(outcome.result)] = outcome.result
 
 
-def _sample_to(file: Path, points: np.ndarray, count: int, starts: int) -> None:
-    np.save(file, sample(points, count, starts), allow_pickle=False)
-
-
-def _start_worker(parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
-    threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
-
-
-def _die_with(parent: int) -> None:
-    """A worker whose parent was killed would wait for work for ever."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
-
-
-def _shown(parts: Iterable[tuple[int, np.ndarray]], total: int) -> Iterator[tuple[int, np.ndarray]]:
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(
-        parts,
-        "sampling points",
-        total=total,
-        console=Console(stderr=True),
-        transient=True,
-        disable=not sys.stderr.isatty(),
-    )
+def _sampler(count: int, starts: int) -> Callable[[np.ndarray], np.ndarray]:
+    return partial(sample, count=count, starts=starts)
 
 
 def _index_type(points: int) -> type[np.signedinteger]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any
 
-from qs3.config.checks import number, one_of, whole
+from qs3.config.checks import check_choice, check_float, check_int
 from qs3.errors import ConfigError
 
 
@@ -26,7 +26,7 @@ class Phases:
     epochs: int = 0
 
     def __post_init__(self) -> None:
-        whole("protocol.epochs", self.warmup, 1)
+        check_int("protocol.epochs", self.warmup, 1)
 
     @property
     def total(self) -> int:
@@ -100,24 +100,25 @@ class Scheme:
     rehearsal: bool = False
 
     def __post_init__(self) -> None:
-        whole("selftraining.rounds", self.rounds, 0)
+        check_int("selftraining.rounds", self.rounds, 0)
         if self.rounds == 0:
             return
         if not hasattr(self.selector, "select"):
             raise ConfigError("selftraining.rounds > 0 needs a selector, e.g. selftraining=qbst")
-        whole("selftraining.epochs", self.epochs, 1)
-        whole("selftraining.batch_size", self.batch_size, 2)  # batch norm needs two clouds
-        one_of("selftraining.init", self.init, ("scratch", "continue", "persistent"))
-        one_of("selftraining.missing_class", self.missing_class, ("warn", "error"))
-        number("selftraining.theta", self.theta)
-        number("selftraining.epsilon", self.epsilon)
+        check_int("selftraining.epochs", self.epochs, 1)
+        check_int("selftraining.batch_size", self.batch_size, 2)  # batch norm needs two clouds
+        check_choice("selftraining.init", self.init, ("scratch", "continue", "persistent"))
+        check_choice("selftraining.missing_class", self.missing_class, ("warn", "error"))
+        check_float("selftraining.theta", self.theta)
+        check_float("selftraining.epsilon", self.epsilon)
         free = bool(getattr(self.selector, "own_thresholds", False)) and self.theta == 0
         if not (0.0 < self.theta < 1.0 or free):
             raise ConfigError(f"selftraining.theta must lie in (0, 1), got {self.theta}")
-        if number("selftraining.mrkld", self.mrkld) < 0:
+        if check_float("selftraining.mrkld", self.mrkld) < 0:
             raise ConfigError(f"selftraining.mrkld must be >= 0, got {self.mrkld}")
         epochs = self.rounds * self.epochs
-        if not 0.0 <= number("selftraining.weight_step", self.weight_step) * (epochs - 1) < 1.0:
+        step = check_float("selftraining.weight_step", self.weight_step)
+        if not 0.0 <= step * (epochs - 1) < 1.0:
             raise ConfigError(
                 f"selftraining.weight_step must be >= 0, and below 1 after {epochs - 1} epochs, "
                 f"got {self.weight_step}"

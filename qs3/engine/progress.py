@@ -8,11 +8,11 @@ import time
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
+from qs3.utils.progress import terminal_bar
 
 log = logging.getLogger(__name__)
 
@@ -36,16 +36,7 @@ class EpochBar(Callback):
         """Show the bar, at the epoch where a resumed run goes on."""
         if not self.enabled or not trainer.is_global_zero:
             return
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("epochs,"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            transient=True,
-            redirect_stdout=sys.stdout.isatty(),
-        )
+        self._progress = terminal_bar("epochs,", transient=True)
         self._progress.add_task("training", total=trainer.max_epochs)
         self._progress.start()
         # Log handlers kept the real stdout; through rich's, their lines appear above the bar.

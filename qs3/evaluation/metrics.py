@@ -17,12 +17,11 @@ from torch import Tensor, nn
 
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.splits import Unlabelled
+from qs3.evaluation.calibration import calibration_error
 from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
 from qs3.runs.metrics import PseudoLabelScores, Scores
 from qs3.runs.predictions import Predictions
 from qs3.runs.pseudo_labels import read_pseudo_labels
-
-CALIBRATION_BINS = 15
 
 
 @torch.no_grad()
@@ -121,23 +120,6 @@ def scores(
         confusion=confusion.tolist(),
         calibration_error=calibration_error(probabilities, labels) if finite else None,
     )
-
-
-def calibration_error(
-    probabilities: Float[np.ndarray, "n c"],
-    labels: Int[np.ndarray, " n"],
-    bins: int = CALIBRATION_BINS,
-) -> float:
-    """Expected calibration error in [0, 1]: how far confidence is from accuracy on average.
-
-    ECE = Σ_b n_b / n |accuracy_b - confidence_b| over bins of equal width, ((b-1)/B, b/B], of the
-    largest probability (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, eq. 3).
-    """
-    confidence = probabilities.max(axis=1)
-    right = probabilities.argmax(axis=1) == labels
-    bin_ = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
-    gap = np.bincount(bin_, weights=right - confidence, minlength=bins)  # n_b (accuracy - conf.)
-    return float(np.abs(gap).sum() / len(labels))
 
 
 class Evaluation:

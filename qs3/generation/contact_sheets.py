@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 
 from qs3.geometry.orthographic import project
-from qs3.utils.files import atomic_path
+from qs3.utils.plotting import DARK, INK, SOFT, blank, cloud_colours, save_png
 
 OBJECTS = 4  # a class, in clouds.png
 _PANEL, _LABEL, _TOP = 1.25, 1.0, 0.62  # inches
-_INK, _SOFT = "#1d2430", "#6b7482"
-_PALE = np.array([0.93, 0.94, 0.96])
-_DARK = "#18141c"
 _SHOWN = (("infrared", "infrared", ""), ("disparity", "disparity", "px"), ("depth_m", "depth", "m"))
 
 Arrays = Mapping[str, np.ndarray]
@@ -34,28 +31,24 @@ def clouds_picture(
         heading: a line above all.
         twin: whether there are clean twins.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     kinds = ("points", "points_clean") if twin else ("points",)
     columns = max(1, *(min(OBJECTS, len(some)) for some in clouds.values())) * len(kinds)
     width, height = _LABEL + columns * _PANEL + 0.1, _TOP + len(clouds) * _PANEL + 0.1
-    figure = Figure(figsize=(width, height), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = blank(width, height, 100)
     # One pair of axes in inches for everything: hundreds of axes would take seconds.
     axes: Any = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
     axes.set_axis_off()
-    axes.text(width / 2, 0.2, heading, size=11, ha="center", va="center", color=_INK)
+    axes.text(width / 2, 0.2, heading, size=11, ha="center", va="center", color=INK)
     for column in range(columns):
         title = "measured" if kinds[column % len(kinds)] == "points" else "clean twin"
-        axes.text(_middle(column), 0.47, title, size=7.5, ha="center", va="center", color=_SOFT)
+        axes.text(_middle(column), 0.47, title, size=7.5, ha="center", va="center", color=SOFT)
     places, colours = [], []
     for row, (cls, objects) in enumerate(clouds.items()):
         middle = _TOP + (row + 0.5) * _PANEL
         extent = max((_extent(cloud[kind]) for cloud in objects for kind in kinds), default=1.0)
-        axes.text(0.08, middle - 0.08, cls, size=10, va="center", color=_INK)
+        axes.text(0.08, middle - 0.08, cls, size=10, va="center", color=INK)
         label = f"panel {extent:.2g} m" if objects else "none"
-        axes.text(0.08, middle + 0.12, label, size=7, va="center", color=_SOFT)
+        axes.text(0.08, middle + 0.12, label, size=7, va="center", color=SOFT)
         for i, cloud in enumerate(objects[:OBJECTS]):
             for j, kind in enumerate(kinds):
                 seen, colour = _drawn(cloud[kind])
@@ -65,7 +58,7 @@ def clouds_picture(
                 colours.append(colour)
     if places:
         axes.scatter(*np.concatenate(places).T, s=0.8, c=np.concatenate(colours), linewidths=0)
-    _save(figure, path)
+    save_png(figure, path)
 
 
 def infrared_picture(path: Path, previews: Mapping[str, tuple[str, Arrays]], heading: str) -> None:
@@ -76,34 +69,30 @@ def infrared_picture(path: Path, previews: Mapping[str, tuple[str, Arrays]], hea
         previews: by class, an object's id and its pictures (qs3.generation.provenance.preview_of).
         heading: a line above all.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     panel, label, caption, gap = 1.7, 0.3, 0.2, 0.25
     blocks = 2 if len(previews) > 3 else 1
     rows = -(-len(previews) // blocks)
     block, step = 3 * panel + gap, label + panel + caption
     width, height = blocks * block + 0.1, 0.45 + rows * step + 0.1
-    figure = Figure(figsize=(width, height), dpi=110, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = blank(width, height, 110)
 
     def write(x: float, y: float, text: str, size: float, color: str, align: str = "left") -> None:
         place: dict[str, Any] = {"ha": align, "va": "center"}
         figure.text(x / width, y / height, text, size=size, color=color, **place)
 
-    write(width / 2, height - 0.2, heading, 11, _INK, "center")
+    write(width / 2, height - 0.2, heading, 11, INK, "center")
     for number, (cls, (name, pictures)) in enumerate(previews.items()):
         x = 0.1 + number // rows * block
         bottom = height - 0.45 - number % rows * step - label - panel
-        write(x, bottom + panel + 0.13, cls, 10, _INK)
-        write(x + 3 * panel - 0.08, bottom + panel + 0.13, name, 6.5, _SOFT, "right")
+        write(x, bottom + panel + 0.13, cls, 10, INK)
+        write(x + 3 * panel - 0.08, bottom + panel + 0.13, name, 6.5, SOFT, "right")
         for column, (kind, title, unit) in enumerate(_SHOWN):
             left = x + column * panel
             box = (left / width, bottom / height, (panel - 0.08) / width, panel / height)
-            axes: Any = figure.add_axes(box, xticks=[], yticks=[], facecolor=_DARK)
+            axes: Any = figure.add_axes(box, xticks=[], yticks=[], facecolor=DARK)
             text = title + _show(axes, pictures.get(kind), unit)
-            write(left + (panel - 0.08) / 2, bottom - 0.09, text, 6.5, _SOFT, "center")
-    _save(figure, path)
+            write(left + (panel - 0.08) / 2, bottom - 0.09, text, 6.5, SOFT, "center")
+    save_png(figure, path)
 
 
 def _show(axes: Any, image: np.ndarray | None, unit: str) -> str:
@@ -115,7 +104,7 @@ def _show(axes: Any, image: np.ndarray | None, unit: str) -> str:
     values = np.ma.masked_invalid(image)
     low, high = np.percentile(values.compressed(), [1, 99])
     name, low = ("viridis", low) if unit else ("gray", 0.0)
-    colours = colormaps[name].with_extremes(bad=_DARK)
+    colours = colormaps[name].with_extremes(bad=DARK)
     axes.imshow(values, cmap=colours, vmin=low, vmax=high)
     return f" {low:.2f} to {high:.2f} {unit}" if unit else ""
 
@@ -132,15 +121,5 @@ def _extent(cloud: np.ndarray) -> float:
 
 def _drawn(cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[P, 2] right and up in metres, farthest first, and [P, 3] colours."""
-    from matplotlib import colormaps
-
     seen, depth, height = project(cloud)
-    near = (0.35 + 0.65 * depth)[:, None]
-    colour = near * colormaps["viridis"](0.02 + 0.86 * height)[:, :3] + (1 - near) * _PALE
-    return seen * _extent(cloud) / 2, colour
-
-
-def _save(figure: Any, path: Path) -> None:
-    """Write the PNG, atomically and without a date in it."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": None})
+    return seen * _extent(cloud) / 2, cloud_colours(height, depth)

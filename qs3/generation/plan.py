@@ -16,7 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.classes import CLASSES, class_list
-from qs3.config.checks import whole
+from qs3.config.checks import check_int
 from qs3.config.hydra import build
 from qs3.data.dataset_folder import VIEWS
 from qs3.errors import ConfigError
@@ -41,7 +41,7 @@ def check(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that no later step would explain as well."""
     for key, least in _WHOLE.items():
         if cfg[key] is not None or key != "limit":
-            whole(key, cfg[key], least)
+            check_int(key, cfg[key], least)
     if not isinstance(cfg.fraction, int | float) or not 0 < cfg.fraction <= 1:
         raise ConfigError(f"fraction must be in (0, 1], got {cfg.fraction!r}")
     if cfg.classes is not None:

@@ -1,23 +1,17 @@
-"""Many objects, several processes: the pool that runs a recipe over meshes.
+"""Many objects, several processes: a recipe run over meshes.
 
 Each worker process makes its renderer once (Blender and Mitsuba are one a process) and is
-replaced after a few hundred objects, because their memory creeps. A worker that dies takes
-nothing with it: what was in flight is tried again, one object at a time, and an object that
-kills its worker twice is reported as failed.
+replaced after a few hundred objects, because their memory creeps. An object that kills its
+worker twice is reported as failed.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import signal
-import threading
-import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
+from functools import partial
 
 from qs3.errors import Qs3Error, RenderError
 from qs3.generation.provenance import Keep
@@ -25,10 +19,12 @@ from qs3.generation.recipes import Cloud, Recipe
 from qs3.generation.view_files import DiskError, disk_errors_travel
 from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
+from qs3.utils.pool import Processes, engine
 
 log = logging.getLogger(__name__)
 
 OBJECTS_PER_WORKER = 200
+_DEATHS = 3  # objects in a row
 DIED = "the worker process died twice on this object (out of memory, or a crash)"
 
 
@@ -63,9 +59,8 @@ class Job:
         make_renderer: picklable; called once in each worker if the recipe needs one.
         seed: of the dataset.
         keep: what is wanted besides the clouds.
-        save: picklable; a worker process saves lasting outcomes by it. Clouds must not come back
-            through the pool's pipe: a worker killed in the middle of a large message leaves half
-            of it there, and the pool waits for the rest for ever.
+        save: picklable; a worker process saves lasting outcomes by it, so that what is done is
+            on disk whatever happens to the others.
     """
 
     recipe: Recipe
@@ -107,14 +102,13 @@ def renderer_provenance(job: Job) -> dict[str, str]:
     """
     if not job.recipe.needs_renderer:
         return {}
-    try:
-        with _pool(job, 1) as pool:
-            provenance, found_out = pool.submit(_provenance).result()
-    except BrokenProcessPool as error:
+    (outcome,) = Processes(1).run(partial(_Inspector, job), [("renderer", None)])
+    if outcome.result is None:
         raise RenderError(
             "the renderer's process died at its start (out of memory, killed, or a library that "
             "does not fit): run again, and see `python -m qs3.tools.doctor` if it happens again"
-        ) from error
+        )
+    provenance, found_out = outcome.result
     # What the child found out about this machine need not be found out by every worker.
     os.environ.update(found_out)
     return provenance
@@ -131,113 +125,44 @@ def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]
     Raises:
         RenderError: one object after the other kills its worker; it is not the objects.
     """
-    if workers == 0:
-        renderer = job.make_renderer() if job.recipe.needs_renderer else None
-        for item in items:
-            yield scan_one(job, renderer, item)
-        return
-    chunk = OBJECTS_PER_WORKER * workers
-    for first in range(0, len(items), chunk):
-        left = {item.id: item for item in items[first : first + chunk]}
-        try:
-            for outcome in _scan_chunk(job, list(left.values()), workers):
-                del left[outcome.item_id]
-                yield outcome
-        except BrokenProcessPool:
-            log.warning("a worker process died; trying the objects that it had one at a time")
-            alone = [_scan_alone(job, left[i]) for i in list(left)[: max(2 * workers, 3)]]
-            survived = [outcome for outcome in alone if outcome.reason != DIED]
-            if len(alone) > 2 and not survived:
-                raise RenderError(
-                    f"{len(alone)} objects in a row ended their worker process: this machine lacks "
-                    "memory, or the renderer does not work here (python -m qs3.tools.doctor)"
-                ) from None
-            for outcome in alone:
-                del left[outcome.item_id]
-                yield outcome
-            yield from scan_all(job, list(left.values()), workers)
+    # Each worker can meet a deadly object at the same time; as many again are too many.
+    patience = min(max(2 * workers, _DEATHS), max(len(items), _DEATHS))
+    deaths = 0
+    make_worker = partial(_Scanner, job, saves=workers > 0)
+    tasks = ((item.id, item) for item in items)
+    for outcome in engine(workers, OBJECTS_PER_WORKER).run(make_worker, tasks):
+        deaths = deaths + 1 if outcome.died else 0
+        if deaths == patience:
+            raise RenderError(
+                f"{deaths} objects in a row ended their worker process: this machine lacks "
+                "memory, or the renderer does not work here (python -m qs3.tools.doctor)"
+            )
+        yield outcome.result or Outcome(outcome.name, "", None, DIED, lasting=False)
 
 
-def _scan_chunk(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]:
-    pool = _pool(job, min(workers, len(items)))
-    try:
-        waiting = iter(items)
-        running: set[Future[Outcome]] = set()
-        while True:
-            # Two a worker in flight: enough that none idles, few to repeat after a crash.
-            while len(running) < 2 * workers and (item := next(waiting, None)) is not None:
-                running.add(pool.submit(_scan, item))
-            if not running:
-                return
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            # In a broken pool every future fails: keep what was done before it broke.
-            finished = [future for future in done if future.exception() is None]
-            for future in finished:
-                yield future.result()
-            for future in done:
-                future.result()
-    finally:
-        for process in list(pool._processes.values()):
-            process.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
+class _Scanner:
+    """A worker: scans objects with a renderer of its own."""
+
+    def __init__(self, job: Job, saves: bool) -> None:
+        self.job = job
+        self.save = job.save if saves else None
+        self.renderer = job.make_renderer() if job.recipe.needs_renderer else None
+
+    def __call__(self, item: MeshItem) -> Outcome:
+        outcome = scan_one(self.job, self.renderer, item)
+        if self.save is None or not outcome.lasting:
+            return outcome
+        with disk_errors_travel():
+            self.save(outcome)
+        return replace(outcome, cloud=None, saved=True)
 
 
-def _scan_alone(job: Job, item: MeshItem) -> Outcome:
-    try:
-        with _pool(job, 1) as pool:
-            return pool.submit(_scan, item).result()
-    except BrokenProcessPool:
-        return Outcome(item.id, "", None, DIED, lasting=False)
+class _Inspector:
+    """A worker that says which renderer it has, and what it has learnt about the machine."""
 
+    def __init__(self, job: Job) -> None:
+        self.renderer = job.make_renderer()
 
-_JOB: Job | None = None
-_RENDERER: Renderer | None = None
-
-
-def _pool(job: Job, workers: int) -> ProcessPoolExecutor:
-    # Spawned, because neither Blender nor a threaded BLAS survives a fork.
-    return ProcessPoolExecutor(
-        workers,
-        mp_context=get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(job, os.getpid()),
-    )
-
-
-def _start_worker(job: Job, parent: int) -> None:
-    global _JOB
-    _JOB = job
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
-    threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
-
-
-def _die_with(parent: int) -> None:
-    """A worker whose parent was killed would wait for work for ever."""
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
-
-
-def _renderer() -> Renderer | None:
-    global _RENDERER
-    assert _JOB is not None
-    if _RENDERER is None and _JOB.recipe.needs_renderer:
-        _RENDERER = _JOB.make_renderer()
-    return _RENDERER
-
-
-def _provenance() -> tuple[dict[str, str], dict[str, str]]:
-    renderer = _renderer()
-    assert renderer is not None
-    found_out = {name: value for name, value in os.environ.items() if name.startswith("QS3_")}
-    return renderer.provenance(), found_out
-
-
-def _scan(item: MeshItem) -> Outcome:
-    assert _JOB is not None
-    outcome = scan_one(_JOB, _renderer(), item)
-    if _JOB.save is None or not outcome.lasting:
-        return outcome
-    with disk_errors_travel():
-        _JOB.save(outcome)
-    return replace(outcome, cloud=None, saved=True)
+    def __call__(self, _: None) -> tuple[dict[str, str], dict[str, str]]:
+        found_out = {name: value for name, value in os.environ.items() if name.startswith("QS3_")}
+        return self.renderer.provenance(), found_out

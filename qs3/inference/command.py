@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from qs3.clouds.files import SUFFIXES, measured, parse_clouds, printable
-from qs3.config.checks import one_of, whole
+from qs3.config.checks import check_choice, check_int
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.model_file import PACKAGES
@@ -54,9 +54,9 @@ class Settings:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        one_of("up", self.up, UP_AXES)
-        whole("batch_size", self.batch_size, 1)
-        whole("threads", self.threads, 1)
+        check_choice("up", self.up, UP_AXES)
+        check_int("batch_size", self.batch_size, 1)
+        check_int("threads", self.threads, 1)
         if Path(self.out).suffix.lower() not in (".csv", ".json"):
             raise ConfigError(f"out={self.out} must end in .csv or .json")
 

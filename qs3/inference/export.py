@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from qs3.clouds.files import measured, parse_clouds
-from qs3.config.checks import whole
+from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.inference.export_graph import Plain, least_points
 from qs3.inference.predictor import Predictor, load
@@ -107,7 +107,7 @@ def export_command(
     """
     from qs3.inference.command import saved
 
-    torch.set_num_threads(whole("threads", threads, 1))
+    torch.set_num_threads(check_int("threads", threads, 1))
     predictor = load(ckpt)
     clouds = None if check is None else clouds_of(predictor, check)
     replaces = Path(out).expanduser().exists()

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import number
+from qs3.config.checks import check_float
 from qs3.errors import ConfigError
 
 
@@ -78,7 +78,7 @@ def class_loss(
 
 def weight(key: str, value: float) -> float:
     """A loss's weight from `method.<key>`: any finite number >= 0; 0 switches the loss off."""
-    if number(f"method.{key}", value) < 0:
+    if check_float(f"method.{key}", value) < 0:
         raise ConfigError(f"method.{key} must be >= 0, got {value}; 0 switches its loss off")
     return float(value)
 

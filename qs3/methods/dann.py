@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import one_of
+from qs3.config.checks import check_choice
 from qs3.methods.base import Method, class_loss, feature_dims, weight
 from qs3.methods.reversal import dann_alpha, reverse_gradient
 from qs3.models.base import ClassHead
@@ -45,7 +45,9 @@ class Dann(Method):
         domain_batches: str = "together",
     ) -> None:
         super().__init__()
-        self.domain_batches = one_of("method.domain_batches", domain_batches, ("together", "apart"))
+        self.domain_batches = check_choice(
+            "method.domain_batches", domain_batches, ("together", "apart")
+        )
         self.class_weight = weight("class_weight", class_weight)
         self.domain_weight = weight("domain_weight", domain_weight)
         self.domain_head: nn.Module | None = None

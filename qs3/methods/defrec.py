@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.config.checks import number, whole
+from qs3.config.checks import check_float, check_int
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.chamfer import masked_chamfer
@@ -53,10 +53,10 @@ class DefRec(Method):
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
-        if not 0 <= number("method.defrec_weight", defrec_weight) <= 1:
+        if not 0 <= check_float("method.defrec_weight", defrec_weight) <= 1:
             raise ConfigError(f"method.defrec_weight must lie in [0, 1], got {defrec_weight}")
         self.defrec_weight, self.scale = defrec_weight, weight("scale", scale)
-        self.min_points = whole("method.min_points", min_points, 1)
+        self.min_points = check_int("method.min_points", min_points, 1)
         self.pcm, self.on_source, self.dropout = pcm, on_source, dropout
         self.head: ReconstructionHead | None = None
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import whole
+from qs3.config.checks import check_int
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.deform import VOXELS, deform
@@ -58,7 +58,7 @@ class Gast(Method):
         self.class_weight = weight("class_weight", class_weight)
         self.def_weight = weight("def_weight", def_weight)
         self.rot_weight = weight("rot_weight", rot_weight)
-        self.min_points, self.pcm = whole("method.min_points", min_points, 1), pcm
+        self.min_points, self.pcm = check_int("method.min_points", min_points, 1), pcm
         self.def_head: nn.Module | None = None
         self.rot_heads: nn.ModuleList | None = None
 

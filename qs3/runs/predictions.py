@@ -7,7 +7,6 @@ where no mesh is known); label (empty if nobody knows it); predicted; and a prob
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from jaxtyping import Float, Int
 
 from qs3.errors import DataError
 from qs3.utils.files import write_text
+from qs3.utils.text_table import csv_text
 
 FILE = "predictions.csv"
 OF_FILES = "predictions_of_files.csv"
@@ -49,14 +49,13 @@ class Predictions:
 
 def write_predictions(path: Path, predictions: Predictions) -> None:
     """Write the table, atomically; probabilities with all their digits."""
-    p, text = predictions, io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_FIRST, *(f"p_{name}" for name in p.classes)])
+    p = predictions
+    lines: list[list[str]] = [[*_FIRST, *(f"p_{name}" for name in p.classes)]]
     rows = zip(p.ids, p.meshes, p.labels, p.predicted, p.probabilities, strict=True)
     for id_, mesh, label, predicted, row in rows:
         name = "" if label < 0 else p.classes[label]
-        writer.writerow([id_, mesh, name, p.classes[predicted], *map(repr, row.tolist())])
-    write_text(path, text.getvalue())
+        lines.append([id_, mesh, name, p.classes[predicted], *map(repr, row.tolist())])
+    write_text(path, csv_text(lines))
 
 
 def write_predictions_of_files(
@@ -73,15 +72,14 @@ def write_predictions_of_files(
         reasons: in what a cloud is unlike the source's; "" if in nothing.
         predictions: of the clouds.
     """
-    p, text = predictions, io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+    p = predictions
     first = ("file", "class", "confidence", "unlike_source", "reason")
-    writer.writerow([*first, *(f"p_{name}" for name in p.classes)])
+    lines: list[list[str]] = [[*first, *(f"p_{name}" for name in p.classes)]]
     rows = zip(files, p.predicted, reasons, p.probabilities, strict=True)
     for file, predicted, reason, row in sorted(rows, key=lambda r: r[0]):
         flag, digits = "yes" if reason else "no", [f"{value:.4f}" for value in row]
-        writer.writerow([file, p.classes[predicted], digits[predicted], flag, reason, *digits])
-    write_text(path, text.getvalue())
+        lines.append([file, p.classes[predicted], digits[predicted], flag, reason, *digits])
+    write_text(path, csv_text(lines))
 
 
 def read_predictions(path: Path) -> Predictions:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.utils.files import write_text
+from qs3.utils.text_table import csv_text
 
 _COLUMNS = ("id", "label", "confidence", "selected")
 
@@ -39,12 +39,9 @@ def write_pseudo_labels(
     classes: Sequence[str],
 ) -> None:
     """Write the table, atomically; confidences with all their digits."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for id_, label, p, kept in zip(ids, predicted, confidence, selected, strict=True):
-        writer.writerow([id_, classes[label], repr(float(p)), int(kept)])
-    write_text(path, text.getvalue())
+    rows = zip(ids, predicted, confidence, selected, strict=True)
+    lines = ([id_, classes[label], float(p), int(kept)] for id_, label, p, kept in rows)
+    write_text(path, csv_text([_COLUMNS, *lines]))
 
 
 def read_pseudo_labels(path: Path) -> list[PseudoLabel]:

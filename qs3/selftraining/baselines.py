@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from qs3.config.checks import one_of, whole
+from qs3.config.checks import check_choice, check_int
 from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, Selector, TeacherPredictions
 from qs3.utils.seeding import derive
@@ -32,8 +32,8 @@ class Random:
     def __post_init__(self) -> None:
         if not hasattr(self.of, "select"):
             raise ConfigError("selftraining.selector.of must be a selector")
-        whole("selftraining.selector.seed", self.seed, 0)
-        one_of("selftraining.selector.pool", self.pool, ("confident", "all"))
+        check_int("selftraining.selector.seed", self.seed, 0)
+        check_choice("selftraining.selector.pool", self.pool, ("confident", "all"))
 
     @property
     def own_thresholds(self) -> bool:

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.config.checks import number, one_of
+from qs3.config.checks import check_choice, check_float
 from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, TeacherPredictions
 
@@ -73,9 +73,9 @@ class Cbst:
     alpha: float = 0.25
 
     def __post_init__(self) -> None:
-        one_of(f"{_KEY}.labels", self.labels, ("hard", "lrent"))
+        check_choice(f"{_KEY}.labels", self.labels, ("hard", "lrent"))
         for key in ("portion", "step", "most", "alpha"):
-            number(f"{_KEY}.{key}", getattr(self, key))
+            check_float(f"{_KEY}.{key}", getattr(self, key))
         if not 0 < self.portion <= self.most <= 1:
             raise ConfigError(
                 f"{_KEY}: 0 < portion <= most <= 1, got portion={self.portion}, most={self.most}"

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.config.checks import one_of
+from qs3.config.checks import check_choice
 from qs3.errors import SelectionError
 
 
@@ -110,9 +110,9 @@ class Qbst:
     counts: str = "confident"
 
     def __post_init__(self) -> None:
-        one_of("selftraining.selector.mu", self.mu, ("balanced", "one"))
-        one_of("selftraining.selector.order", self.order, ("descending", "ascending"))
-        one_of("selftraining.selector.counts", self.counts, ("confident", "all"))
+        check_choice("selftraining.selector.mu", self.mu, ("balanced", "one"))
+        check_choice("selftraining.selector.order", self.order, ("descending", "ascending"))
+        check_choice("selftraining.selector.counts", self.counts, ("confident", "all"))
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes alone."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Window, project
 from qs3.sensors.renderers.base import Body, Renderer
 
@@ -91,6 +92,19 @@ class DepthSensor(Protocol):
             The frame, or None if the box is outside the view.
         """
         ...
+
+
+def check_depths(sensor: Any) -> None:
+    """Check the nearest and the farthest depth that a sensor gives.
+
+    Raises:
+        ConfigError: not 0 < min_depth_m < max_depth_m.
+    """
+    if not 0 < sensor.min_depth_m < sensor.max_depth_m:
+        raise ConfigError(
+            "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
+            f"{sensor.min_depth_m} and {sensor.max_depth_m}"
+        )
 
 
 def window_of(box_m: np.ndarray, camera: Camera, *, margin_px: int = 0) -> Window | None:

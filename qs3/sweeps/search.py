@@ -24,7 +24,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig
 
 from qs3.config import hashing
-from qs3.config.checks import whole
+from qs3.config.checks import check_int
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.launching import OverLauncher
@@ -57,10 +57,10 @@ class LabelFreeSearch(OverLauncher):
         folder: str,
     ) -> None:  # fmt: skip
         self.params = dict(params)
-        self.trials = whole("hydra.sweeper.trials", trials, 1)
-        self.at_once = whole("hydra.sweeper.at_once", at_once, 1)
-        self.seed = whole("hydra.sweeper.seed", seed, 0)
-        self.random = whole("hydra.sweeper.random", random, 1)
+        self.trials = check_int("hydra.sweeper.trials", trials, 1)
+        self.at_once = check_int("hydra.sweeper.at_once", at_once, 1)
+        self.seed = check_int("hydra.sweeper.seed", seed, 0)
+        self.random = check_int("hydra.sweeper.random", random, 1)
         self.folder = Path(folder)
 
     def run(self, arguments: list[str]) -> list[JobReturn]:

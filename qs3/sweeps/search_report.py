@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from qs3.evaluation.validators import LABEL_FREE
-from qs3.report.tables.aggregate import align
 from qs3.sweeps.search_space import overrides
+from qs3.utils.text_table import aligned
 
 FAILED = "failed"
 
@@ -55,7 +55,7 @@ def report(headline: str, objective: str, tried: Sequence[Tried], fixed: Sequenc
         value = "-" if one.value is None else f"{one.value:.4f}"
         values = (one.params.get(key, "-") for key in keys)
         rows.append((str(one.number), value, *values, one.run))
-    lines = [headline, *align(rows)]
+    lines = [headline, *aligned(rows)]
     judged = [one for one in tried if one.value is not None]
     if judged:
         sign = 1 if LABEL_FREE[objective].higher_is_better else -1

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config import hashing
-from qs3.config.checks import number, one_of, whole
+from qs3.config.checks import check_choice, check_float, check_int
 from qs3.config.hydra import build, in_multirun
 from qs3.data.ensure_source import check_or_make
 from qs3.data.store import is_finished
@@ -42,7 +42,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     scheme: Scheme = build(cfg.selftraining)
     run = Run(
         cfg=cfg,
-        seed=whole("seed", cfg.seed, 0),
+        seed=check_int("seed", cfg.seed, 0),
         folder=hashing.run_folder(cfg),
         scheme=scheme,
         phases=Phases(cfg.protocol.epochs, scheme.rounds, scheme.epochs),
@@ -153,39 +153,39 @@ def _wandb_forgotten() -> Iterator[None]:
 
 def _check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
-    one_of("selection.teacher", cfg.selection.teacher, TEACHERS)
-    one_of("selection.student", cfg.selection.student, STUDENT_RULES)
-    whole("data.points", cfg.data.points, 1)
-    whole("data.fps_starts", cfg.data.fps_starts, 1)
+    check_choice("selection.teacher", cfg.selection.teacher, TEACHERS)
+    check_choice("selection.student", cfg.selection.student, STUDENT_RULES)
+    check_int("data.points", cfg.data.points, 1)
+    check_int("data.fps_starts", cfg.data.fps_starts, 1)
     for key in ("clouds_a_class", "clouds_a_split"):
         if cfg.data[key] is not None:
-            whole(f"data.{key}", cfg.data[key], 1)
+            check_int(f"data.{key}", cfg.data[key], 1)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
         raise ConfigError(f"ckpt_path must be last or a path, got {cfg.ckpt_path!r}")
     if cfg.ckpt_path is not None and cfg.force:
         raise ConfigError(
             "force=true begins the run anew and ckpt_path goes on with one; give one of them"
         )
-    whole("data.eval_batch_size", cfg.data.eval_batch_size, 1)
-    one_of("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
-    whole("evaluation.rotations", cfg.evaluation.rotations, 0)
-    whole("protocol.batch_size", cfg.protocol.batch_size, 2)  # batch norm needs two clouds
-    one_of("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
-    highest = 1 - 1 / whole("num_classes", cfg.num_classes, 2)  # there all classes are alike
-    if not 0 <= number("protocol.smoothing", cfg.protocol.smoothing) <= highest:
+    check_int("data.eval_batch_size", cfg.data.eval_batch_size, 1)
+    check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
+    check_int("evaluation.rotations", cfg.evaluation.rotations, 0)
+    check_int("protocol.batch_size", cfg.protocol.batch_size, 2)  # batch norm needs two clouds
+    check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
+    highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
+    if not 0 <= check_float("protocol.smoothing", cfg.protocol.smoothing) <= highest:
         raise ConfigError(
             f"protocol.smoothing must lie in [0, {highest:g}], got {cfg.protocol.smoothing}"
         )
-    if number("protocol.regulariser", cfg.protocol.regulariser) < 0:
+    if check_float("protocol.regulariser", cfg.protocol.regulariser) < 0:
         raise ConfigError(f"protocol.regulariser must be >= 0, got {cfg.protocol.regulariser}")
     if "lr" in cfg.protocol.optimizer:
-        number("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
+        check_float("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
     if not isinstance(cfg.data.make_source, bool):
         raise ConfigError(f"data.make_source must be true or false, got {cfg.data.make_source!r}")
     if not isinstance(cfg.report.pictures, bool):
         raise ConfigError(f"report.pictures must be true or false, got {cfg.report.pictures!r}")
     if cfg.trainer.threads is not None:
-        whole("trainer.threads", cfg.trainer.threads, 1)
+        check_int("trainer.threads", cfg.trainer.threads, 1)
 
 
 def _is_upper_bound(cfg: DictConfig) -> bool:

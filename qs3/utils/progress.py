@@ -1,12 +1,18 @@
-"""Progress of a generation: a bar in a terminal, a line now and then in a log."""
+"""How far a loop is: a bar on a terminal, a line now and then in a log."""
 
 from __future__ import annotations
 
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -32,8 +38,29 @@ def progress_bar(label: str, *, total: int, done: int = 0) -> Iterator[Callable[
         yield _LogLines(label, total, done).advance
 
 
-@contextmanager
-def _rich_bar(label: str, total: int, done: int) -> Iterator[Callable[[], None]]:
+def shown(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+    """Iterate with a bar on a terminal that goes away at the end; silent elsewhere.
+
+    Args:
+        items: to iterate over.
+        label: what is going on.
+        total: how many there are, if `items` has no length.
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    quiet = not console.is_terminal
+    yield from track(items, label, total, console=console, transient=True, disable=quiet)
+
+
+def terminal_bar(*fields: str, transient: bool = False) -> Progress:
+    """A bar on stderr, to be started: description, bar, steps of all, `fields`, time gone and left.
+
+    Args:
+        fields: formats of rich, e.g. "epochs," or "{task.fields[rate]}".
+        transient: whether it goes away at the end.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -44,17 +71,25 @@ def _rich_bar(label: str, total: int, done: int) -> Iterator[Callable[[], None]]
         TimeRemainingColumn,
     )
 
-    columns = (
+    return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
+        *map(TextColumn, fields),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=transient,
+        # What goes to a file or a pipe stays what it is; on a terminal it goes above the bar.
+        redirect_stdout=sys.stdout.isatty(),
     )
+
+
+@contextmanager
+def _rich_bar(label: str, total: int, done: int) -> Iterator[Callable[[], None]]:
     start, steps = time.monotonic(), 0
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with terminal_bar("{task.fields[rate]}") as bar:
         task = bar.add_task(label, total=total, completed=done, rate="")
 
         def advance() -> None:

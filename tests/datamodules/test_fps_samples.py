@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import numpy as np
@@ -59,13 +60,13 @@ def test_processes_do_not_change_the_result(monkeypatch):
 
 def test_if_there_can_be_no_processes_this_one_does_it(monkeypatch, caplog):
     def full(*args, **kwargs):
-        raise OSError(28, "No space left on device")
+        raise OSError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(qs3.datamodules.fps_samples.tempfile, "TemporaryDirectory", full)
+    monkeypatch.setattr(SpawnProcess, "start", full)
     with caplog.at_level(logging.WARNING):
         order = sample_all(CLOUDS, 10, 3, processes=2)
     assert np.array_equal(order, sample(CLOUDS, 10, 3))
-    assert "No space left" in caplog.text
+    assert "temporarily unavailable" in caplog.text
 
 
 _SLOW = """

@@ -10,9 +10,9 @@ from torch import nn
 from qs3.datamodules.adaptation import Unlabelled
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
+from qs3.evaluation.calibration import calibration_error
 from qs3.evaluation.metrics import (
     Evaluation,
-    calibration_error,
     figures,
     figures_without_labels,
     predict,

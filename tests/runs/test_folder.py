@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config import hashing
-from qs3.config.checks import whole
+from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs import folder as runs
 from qs3.runs.metrics import read_metrics, write_metrics
@@ -113,11 +113,11 @@ def test_folder():
 @pytest.mark.parametrize("seed", [None, "1", 1.0, -1, True])
 def test_seed_must_be_a_whole_number(seed):
     with pytest.raises(ConfigError, match="seed must be"):
-        whole("seed", seed, 0)
+        check_int("seed", seed, 0)
 
 
 def test_seed_zero_is_a_seed():
-    assert whole("seed", 0, 0) == 0
+    assert check_int("seed", 0, 0) == 0
 
 
 def test_metrics_mark_a_finished_run(tmp_path):

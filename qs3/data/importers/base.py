@@ -7,10 +7,10 @@ import dataclasses
 import logging
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -19,10 +19,9 @@ from qs3.data.manifest import ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
 from qs3.errors import ConfigError, DataError
 from qs3.utils.locks import locked
+from qs3.utils.progress import shown
 
 log = logging.getLogger(__name__)
-
-T = TypeVar("T")
 
 
 class Item(NamedTuple):
@@ -115,7 +114,7 @@ class Importer(abc.ABC):
             DataError: names the file, the line or item, and what is wrong.
         """
         clouds, rows = [], []
-        for row, where, load in _progress(self.items(classes), f"importing {self.root.name}"):
+        for row, where, load in shown(self.items(classes), f"importing {self.root.name}"):
             try:
                 raw = load()
                 cloud = check_cloud(self.thin(raw, where), self.points, where)
@@ -220,6 +219,25 @@ def inside(path: Path, root: Path) -> Path:
     return path
 
 
+def visible(folder: Path, root: Path) -> list[Path]:
+    """What is in a folder in order of its names, hidden things left out.
+
+    Raises:
+        DataError: it cannot be read, a name is not printable text, or a link leads out of `root`.
+    """
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError as error:
+        raise DataError(f"{folder} cannot be read ({error.strerror})") from error
+    clear = [name for name in names if not name.startswith(".") and name != "__MACOSX"]
+    for name in clear:
+        if not name.isprintable():
+            raise DataError(
+                f"{folder / name!r}: a name with control or broken characters; rename it"
+            )
+    return [inside(folder / name, root) for name in clear]
+
+
 def check_cloud(cloud: np.ndarray, points: int, where: str) -> np.ndarray:
     """[P, 3] float32 from [n, 3] with 1 <= n <= P, filled up by repeating from the first point.
 
@@ -271,12 +289,3 @@ def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
         log.warning("%s: %d clouds have under %d points and repeat some", where, short, points)
     if skipped:
         log.warning("%s: %d clouds left out; manifest.csv says why", where, skipped)
-
-
-def _progress(items: Sequence[T], what: str) -> Iterator[T]:
-    """Iterate with a progress bar on the terminal; silent where stderr is none."""
-    from rich.console import Console
-    from rich.progress import track
-
-    console = Console(stderr=True)
-    yield from track(items, description=what, console=console, disable=not console.is_terminal)

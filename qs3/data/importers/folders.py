@@ -34,9 +34,8 @@ from qs3.clouds.files import (
     read_clouds,
     split_prefix,
 )
-from qs3.config.checks import one_of, whole
-from qs3.data.importers.base import Importer, Item, class_of, split_of
-from qs3.data.importers.trees import _visible
+from qs3.config.checks import check_choice, check_int
+from qs3.data.importers.base import Importer, Item, class_of, split_of, visible
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError
 
@@ -82,9 +81,9 @@ class CloudFolder(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of("published.layout", self.layout, LAYOUTS)
-        one_of("published.up", self.up, tuple(_UP))
-        whole("published.test_every", self.test_every, 0)
+        check_choice("published.layout", self.layout, LAYOUTS)
+        check_choice("published.up", self.up, tuple(_UP))
+        check_int("published.test_every", self.test_every, 0)
         if self.test_every == 1:
             raise ConfigError("published.test_every=1 leaves nothing for training; 0 tests nothing")
 
@@ -167,7 +166,7 @@ class CloudFolder(Importer):
         """
         if self.layout != "auto":
             return self.layout
-        folders = [e for e in _visible(self.root, self.root) if e.is_dir()]
+        folders = [e for e in visible(self.root, self.root) if e.is_dir()]
         folders = [f for f in folders if next(_files(f, self.root), None) is not None]
         if not folders:
             return "none"
@@ -181,7 +180,7 @@ class CloudFolder(Importer):
                 f"{', '.join(classes)} (`classes` of the domain), or read all files without labels "
                 "with published.layout=none"
             )
-        inner = [e for f in folders for e in _visible(f, self.root) if e.is_dir()]
+        inner = [e for f in folders for e in visible(f, self.root) if e.is_dir()]
         return "class/split" if inner and all(_is_split(e.name) for e in inner) else "class"
 
     def _place(self, path: Path, layout: str, classes: Sequence[str]) -> tuple[str, str]:
@@ -312,7 +311,7 @@ def _is_split(name: str) -> bool:
 
 def _files(folder: Path, root: Path) -> Iterator[Path]:
     """All files of known formats below a folder, in order; links may not leave `root`."""
-    for path in _visible(folder, root):
+    for path in visible(folder, root):
         if path.is_dir():
             if path.is_symlink():  # it could lead in a circle, or give the same clouds twice
                 raise DataError(f"{path} is a link to a folder; move or copy the folder instead")

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from qs3.data.importers.base import Importer, Item
-from qs3.data.importers.trees import _visible, read_xyz
+from qs3.clouds.files import parse_cloud
+from qs3.data.importers.base import Importer, Item, visible
 from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError, DataError
 
@@ -66,14 +66,14 @@ class GraspNetPC(Importer):
                 folder = self._folder(split, sensor)
                 if not folder.is_dir():
                     continue  # the synthetic domain has no test split
-                for class_folder in (e for e in _visible(folder, self.root) if e.is_dir()):
+                for class_folder in (e for e in visible(folder, self.root) if e.is_dir()):
                     if class_folder.name not in classes:
                         raise DataError(
                             f"{class_folder}: unknown class; known are {', '.join(classes)}"
                         )
                     of_split += [
                         self._item(path, class_folder.name, split, sensor)
-                        for path in _visible(class_folder, self.root)
+                        for path in visible(class_folder, self.root)
                         if path.suffix.lower() == ".xyz" and path.is_file()
                     ]
             found += sorted(of_split, key=lambda item: (classes.index(item.row.cls), item.row.id))
@@ -93,4 +93,4 @@ class GraspNetPC(Importer):
             split,
             origin=path.relative_to(self.root).as_posix(),
         )
-        return Item(row, str(path), functools.partial(read_xyz, path))
+        return Item(row, str(path), functools.partial(parse_cloud, path))

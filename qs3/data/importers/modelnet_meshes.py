@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.classes import ALIASES
-from qs3.data.importers.base import Importer, Item, inside, split_of
+from qs3.data.importers.base import Importer, Item, split_of, visible
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError, MeshError
 from qs3.utils.seeding import derive
@@ -138,20 +137,8 @@ def wanted_class(folder: str, classes: Sequence[str]) -> str | None:
 
 
 def _folders(folder: Path, root: Path) -> Iterator[Path]:
-    return (path for path in _visible(folder, root) if path.is_dir())
+    return (path for path in visible(folder, root) if path.is_dir())
 
 
 def _off_files(folder: Path, root: Path) -> Iterator[Path]:
-    return (path for path in _visible(folder, root) if path.suffix.lower() == ".off")
-
-
-def _visible(folder: Path, root: Path) -> list[Path]:
-    try:
-        names = sorted(os.listdir(folder))
-    except OSError as error:
-        raise DataError(f"{folder} cannot be read ({error.strerror})") from error
-    shown = [name for name in names if not name.startswith(".") and name != "__MACOSX"]
-    for name in shown:
-        if not name.isprintable():
-            raise DataError(f"{folder / name!r}: a name with control or broken characters")
-    return [inside(folder / name, root) for name in shown]
+    return (path for path in visible(folder, root) if path.suffix.lower() == ".off")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from qs3.data.inspection.open_dataset import Opened, open_named, parse
 from qs3.data.inspection.text import of_domain, of_pair
 from qs3.errors import ConfigError
 from qs3.utils.files import make_folder, write_json, write_text
+from qs3.utils.progress import progress_bar
 
 OUT = Path("out/inspection")
 _OWN = {"domain": str, "out": str, "sample": int, "seed": int, "meshes": str}
@@ -35,7 +35,7 @@ def inspect_command(argv: Sequence[str]) -> str:
     opened = open_named(names[0], overrides)
     bounds = _bounds(values)
     steps = min(bounds.sample, len(opened.data))
-    with _bar(f"inspecting {opened.name}", steps) as advance:
+    with progress_bar(f"inspecting {opened.name}", total=steps) as advance:
         facts = inspect(opened, bounds, advance)
     out = make_folder(str(values.get("out", OUT / _file_name(opened))))
     write_json(out / "inspection.json", facts)
@@ -53,7 +53,7 @@ def compare_command(argv: Sequence[str]) -> str:
         raise ConfigError(f"compare takes two domains, names or folders: compare A B; {_got(argv)}")
     a, b = (open_named(name, of) for name, of in zip(names, overrides, strict=True))
     bounds = _bounds(values)
-    with _bar(f"comparing {a.name} and {b.name}", COMPARE_STEPS) as advance:
+    with progress_bar(f"comparing {a.name} and {b.name}", total=COMPARE_STEPS) as advance:
         facts = compare(a, b, bounds, advance)
     default = OUT / f"{_file_name(a)}-{_file_name(b)}"
     out = make_folder(str(values.get("out", default)))
@@ -87,11 +87,3 @@ def _bounds(values: dict[str, Any]) -> Bounds:
 
 def _file_name(opened: Opened) -> str:
     return opened.name if opened.variant == "points" else f"{opened.name}_{opened.variant}"
-
-
-@contextmanager
-def _bar(label: str, total: int) -> Any:
-    from qs3.utils.progress import progress_bar
-
-    with progress_bar(label, total=total) as advance:
-        yield advance

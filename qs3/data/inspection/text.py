@@ -5,20 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from qs3.utils import text_table
+
 Numbers = dict[str, Any]
 
 
 def table(rows: Sequence[Sequence[str]], markdown: bool = False) -> str:
     """Rows of words, header first: the first column to the left, the others to the right."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [row[0].ljust(widths[0])]
-        cells += [w.rjust(n) for w, n in zip(row[1:], widths[1:], strict=True)]
-        lines.append(f"| {' | '.join(cells)} |" if markdown else "  ".join(cells).rstrip())
     if markdown:
-        lines.insert(1, f"|{'|'.join(['---'] + ['---:'] * (len(widths) - 1))}|")
-    return "\n".join(lines)
+        return "\n".join(text_table.markdown(rows, numbers=True))
+    return "\n".join(text_table.aligned(rows, numbers=True, rule=False))
 
 
 def of_domain(facts: Numbers) -> str:

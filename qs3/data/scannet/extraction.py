@@ -6,10 +6,8 @@ number of workers, nor their order, nor an interruption changes a byte of it.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
-import io
 import logging
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -20,7 +18,7 @@ import cv2
 import numpy as np
 
 from qs3.classes import CLASSES
-from qs3.config.checks import whole
+from qs3.config.checks import check_int
 from qs3.data.dataset_folder import RECIPE, delete_dataset
 from qs3.data.manifest import ManifestRow
 from qs3.data.scannet.files import Found, SceneFiles, find_scenes
@@ -35,6 +33,7 @@ from qs3.errors import DataError
 from qs3.utils.files import make_folder, sha256_file, write_text
 from qs3.utils.locks import locked
 from qs3.utils.progress import progress_bar
+from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
 
 log = logging.getLogger(__name__)
@@ -81,7 +80,7 @@ def extract(
         DataError: no object gave a cloud.
     """
     settings = settings or Extraction()
-    whole("workers", workers, 0)
+    check_int("workers", workers, 0)
     scans, out = scans.absolute(), out.absolute()
     label_map = read_label_map(labels, settings.column)
     found = find_scenes(scans, read_scene_list(train), read_scene_list(val))
@@ -183,9 +182,7 @@ def _row(files: SceneFiles, one: ObjectCloud) -> ManifestRow:
 
 def _scenes_csv(results: Sequence[SceneResult], scans: Path) -> str:
     """One line a scene; paths in it are relative to `scans`, so it is the same anywhere."""
-    file = io.StringIO(newline="")
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(_COLUMNS)
+    rows: list[Sequence[Any]] = [_COLUMNS]
     for result in results:
         clouds = [one.cloud for one in result.objects if one.cloud is not None]
         digest = hashlib.sha256()
@@ -199,8 +196,8 @@ def _scenes_csv(results: Sequence[SceneResult], scans: Path) -> str:
             result.frames_lost, result.frames_unmasked, digest.hexdigest()[:16],
             " ".join(notes.replace(f"{scans}/", "").splitlines()),
         ]  # fmt: skip
-        writer.writerow(values)
-    return file.getvalue()
+        rows.append(values)
+    return csv_text(rows)
 
 
 def _versions() -> dict[str, str]:

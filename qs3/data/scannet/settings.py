@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from qs3.config.checks import number, one_of, whole
+from qs3.config.checks import check_choice, check_float, check_int
 from qs3.data.scannet.labels import COLUMNS
 from qs3.errors import ConfigError
 
@@ -39,8 +39,9 @@ class Extraction:
         for key, least in (
             ("points", 1), ("min_points", 0), ("views", 1), ("stride", 1), ("margin_px", 0),
         ):  # fmt: skip
-            whole(key, getattr(self, key), least)
-        near, far = number("depth_min_m", self.depth_min_m), number("depth_max_m", self.depth_max_m)
+            check_int(key, getattr(self, key), least)
+        near = check_float("depth_min_m", self.depth_min_m)
+        far = check_float("depth_max_m", self.depth_max_m)
         if not 0 < near < far < float("inf"):
             raise ConfigError(
                 f"0 < depth_min_m < depth_max_m must hold, got {self.depth_min_m} and "
@@ -48,4 +49,4 @@ class Extraction:
             )
         if not isinstance(self.align, bool):
             raise ConfigError(f"align must be true or false, got {self.align!r}")
-        one_of("column", self.column, COLUMNS)
+        check_choice("column", self.column, COLUMNS)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import look_at, rotation_xyz
 from qs3.meshes.mesh import Mesh
@@ -62,15 +63,8 @@ class GrowingJitterViews:
                     f"recipe.views.{low} must not exceed {high}, got {getattr(self, low)} and "
                     f"{getattr(self, high)}"
                 )
-        if not self.min_distance_m > 0:
-            raise ConfigError(
-                f"recipe.views.min_distance_m must be positive, got {self.min_distance_m}"
-            )
-        for key in ("shift_sigma_m", "turn_sigma_rad", "max_shift_m", "max_turn_rad"):
-            if not getattr(self, key) >= 0:
-                raise ConfigError(
-                    f"recipe.views.{key} must not be negative, got {getattr(self, key)}"
-                )
+        drift = ("shift_sigma_m", "turn_sigma_rad", "max_shift_m", "max_turn_rad")
+        check_ranges(self, "recipe.views.", min_distance_m="> 0", **dict.fromkeys(drift, ">= 0"))
 
     def poses(
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-INK, SOFT, GRID = "#1d2430", "#6b7482", "#e3e6eb"
-BLUE, ORANGE, GREEN, RED = "#2f6db3", "#d9822b", "#3a8f5c", "#b5403a"
-PALE_BLUE = "#b9d0ea"
+from qs3.utils.plotting import GRID, INK, SOFT, blank
+
 _DPI = 130
 
 
@@ -30,11 +29,7 @@ def new_figure(
     heights: Sequence[float] | None = None,
 ) -> tuple[Any, list[Any]]:
     """A figure with its axes in row order; sizes in inches."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(width, height, _DPI, constrained=True)
     grid: Any = figure.subplots(
         rows, columns, squeeze=False, sharex=sharex, gridspec_kw={"height_ratios": heights}
     )

@@ -9,8 +9,8 @@ import numpy as np
 
 from qs3.data.store import PointSet
 from qs3.errors import DataError
-from qs3.report.figures.canvas import BLUE, GRID, INK, PALE_BLUE, SOFT, new_figure
-from qs3.utils.files import atomic_path
+from qs3.report.figures.canvas import new_figure
+from qs3.utils.plotting import BLUE, GRID, INK, PALE_BLUE, SOFT, save_png
 
 _COLOURS = {"train": BLUE, "test": PALE_BLUE}
 
@@ -52,8 +52,7 @@ def class_picture(domains: Mapping[str, PointSet], path: str | Path) -> Path:
         ax.grid(axis="y", color=GRID, linewidth=0.7)
         ax.legend(fontsize=8.5, frameon=False, ncols=2, loc="lower right",
                   bbox_to_anchor=(1.0, 0.99))  # fmt: skip
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": None})
+    save_png(figure, Path(path))
     return Path(path)
 
 

@@ -14,10 +14,9 @@ import numpy as np
 from qs3.generation.provenance import photograph
 from qs3.generation.view_files import REASON_COLOURS, KeptView
 from qs3.geometry.orthographic import axes_of, unit
-from qs3.report.figures.canvas import INK, SOFT
 from qs3.report.figures.pipeline import ScannedObject
 from qs3.sensors.pixel_status import Reason
-from qs3.utils.files import atomic_path
+from qs3.utils.plotting import DARK, GRID, INK, PALE, PANEL, SOFT, blank, save_png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,8 +24,6 @@ if TYPE_CHECKING:
 _DPI = 150
 _ROW = 3.9  # inches
 _UPRIGHT = 1.06  # a panel's height by its width: room for the bar of length below a cloud
-_DARK = "#18141c"  # where nothing was measured
-_PALE = np.array([0.93, 0.94, 0.96])  # what colours fade to with distance
 _ASIDE_DEG = 40.0  # the clouds are seen from so far beside the camera, to show errors of depth
 _STEPS = (1, 1.5, 2, 3, 4, 5, 6, 8, 10)
 _BEFORE_BEHIND = ("#1f5fbf", "#b4bac3", "#c8321f")
@@ -42,14 +39,10 @@ def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
     Raises:
         ConfigError: it has no such view.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     shown = one.view(view)
     rows = 1 if shown is None else 2
     width, height = 12.0, _ROW * rows + 0.45  # inches
-    figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = blank(width, height, _DPI)
     axes: Any = figure.subplots(
         rows,
         4,
@@ -80,8 +73,7 @@ def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
 def save_pipeline(one: ScannedObject, path: str | Path, view: int = 0) -> Path:
     """Write the figure as a PNG, atomically and without a date in it."""
     figure = pipeline_figure(one, view)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": None})
+    save_png(figure, Path(path))
     return Path(path)
 
 
@@ -148,7 +140,9 @@ def draw_clouds(axes: Any, one: ScannedObject) -> None:
             continue
         seen, near, order = _turned(cloud, middle, turn)
         colour = _viridis(0.02 + 0.86 * unit(cloud[:, 2].astype(np.float64))[order])
-        ax.scatter(*seen.T, s=_size(cloud), c=near * colour + (1 - near) * _PALE, linewidths=0)
+        ax.scatter(
+            *seen.T, s=_size(cloud), c=near * colour + (1 - near) * np.array(PALE), linewidths=0
+        )
         _room(ax, radius, bar)
         _frame(ax, f"{title}\n{len(cloud):,} points, colour is height")
     _draw_residuals(axes[2], one, middle, turn, radius, bar)
@@ -242,7 +236,7 @@ def _values(ax: Any, title: str, values: np.ndarray, unit_: str, reverse: bool =
         _say(ax, title, "no pixel has one")
         return
     low, high = np.percentile(finite, [1, 99])
-    colours = colormaps["viridis_r" if reverse else "viridis"].with_extremes(bad=_DARK)
+    colours = colormaps["viridis_r" if reverse else "viridis"].with_extremes(bad=DARK)
     shown = ax.imshow(np.ma.masked_invalid(values), cmap=colours, vmin=low, vmax=high,
                       interpolation="nearest")  # fmt: skip
     _frame(ax, title)
@@ -261,13 +255,13 @@ def _frame(ax: Any, title: str) -> None:
     ax.set(xticks=[], yticks=[])
     ax.set_title(title, fontsize=9, color=INK)
     for spine in ax.spines.values():
-        spine.set(color="#e3e6eb", linewidth=0.6)
+        spine.set(color=GRID, linewidth=0.6)
 
 
 def _say(ax: Any, title: str, words: str) -> None:
     """Write instead of drawing."""
     _frame(ax, title)
-    ax.set(facecolor="#f7f8fa", xlim=(0, 1), ylim=(0, 1))
+    ax.set(facecolor=PANEL, xlim=(0, 1), ylim=(0, 1))
     ax.set_box_aspect(_UPRIGHT)
     ax.text(0.5, 0.5, words, ha="center", va="center", fontsize=9, color=SOFT)
 

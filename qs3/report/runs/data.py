@@ -27,8 +27,6 @@ from qs3.runs.predictions import Predictions, read_predictions
 from qs3.runs.pseudo_labels import PseudoLabel, path_of, read_pseudo_labels
 
 HISTORY = "history.csv"
-BINS = 15
-"""Of the reliability diagram: those of `qs3.evaluation.metrics.CALIBRATION_BINS`."""
 
 _ROUND = re.compile(r"round_(\d+)")
 
@@ -170,41 +168,6 @@ def read_run(folder: str | Path) -> RunFiles:
         command=_command(folder),
         notes=tuple(notes),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Reliability:
-    """Confidence against accuracy in bins ((b-1)/B, b/B] of the largest probability.
-
-    Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, figure 1 and eq. 1 to 3.
-
-    Attributes:
-        count: [B] clouds in each bin.
-        confidence: [B] their mean largest probability; NaN in an empty bin.
-        accuracy: [B] the share that is right; NaN likewise.
-        error: expected calibration error in [0, 1].
-    """
-
-    count: Int[np.ndarray, " b"]
-    confidence: Float[np.ndarray, " b"]
-    accuracy: Float[np.ndarray, " b"]
-    error: float
-
-
-def reliability(predictions: Predictions, bins: int = BINS) -> Reliability | None:
-    """The diagram's figures; None if no cloud has a label. Clouds without one are left out."""
-    known = predictions.labels >= 0
-    if not known.any():
-        return None
-    confidence = predictions.probabilities[known].max(axis=1)
-    right = (predictions.predicted == predictions.labels)[known]
-    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
-    count = np.bincount(place, minlength=bins)
-    sums = [np.bincount(place, weights=w, minlength=bins) for w in (confidence, right)]
-    some = np.where(count, count, 1)
-    means = [np.where(count, total / some, np.nan) for total in sums]
-    error = float(np.abs(sums[1] - sums[0]).sum() / len(confidence))
-    return Reliability(count, means[0], means[1], error)
 
 
 def _history(path: Path) -> History | None:

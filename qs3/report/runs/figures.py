@@ -10,14 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qs3.evaluation.calibration import CALIBRATION_BINS, reliability
 from qs3.report.figures.canvas import (
-    BLUE,
-    GREEN,
-    INK,
-    ORANGE,
-    PALE_BLUE,
-    RED,
-    SOFT,
     NothingToDrawError,
     cell_text,
     cells,
@@ -25,7 +19,8 @@ from qs3.report.figures.canvas import (
     new_figure,
     say,
 )
-from qs3.report.runs.data import BINS, RunFiles, reliability
+from qs3.report.runs.data import RunFiles
+from qs3.utils.plotting import BLUE, GREEN, INK, ORANGE, PALE_BLUE, RED, SOFT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -274,11 +269,11 @@ def calibration(run: RunFiles) -> Figure:
     """Reliability diagram of the result, and how many clouds each bin holds."""
     if run.predictions is None:
         raise NothingToDrawError("there is no predictions.csv")
-    found = reliability(run.predictions)
+    found = reliability(run.predictions.probabilities, run.predictions.labels)
     if found is None:
         raise NothingToDrawError("the target has no labels")
     figure, axes = new_figure(5.6, 6.6, 2, 1, sharex=True, heights=(3.2, 1.0))
-    centre, wide = (np.arange(BINS) + 0.5) / BINS, 0.92 / BINS
+    centre, wide = (np.arange(CALIBRATION_BINS) + 0.5) / CALIBRATION_BINS, 0.92 / CALIBRATION_BINS
     some = found.count > 0
     upper, lower = axes
     upper.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle=":", label="perfectly calibrated")
@@ -294,7 +289,7 @@ def calibration(run: RunFiles) -> Figure:
     lower.set_xlim(0, 1)
     figure.suptitle(
         f"{run.title}: calibration on {run.target}\nexpected calibration error "
-        f"{100 * found.error:.1f}% in {BINS} bins\n({EVALUATION_ONLY})",
+        f"{100 * found.error:.1f}% in {CALIBRATION_BINS} bins\n({EVALUATION_ONLY})",
         fontsize=11,
     )
     return figure

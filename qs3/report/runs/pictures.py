@@ -22,7 +22,8 @@ from qs3.report.runs.clouds import cloud_pictures
 from qs3.report.runs.data import RunFiles, read_run
 from qs3.report.runs.page import page
 from qs3.runs.metrics import RunMetrics, read_metrics
-from qs3.utils.files import atomic_path, write_text
+from qs3.utils.files import write_text
+from qs3.utils.plotting import save_png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -125,10 +126,7 @@ def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | No
 
 
 def _save(make: Callable[[], Figure], path: Path) -> None:
-    """Write the PNG, atomically and without a date in it."""
-    figure = make()
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", metadata={"Software": None})
+    save_png(make(), path)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from qs3.errors import DataError
 from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, Scores, read_metrics
+from qs3.utils.text_table import aligned
 
 FEW_SEEDS = 3
 """Below this number of seeds a mean is marked."""
@@ -247,15 +248,4 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
     if any("(!)" in line[-2] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
-    return "\n".join([caption, *align(lines), *notes])
-
-
-def align(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Columns padded to their widest entry, with a rule under the first line."""
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-
-    def row(cells: Sequence[str]) -> str:
-        return "  ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)).rstrip()
-
-    rule = "  ".join("-" * width for width in widths)
-    return [row(lines[0]), rule, *(row(line) for line in lines[1:])]
+    return "\n".join([caption, *aligned(lines), *notes])

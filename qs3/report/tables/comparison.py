@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from qs3.errors import ConfigError, DataError
-from qs3.report.tables.aggregate import align
 from qs3.report.tables.formats import SIMULATED, marks
 from qs3.report.tables.paired import LEVEL, Difference, compare_on_average
 from qs3.report.tables.table import Cell, Table
 from qs3.runs.predictions import FILE, read_predictions
+from qs3.utils import text_table
 
 _MORE_MESHES = "more meshes"
 
@@ -177,7 +176,7 @@ def text(
         # Whatever else is missing: numbers on a simulated target are never shown without the word.
         simulated = [mark for mark in marks(table) if mark.startswith(SIMULATED)]
         head = [f"{'## ' if markdown else ''}{table.title}", "", *simulated, ""]
-    layout: Callable[[Sequence[Sequence[str]]], list[str]] = _markdown if markdown else align
+    layout = text_table.markdown if markdown else text_table.aligned
     body = layout(lines) if len(lines) > 1 else []
     return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"
 
@@ -189,23 +188,21 @@ def csv_text(found: Sequence[Compared], table: Table) -> str:
         found: of `against` or `effects`.
         table: that they are of.
     """
-    file = io.StringIO(newline="")
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(
+    rows: list[list[Any]] = [
         ["name", "metric", "difference", "low", "high", "seeds", "meshes", "seeds_needed",
          "simulated", "why"]
-    )  # fmt: skip
+    ]  # fmt: skip
     simulated = str(any(cell.simulated for cell in table.cells)).lower()
     for one in found:
         for i, metric in enumerate(("accuracy", "balanced accuracy")):
             if one.differences is None:
-                writer.writerow([one.name, metric, *[""] * 6, simulated, one.why])
+                rows.append([one.name, metric, *[""] * 6, simulated, one.why])
                 continue
             d = one.differences[i]
             points = [f"{100 * value:.4f}" for value in (d.mean, d.low, d.high)]
             needed = "" if d.seeds_needed is None else d.seeds_needed
-            writer.writerow([one.name, metric, *points, d.seeds, d.meshes, needed, simulated, ""])
-    return file.getvalue()
+            rows.append([one.name, metric, *points, d.seeds, d.meshes, needed, simulated, ""])
+    return text_table.csv_text(rows)
 
 
 def _shown(d: Difference) -> str:
@@ -217,13 +214,3 @@ def _needed(d: Difference) -> str:
     if d.clear:
         return "-"
     return _MORE_MESHES if d.seeds_needed is None else f"{d.seeds_needed} seeds"
-
-
-def _markdown(lines: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-
-    def row(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)) + " |"
-
-    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    return [row(lines[0]), rule, *(row(line) for line in lines[1:])]

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from typing import Any
 
 from qs3.report.tables.aggregate import FEW_SEEDS, Group, task
 from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Table
+from qs3.utils import text_table
+from qs3.utils.text_table import latex_row, latex_text
 
 _ACCURACY = "accuracy"  # what papers give
 SIMULATED = "SIMULATED target"
 TO_RUN = "Not run yet, or fewer than three seeds"
 _RULES = {"source_val": "source validation", "last": "last epoch"}
-_LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
-    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "±": r"$\pm$", "→": r"$\rightarrow$", "†": r"$\dagger$", "<": r"$<$", ">": r"$>$",
-    "|": r"$|$",
-}  # fmt: skip
 
 
 def grid(table: Table) -> list[list[str]]:
@@ -211,14 +205,7 @@ def markdown(table: Table) -> str:
 
 
 def _markdown_table(lines: Sequence[Sequence[str]]) -> list[str]:
-    lines = [[cell.replace("|", r"\|").replace("*", r"\*") for cell in line] for line in lines]
-    widths = [max(len(row[i]) for row in lines) for i in range(len(lines[0]))]
-
-    def row(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(c.ljust(w) for c, w in zip(cells, widths, strict=True)) + " |"
-
-    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    return [row(lines[0]), rule, *(row(line) for line in lines[1:])]
+    return text_table.markdown([[cell.replace("*", r"\*") for cell in line] for line in lines])
 
 
 def latex(table: Table) -> str:
@@ -229,31 +216,20 @@ def latex(table: Table) -> str:
     package = r"\usepackage{booktabs}"
     lines = [f"% {' '.join(note.split())}" for note in [table.title, package, *notes]]
     lines += [rf"\begin{{tabular}}{{@{{}}l{'c' * (len(header) - 1)}@{{}}}}", r"\toprule"]
-    lines += [_latex_row(header), r"\midrule", *map(_latex_row, body), r"\bottomrule"]
+    lines += [latex_row(header), r"\midrule", *map(latex_row, body), r"\bottomrule"]
     for mark in marks(table):
         text = latex_text(mark.removesuffix(": see below"))
         lines.append(rf"\multicolumn{{{len(header)}}}{{@{{}}l@{{}}}}{{\footnotesize {text}}} \\")
     return "\n".join([*lines, r"\end{tabular}"]) + "\n"
 
 
-def latex_text(text: str) -> str:
-    """Plain text with what LaTeX would take for a command escaped."""
-    return "".join(_LATEX.get(letter, letter) for letter in text)
-
-
-def _latex_row(cells: Sequence[str]) -> str:
-    return " & ".join(map(latex_text, cells)) + r" \\"
-
-
 def csv_text(table: Table) -> str:
     """A line a cell and metric, in percent, with the command and what is wrong."""
-    file = io.StringIO(newline="")
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(
+    rows: list[list[Any]] = [
         ["row", "column", "metric", "mean", "sem", "n", "seeds", "paper_mean", "paper_sem",
          "paper_selected", "paper_source", "task", "target", "simulated", "teacher_selected",
          "student_selected", "seconds", "problems", "hash", "command"]
-    )  # fmt: skip
+    ]  # fmt: skip
     for cell in table.cells:
         known = cell.group.first if cell.group else None
         times = seconds(cell.group) if cell.group else []
@@ -269,8 +245,8 @@ def csv_text(table: Table) -> str:
             values += [_rule(cell, "teacher"), _rule(cell, "student")]
             values.append(" ".join(f"{value:g}" for value in times))
             values.append("; ".join(cell.group.problems) if cell.group else "")
-            writer.writerow([*values, cell.group.hash if cell.group else "", cell.command])
-    return file.getvalue()
+            rows.append([*values, cell.group.hash if cell.group else "", cell.command])
+    return text_table.csv_text(rows)
 
 
 def _percent(value: float | None) -> float | str:

@@ -14,7 +14,7 @@ from qs3.config.location import ROOT
 from qs3.errors import MissingDataError
 from qs3.sensors.bench import real
 from qs3.sensors.bench.figures import draw_real
-from qs3.sensors.bench.runner import _read, fingerprint
+from qs3.sensors.bench.runner import fingerprint, read_cached
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.tabletop import Tabletop
 from qs3.sensors.renderers.base import Renderer
@@ -91,7 +91,7 @@ def compare(
     key = fingerprint(config, renderer.provenance(), repr(table), scenes)
     path = cache / subject.name / f"tabletop-{key[:12]}.json"
     images = path.with_suffix(".npz")
-    found = _read(path)
+    found = read_cached(path)
     if found is None or not images.is_file():
         depths = []
         for seed in range(scenes):

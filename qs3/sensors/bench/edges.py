@@ -14,7 +14,7 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.bench import metrics
-from qs3.sensors.bench.planar import _plain
+from qs3.sensors.bench.planar import without_nan
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.targets import POSE, SquareBeforeWall
 from qs3.sensors.renderers.base import Renderer
@@ -103,7 +103,7 @@ def measure(
         out[f"lateral_{side}_px"] = _jitter(sides[side])
     out["half_window_px"] = None if subject.window_px is None else subject.window_px / 2
     out["nguyen_lateral_px"] = 0.8
-    return _plain(out)
+    return without_nan(out)
 
 
 def _full(frame: DepthFrame, fb: float | None, subject: Subject) -> tuple[np.ndarray, np.ndarray]:

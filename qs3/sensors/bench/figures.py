@@ -10,7 +10,7 @@ import numpy as np
 
 from qs3.sensors.bench import bands, laws
 from qs3.sensors.bench.runner import SensorResult
-from qs3.utils.files import atomic_path
+from qs3.utils.plotting import GRID, blank, save_png
 
 _COLOURS = (
     "#1f6fb2",
@@ -99,19 +99,11 @@ def _family(result: SensorResult) -> str:
 
 
 def _axes(width: float = 6.4, height: float = 4.2) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = blank(width, height, _DPI, constrained=True)
     axes = figure.subplots()
-    axes.grid(True, which="both", color="#e3e6ea", linewidth=0.6)
+    axes.grid(True, which="both", color=GRID, linewidth=0.6)
     axes.set_axisbelow(True)
     return figure, axes
-
-
-def save(figure: Any, path: Path) -> None:
-    """As PNG, without a date in it."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=_DPI, metadata={"Software": None})
 
 
 def _depths(result: SensorResult, key: str) -> tuple[np.ndarray, np.ndarray]:
@@ -141,7 +133,7 @@ def _noise(results: Sequence[SensorResult], styles: dict, path: Path, draw_laws:
     axes.set_xlabel("distance Z (m)")
     axes.set_ylabel("axial noise sigma_Z (mm)")
     axes.legend(fontsize=8)
-    save(figure, path)
+    save_png(figure, path)
 
 
 def _kinect_laws(axes: Any) -> None:
@@ -195,7 +187,7 @@ def _subpixel(results: Sequence[SensorResult], styles: dict, path: Path) -> None
     axes.set_xlabel("distance Z (m)")
     axes.set_ylabel("sub-pixel RMS (px)")
     axes.legend(fontsize=8, ncols=2)
-    save(figure, path)
+    save_png(figure, path)
 
 
 def _tilts(result: SensorResult, across: bool, key: str) -> tuple[np.ndarray, np.ndarray]:
@@ -226,7 +218,7 @@ def _fill(results: Sequence[SensorResult], styles: dict, path: Path) -> None:
     axes.set_xlabel("tilt of the plane (degrees)")
     axes.set_ylabel("fill rate (%)")
     axes.legend(fontsize=8, loc="lower left")
-    save(figure, path)
+    save_png(figure, path)
 
 
 def _tilt(results: Sequence[SensorResult], styles: dict, path: Path) -> None:
@@ -241,15 +233,13 @@ def _tilt(results: Sequence[SensorResult], styles: dict, path: Path) -> None:
     axes.set_xlabel("tilt of the plane along the baseline (degrees)")
     axes.set_ylabel("error of the disparity, one sigma (px)")
     axes.legend(fontsize=8, loc="upper left")
-    save(figure, path)
+    save_png(figure, path)
 
 
 def _grid(count: int, height: float) -> tuple[Any, list[Any]]:
-    from matplotlib.figure import Figure
-
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(2.9 * columns, height * rows), layout="constrained")
+    figure = blank(2.9 * columns, height * rows, _DPI, constrained=True)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
     for unused in axes[count:]:
         unused.set_axis_off()
@@ -272,7 +262,7 @@ def _locking(results: Sequence[SensorResult], styles: dict, path: Path) -> None:
         axes.tick_params(labelsize=8)
     figure.supxlabel("fraction of the true disparity (px)", fontsize=9)
     figure.supylabel("median error (px)", fontsize=9)
-    save(figure, path)
+    save_png(figure, path)
 
 
 def _histogram(results: Sequence[SensorResult], styles: dict, path: Path) -> None:
@@ -291,7 +281,7 @@ def _histogram(results: Sequence[SensorResult], styles: dict, path: Path) -> Non
         axes.tick_params(labelsize=8)
     figure.supxlabel("fraction of the measured disparity (px)", fontsize=9)
     figure.supylabel("density (1: even)", fontsize=9)
-    save(figure, path)
+    save_png(figure, path)
 
 
 def draw_real(
@@ -306,9 +296,7 @@ def draw_real(
         real, simulated: [480, 640] depth images in metres with NaN.
         runs: lengths of all holes in px, real and simulated.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.6, 6.4), layout="constrained")
+    figure = blank(8.6, 6.4, _DPI, constrained=True)
     panels = figure.subplots(2, 2)
     names = ("REAL Kinect v1", "SIMULATED, kinect_v1")
     for axes, depth, name in zip(panels[0], (real, simulated), names, strict=True):
@@ -340,4 +328,4 @@ def draw_real(
     holes.set_xlabel("length of a hole along a row (px)")
     holes.set_ylabel("share of all holes (%)")
     holes.legend(fontsize=8)
-    save(figure, path)
+    save_png(figure, path)

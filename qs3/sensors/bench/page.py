@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from qs3.sensors.bench import bands, laws
 from qs3.sensors.bench.comparison import Comparison
 from qs3.sensors.bench.runner import Plan, SensorResult
+from qs3.utils import text_table
 
 _INTRO = """# What our depth sensors measure
 
@@ -77,9 +76,7 @@ def page(
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
+    return "\n".join(text_table.markdown([header, *rows])) + "\n"
 
 
 def _number(value: Any, form: str = ".3f", factor: float = 1.0) -> str:
@@ -314,15 +311,13 @@ def csv_text(results: Sequence[SensorResult]) -> str:
         "levels_expected",
         "law_m",
     )
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["sensor", "depth_m", "tilt_deg", "recedes", *keys])
+    rows: list[list[Any]] = [["sensor", "depth_m", "tilt_deg", "recedes", *keys]]
     for result in results:
         for m in result.planes:
             c = m["condition"]
             word = "" if c["tilt_deg"] == 0 else ("along" if c["across"] else "across")
             values = [m.get(key) for key in keys]
-            writer.writerow(
+            rows.append(
                 [
                     result.subject.name,
                     c["depth_m"],
@@ -331,4 +326,4 @@ def csv_text(results: Sequence[SensorResult]) -> str:
                     *(f"{v:.6g}" if isinstance(v, float) else v for v in values),
                 ]
             )
-    return out.getvalue()
+    return text_table.csv_text(rows)

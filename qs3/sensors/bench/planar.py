@@ -208,7 +208,7 @@ def _summary(
             "phase_histogram": _histogram(np.concatenate(pool.disparity) - subject.whole_px),
         }
         out |= _levels(subject, np.concatenate(pool.disparity), fb / depths)
-    return _plain(out)
+    return without_nan(out)
 
 
 def _levels(subject: Subject, disparity: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
@@ -248,12 +248,12 @@ def _histogram(disparity: np.ndarray, bins: int = 32) -> list[float]:
     return (counts / max(counts.sum(), 1)).tolist()
 
 
-def _plain(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """NaN becomes None, so that JSON can hold it."""
     if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
+        return {key: without_nan(v) for key, v in value.items()}
     if isinstance(value, list):
-        return [_plain(v) for v in value]
+        return [without_nan(v) for v in value]
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value

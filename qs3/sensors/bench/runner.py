@@ -154,7 +154,7 @@ def run(
     for condition in plan.conditions(subject):
         key = fingerprint(config, renderer.provenance(), asdict(condition))
         path = cache / subject.name / f"{condition.name}-{key[:12]}.json"
-        found = _read(path)
+        found = read_cached(path)
         if found is None:
             module: Any = edges if isinstance(condition, edges.EdgeCondition) else planar
             found = module.measure(subject, condition, renderer)
@@ -195,7 +195,7 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def read_cached(path: Path) -> dict[str, Any] | None:
     """A cached result; None if there is none that can be read."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))

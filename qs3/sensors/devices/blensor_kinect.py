@@ -21,9 +21,9 @@ from itertools import product
 
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, on_grid, window_of
+from qs3.sensors.base import DepthFrame, check_depths, on_grid, window_of
 from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.matching.triangulation import Triangulation
@@ -76,23 +76,16 @@ class DotMask:
     quantiser: Quantiser = field(default_factory=lambda: Quantiser(8))
 
     def __post_init__(self) -> None:
-        for key in ("baseline_m", "inlier_m", "field_cell_px"):
-            if not getattr(self, key) > 0:
-                raise ConfigError(f"sensor.{key} must be positive, got {getattr(self, key)}")
-        for key in ("fill_px", "column_sigma_px", "field_sigma_px"):
-            if not getattr(self, key) >= 0:
-                raise ConfigError(f"sensor.{key} must not be negative, got {getattr(self, key)}")
-        if self.step_px < 1:
-            raise ConfigError(f"sensor.step_px must be at least 1, got {self.step_px}")
-        if self.window_px < 1 or self.window_px % 2 == 0:
-            raise ConfigError(f"sensor.window_px must be odd and >= 1, got {self.window_px}")
-        if not 0 <= self.min_share < 1:
-            raise ConfigError(f"sensor.min_share must be in [0, 1), got {self.min_share}")
-        if not 0 < self.min_depth_m < self.max_depth_m:
-            raise ConfigError(
-                "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
-                f"{self.min_depth_m} and {self.max_depth_m}"
-            )
+        check_ranges(
+            self,
+            "sensor.",
+            **dict.fromkeys(("baseline_m", "inlier_m", "field_cell_px"), "> 0"),
+            **dict.fromkeys(("fill_px", "column_sigma_px", "field_sigma_px"), ">= 0"),
+            step_px=">= 1",
+            window_px="odd >= 1",
+            min_share="[0, 1)",
+        )
+        check_depths(self)
 
     @property
     def intrinsics(self) -> Intrinsics:

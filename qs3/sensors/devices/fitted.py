@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics
-from qs3.sensors.base import DepthFrame, on_grid, window_of
+from qs3.sensors.base import DepthFrame, check_depths, on_grid, window_of
 from qs3.sensors.optics.visibility import reached_from
 from qs3.sensors.pixel_status import Reason
 from qs3.sensors.renderers.base import Body, Renderer, Scene
@@ -66,19 +67,10 @@ class FittedDepth:
     baseline_m: float | None = None
 
     def __post_init__(self) -> None:
-        for key in ("noise_floor_m", "noise_factor", "inverse_step_per_m", "depth_step_m"):
-            if not getattr(self, key) >= 0:
-                raise ConfigError(f"sensor.{key} must not be negative, got {getattr(self, key)}")
-        for key in ("correlation_px", "hole_px"):
-            if not 0 <= getattr(self, key) <= 50:
-                raise ConfigError(f"sensor.{key} must be in 0..50, got {getattr(self, key)}")
-        if self.step_px < 1:
-            raise ConfigError(f"sensor.step_px must be at least 1, got {self.step_px}")
-        if not 0 < self.min_depth_m < self.max_depth_m:
-            raise ConfigError(
-                "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
-                f"{self.min_depth_m} and {self.max_depth_m}"
-            )
+        lengths = ("noise_floor_m", "noise_factor", "inverse_step_per_m", "depth_step_m")
+        check_ranges(self, "sensor.", **dict.fromkeys(lengths, ">= 0"))
+        check_ranges(self, "sensor.", correlation_px="[0, 50]", hole_px="[0, 50]", step_px=">= 1")
+        check_depths(self)
         if len(self.tilts_deg) != len(self.fill_rates) or not self.tilts_deg:
             raise ConfigError(
                 f"sensor.tilts_deg has {len(self.tilts_deg)} values and fill_rates "

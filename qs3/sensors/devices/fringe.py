@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.base import DepthFrame, check_depths, window_of
 from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import PostFilter, Quantiser
 from qs3.sensors.matching.triangulation import Triangulation
@@ -70,19 +70,15 @@ class FringeProjection:
     filters: tuple[PostFilter, ...] = ()
 
     def __post_init__(self) -> None:
-        for key in ("baseline_m", "tan_half_width", "projector_strength"):
-            if not getattr(self, key) > 0:
-                raise ConfigError(f"sensor.{key} must be positive, got {getattr(self, key)}")
-        for key in ("ambient", "min_modulation"):
-            if not getattr(self, key) >= 0:
-                raise ConfigError(f"sensor.{key} must not be negative, got {getattr(self, key)}")
-        if not 0 < self.max_misfit <= 0.5:
-            raise ConfigError(f"sensor.max_misfit must be in (0, 0.5], got {self.max_misfit}")
-        if not 0 < self.min_depth_m < self.max_depth_m:
-            raise ConfigError(
-                "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
-                f"{self.min_depth_m} and {self.max_depth_m}"
-            )
+        check_ranges(
+            self,
+            "sensor.",
+            **dict.fromkeys(("baseline_m", "tan_half_width", "projector_strength"), "> 0"),
+            ambient=">= 0",
+            min_modulation=">= 0",
+            max_misfit="(0, 0.5]",
+        )
+        check_depths(self)
 
     @property
     def intrinsics(self) -> Intrinsics:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, on_grid, window_of
 from qs3.sensors.pixel_status import Reason
@@ -46,15 +46,8 @@ class GaussianTimeOfFlight:
     max_distance_m: float = 20.0
 
     def __post_init__(self) -> None:
-        if self.step_px < 1:
-            raise ConfigError(f"sensor.step_px must be at least 1, got {self.step_px}")
-        if not self.noise_sigma_m >= 0:
-            raise ConfigError(
-                f"sensor.noise_sigma_m must not be negative, got {self.noise_sigma_m}"
-            )
-        for key in ("unambiguous_m", "max_distance_m"):
-            if not getattr(self, key) > 0:
-                raise ConfigError(f"sensor.{key} must be positive, got {getattr(self, key)}")
+        check_ranges(self, "sensor.", step_px=">= 1", noise_sigma_m=">= 0")
+        check_ranges(self, "sensor.", unambiguous_m="> 0", max_distance_m="> 0")
 
     @property
     def intrinsics(self) -> Intrinsics:

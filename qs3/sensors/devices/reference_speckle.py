@@ -16,7 +16,7 @@ import numpy as np
 
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics
-from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.base import DepthFrame, check_depths, window_of
 from qs3.sensors.matching import Matcher, ReferenceMatcher
 from qs3.sensors.matching.filters import PostFilter, Quantiser
 from qs3.sensors.matching.triangulation import Triangulation
@@ -64,11 +64,7 @@ class ReferenceSpeckle:
     filters: tuple[PostFilter, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 0 < self.min_depth_m < self.max_depth_m:
-            raise ConfigError(
-                "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
-                f"{self.min_depth_m} and {self.max_depth_m}"
-            )
+        check_depths(self)
         low, high = (self.disparity(z) for z in (self.max_depth_m, self.min_depth_m))
         first = self.matcher.min_disparity
         last = first + self.matcher.num_disparities - 1

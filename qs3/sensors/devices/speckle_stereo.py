@@ -15,9 +15,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.base import DepthFrame, check_depths, window_of
 from qs3.sensors.matching import Matcher, StereoBlockMatcher
 from qs3.sensors.matching.filters import PostFilter, Quantiser
 from qs3.sensors.matching.triangulation import Triangulation
@@ -77,28 +78,14 @@ class SpeckleStereo:
     blind_left_px: int = 0
 
     def __post_init__(self) -> None:
-        if not self.baseline_m > 0:
-            raise ConfigError(f"sensor.baseline_m must be positive, got {self.baseline_m}")
-        if self.step_px < 1:
-            raise ConfigError(f"sensor.step_px must be at least 1, got {self.step_px}")
-        if not 0 < self.min_depth_m < self.max_depth_m:
-            raise ConfigError(
-                "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
-                f"{self.min_depth_m} and {self.max_depth_m}"
-            )
-        if not self.projector_strength > 0:
-            raise ConfigError(
-                f"sensor.projector_strength must be positive, got {self.projector_strength}"
-            )
+        check_ranges(self, "sensor.", baseline_m="> 0", step_px=">= 1", projector_strength="> 0")
+        check_depths(self)
         if self.sample_offset_px is not None and not 0 <= self.sample_offset_px < self.step_px:
             raise ConfigError(
                 f"sensor.sample_offset_px must be null or in 0..{self.step_px - 1} (step_px is "
                 f"{self.step_px}), got {self.sample_offset_px}"
             )
-        if not 0 <= self.blind_left_px < self.width_px:
-            raise ConfigError(
-                f"sensor.blind_left_px must be in 0..{self.width_px - 1}, got {self.blind_left_px}"
-            )
+        check_ranges(self, "sensor.", blind_left_px=f"[0, {self.width_px})")
         end = self.matcher.min_disparity + self.matcher.num_disparities
         if self.focal_px * self.baseline_m / self.min_depth_m > end:
             nearest = self.focal_px * self.baseline_m / end

@@ -34,9 +34,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, window_of
+from qs3.sensors.base import DepthFrame, check_depths, window_of
 from qs3.sensors.optics.point_light import grey_picture, white_lamp
 from qs3.sensors.pixel_status import Reason
 from qs3.sensors.renderers.base import Body, Image, Renderer, Scene
@@ -95,23 +96,15 @@ class TimeOfFlight:
                 "sensor.frequencies_hz must hold one frequency or more, in Hz, got "
                 f"{list(self.frequencies_hz)}"
             )
-        if not 0 < self.contrast <= 1:
-            raise ConfigError(f"sensor.contrast must be in (0, 1], got {self.contrast}")
-        for key in ("electrons_at_1m", "full_well_e", "max_disagreement_m"):
-            if not getattr(self, key) > 0:
-                raise ConfigError(f"sensor.{key} must be positive, got {getattr(self, key)}")
-        for key in ("read_noise_e", "ambient", "min_amplitude_e"):
-            if not getattr(self, key) >= 0:
-                raise ConfigError(f"sensor.{key} must not be negative, got {getattr(self, key)}")
-        if self.supersampling < 1 or self.supersampling % 2 == 0:
-            raise ConfigError(
-                f"sensor.supersampling must be 1, 3, 5, ..., got {self.supersampling}"
-            )
-        if not 0 < self.min_depth_m < self.max_depth_m:
-            raise ConfigError(
-                "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
-                f"{self.min_depth_m} and {self.max_depth_m}"
-            )
+        check_ranges(
+            self,
+            "sensor.",
+            contrast="(0, 1]",
+            **dict.fromkeys(("electrons_at_1m", "full_well_e", "max_disagreement_m"), "> 0"),
+            **dict.fromkeys(("read_noise_e", "ambient", "min_amplitude_e"), ">= 0"),
+            supersampling="odd >= 1",
+        )
+        check_depths(self)
 
     @property
     def intrinsics(self) -> Intrinsics:

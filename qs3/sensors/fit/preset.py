@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 
 from qs3.geometry.cameras import Intrinsics
@@ -17,6 +14,10 @@ from qs3.sensors.fit.laws import Fill, Noise
 from qs3.sensors.fit.planes import Wall
 from qs3.sensors.fit.steps import Steps
 from qs3.utils.files import write_text
+from qs3.utils.plotting import blank, save_png
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,21 +105,20 @@ class FittedPreset:
 
     def plot(self, path: Path) -> None:
         """Four panels: noise, steps, residuals of one frame, fill."""
-        figure, axes = plt.subplots(2, 2, figsize=(10, 7.5), constrained_layout=True)
+        figure = blank(10, 7.5, 110, constrained=True)
+        axes: Any = figure.subplots(2, 2)
         self._plot_noise(axes[0, 0])
         self._plot_steps(axes[0, 1])
         self._plot_residual(figure, axes[1, 0])
         self._plot_fill(axes[1, 1])
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=110)
-        plt.close(figure)
+        save_png(figure, path)
 
     def _range(self) -> tuple[float, float]:
         z = np.concatenate([wall.depth_m[wall.on_wall] for wall in self.walls])
         low, high = np.quantile(z, [0.01, 0.99])
         return float(low), float(high)
 
-    def _plot_noise(self, ax: plt.Axes) -> None:
+    def _plot_noise(self, ax: Any) -> None:
         low, high = self._range()
         z = np.linspace(0.9 * low, 1.1 * high, 200)
         step2 = (self.steps.inverse_per_m * z**2) ** 2 / 12 + self.steps.depth_m**2 / 12
@@ -132,7 +132,7 @@ class FittedPreset:
         ax.set_ylim(bottom=0)
         ax.legend(fontsize=8)
 
-    def _plot_steps(self, ax: plt.Axes) -> None:
+    def _plot_steps(self, ax: Any) -> None:
         values = np.concatenate([wall.depth_m[wall.on_wall] for wall in self.walls])
         levels = np.unique(np.round(values, 5))
         ax.set(xlabel="distance (m)", ylabel="gap to the next level (mm)", title="Steps of depth")
@@ -150,7 +150,7 @@ class FittedPreset:
         ax.set_ylim(0, 1e3 * 4 * float(np.median(gaps)))
         ax.legend(fontsize=8)
 
-    def _plot_residual(self, figure: plt.Figure, ax: plt.Axes) -> None:
+    def _plot_residual(self, figure: Figure, ax: Any) -> None:
         wall = self.walls[0]
         error = 1e3 * np.where(wall.on_wall, wall.depth_m - wall.plane_m, np.nan)
         reach = float(np.nanquantile(np.abs(error), 0.98))
@@ -159,7 +159,7 @@ class FittedPreset:
         ax.set_facecolor("0.85")
         figure.colorbar(picture, ax=ax, label="mm (grey: no depth, or not on the wall)")
 
-    def _plot_fill(self, ax: plt.Axes) -> None:
+    def _plot_fill(self, ax: Any) -> None:
         ax.plot(self.fill.tilts_deg, 100 * np.array(self.fill.rates), "o-")
         ax.set(xlabel="angle of incidence (degrees)", ylabel="valid pixels (%)", title="Fill rate")
         ax.set_ylim(min(90, 100 * min(self.fill.rates) - 5), 101)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.sensors.matching.base import Match, side_by_side
 from qs3.sensors.pixel_status import Reason
@@ -40,12 +41,11 @@ class StereoBlockMatcher:
     max_difference_px: int = -1
 
     def __post_init__(self) -> None:
-        if self.num_disparities < 16 or self.num_disparities % 16:
+        if self.num_disparities % 16:
             raise ConfigError(
-                f"num_disparities must be a positive multiple of 16, got {self.num_disparities}"
+                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
             )
-        if self.block_size % 2 == 0 or not 5 <= self.block_size <= 255:
-            raise ConfigError(f"block_size must be odd and in 5..255, got {self.block_size}")
+        check_ranges(self, num_disparities=">= 16", block_size="odd [5, 255]")
 
     @property
     def reach_px(self) -> int:

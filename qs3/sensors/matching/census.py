@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import as_strided, sliding_window_view
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.sensors.matching.base import Match
 from qs3.sensors.matching.hamming import census, count_ones
@@ -76,12 +77,7 @@ class CensusMatcher:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fit", Fit.of(self.fit))
-        if not 3 <= self.num_disparities <= 512:
-            raise ConfigError(f"num_disparities must be in 3..512, got {self.num_disparities}")
-        if self.window_px % 2 == 0 or not 3 <= self.window_px <= 15:
-            raise ConfigError(f"window_px must be odd and in 3..15, got {self.window_px}")
-        if self.block_px % 2 == 0 or self.block_px < 1:
-            raise ConfigError(f"block_px must be odd and >= 1, got {self.block_px}")
+        check_ranges(self, num_disparities="[3, 512]", window_px="odd [3, 15]", block_px="odd >= 1")
         if self.paths not in (0, 4, 8):
             raise ConfigError(f"paths must be 0, 4 or 8, got {self.paths}")
         if not 0 <= self.small_step <= self.large_step:
@@ -89,13 +85,9 @@ class CensusMatcher:
                 "small_step and large_step must satisfy 0 <= small_step <= large_step, got "
                 f"{self.small_step} and {self.large_step}"
             )
-        for key in ("difference_weight", "difference_cap", "edge_grey", "min_texture"):
-            if getattr(self, key) < 0:
-                raise ConfigError(f"{key} must be >= 0, got {getattr(self, key)}")
-        if self.uniqueness_percent < 0:
-            raise ConfigError(f"uniqueness_percent must be >= 0, got {self.uniqueness_percent}")
-        if self.a_factor is not None and not -1 <= self.a_factor <= 1:
-            raise ConfigError(f"a_factor must be null or in -1..1, got {self.a_factor}")
+        grey = ("difference_weight", "difference_cap", "edge_grey", "min_texture")
+        check_ranges(self, **dict.fromkeys(grey, ">= 0"))
+        check_ranges(self, uniqueness_percent=">= 0", a_factor="[-1, 1]")
         if self._worst * self.block_px**2 > 65535:
             raise ConfigError(
                 f"block_px {self.block_px} with costs up to {self._worst} a pixel exceeds 16 "

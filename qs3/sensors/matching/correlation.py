@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 from qs3.sensors.matching.base import Match
 from qs3.sensors.matching.subpixel import linearised
 from qs3.sensors.pixel_status import Reason
@@ -42,14 +42,8 @@ class NormalisedCorrelation:
     a_factor: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.window_px % 2 == 0 or self.window_px < 3:
-            raise ConfigError(f"window_px must be odd and >= 3, got {self.window_px}")
-        if self.num_disparities < 3:
-            raise ConfigError(f"num_disparities must be >= 3, got {self.num_disparities}")
-        if self.steps_per_px < 0:
-            raise ConfigError(f"steps_per_px must be >= 0, got {self.steps_per_px}")
-        if not -1 <= self.a_factor <= 1:
-            raise ConfigError(f"a_factor must be in -1..1, got {self.a_factor}")
+        check_ranges(self, window_px="odd >= 3", num_disparities=">= 3")
+        check_ranges(self, steps_per_px=">= 0", a_factor="[-1, 1]")
 
     @property
     def reach_px(self) -> int:

@@ -8,7 +8,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,7 @@ class Quantiser:
     steps_per_px: int = 0
 
     def __post_init__(self) -> None:
-        if self.steps_per_px < 0:
-            raise ConfigError(f"steps_per_px must be >= 0, got {self.steps_per_px}")
+        check_ranges(self, steps_per_px=">= 0")
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """[h, w] float32, rounded to the nearest step; NaN stays."""
@@ -53,11 +52,7 @@ class SmallRegions:
     max_step_px: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.max_size_px < 0 or not self.max_step_px > 0:
-            raise ConfigError(
-                "SmallRegions needs max_size_px >= 0 and max_step_px > 0, got "
-                f"{self.max_size_px} and {self.max_step_px}"
-            )
+        check_ranges(self, "SmallRegions.", max_size_px=">= 0", max_step_px="> 0")
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""
@@ -83,8 +78,7 @@ class Median:
     size_px: int = 3
 
     def __post_init__(self) -> None:
-        if self.size_px % 2 == 0 or self.size_px < 3:
-            raise ConfigError(f"Median.size_px must be odd and >= 3, got {self.size_px}")
+        check_ranges(self, "Median.", size_px="odd >= 3")
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""
@@ -113,10 +107,7 @@ class NeighbourCheck:
     min_share: float = 0.4
 
     def __post_init__(self) -> None:
-        if self.size_px % 2 == 0 or self.size_px < 3:
-            raise ConfigError(f"NeighbourCheck.size_px must be odd and >= 3, got {self.size_px}")
-        if not 0 <= self.min_share <= 1:
-            raise ConfigError(f"NeighbourCheck.min_share must be in [0, 1], got {self.min_share}")
+        check_ranges(self, "NeighbourCheck.", size_px="odd >= 3", min_share="[0, 1]")
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""
@@ -137,8 +128,7 @@ class FillHoles:
     max_width_px: int = 5
 
     def __post_init__(self) -> None:
-        if self.max_width_px < 1:
-            raise ConfigError(f"FillHoles.max_width_px must be >= 1, got {self.max_width_px}")
+        check_ranges(self, "FillHoles.", max_width_px=">= 1")
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """See `PostFilter.apply`."""

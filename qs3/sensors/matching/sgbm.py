@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from qs3.config.checks import check_choice, check_ranges
 from qs3.errors import ConfigError
 from qs3.sensors.matching.base import Match, side_by_side
 from qs3.sensors.matching.subpixel import linearised
@@ -58,19 +59,15 @@ class SemiGlobalMatcher:
     a_factor: float = SGBM_A_FACTOR
 
     def __post_init__(self) -> None:
-        if self.num_disparities < 16 or self.num_disparities % 16:
+        if self.num_disparities % 16:
             raise ConfigError(
-                f"num_disparities must be a positive multiple of 16, got {self.num_disparities}"
+                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
             )
-        if self.block_size % 2 == 0 or not 1 <= self.block_size <= 31:
-            raise ConfigError(f"block_size must be odd and in 1..31, got {self.block_size}")
-        if self.mode not in _MODES:
-            raise ConfigError(f"mode is one of {', '.join(_MODES)}, got {self.mode!r}")
+        check_ranges(self, num_disparities=">= 16", block_size="odd [1, 31]", a_factor="[-1, 1]")
+        check_choice("mode", self.mode, tuple(_MODES))
         small, large = self.penalties
         if not 0 < small < large:
             raise ConfigError(f"penalties must satisfy 0 < p1 < p2, got {small} and {large}")
-        if not -1 <= self.a_factor <= 1:
-            raise ConfigError(f"a_factor must be in -1..1, got {self.a_factor}")
 
     @property
     def penalties(self) -> tuple[int, int]:

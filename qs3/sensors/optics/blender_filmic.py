@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 
 # Logarithms to base 2 of the radiance where the curve begins and where it ends.
 _FIRST_STOP, _LAST_STOP = -12.473931188, 4.026068812
@@ -64,10 +64,7 @@ class FilmicCamera:
     faintest: float = 0.216
 
     def __post_init__(self) -> None:
-        if not self.background >= 0:
-            raise ConfigError(f"infrared.background must not be negative, got {self.background}")
-        if not self.faintest > 0:
-            raise ConfigError(f"infrared.faintest must be positive, got {self.faintest}")
+        check_ranges(self, "infrared.", background=">= 0", faintest="> 0")
 
     def gain(self, radiance: np.ndarray, region: np.ndarray) -> float:
         """1: exposure 0, whatever is seen."""

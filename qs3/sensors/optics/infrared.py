@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 
 
 @dataclass(frozen=True)
@@ -42,20 +42,17 @@ class InfraredCamera:
     speckle_grain_px: int = 1
 
     def __post_init__(self) -> None:
-        if not 0 < self.white_quantile <= 1:
-            raise ConfigError(f"white_quantile must be in (0, 1], got {self.white_quantile}")
-        if not 0 < self.white_level <= 255:
-            raise ConfigError(f"white_level must be in (0, 255], got {self.white_level}")
-        if not self.electrons_at_white > 0 or self.read_noise_e < 0:
-            raise ConfigError("electrons_at_white must be positive and read_noise_e >= 0")
-        if not 0 <= self.speckle_contrast <= 1:
-            raise ConfigError(f"speckle_contrast must be in [0, 1], got {self.speckle_contrast}")
-        if self.speckle_grain_px < 1:
-            raise ConfigError(f"speckle_grain_px must be >= 1, got {self.speckle_grain_px}")
-        if not 0 <= self.psf_px <= 10:
-            raise ConfigError(f"psf_px must be in [0, 10], got {self.psf_px}")
-        if self.fixed_gain is not None and not self.fixed_gain > 0:
-            raise ConfigError(f"fixed_gain must be positive or null, got {self.fixed_gain}")
+        check_ranges(
+            self,
+            white_quantile="(0, 1]",
+            white_level="(0, 255]",
+            electrons_at_white="> 0",
+            read_noise_e=">= 0",
+            speckle_contrast="[0, 1]",
+            speckle_grain_px=">= 1",
+            psf_px="[0, 10]",
+            fixed_gain="> 0",
+        )
 
     def gain(self, radiance: np.ndarray, region: np.ndarray) -> float:
         """Grey values per unit of radiance, from the pixels of `region` (bool, [h, w])."""

@@ -15,6 +15,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError, DataError
 
 _MAX_PICTURE_PX = 64_000_000
@@ -88,12 +89,12 @@ class Speckle:
     brightness_spread: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.brightness_spread <= 1:
-            raise ConfigError(
-                f"pattern.brightness_spread must be in [0, 1], got {self.brightness_spread}"
-            )
-        if min(self.columns, self.rows, self.tiles, self.dot_px) < 1:
-            raise ConfigError("a speckle pattern needs columns, rows, tiles and dot_px >= 1")
+        check_ranges(
+            self,
+            "pattern.",
+            brightness_spread="[0, 1]",
+            **dict.fromkeys(("columns", "rows", "tiles", "dot_px"), ">= 1"),
+        )
         densest = 1 / (1 + self.spacing) ** 2
         if not 0 < self.fill <= 0.6 * densest:
             raise ConfigError(

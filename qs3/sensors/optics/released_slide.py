@@ -8,7 +8,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 from qs3.sensors.optics.patterns import Speckle
 
 
@@ -33,8 +33,7 @@ class ReleasedSlide(Speckle):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.detail < 1:
-            raise ConfigError(f"pattern.detail must be at least 1, got {self.detail}")
+        check_ranges(self, "pattern.", detail=">= 1")
 
     @cached_property
     def slide(self) -> np.ndarray:

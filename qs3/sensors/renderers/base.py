@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera
 from qs3.meshes.mesh import Mesh
@@ -27,10 +28,7 @@ class Body:
     label: int = 1
 
     def __post_init__(self) -> None:
-        if not 0 < self.albedo <= 1:
-            raise ConfigError(f"albedo must be in (0, 1], got {self.albedo}")
-        if not 0 <= self.label <= 255:
-            raise ConfigError(f"label must be in 0..255, got {self.label}")
+        check_ranges(self, albedo="(0, 1]", label="[0, 255]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +57,7 @@ class Projector:
             raise ConfigError(
                 f"a slide is a float32 image [H, W], got {self.slide.dtype} {self.slide.shape}"
             )
-        if not self.tan_half_width > 0:
-            raise ConfigError(f"tan_half_width must be positive, got {self.tan_half_width}")
+        check_ranges(self, tan_half_width="> 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +80,7 @@ class Scene:
     def __post_init__(self) -> None:
         if not self.bodies:
             raise ConfigError("a scene needs at least one body")
-        if not self.ambient >= 0:
-            raise ConfigError(f"ambient must not be negative, got {self.ambient}")
+        check_ranges(self, ambient=">= 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,5 +155,4 @@ class RendererSettings:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise ConfigError(f"renderer.samples must be at least 1, got {self.samples}")
+        check_ranges(self, "renderer.", samples=">= 1")

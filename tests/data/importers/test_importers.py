@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from qs3.classes import CLASSES
+from qs3.clouds.files import parse_cloud
 from qs3.data.importers import NamedArrays, NpyTree, PointDAH5, XyzTree, import_into
 from qs3.data.importers.base import check_cloud, y_up_to_z_up
-from qs3.data.importers.trees import read_npy, read_xyz
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError
 from tests.fixtures import published as fixtures
@@ -68,15 +68,13 @@ def test_more_points_than_published_is_another_dataset(tmp_path):
     ("text", "message"),
     [
         (b"", "0 bytes"),
-        (b"\n\n", "the file is blank"),
-        (b"1 2 3\n4 5\n", r"line 2: '4 5' is not three numbers"),
-        (b"1 2 3\n4 5 6 7\n", r"line 2: '4 5 6 7' is not three numbers"),
-        (b"1 2 3\n\n4 x 6\n", r"line 3: '4 x 6' is not three numbers"),
-        (b"1,2,3\n", "line 1"),
+        (b"\n\n", "there are no points"),
+        (b"1 2 3\n4 5\n", r"line 2: '4 5' has 2 numbers, not 3"),
+        (b"1 2 3\n4 5 6 7\n", r"line 2: '4 5 6 7' has 4 numbers, not 3"),
+        (b"1 2 3\n\n4 x 6\n", r"line 3: '4 x 6' is not a row of numbers"),
         (b"1 2 3\n4 nan 6\n", r"point 2: \[4.0, nan, 6.0\] is not finite"),
         (b"1 2 3\n4 1e39 6\n", "point 2: .*inf.* is not finite"),
         (b"\xff\xfe\x00", "line 1"),
-        (b"# 1\n1 2 3\n", "line 1"),
         (b"1 2\n3 4\n", "line 1"),
     ],
 )
@@ -95,18 +93,18 @@ def test_skipping_damage_is_recorded(tmp_path, caplog):
     assert len(open_pointset(tmp_path / "s")) == 7
     skipped = [row for row in read_manifest(tmp_path / "s", TWO) if row.status != "ok"]
     assert [row.id for row in skipped] == ["chair/test/b"]
-    assert "is not three numbers" in skipped[0].reason
+    assert "has 2 numbers, not 3" in skipped[0].reason
     assert "1 clouds left out" in caplog.text
 
 
 def test_truncated_text_never_gives_wrong_rows(tmp_path):
     path = tmp_path / "a.xyz"
     np.savetxt(path, np.random.default_rng(0).normal(size=(3, 3)), fmt="%.3f")
-    whole, data = read_xyz(path), path.read_bytes()
+    whole, data = parse_cloud(path), path.read_bytes()
     for size in range(1, len(data)):
         path.write_bytes(data[:size])
         try:
-            found = read_xyz(path)
+            found = parse_cloud(path)
         except DataError:
             continue
         # a cut inside the last number of a row cannot be seen; all before it must be right
@@ -212,10 +210,10 @@ def test_pickled_arrays_are_refused_unopened(tmp_path):
     path = tmp_path / "x.npy"
     np.save(path, np.array([Trap(), Trap()]), allow_pickle=True)
     with pytest.raises(DataError, match=r"x\.npy: a pickled array, refused"):
-        read_npy(path)
+        parse_cloud(path)
     path.write_bytes(pickle.dumps(Trap()))
     with pytest.raises(DataError, match=r"not a readable \.npy"):
-        read_npy(path)
+        parse_cloud(path)
     assert not TRAP.exists()
 
 
@@ -226,13 +224,13 @@ def test_npy_damage_anywhere(tmp_path):
     for size in range(1, len(data), 3):
         path.write_bytes(data[:size])
         with pytest.raises(DataError, match=r"x\.npy"):
-            read_npy(path)
+            parse_cloud(path)
     for at in range(128):  # of the header: an error, or still numbers
         changed = bytearray(data)
         changed[at] ^= 1 << (at % 8)
         path.write_bytes(changed)
         try:
-            check_cloud(read_npy(path), 4, str(path))
+            check_cloud(parse_cloud(path), 4, str(path))
         except DataError as error:
             assert "x.npy" in str(error)  # noqa: PT017
 
@@ -241,7 +239,7 @@ def test_npy_damage_anywhere(tmp_path):
 def test_npy_of_other_things(tmp_path, array):
     np.save(tmp_path / "x.npy", array)
     with pytest.raises(DataError, match=r"x\.npy"):
-        check_cloud(read_npy(tmp_path / "x.npy"), 4, str(tmp_path / "x.npy"))
+        check_cloud(parse_cloud(tmp_path / "x.npy"), 4, str(tmp_path / "x.npy"))
 
 
 def h5_file(path, n=2, points=4, **changes):

@@ -119,7 +119,7 @@ def test_the_views_follow_the_released_law():
 def test_views_that_contradict_themselves_are_refused():
     with pytest.raises(ConfigError, match="min_azimuth_deg must not exceed"):
         GrowingJitterViews(min_azimuth_deg=100)
-    with pytest.raises(ConfigError, match="turn_sigma_rad must not be negative"):
+    with pytest.raises(ConfigError, match="turn_sigma_rad must be >= 0"):
         GrowingJitterViews(turn_sigma_rad=-1)
     with pytest.raises(ConfigError, match="views must be at least 1"):
         GrowingJitterViews(count=0)
@@ -215,7 +215,7 @@ def test_the_blind_columns_are_those_that_stereobm_leaves_empty(renderer):
 def test_a_sensor_with_impossible_settings_is_refused():
     for settings, why in (
         ({"sample_offset_px": 4}, r"sample_offset_px must be null or in 0\.\.3"),
-        ({"projector_strength": 0}, "projector_strength must be positive"),
+        ({"projector_strength": 0}, "projector_strength must be > 0"),
         ({"blind_left_px": 1080}, "blind_left_px must be in"),
     ):
         with pytest.raises(ConfigError, match=why):

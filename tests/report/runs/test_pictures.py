@@ -14,13 +14,13 @@ import torch
 
 from qs3.config import hashing
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.evaluation.metrics import CALIBRATION_BINS, calibration_error
+from qs3.evaluation.calibration import calibration_error, reliability
 from qs3.inference.model_file import Result, write_result
 from qs3.models.pointnet import pointnet
 from qs3.report.__main__ import main
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
-from qs3.report.runs.data import BINS, read_run, reliability
+from qs3.report.runs.data import read_run
 from qs3.report.runs.pictures import AfterTraining, draw
 from qs3.runs.checkpoints import save
 from qs3.runs.metrics import read_metrics
@@ -151,9 +151,8 @@ def test_classes_are_counted(run):
 
 
 def test_calibration_is_the_reported_error(run):
-    assert BINS == CALIBRATION_BINS
     p = read_predictions(run / "predictions.csv")
-    found = reliability(p)
+    found = reliability(p.probabilities, p.labels)
     assert found.error == pytest.approx(calibration_error(p.probabilities, p.labels))
     assert found.error == pytest.approx(read_metrics(run).final.calibration_error)
     axes = run_figures.calibration(read_run(run)).axes
@@ -167,13 +166,13 @@ def test_reliability_of_known_bins():
     labels = np.array([0, 1, 0, 0, -1])
     p = Predictions(("a", "b"), tuple("vwxyz"), tuple("vwxyz"), labels,
                     np.stack([top, 1 - top], axis=1))  # fmt: skip
-    found = reliability(p, bins=5)
+    found = reliability(p.probabilities, p.labels, bins=5)
     assert found.count.tolist() == [0, 0, 2, 1, 1]
     np.testing.assert_allclose(found.accuracy[2:], [0.5, 1, 1])
     np.testing.assert_allclose(found.confidence[2:], [0.6, 0.61, 1])
     assert found.error == pytest.approx((2 * 0.1 + 0.39 + 0) / 4)
     unknown = Predictions(p.classes, p.ids, p.meshes, np.full(5, -1), p.probabilities)
-    assert reliability(unknown) is None
+    assert reliability(unknown.probabilities, unknown.labels) is None
 
 
 def test_missing_round_folders(run):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.report.tables.aggregate import Stat, align, group, load_run, load_runs, summarise
+from qs3.report.tables.aggregate import Stat, group, load_run, load_runs, summarise
 from tests.report.made_runs import write_run
 
 
@@ -118,7 +118,3 @@ def test_summary_of_nothing_finished(tmp_path):
 def test_load_run_of_another_name(tmp_path):
     run = load_run(tmp_path / "elsewhere")
     assert (run.seed, run.status) == (None, "unfinished")
-
-
-def test_align():
-    assert align([("a", "bb"), ("ccc", "d")]) == ["a    bb", "---  --", "ccc  d"]

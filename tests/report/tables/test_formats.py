@@ -16,9 +16,10 @@ from qs3.report.__main__ import main
 from qs3.report.tables import table as tables
 from qs3.report.tables.aggregate import load_run
 from qs3.report.tables.cells import Cell, Published, Table
-from qs3.report.tables.formats import csv_text, details, grid, latex, latex_text, markdown, to_run
+from qs3.report.tables.formats import csv_text, details, grid, latex, markdown, to_run
 from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
+from qs3.utils.text_table import latex_text
 from tests.report.made_runs import write_run
 from tests.report.tables.test_tables import run_cell
 

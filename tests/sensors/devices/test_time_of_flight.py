@@ -223,7 +223,7 @@ def test_samples_lie_on_one_grid_whatever_the_window(start, count, step):
     ("settings_", "message"),
     [
         ({"frequencies_hz": ()}, "frequencies_hz"),
-        ({"supersampling": 2}, "supersampling must be 1, 3, 5"),
+        ({"supersampling": 2}, "supersampling must be odd >= 1"),
         ({"contrast": 1.2}, "contrast"),
         ({"min_depth_m": 7.0}, "min_depth_m"),
         ({"read_noise_e": -1.0}, "read_noise_e"),

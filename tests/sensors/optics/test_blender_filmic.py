@@ -82,7 +82,7 @@ def test_the_background_shows_where_the_object_does_not_cover_the_pixel():
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match=r"background must not be negative"):
+    with pytest.raises(ConfigError, match=r"background must be >= 0"):
         FilmicCamera(background=-1)
-    with pytest.raises(ConfigError, match=r"faintest must be positive"):
+    with pytest.raises(ConfigError, match=r"faintest must be > 0"):
         FilmicCamera(faintest=0)

@@ -43,7 +43,7 @@ def test_the_slide_repeats_in_tiles_and_holds_the_dots_of_its_pattern():
 
 
 def test_detail_below_one_is_refused():
-    with pytest.raises(ConfigError, match=r"pattern\.detail must be at least 1"):
+    with pytest.raises(ConfigError, match=r"pattern\.detail must be >= 1"):
         ReleasedSlide(detail=0)
 
 

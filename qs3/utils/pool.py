@@ -1,0 +1,248 @@
+"""Tasks in several processes; one that kills its process costs only itself.
+
+An engine takes named tasks and gives their outcomes, each as soon as it is there. Two are here;
+a cluster's queue could stand behind the same protocol.
+
+Each worker has a pipe of its own and one task at a time. A process that is killed in the middle
+of a message therefore spoils nobody else's, and which task it had is known.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection, wait
+from typing import Any, Generic, Protocol, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+ResultOut = TypeVar("ResultOut", covariant=True)
+
+_STOP_S = 10.0  # how long a worker may take to end before it is killed
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome(Generic[ResultOut]):
+    """What became of a task.
+
+    Attributes:
+        name: of the task.
+        result: what the worker returned; None if it died.
+        died: the task's process ended twice before it was done: out of memory, a crash, or killed.
+    """
+
+    name: str
+    result: ResultOut | None
+    died: bool = False
+
+
+class Engine(Protocol):
+    """Something that does tasks."""
+
+    def run(
+        self,
+        make_worker: Callable[[], Callable[[Task], Result]],
+        tasks: Iterable[tuple[str, Task]],
+    ) -> Iterator[Outcome[Result]]:
+        """Do the tasks.
+
+        Args:
+            make_worker: called once in each process; what it returns is called with each task.
+                It, the tasks and the results are picklable.
+            tasks: names and tasks; taken one by one, when somebody is free for them.
+
+        Yields:
+            One outcome a task, in the order in which they are done.
+
+        Raises:
+            Exception: what a worker raises ends everything; failures that must not are results.
+        """
+        ...
+
+
+def engine(workers: int, tasks_per_process: int | None = None) -> Engine:
+    """`ThisProcess` for 0 workers (for tests and debuggers), else `Processes`."""
+    return Processes(workers, tasks_per_process) if workers else ThisProcess()
+
+
+@dataclass(frozen=True)
+class ThisProcess:
+    """Does the tasks here, one after the other."""
+
+    def run(
+        self,
+        make_worker: Callable[[], Callable[[Task], Result]],
+        tasks: Iterable[tuple[str, Task]],
+    ) -> Iterator[Outcome[Result]]:
+        """See `Engine.run`."""
+        work = make_worker()
+        for name, task in tasks:
+            yield Outcome(name, work(task))
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Does the tasks in processes of this machine.
+
+    They are spawned, because neither Blender nor threads survive a fork; they leave Ctrl-C to
+    their parent, and end with it however it ends. A task whose process dies is tried once more,
+    in a new process beside which no other one works.
+
+    Args:
+        workers: how many at once.
+        tasks_per_process: after so many a process is replaced (where memory creeps).
+    """
+
+    workers: int
+    tasks_per_process: int | None = None
+
+    def run(
+        self,
+        make_worker: Callable[[], Callable[[Task], Result]],
+        tasks: Iterable[tuple[str, Task]],
+    ) -> Iterator[Outcome[Result]]:
+        """See `Engine.run`.
+
+        Raises:
+            OSError: there can be no more processes.
+        """
+        waiting = iter(tasks)
+        crew: list[_Worker] = []
+        suspects: list[tuple[str, Any]] = []
+        outcomes: list[Outcome[Result]] = []
+        try:
+            while True:
+                # Nobody gets new work while one is to be tried again alone.
+                while not suspects and (free := self._free(crew)):
+                    if (task := next(waiting, None)) is None:
+                        break
+                    worker = free[0] or _Worker(make_worker)
+                    if worker not in crew:
+                        crew.append(worker)
+                    worker.give(*task)
+                # After they have new work: whoever takes the outcomes may be slow.
+                yield from outcomes
+                outcomes.clear()
+                busy = {worker.pipe: worker for worker in crew if worker.task is not None}
+                for pipe in wait(list(busy)) if busy else ():
+                    worker = busy[pipe]  # type: ignore[index]
+                    if (outcome := worker.receive()) is not None:
+                        outcomes.append(outcome)
+                    elif worker.task is not None:
+                        suspects.append(worker.task)
+                    if outcome is None or worker.done == self.tasks_per_process:
+                        crew.remove(worker)
+                        worker.stop()
+                if busy:
+                    continue
+                if not suspects:
+                    return
+                while crew:
+                    crew.pop().stop()
+                while suspects:
+                    yield _alone(make_worker, *suspects.pop(0))
+        finally:
+            for worker in crew:
+                worker.stop()
+
+    def _free(self, crew: list[_Worker]) -> list[_Worker | None]:
+        """The workers without a task; None stands for one that is still to be started."""
+        idle: list[_Worker | None] = [worker for worker in crew if worker.task is None]
+        return idle or [None] * (len(crew) < self.workers)
+
+
+def _alone(make_worker: Callable[[], Callable[[Any], Any]], name: str, task: Any) -> Outcome[Any]:
+    worker = _Worker(make_worker)
+    try:
+        worker.give(name, task)
+        return worker.receive() or Outcome(name, None, died=True)
+    finally:
+        worker.stop()
+
+
+class _Worker:
+    """The parent's side of a process."""
+
+    def __init__(self, make_worker: Callable[[], Callable[[Any], Any]]) -> None:
+        context = get_context("spawn")
+        self.task: tuple[str, Any] | None = None
+        self.done = 0
+        self.pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(theirs, make_worker), daemon=True)
+        try:
+            self._process.start()
+        except BaseException:
+            self.pipe.close()
+            raise
+        finally:
+            theirs.close()
+
+    def give(self, name: str, task: Any) -> None:
+        self.task = (name, task)
+        message = pickle.dumps(task)
+        with suppress(OSError):  # it is dead, which `receive` will find
+            self.pipe.send_bytes(message)
+
+    def receive(self) -> Outcome[Any] | None:
+        """The outcome of its task, waiting for it; None if the process died."""
+        assert self.task is not None
+        try:
+            message = self.pipe.recv_bytes()
+        except (EOFError, OSError):
+            return None
+        good, value = pickle.loads(message)  # from a process of our own
+        if not good:
+            raise value
+        name, self.task = self.task[0], None
+        self.done += 1
+        return Outcome(name, value)
+
+    def stop(self) -> None:
+        self.pipe.close()
+        self._process.terminate()
+        self._process.join(_STOP_S)
+        self._process.kill()
+        self._process.join()
+
+
+def _work(pipe: Connection, make_worker: Callable[[], Callable[[Any], Any]]) -> None:
+    """The process: answers each task with (True, result) or (False, error)."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    work = None
+    while True:
+        try:
+            message = pipe.recv_bytes()
+        except (EOFError, OSError):
+            return
+        try:
+            work = work or make_worker()
+            answer = pickle.dumps((True, work(pickle.loads(message))))
+        except Exception as error:
+            answer = pickle.dumps((False, _portable(error)))
+        pipe.send_bytes(answer)
+
+
+def _die_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _portable(error: Exception) -> Exception:
+    """The error, with where it was raised as a note, or what it says if it cannot be pickled."""
+    where = "".join(traceback.format_exception(error))
+    try:
+        error.add_note(f"in a worker process:\n{where}")
+        copy: Exception = pickle.loads(pickle.dumps(error))
+    except Exception:
+        copy = RuntimeError(f"{type(error).__name__}: {error}\n{where}")
+    return copy

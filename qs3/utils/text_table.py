@@ -1,0 +1,77 @@
+"""Tables of words, header first, as aligned text, Markdown, CSV and rows of LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+Rows = Sequence[Sequence[str]]
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "±": r"$\pm$", "→": r"$\rightarrow$", "†": r"$\dagger$", "<": r"$<$", ">": r"$>$",
+    "|": r"$|$",
+}  # fmt: skip
+
+
+def aligned(rows: Rows, *, numbers: bool = False, rule: bool = True) -> list[str]:
+    """Lines for a terminal: columns as wide as their widest entry, two spaces between them.
+
+    Args:
+        rows: header first; all of one length.
+        numbers: whether all columns but the first are flush right.
+        rule: whether there is a line of dashes below the header.
+    """
+    lines = ["  ".join(cells).rstrip() for cells in _padded(rows, numbers)]
+    if rule:
+        lines.insert(1, "  ".join("-" * width for width in _widths(rows)))
+    return lines
+
+
+def markdown(rows: Rows, *, numbers: bool = False) -> list[str]:
+    """Lines of Markdown, which are readable as they are, too; for `numbers` see `aligned`.
+
+    A `|` in a cell is escaped; what else Markdown reads as a sign is kept.
+    """
+    rows = [[cell.replace("|", r"\|") for cell in row] for row in rows]
+    lines = [f"| {' | '.join(cells)} |" for cells in _padded(rows, numbers)]
+    first, *others = _widths(rows)
+    end = ":" if numbers else "-"
+    rules = ["-" * (first + 2), *("-" * (width + 1) + end for width in others)]
+    lines.insert(1, f"|{'|'.join(rules)}|")
+    return lines
+
+
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    r"""CSV whose lines end with `\n`; None is an empty cell, a float has all its digits."""
+    file = io.StringIO(newline="")
+    csv.writer(file, lineterminator="\n").writerows(rows)
+    return file.getvalue()
+
+
+def latex_row(cells: Iterable[str]) -> str:
+    """A row of a tabular, with plain text in its cells."""
+    return " & ".join(map(latex_text, cells)) + r" \\"
+
+
+def latex_text(text: str) -> str:
+    """Plain text with what LaTeX would take for a command escaped."""
+    return "".join(_LATEX.get(letter, letter) for letter in text)
+
+
+def _widths(rows: Rows) -> list[int]:
+    return [max(map(len, column)) for column in zip(*rows, strict=True)]
+
+
+def _padded(rows: Rows, numbers: bool) -> list[list[str]]:
+    widths = _widths(rows)
+    return [
+        [
+            cell.rjust(width) if numbers and i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        for row in rows
+    ]

@@ -1,0 +1,194 @@
+"""The engines: the same outcomes here and in processes, and processes that die."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.errors import DataError
+from qs3.utils.pool import Processes, engine
+
+
+class Strange(Exception):
+    """Cannot be made again from what a pickle keeps of it."""
+
+    def __init__(self, a, b):
+        super().__init__(f"{a} and {b}")
+
+
+def work(task):
+    what, value = task
+    match what:
+        case "square":
+            return value * value
+        case "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "kill once":
+            if not value.exists():
+                value.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            return "survived"
+        case "raise":
+            raise value
+        case "raise strange":
+            raise Strange(1, 2)
+        case "pid":
+            return os.getpid()
+        case "large":
+            return np.zeros(value)
+        case "unpicklable":
+            return lambda: None
+
+
+def make():
+    return work
+
+
+def run(tasks, workers=2, **settings):
+    return {o.name: o for o in Processes(workers, **settings).run(make, tasks)}
+
+
+def squares(n):
+    return [(f"task {i}", ("square", i)) for i in range(n)]
+
+
+@pytest.mark.parametrize("workers", [0, 1, 3])
+def test_any_number_of_workers_gives_the_same(workers):
+    outcomes = engine(workers).run(make, squares(7))
+    assert sorted((o.name, o.result, o.died) for o in outcomes) == [
+        (f"task {i}", i * i, False) for i in range(7)
+    ]
+    assert list(engine(workers).run(make, [])) == []
+
+
+def test_a_deadly_task_costs_only_itself_and_an_unlucky_one_nothing(tmp_path):
+    tasks = squares(6)
+    tasks[2:2] = [("deadly", ("kill", None)), ("unlucky", ("kill once", tmp_path / "tried"))]
+    outcomes = run(tasks)
+    assert outcomes.pop("deadly").died
+    assert outcomes.pop("unlucky").result == "survived"
+    assert {name: o.result for name, o in outcomes.items()} == {
+        f"task {i}": i * i for i in range(6)
+    }
+
+
+def die_at_once():
+    os._exit(3)
+
+
+def test_a_worker_that_cannot_start_is_the_death_of_each_task():
+    assert all(o.died for o in Processes(2).run(die_at_once, squares(3)))
+
+
+def no_worker():
+    raise DataError("no licence")
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_errors_end_everything_and_stay_what_they_are(workers):
+    tasks = [("bad", ("raise", DataError("broken file"))), *squares(3)]
+    with pytest.raises(DataError, match="broken file"):
+        list(engine(workers).run(make, tasks))
+    with pytest.raises(DataError, match="no licence"):
+        list(engine(workers).run(no_worker, squares(3)))
+
+
+def test_an_error_says_where_it_was_raised():
+    with pytest.raises(KeyError) as error:
+        run([("bad", ("raise", KeyError("x")))])
+    assert "in work" in error.value.__notes__[0]
+    with pytest.raises(RuntimeError, match="Strange: 1 and 2"):
+        run([("bad", ("raise strange", None))])
+    with pytest.raises(Exception, match=r"pickle.*lambda"):
+        run([("bad", ("unpicklable", None))])
+
+
+def test_processes_are_replaced_after_a_number_of_tasks():
+    tasks = [(str(i), ("pid", None)) for i in range(5)]
+    pids = [o.result for o in Processes(1, tasks_per_process=2).run(make, tasks)]
+    assert [pids.count(pid) for pid in dict.fromkeys(pids)] == [2, 2, 1]
+    assert os.getpid() not in pids
+
+
+def test_tasks_are_taken_when_somebody_is_free_and_large_messages_pass():
+    taken = []
+
+    def tasks():
+        for i in range(8):
+            taken.append(i)
+            yield str(i), ("large", 1_000_000)
+
+    outcomes = Processes(2).run(make, tasks())
+    first = next(outcomes)
+    assert first.result.shape == (1_000_000,)
+    assert len(taken) <= 4
+    assert len(list(outcomes)) == 7
+
+
+def alive(pid):
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+    return stat.rpartition(")")[2].split()[0] != "Z"
+
+
+def test_whoever_stops_taking_outcomes_leaves_no_process():
+    outcomes = Processes(2).run(make, [(str(i), ("pid", None)) for i in range(50)])
+    pids = {next(outcomes).result for _ in range(4)}
+    outcomes.close()
+    assert not any(map(alive, pids))
+
+
+def sleep(seconds):
+    time.sleep(seconds)
+
+
+def make_sleepers():
+    return sleep
+
+
+SCRIPT = """
+import signal
+from tests.utils.test_pool import Processes, make_sleepers
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if tests run behind an &
+    list(Processes(2).run(make_sleepers, [("a", 600), ("b", 600), ("c", 600)]))
+"""
+
+
+def children(pid):
+    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+
+
+def until(condition, seconds=60):
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=lambda how: how.name)
+def test_processes_end_with_their_parent_while_they_work(tmp_path, how):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "script.py")],
+        env={**os.environ, "PYTHONPATH": os.getcwd()},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert until(lambda: len(children(process.pid)) >= 3)  # two workers, a resource tracker
+        workers = children(process.pid)
+        time.sleep(3)  # they are at work
+        process.send_signal(how)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert until(lambda: not any(map(alive, workers)))
+    assert errors.count("Traceback") == (how == signal.SIGINT)  # the parent's

@@ -1,0 +1,27 @@
+"""Tables as text: by hand."""
+
+from qs3.utils.text_table import aligned, csv_text, latex_row, markdown
+
+ROWS = [("class", "n"), ("a|b", "1000"), ("é", "5 %")]
+
+
+def test_aligned_text():
+    assert aligned(ROWS) == ["class  n", "-----  ----", "a|b    1000", "é      5 %"]
+    assert aligned(ROWS, numbers=True, rule=False) == ["class     n", "a|b    1000", "é       5 %"]
+
+
+def test_markdown():
+    assert markdown(ROWS) == [
+        "| class | n    |",
+        "|-------|------|",
+        r"| a\|b  | 1000 |",
+        "| é     | 5 %  |",
+    ]
+    assert markdown(ROWS[:1], numbers=True) == ["| class | n |", "|-------|--:|"]
+
+
+def test_csv_and_latex():
+    assert csv_text([["a", None, 0.1], ['x"y', "1,2", "two\nlines"]]) == (
+        'a,,0.1\n"x""y","1,2","two\nlines"\n'
+    )
+    assert latex_row(ROWS[2]) == r"é & 5 \% \\"
