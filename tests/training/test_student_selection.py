@@ -29,7 +29,7 @@ from qs3.evaluation.validators import LABEL_FREE, hold_out
 from qs3.report.tables.aggregate import group, load_runs, summarise
 from qs3.report.tables.table import build_table, markdown
 from qs3.runs.checkpoints import copy_weights, load
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.student_selection import StudentSelection, candidate_path
 from qs3.training.command import headline, train
@@ -68,7 +68,7 @@ def by_rule(toy_data: Path, finished: Path, tmp_path_factory: pytest.TempPathFac
     return trained
 
 
-def metrics_of(folder: Path) -> dict[str, Any]:
+def metrics_of(folder: Path) -> RunMetrics:
     metrics = read_metrics(folder)
     assert metrics is not None
     return metrics
@@ -96,12 +96,12 @@ def table_of(cfg: Any, weights: Path, points: torch.Tensor) -> np.ndarray:
 def test_last_is_the_default_and_leaves_nothing_behind(finished):
     metrics = metrics_of(finished)
     assert metrics.selection.student == "last"
-    assert "student" not in metrics
+    assert metrics.student is None
     assert not (finished / "student_selected.pt").exists()
     assert not (finished / "candidates").exists()
     assert "StudentSelection" not in load(finished / "last.ckpt")["callbacks"]
     assert headline(metrics).endswith(
-        f"; teacher selected by {metrics['selection']['teacher']}; student by last"
+        f"; teacher selected by {metrics.selection.teacher}; student by last"
     )
 
 
@@ -128,21 +128,19 @@ def test_a_rule_without_held_out_clouds_only_looks(by_rule, finished, rule):
 def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
     metrics = metrics_of(by_rule(rule))
     student = metrics.student
-    assert list(student["scores"]) == [str(epoch) for epoch in LAST_ROUND]
-    scores = {int(epoch): score for epoch, score in student["scores"].items()}
+    assert list(student.scores) == [str(epoch) for epoch in LAST_ROUND]
+    scores = {int(epoch): score for epoch, score in student.scores.items()}
     best = (min if rule == "entropy" else max)(scores.values())
-    assert student["score"] == best
-    assert student["epoch"] == min(epoch for epoch in scores if scores[epoch] == best)
+    assert student.score == best
+    assert student.epoch == min(epoch for epoch in scores if scores[epoch] == best)
     name = ORACLE_IN_WORDS if rule == "oracle" else rule
-    said = f"{name}, epoch {student['epoch']}, score {best:.6g}"
+    said = f"{name}, epoch {student.epoch}, score {best:.6g}"
     assert metrics.selection.student == said
     assert headline(metrics).endswith(f"; student by {said}")
-    assert student["rule"] == name
-    assert metrics.final == student["selected"]
-    assert student["last"]["epoch"] == 9
+    assert student.rule == name
+    assert student.last.epoch == 9
     if rule != "pseudo_val":  # there the last round was trained on fewer clouds
-        last = {k: v for k, v in student["last"].items() if k != "epoch"}
-        assert last == metrics_of(finished)["final"]
+        assert student.last.scores == metrics_of(finished).final
 
 
 @pytest.mark.parametrize("rule", LABEL_FREE)
@@ -150,17 +148,17 @@ def test_scores_are_those_of_each_epoch_on_the_targets_training_clouds(
     by_rule, toy, toy_data, rule
 ):
     """Again from the weights of each epoch, which the run with the oracle has kept."""
-    from qs3.datamodules.adaptation import load_clouds
+    from qs3.datamodules.splits import load_clouds
 
     kept, cfg = by_rule("oracle"), toy()
     points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
-    student = metrics_of(by_rule(rule))["student"]
+    student = metrics_of(by_rule(rule)).student
     for epoch in LAST_ROUND:
         table = table_of(cfg, candidate_path(kept, epoch), points)
         score = LABEL_FREE[rule].score(table)
-        assert student["scores"][str(epoch)] == pytest.approx(score, abs=1e-6)
+        assert student.scores[str(epoch)] == pytest.approx(score, abs=1e-6)
     chosen = by_rule(rule) / "student_selected.pt"
-    assert same_weights(chosen, candidate_path(kept, student["epoch"]))
+    assert same_weights(chosen, candidate_path(kept, student.epoch))
     assert same_weights(by_rule(rule) / "result.pt", chosen)
 
 
@@ -219,27 +217,27 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
         both = [*zip(index.tolist(), labels.tolist(), strict=True)]
         both += zip(held.tolist(), held_labels.tolist(), strict=True)
         assert all(CLASSES[label] == rows[i].label for i, label in both)
-    assert len(sets[4][0]) == metrics.rounds[0]["total_selected"]  # round 0 holds nothing out
+    assert len(sets[4][0]) == metrics.rounds[0].total_selected  # round 0 holds nothing out
     assert metrics.student.held_out == len(held)
-    assert metrics.rounds[1]["total_selected"] == len(selected)
+    assert metrics.rounds[1].total_selected == len(selected)
     assert len(held) == pytest.approx(len(selected) / 5, abs=1.5)
 
 
 def test_held_out_accuracy(by_rule, toy, toy_data):
     """Of the epoch that was chosen, again from its weights, the seed and the round's table."""
-    from qs3.datamodules.adaptation import load_clouds
+    from qs3.datamodules.splits import load_clouds
     from qs3.utils.seeding import derive
 
     folder = by_rule("pseudo_val")
-    student = metrics_of(folder)["student"]
+    student = metrics_of(folder).student
     rows = read_pseudo_labels(folder / "round_01" / "pseudo_labels.csv")
     selected = [i for i, row in enumerate(rows) if row.selected]
     labels = np.array([CLASSES.index(rows[i].label) for i in selected])
     held = hold_out(labels, [rows[i].id for i in selected], derive(0, "pseudo_val", 1))
-    assert held.sum() == student["held_out"] > 0
+    assert held.sum() == student.held_out > 0
     points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
     table = table_of(toy(), folder / "student_selected.pt", points[np.array(selected)[held]])
-    assert student["score"] == (table.argmax(axis=1) == labels[held]).mean()
+    assert student.score == (table.argmax(axis=1) == labels[held]).mean()
 
 
 def test_all_before_the_last_round_is_as_without_holding_out(by_rule, finished):
@@ -282,19 +280,19 @@ def test_too_few_to_hold_out(toy, monkeypatch):
 
 
 def test_the_oracle_is_the_best_epoch_on_the_test_set(by_rule, toy, toy_data):
-    from qs3.datamodules.adaptation import load_clouds
+    from qs3.datamodules.splits import load_clouds
 
     folder, cfg = by_rule("oracle"), toy()
     target = open_pointset(toy_data / "kinectsim10")
     points = load_clouds(target, "test", points=32).points
     labels = target.labels[target.indices("test")]
-    student = metrics_of(folder)["student"]
+    student = metrics_of(folder).student
     files = sorted((folder / "candidates").iterdir())
     assert [file.name for file in files] == [f"epoch_{epoch:03d}.pt" for epoch in LAST_ROUND]
-    for file, score in zip(files, student["scores"].values(), strict=True):
+    for file, score in zip(files, student.scores.values(), strict=True):
         assert score == (table_of(cfg, file, points).argmax(axis=1) == labels).mean()
-    assert metrics_of(folder)["final"]["accuracy"] == max(student["scores"].values())
-    assert same_weights(folder / "result.pt", candidate_path(folder, student["epoch"]))
+    assert metrics_of(folder).final.accuracy == max(student.scores.values())
+    assert same_weights(folder / "result.pt", candidate_path(folder, student.epoch))
 
 
 def test_the_oracle_is_loud(toy, caplog):
@@ -350,13 +348,13 @@ def test_no_table_has_the_oracle(by_rule, finished):
     folder = by_rule("oracle")
     (found,) = group(load_runs(folder.parent))
     assert found.finished == ()
-    assert found.stat("final", "accuracy") is None
+    assert found.stat("accuracy") is None
     text = summarise([folder, finished])
     said = f"seed 0: left out, because its student was chosen by the {ORACLE_IN_WORDS} ({folder})"
     assert text.endswith(said) or f"{said}\n" in text
     rows = [line for line in text.splitlines() if line.startswith("quickstart  ")]
     assert len(rows) == 1
-    assert f"{100 * metrics_of(finished)['final']['accuracy']:.1f}" in rows[0]
+    assert f"{100 * metrics_of(finished).final.accuracy:.1f}" in rows[0]
     assert summarise([folder]).count("quickstart  ") == 0
     table = build_table("quickstart", folder.parents[1])
     assert f"- runs left out: 1, chosen by the {ORACLE_IN_WORDS}\n" in markdown(table)
@@ -442,15 +440,15 @@ def test_two_processes_choose_one_student(toy_data, tmp_path, rule):
     assert done.returncode == 0, done.stderr
     cfg = toy_config(tmp_path, *more)
     folder = hashing.run_folder(cfg)
-    student = metrics_of(folder)["student"]
+    student = metrics_of(folder).student
     if rule in LABEL_FREE:
-        from qs3.datamodules.adaptation import load_clouds
+        from qs3.datamodules.splits import load_clouds
 
         points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
         table = table_of(cfg, folder / "student_selected.pt", points)
-        assert student["score"] == pytest.approx(LABEL_FREE[rule].score(table), abs=1e-6)
-    scores = student["scores"].values()
-    assert student["score"] == (min if rule == "entropy" else max)(scores)
+        assert student.score == pytest.approx(LABEL_FREE[rule].score(table), abs=1e-6)
+    scores = student.scores.values()
+    assert student.score == (min if rule == "entropy" else max)(scores)
 
 
 # --- errors ------------------------------------------------------------------------------------
