@@ -1,7 +1,5 @@
 """The commands as functions, on the toy problem that the notebooks use."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -13,6 +11,7 @@ from qs3.config.compose import composed
 from qs3.errors import ConfigError, DataError
 from qs3.report.runs.data import read_run
 from qs3.report.tables.table import build_table
+from qs3.runs.metrics import read_metrics
 from qs3.tools.toy import SHAPES, ToyNet, toy_overrides, write_toy
 
 SHORT = ["protocol.epochs=2", "selftraining.rounds=1", "selftraining.epochs=1"]
@@ -37,7 +36,7 @@ def test_toy_is_the_same_each_time_and_as_it_says(tmp_path):
 def test_train_leaves_what_the_command_leaves(tmp_path):
     write_toy(tmp_path)
     folder = train(*toy_overrides(tmp_path), *SHORT, "seed=3")
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = read_metrics(folder)
     assert (metrics.seed, metrics.source, metrics.simulated) == (3, "toy_source", True)
     assert (metrics.method, metrics.selftraining) == ("source_only", "qbst")  # as typed
     assert not HydraConfig.initialized()

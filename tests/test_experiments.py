@@ -1,6 +1,5 @@
 """Every experiment file really runs: two batches an epoch, on files in the published formats."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -8,6 +7,7 @@ from hydra import compose, initialize_config_dir
 
 from qs3.config import hashing
 from qs3.config.hydra import build
+from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
 from tests.fixtures.published import write_all
 
@@ -37,7 +37,7 @@ def test_experiment_runs(experiment, data_dir, tmp_path):
             cfg = compose("train", [*overrides, "selftraining.rounds=2"])
     metrics = train(cfg)
     assert metrics.experiment == experiment
-    assert metrics == json.loads((hashing.run_folder(cfg) / "metrics.json").read_text())
+    assert metrics == read_metrics(hashing.run_folder(cfg))
     assert len(metrics.rounds) == min(rounds, 2)
     if experiment == "own_scans":  # its folders are no labels, so all clouds are the user's
         assert (metrics.final.n, metrics.final.accuracy) == (60, None)

@@ -91,6 +91,7 @@ class AdaptationData(LightningDataModule):
             val=val,
             sampler=sampler,
             clouds_a_class=clouds_a_class,
+            asks="data.source" if owner == "source" else "method=supervised",
             **shared,
         )
         self.target_domain = DomainData(target, labels=False, **shared)

@@ -3,8 +3,9 @@
     data = SpeckleNetData(points=256, batch_size=32)
     Trainer(max_epochs=10).fit(my_module, data)
 
-A batch is `{"points": [B, N, 3] float32, "labels": [B] int64, "index": i, "epoch": e}`: clouds in
-the unit ball, z up, sampled by farthest points. Without labels the key "labels" is not there.
+A batch is `{"points": [B, N, 3] float32, "labels": [B] int64}`: clouds in the unit ball, z up,
+sampled by farthest points. Without labels the key "labels" is not there; without a trainer, that
+takes them away, the step's "index" and "epoch" are there as well.
 """
 
 from __future__ import annotations
@@ -52,6 +53,7 @@ class DomainData(LightningDataModule):
         clouds_a_split: only so many clouds of each split, at even steps.
         clouds_a_class: only the first so many training clouds of each class.
         data_dir: where the dataset of a named domain lies.
+        asks: who needs the labels, for the message where there are none; None: the domain.
 
     Attributes:
         train, validation, test: clouds of each part, after `setup`.
@@ -81,6 +83,7 @@ class DomainData(LightningDataModule):
         clouds_a_split: int | None = None,
         clouds_a_class: int | None = None,
         data_dir: str | Path = "data",
+        asks: str | None = None,
     ) -> None:
         super().__init__()
         if isinstance(domain, str):
@@ -92,6 +95,7 @@ class DomainData(LightningDataModule):
         self.val = check_choice("data.val", val, sorted(RULES))
         self.sampler = check_choice("data.sampler", sampler, SAMPLERS)
         self.clouds_a_split, self.clouds_a_class = clouds_a_split, clouds_a_class
+        self.asks = asks or f"domain {domain.name}"
         # Indices that are cached are those of whole splits.
         self.cache_dir = Path(cache_dir) if cache_dir and clouds_a_split is None else None
         self.whole: Labelled | Unlabelled | None = None
@@ -143,12 +147,13 @@ class DomainData(LightningDataModule):
 
     def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
         """Augment training batches, on their device."""
+        # Lightning could not tell a batch's size for `self.log` if these numbers stayed beside it.
+        result = {key: value for key, value in batch.items() if key not in ("index", "epoch")}
         if self.augment is None or self.trainer is None or not self.trainer.training:
-            return batch
-        points = batch["points"]
-        rank = self.trainer.global_rank
+            return result
+        points, rank = batch["points"], self.trainer.global_rank
         generator = generator_of(batch, "augment", self.seed, rank, points.device)
-        return {**batch, "points": self.augment(points, generator)}
+        return {**result, "points": self.augment(points, generator)}
 
     def _setup_training(self, dataset: PointSet) -> None:
         train = self._load(dataset, "train", starts=self.fps_starts)
@@ -165,7 +170,7 @@ class DomainData(LightningDataModule):
         clouds = load_clouds(dataset, split, self.points, starts, self.cache_dir)
         if not self.has_labels:
             return clouds
-        return with_labels(clouds, dataset, split, f"domain {self.domain.name}")
+        return with_labels(clouds, dataset, split, self.asks)
 
     def _loader(
         self, part: Labelled | Unlabelled | None, batch_size: int, shuffle: bool = False
@@ -177,18 +182,18 @@ class DomainData(LightningDataModule):
         trainer = self.trainer
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
 
-        def batches() -> Batches:
+        def batches(epoch: int) -> Batches:
             return Batches(
                 {Loader.KEY: Table(part.clouds, labels, balance)},
                 batch_size,
                 seed=self.seed,
-                epoch=self._epoch() if shuffle else 0,
+                epoch=epoch,
                 shuffle=shuffle,
                 rank=rank if shuffle else 0,
                 world=world if shuffle else 1,
             )
 
-        return Loader(batches)
+        return Loader(batches, self._epoch if shuffle else int)
 
     def _epoch(self) -> int:
         if self.trainer is not None:
@@ -201,20 +206,21 @@ class Loader:
     """Batches of one domain, made anew for each pass.
 
     Args:
-        make: the batches of the next pass, of a table called `KEY`.
+        make: the batches of an epoch, of a table called `KEY`.
+        epoch: which one the next pass is.
     """
 
     KEY: ClassVar[str] = "domain"
 
-    def __init__(self, make: Callable[[], Batches]) -> None:
-        self._make = make
-        self._batches = make()
+    def __init__(self, make: Callable[[int], Batches], epoch: Callable[[], int]) -> None:
+        self._make, self._epoch = make, epoch
+        self._length = len(make(0))
 
     def __len__(self) -> int:
-        return len(self._batches)
+        return self._length
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        for batch in self._make():
+        for batch in self._make(self._epoch()):
             yield {**batch[self.KEY], "index": batch["index"], "epoch": batch["epoch"]}
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import field
 from pathlib import Path
-from typing import Any
+from typing import Final, Literal
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -17,9 +17,9 @@ from qs3.errors import DataError
 from qs3.utils.files import write_text
 
 METRICS = "metrics.json"
-FINISHED = "finished"
+FINISHED: Final = "finished"
 
-_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+_STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -236,7 +236,7 @@ class RunMetrics:
     hash: str
     config_sha256: str
     seed: int
-    status: str = FINISHED
+    status: Literal["finished"] = FINISHED
     source: str
     target: str
     simulated: bool
@@ -291,9 +291,3 @@ _REMEDY = "delete it and repeat the run's command, which trains nothing again"
 def write_metrics(folder: str | Path, metrics: RunMetrics) -> None:
     """Save the result, atomically, which also marks the run as finished."""
     write_text(Path(folder) / METRICS, _SCHEMA.dump_json(metrics, indent=2).decode() + "\n")
-
-
-def as_dict(metrics: RunMetrics) -> dict[str, Any]:
-    """The contents of the file as plain values."""
-    found: dict[str, Any] = _SCHEMA.dump_python(metrics)
-    return found

@@ -16,11 +16,13 @@ import torch
 from lightning.pytorch import Trainer
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.datamodules.adaptation import Labelled, UdaData, Unlabelled
+from qs3.data.domain import Domain
+from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
 from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.splits import Labelled
 
 CLOUDS, STORED, POINTS, BATCH = 4183, 2048, 1024, 16  # PointDA-10's ModelNet, QS3's warm-up
 TEXT_FILES = 32
@@ -46,26 +48,27 @@ def released_item(path: Path, rng: np.random.Generator) -> np.ndarray:
     return (points + noise).astype(np.float32)
 
 
-def our_data(clouds: Clouds) -> UdaData:
+def our_data(clouds: Clouds) -> AdaptationData:
     """The datamodule of a run, all whose clouds train."""
     ids = tuple(f"{i:05d}" for i in range(len(clouds)))
     labelled = Labelled(clouds, ids, torch.arange(len(clouds)) % 10)
-    data = UdaData(
-        labelled,
-        Unlabelled(clouds, ids),
+    domain = Domain("made", "M", "Made", "nowhere")
+    data = AdaptationData(
+        domain,
+        domain,
         phases=Phases(200),
         scheme=Scheme(),
         augment=Augment(),
         batch_size=BATCH,
         seed=0,
     )
-    data.labelled = labelled
+    data.labelled_domain.train = labelled
     data.trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     data.trainer.training = True
     return data
 
 
-def epoch(data: UdaData) -> int:
+def epoch(data: AdaptationData) -> int:
     """All batches of one epoch, augmented; how many clouds they hold."""
     seen = 0
     for batch in data.train_dataloader():

@@ -7,6 +7,7 @@ import torch
 from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
+from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.test_resume import interrupt
 
 LONG = 1e6  # seconds; no test takes as long
@@ -19,14 +20,14 @@ def wind_forward(checkpoint):
     torch.save(content, checkpoint)
 
 
-def test_earlier_starts_count(toy):
+def test_earlier_starts_count(toy):  # noqa: F811
     cfg = toy("selftraining=none")
     interrupt(cfg, "on_train_epoch_start", 3)
     wind_forward(hashing.run_folder(cfg) / "last.ckpt")
     assert LONG < train(cfg).times.seconds < 2 * LONG
 
 
-def test_a_shared_warmup_counts(toy, tmp_path):
+def test_a_shared_warmup_counts(toy, tmp_path):  # noqa: F811
     assert 0 < train(toy("selftraining=none")).times.seconds < LONG
     (shared,) = (tmp_path / "logs" / "warmups").rglob("*.ckpt")
     wind_forward(shared)

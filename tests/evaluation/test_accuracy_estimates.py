@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from qs3.evaluation import accuracy_estimates as quality
 from qs3.evaluation.estimates_text import MEANINGS, in_words, table
 from qs3.report.runs.data import read_run
 from qs3.report.runs.page import page
+from qs3.runs.metrics import AccuracyEstimates, Estimates, read_metrics
 from qs3.runs.predictions import OF_FILES, Predictions, write_predictions_of_files
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES, toy_config, write_domain
@@ -157,19 +157,32 @@ def test_agreements_by_hand():
 
 def test_words_have_a_range_or_one_figure_and_nothing_without_estimates():
     some = {"calibrated": 0.712, "thresholded": 0.655, "difference": 0.74}
-    assert "66% to 74%, too high as a rule" in in_words(some)
-    assert "71%, too" in in_words(dict.fromkeys(some, 0.71))
-    assert in_words({}) == in_words(dict.fromkeys(some)) == ""
-    rows = table({**some, "never_predicted": ["bed", "sofa"], "teacher_agrees": None})
-    assert [row[0] for row in rows] == [
-        "calibrated",
-        "thresholded",
-        "difference",
-        "never predicted",
+    always = {"clouds": 9, "validated_on": "source_val", "validation_clouds": 5}
+    always |= {"validation_accuracy": 0.9, "unlike_source": 0.0}
+
+    def said(**more):
+        return AccuracyEstimates(**{**always, "never_predicted": [], **more})
+
+    assert "66% to 74%, too high as a rule" in in_words(said(**some))
+    assert "71%, too" in in_words(said(**dict.fromkeys(some, 0.71)))
+    taught = Estimates(validation_accuracy=0.8, **dict.fromkeys(some, 0.5))
+    assert "71% (before self-training 50%), too" in in_words(
+        said(**dict.fromkeys(some, 0.71), teacher=taught)
+    )
+    assert in_words(said()) == in_words(said(**dict.fromkeys(some))) == ""
+    rows = {row[0]: row[1:] for row in table(said(**some, never_predicted=["bed", "sofa"]))}
+    assert list(rows) == [
+        *("validation accuracy", "calibrated", "thresholded", "difference"),
+        *("unlike source", "never predicted"),
     ]
-    assert rows[0][1:] == ("71.2%", MEANINGS["calibrated"] + ".")
-    assert rows[-1][1] == "bed, sofa"
-    assert table({}) == []
+    assert rows["calibrated"] == ("71.2%", MEANINGS["calibrated"] + ".")
+    assert rows["never predicted"][0] == "bed, sofa"
+    rows = {row[0]: row[1] for row in table(said(teacher=taught))}
+    assert rows == {
+        "validation accuracy": "90.0% (before self-training 80.0%)",
+        "unlike source": "0.0%",
+        "never predicted": "none",
+    }
 
 
 def test_the_table_of_files(tmp_path):
@@ -215,18 +228,18 @@ def own(toy):
 def test_a_run_on_one_s_own_scans_says_what_it_can(own):
     cfg, metrics = own
     found = metrics.quality
-    assert found["clouds"] == 30
-    assert found["validated_on"] == "source_val"
-    assert found["validation_clouds"] > 5
+    assert found.clouds == 30
+    assert found.validated_on == "source_val"
+    assert found.validation_clouds > 5
     shares = [*MEANINGS][:-1]
-    assert all(0 <= found[name] <= 1 for name in shares)  # none is missing
-    assert set(MEANINGS) <= set(found)
+    assert all(0 <= getattr(found, name) <= 1 for name in shares)  # none is missing
+    assert set(found.never_predicted) <= set(CLASSES)
     assert "no labels to judge own by; predicted " in headline(metrics)
     assert "accuracy estimated from confidences" in headline(metrics)
-    assert set(found["teacher"]) <= set(found)
+    assert 0 <= found.teacher.calibrated <= 1
     assert "before self-training" in headline(metrics)
     folder = hashing.run_folder(cfg)
-    assert json.loads((folder / "metrics.json").read_text())["quality"] == found
+    assert read_metrics(folder) == metrics
     html = page(read_run(folder), {}, {})
     assert "Quality without labels" in html
     assert MEANINGS["thresholded"] in html
@@ -261,6 +274,6 @@ def test_no_label_of_the_target_has_a_part_in_it(tmp_path, monkeypatch):
         name="kinectsim10", classes=CLASSES, arrays={"points": points}, rows=rows, meta={},
     )  # fmt: skip
     found = [train(toy_config(tmp_path / folder)) for folder in ("a", "b")]
-    assert found[0]["quality"] == found[1]["quality"]
-    assert found[0]["final"]["accuracy"] != found[1]["final"]["accuracy"]
+    assert found[0].quality == found[1].quality
+    assert found[0].final.accuracy != found[1].final.accuracy
     assert not (hashing.run_folder(toy_config(tmp_path / "a")) / OF_FILES).exists()  # it has labels

@@ -7,37 +7,42 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from qs3.datamodules.adaptation import Unlabelled
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.splits import Unlabelled
 from qs3.evaluation.calibration import calibration_error
 from qs3.evaluation.metrics import (
     Evaluation,
-    figures,
-    figures_without_labels,
     predict,
     predict_turned,
+    scores,
 )
+from qs3.runs.metrics import Scores
 
 
-def test_figures_worked_by_hand():
+def test_scores_worked_by_hand():
     labels = np.array([0, 0, 0, 0, 1, 1])
-    predicted = np.array([0, 0, 0, 1, 1, 0])
-    result = figures(predicted, labels, ("a", "b", "c"))
-    assert result["accuracy"] == pytest.approx(4 / 6)
-    assert result["balanced_accuracy"] == pytest.approx((3 / 4 + 1 / 2) / 2)
-    assert result["per_class_recall"] == {"a": 0.75, "b": 0.5, "c": None}
-    assert result["confusion"] == [[3, 1, 0], [1, 1, 0], [0, 0, 0]]
-    assert result["majority_rate"] == pytest.approx(4 / 6)
-    assert result["n"] == 6
-    assert result["predicted"] == {"a": 4, "b": 2, "c": 0}
+    said = np.eye(3)[[0, 0, 0, 1, 1, 0]] * 0.7 + 0.1
+    result = scores(said, labels, ("a", "b", "c"))
+    assert result.accuracy == pytest.approx(4 / 6)
+    assert result.balanced_accuracy == pytest.approx((3 / 4 + 1 / 2) / 2)
+    assert result.per_class_recall == {"a": 0.75, "b": 0.5, "c": None}
+    assert result.confusion == [[3, 1, 0], [1, 1, 0], [0, 0, 0]]
+    assert result.majority_rate == pytest.approx(4 / 6)
+    assert result.n == 6
+    assert result.predicted == {"a": 4, "b": 2, "c": 0}
+    assert result.calibration_error == pytest.approx(0.8 - 4 / 6)
 
 
 def test_without_labels_only_counts():
-    result = figures_without_labels(np.array([0, 2, 2]), ("a", "b", "c"))
-    assert result["predicted"] == {"a": 1, "b": 0, "c": 2}
-    assert result["n"] == 3
-    assert result["accuracy"] is result["balanced_accuracy"] is result["confusion"] is None
+    assert scores(np.eye(3)[[0, 2, 2]], None, ("a", "b", "c")) == Scores(
+        n=3, predicted={"a": 1, "b": 0, "c": 2}
+    )
+
+
+def test_a_net_that_has_diverged_has_scores_but_is_not_calibrated():
+    result = scores(np.full((4, 2), np.nan), np.array([0, 0, 0, 1]), ("a", "b"))
+    assert (result.accuracy, result.calibration_error) == (0.75, None)
 
 
 def test_calibration_worked_by_hand():
@@ -102,19 +107,19 @@ def test_mean_over_turns():
 
 @pytest.mark.parametrize("rotations", [0, 3])
 @pytest.mark.parametrize("labelled", [True, False])
-def test_turned_figures_stand_beside_the_plain_ones(rotations, labelled):
+def test_turned_scores_stand_beside_the_plain_ones(rotations, labelled):
     clouds = Clouds.of(np.random.default_rng(0).normal(size=(5, 6, 3)).astype(np.float32))
     labels = torch.tensor([0, 1, 0, 1, 1]) if labelled else None
     evaluation = Evaluation(
         Unlabelled(clouds, tuple("abcde")), labels, None, ("x", "y"), 2, rotations
     )
     net = Net()
-    plain, turned = evaluation.figures(net), evaluation.turned(net)
+    plain, turned = evaluation.scores(net), evaluation.turned(net)
     assert (turned is None) == (rotations == 0)
-    assert (plain["accuracy"] is None) == (not labelled)
+    assert (plain.accuracy is None) == (not labelled)
     predicted = predict(net, clouds.all(), 5).argmax(axis=1)
-    assert list(plain["predicted"].values()) == np.bincount(predicted, minlength=2).tolist()
+    assert list(plain.predicted.values()) == np.bincount(predicted, minlength=2).tolist()
     if turned is not None:
-        assert turned.keys() == plain.keys()
+        assert (turned.n, turned.accuracy is None) == (plain.n, plain.accuracy is None)
         predicted = predict_turned(net, clouds.all(), rotations, 5).argmax(axis=1)
-        assert list(turned["predicted"].values()) == np.bincount(predicted, minlength=2).tolist()
+        assert list(turned.predicted.values()) == np.bincount(predicted, minlength=2).tolist()

@@ -155,7 +155,7 @@ def test_points_that_are_not_finite_are_left_out_and_counted(run, clouds, tmp_pa
     assert predict(run, source.parent, tmp_path / "said.csv") == 0
     assert predict(run, source.parent, tmp_path / "said.json") == 0
     first, *others = table(tmp_path / "said.csv")
-    assert (first.status, first["points"], first["dropped"]) == ("ok", "125", "3")
+    assert (first["status"], first["points"], first["dropped"]) == ("ok", "125", "3")
     left = rows[0][np.isfinite(rows[0]).all(1)]
     np.testing.assert_allclose(probabilities(first), qs3.load(run)([left])[0], atol=1e-6)
     assert "finite" not in first["reason"]

@@ -1,45 +1,78 @@
 """Runs as training leaves them, for the tests of the report."""
 
 import csv
-import json
+from dataclasses import replace
 
 import matplotlib.image
 
+from qs3.runs.metrics import (
+    AccuracyEstimates,
+    DataHashes,
+    EpochScores,
+    Evaluated,
+    Loading,
+    RunMetrics,
+    Scores,
+    Selection,
+    Times,
+    Warmup,
+    read_metrics,
+    write_metrics,
+)
+
+
+def scores(accuracy=0.5, **changes):
+    """Of 200 clouds of two classes; with accuracy=None of clouds without labels."""
+    known = {}
+    if accuracy is not None:
+        known = {"accuracy": accuracy, "balanced_accuracy": accuracy - 0.1, "majority_rate": 0.45}
+    return Scores(**{"n": 200, "predicted": {"a": 90, "b": 110}, **known, **changes})
+
 
 def metrics(seed=0, accuracy=0.5, **changes):
-    return {
+    """A complete result; `changes` are its fields."""
+    epoch = 3 + seed
+    before = EpochScores(epoch=epoch, scores=scores())
+    content = {
         "experiment": "exp",
         "hash": "0123abcd",
-        "seed": seed,
-        "status": "finished",
+        "config_sha256": "0123abcd" * 8,
         "source": "specklenet10",
         "target": "kinectsim10",
         "method": "pcm",
         "selftraining": "qbst",
         "model": "dgcnn",
         "simulated": True,
-        "selection": {"teacher": f"source_val, epoch {3 + seed}", "student": "last"},
-        "final": {
-            "accuracy": accuracy,
-            "balanced_accuracy": accuracy - 0.1,
-            "majority_rate": 0.45,
-            "n": 200,
-        },
-        "warmup": {},
-        "rounds": [],
-        "data": {"source": "a" * 64, "target": "b" * 64},
-        "times": {},
-        "versions": {},
-        **changes,
+        "selection": Selection(
+            teacher=f"source_val, epoch {epoch}", student="last", validation="lineage"
+        ),
+        "loading": Loading(points=1024, fps_starts=4, sampler="shuffled"),
+        "final": scores(accuracy),
+        "evaluation": Evaluated(
+            split="test", labels=accuracy is not None, rotations=0, norms="trained"
+        ),
+        "warmup": Warmup(selected=before, last=before),
+        "validators": {"infomax": 0.5},
+        "quality": AccuracyEstimates(
+            validation_accuracy=0.9,
+            clouds=200,
+            validated_on="source_val",
+            validation_clouds=40,
+            unlike_source=0.1,
+            never_predicted=[],
+        ),
+        "data": DataHashes(source="a" * 64, target="b" * 64),
+        "times": Times(seconds=60.0),
+        "versions": {"qs3": "0.1.0"},
     }
+    return RunMetrics(seed=seed, **{**content, **changes})
 
 
 def write_run(log_dir, **changes):
     content = metrics(**changes)
-    name = f"seed{content['seed']}-{content['hash']}"
-    folder = log_dir / content["experiment"] / name
+    folder = log_dir / content.experiment / f"seed{content.seed}-{content.hash}"
     folder.mkdir(parents=True)
-    (folder / "metrics.json").write_text(json.dumps(content))
+    write_metrics(folder, content)
     return folder
 
 
@@ -50,10 +83,7 @@ def table(path):
 
 def change(folder, **changes):
     """Put other values into a run's metrics.json."""
-    path = folder / "metrics.json"
-    metrics = json.loads(path.read_text())
-    metrics.update(changes)
-    path.write_text(json.dumps(metrics))
+    write_metrics(folder, replace(read_metrics(folder), **changes))
 
 
 def not_blank(path):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import torch
 
+from tests.training.conftest import finished, toy_data  # noqa: F401 (fixtures)
+
 KINDS = {"last.ckpt", "result.pt", "student.pt", "warmup_last.pt", "warmup_selected.pt"}
 
 
-def test_every_file_loads_without_unpickling_objects(finished):
+def test_every_file_loads_without_unpickling_objects(finished):  # noqa: F811
     files = [path for path in finished.rglob("*") if path.suffix in (".pt", ".ckpt")]
     assert {path.name for path in files} >= KINDS
     added = torch.serialization.get_safe_globals()  # by torch and by torch-geometric, for theirs

@@ -12,7 +12,6 @@ from qs3.config import hashing
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs import folder as runs
-from qs3.runs.metrics import read_metrics, write_metrics
 from qs3.utils.locks import owned
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -120,13 +119,13 @@ def test_seed_zero_is_a_seed():
     assert check_int("seed", 0, 0) == 0
 
 
-def test_metrics_mark_a_finished_run(tmp_path):
-    assert read_metrics(tmp_path) is None
-    write_metrics(tmp_path, {"status": "finished"})
-    assert read_metrics(tmp_path) == {"status": "finished"}
-    (tmp_path / runs.METRICS).write_text("{")
-    with pytest.raises(DataError, match="force=true"):
-        read_metrics(tmp_path)
+def test_what_a_run_was_started_with(tmp_path):
+    assert runs.read_started(tmp_path) is None
+    runs.write_started(tmp_path, {"config_sha256": "0" * 64})
+    assert runs.read_started(tmp_path) == {"config_sha256": "0" * 64}
+    (tmp_path / runs.STARTED).write_text("{")
+    with pytest.raises(DataError, match=r"started\.json cannot be read.*force=true"):
+        runs.read_started(tmp_path)
 
 
 def test_lock(tmp_path):

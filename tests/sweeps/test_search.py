@@ -6,6 +6,7 @@ import logging
 import math
 import re
 import shlex
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -163,12 +164,12 @@ def test_the_objective_is_what_the_validator_says(toy):  # noqa: F811
     cfg = toy("selftraining=none", "objective=entropy")
     metrics = train(cfg)
     assert 0 <= objective_of(cfg, metrics) == metrics.validators["entropy"] <= 1.0987
-    metrics.validators["entropy"] = None  # as `qs3.training.final_scores.without_labels` says it
-    assert math.isnan(objective_of(cfg, metrics))
-    assert judged(cfg, metrics).endswith(": objective=entropy none: the net has diverged")
-    del metrics["validators"]["entropy"]  # as it is with SND of a single cloud
+    # as `qs3.training.final_scores.without_labels` says it
+    lost = replace(metrics, validators={**metrics.validators, "entropy": None})
+    assert math.isnan(objective_of(cfg, lost))
+    assert judged(cfg, lost).endswith(": objective=entropy none: the net has diverged")
     with pytest.raises(ConfigError, match="two training clouds or more"):
-        objective_of(cfg, metrics)
+        objective_of(cfg, replace(metrics, validators={}))
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)

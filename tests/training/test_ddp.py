@@ -19,7 +19,7 @@ import torch
 from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.data.store import open_pointset
-from qs3.datamodules.adaptation import load_clouds
+from qs3.datamodules.splits import load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
 from qs3.runs.pseudo_labels import write_pseudo_labels

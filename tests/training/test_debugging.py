@@ -12,9 +12,10 @@ from hydra import compose, initialize_config_dir
 
 from qs3.config import hashing
 from qs3.data.store import open_pointset
-from qs3.datamodules.adaptation import few_of_each_split
+from qs3.datamodules.splits import few_of_each_split
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
+from qs3.runs.metrics import TrainingAccuracy
 from qs3.training.command import train
 from qs3.utils.locks import owned
 from tests.training.conftest import result_of
@@ -30,12 +31,14 @@ def stop_in(epoch: int) -> str:
 def test_overfit_learns_a_few_clouds_by_heart(toy):
     cfg = toy("debug=overfit", "protocol.epochs=100", "selftraining.rounds=0")
     metrics = train(cfg)
-    assert metrics.training == {"n": 10, "accuracy": 1.0}  # 12 clouds less 2 for validation
+    assert metrics.training == TrainingAccuracy(
+        n=10, accuracy=1.0
+    )  # 12 clouds less 2 for validation
     assert metrics.selftraining == "none"
     lr = "protocol.optimizer.lr=1e-9"
     cannot = train(toy("debug=overfit", "protocol.epochs=3", "selftraining.rounds=0", lr))
-    assert cannot["training"]["accuracy"] < 1
-    assert "training" not in train(toy("selftraining=none"))
+    assert cannot.training.accuracy < 1
+    assert train(toy("selftraining=none")).training is None
     with pytest.raises(ConfigError, match=r"data\.clouds_a_class"):
         train(toy("data.clouds_a_class=0"))
 

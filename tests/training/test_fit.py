@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
 from qs3.runs.checkpoints import copy_weights, load
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training.command import train
 from qs3.utils.locks import owned
 from tests.training.conftest import result_of
@@ -36,8 +37,8 @@ def test_metrics_and_files(finished):
     assert metrics.simulated is True
     assert metrics.selection.student == "last"
     assert metrics.selection.teacher.startswith("source_val, epoch ")
-    assert [r["round"] for r in metrics.rounds] == [0, 1]
-    assert [r["theta"] for r in metrics.rounds] == [0.4, 0.405]
+    assert [r.round for r in metrics.rounds] == [0, 1]
+    assert [r.theta for r in metrics.rounds] == [0.4, 0.405]
     assert metrics.final.n == 24
     assert metrics.final.majority_rate == pytest.approx(1 / 3)
     rows = table(finished / "history.csv")
@@ -54,7 +55,7 @@ def test_selected_labels_match_the_table(finished):
     rows = table(finished / "round_00" / "pseudo_labels.csv")
     assert len(rows) == 72
     kept = [row for row in rows if row["selected"] == "1"]
-    assert len(kept) == metrics.rounds[0]["total_selected"]
+    assert len(kept) == metrics.rounds[0].total_selected
     assert all(float(row["confidence"]) > 0.4 for row in kept)
 
 
@@ -94,15 +95,14 @@ def test_finished_run_is_skipped_and_force_repeats_it(toy, monkeypatch):
     assert (folder / "last.ckpt").stat().st_mtime_ns == stamp
     again = train(toy("selftraining=none", "method=source_only", "force=true"))
     assert (folder / "last.ckpt").stat().st_mtime_ns != stamp
-    assert {**again, "times": 0} == {**first, "times": 0}
+    assert replace(again, times=first.times) == first
 
 
 def test_without_self_training_the_selected_warmup_is_reported(toy):
     metrics = train(toy("selftraining=none"))
     assert metrics.rounds == []
     assert metrics.selection.student == metrics.selection.teacher
-    selected = {k: v for k, v in metrics.warmup.selected.items() if k != "epoch"}
-    assert metrics.final == selected
+    assert metrics.final == metrics.warmup.selected.scores
 
 
 def test_the_warmup_of_self_training_is_the_run_without_it(toy, finished):
@@ -216,16 +216,16 @@ def test_other_target_labels_change_the_figures_and_nothing_else(toy, toy_data, 
 
 def test_metrics_say_how_clouds_were_loaded_and_judged(finished):
     metrics = read_metrics(finished)
-    assert metrics.loading == {"points": 32, "fps_starts": 4, "sampler": "shuffled"}
+    assert metrics.loading == Loading(points=32, fps_starts=4, sampler="shuffled")
     assert metrics.selection.validation == "lineage"
-    assert metrics.evaluation == {
-        "split": "test",
-        "labels": True,
-        "rotations": 0,
-        "norms": "trained",
-        "final_over_rotations": None,
-        "warmup_over_rotations": None,
-    }
+    assert metrics.evaluation == Evaluated(
+        split="test",
+        labels=True,
+        rotations=0,
+        norms="trained",
+        final_over_rotations=None,
+        warmup_over_rotations=None,
+    )
     assert 0 <= metrics.final.calibration_error <= 1
 
 
@@ -233,10 +233,10 @@ def test_turned_figures_stand_beside_the_plain_ones(toy, finished):
     metrics = train(toy("evaluation.rotations=12"))
     assert metrics.final == read_metrics(finished).final
     evaluation = metrics.evaluation
-    assert evaluation["rotations"] == 12
-    for name in ("final_over_rotations", "warmup_over_rotations"):
-        assert evaluation[name].keys() == metrics.final.keys()
-        assert evaluation[name]["calibration_error"] != metrics.final.calibration_error
+    assert evaluation.rotations == 12
+    for turned in (evaluation.final_over_rotations, evaluation.warmup_over_rotations):
+        assert turned.n == metrics.final.n
+        assert turned.calibration_error != metrics.final.calibration_error
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_turned_figures_stand_beside_the_plain_ones(toy, finished):
 def test_other_loading_is_another_result_and_named(toy, finished, more, where, value):
     cfg = toy(more, "selftraining=none")
     metrics = train(cfg)
-    assert metrics[where[0]][where[1]] == value
+    assert getattr(getattr(metrics, where[0]), where[1]) == value
     rows = table(hashing.run_folder(cfg) / "history.csv")
     assert rows != table(finished / "history.csv")[: len(rows)]
 
@@ -321,7 +321,7 @@ def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
     with caplog.at_level(logging.WARNING):
         metrics = train(toy())
     assert "no pseudo-label for slab" in caplog.text
-    assert metrics.rounds[0]["missing_classes"] == ["slab"]
+    assert metrics.rounds[0].missing_classes == ["slab"]
     with pytest.raises(SelectionError, match="no pseudo-label for slab"):
         train(toy("selftraining.missing_class=error"))
 

@@ -13,9 +13,10 @@ from omegaconf import open_dict
 from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.data.store import open_pointset
-from qs3.datamodules.adaptation import Unlabelled, load_clouds
+from qs3.datamodules.splits import Unlabelled, load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
+from qs3.runs.metrics import RunMetrics
 from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
 from qs3.training.command import train
@@ -32,7 +33,7 @@ class Kept:
     cfg: Any
     folder: Path
     kept: Path
-    metrics: dict[str, Any]
+    metrics: RunMetrics
     target: Unlabelled
 
     def before(self, epoch: int, batch: int = 0) -> dict[str, Any]:

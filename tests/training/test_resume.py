@@ -16,8 +16,8 @@ from lightning.pytorch import Callback
 from omegaconf import open_dict
 
 import qs3.runs.checkpoints
-import qs3.runs.folder
 import qs3.selftraining.callback
+import qs3.training.command
 from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
@@ -135,7 +135,7 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
         (qs3.selftraining.callback, "predict", 2),
         (qs3.selftraining.callback, "write_pseudo_labels", 1),
         (qs3.selftraining.callback, "check_selection", 2),
-        (qs3.runs.folder, "write_metrics", 1),
+        (qs3.training.command, "write_metrics", 1),
     ],
 )
 def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, call):

@@ -24,7 +24,7 @@ from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.evaluation.validators import LABEL_FREE, hold_out
 from qs3.runs.checkpoints import copy_weights, load
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.student_selection import StudentSelection
 from qs3.training.command import headline, train
@@ -77,7 +77,7 @@ def keep_and_score(self, net, data, classifier, score=StudentSelection._score):
     return score(self, net, data, classifier)
 
 
-def metrics_of(folder: Path) -> dict[str, Any]:
+def metrics_of(folder: Path) -> RunMetrics:
     metrics = read_metrics(folder)
     assert metrics is not None
     return metrics
@@ -105,11 +105,11 @@ def table_of(cfg: Any, weights: Path, points: torch.Tensor) -> np.ndarray:
 def test_last_is_the_default_and_leaves_nothing_behind(finished):
     metrics = metrics_of(finished)
     assert metrics.selection.student == "last"
-    assert "student" not in metrics
+    assert metrics.student is None
     assert not (finished / "student_selected.pt").exists()
     assert "StudentSelection" not in load(finished / "last.ckpt")["callbacks"]
     assert headline(metrics).endswith(
-        f"; teacher selected by {metrics['selection']['teacher']}; student by last"
+        f"; teacher selected by {metrics.selection.teacher}; student by last"
     )
 
 
@@ -130,20 +130,18 @@ def test_a_rule_without_held_out_clouds_only_looks(by_rule, finished, rule):
 def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
     metrics = metrics_of(by_rule(rule))
     student = metrics.student
-    assert list(student["scores"]) == [str(epoch) for epoch in LAST_ROUND]
-    scores = {int(epoch): score for epoch, score in student["scores"].items()}
+    assert list(student.scores) == [str(epoch) for epoch in LAST_ROUND]
+    scores = {int(epoch): score for epoch, score in student.scores.items()}
     best = (min if rule == "entropy" else max)(scores.values())
-    assert student["score"] == best
-    assert student["epoch"] == min(epoch for epoch in scores if scores[epoch] == best)
-    said = f"{rule}, epoch {student['epoch']}, score {best:.6g}"
-    assert metrics["selection"]["student"] == said
+    assert student.score == best
+    assert student.epoch == min(epoch for epoch in scores if scores[epoch] == best)
+    said = f"{rule}, epoch {student.epoch}, score {best:.6g}"
+    assert metrics.selection.student == said
     assert headline(metrics).endswith(f"; student by {said}")
-    assert student["rule"] == rule
-    assert metrics["final"] == student["selected"]
-    assert student["last"]["epoch"] == 9
+    assert student.rule == rule
+    assert student.last.epoch == 9
     if rule != "pseudo_val":  # there the last round was trained on fewer clouds
-        last = {k: v for k, v in student["last"].items() if k != "epoch"}
-        assert last == metrics_of(finished)["final"]
+        assert student.last.scores == metrics_of(finished).final
 
 
 @pytest.mark.parametrize("rule", LABEL_FREE)
@@ -151,17 +149,17 @@ def test_scores_are_those_of_each_epoch_on_the_targets_training_clouds(
     by_rule, toy, toy_data, rule
 ):
     """Again from the weights of each epoch."""
-    from qs3.datamodules.adaptation import load_clouds
+    from qs3.datamodules.splits import load_clouds
 
     folder, cfg = by_rule(rule), toy()
     points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
-    student = metrics_of(folder)["student"]
+    student = metrics_of(folder).student
     for epoch in LAST_ROUND:
         table = table_of(cfg, epoch_file(folder, epoch), points)
         score = LABEL_FREE[rule].score(table)
-        assert student["scores"][str(epoch)] == pytest.approx(score, abs=1e-6)
+        assert student.scores[str(epoch)] == pytest.approx(score, abs=1e-6)
     chosen = folder / "student_selected.pt"
-    assert same_weights(chosen, epoch_file(folder, student["epoch"]))
+    assert same_weights(chosen, epoch_file(folder, student.epoch))
     assert same_weights(folder / "result.pt", chosen)
 
 
@@ -220,27 +218,27 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
         both = [*zip(index.tolist(), labels.tolist(), strict=True)]
         both += zip(held.tolist(), held_labels.tolist(), strict=True)
         assert all(CLASSES[label] == rows[i].label for i, label in both)
-    assert len(sets[4][0]) == metrics.rounds[0]["total_selected"]  # round 0 holds nothing out
+    assert len(sets[4][0]) == metrics.rounds[0].total_selected  # round 0 holds nothing out
     assert metrics.student.held_out == len(held)
-    assert metrics.rounds[1]["total_selected"] == len(selected)
+    assert metrics.rounds[1].total_selected == len(selected)
     assert len(held) == pytest.approx(len(selected) / 5, abs=1.5)
 
 
 def test_held_out_accuracy(by_rule, toy, toy_data):
     """Of the epoch that was chosen, again from its weights, the seed and the round's table."""
-    from qs3.datamodules.adaptation import load_clouds
+    from qs3.datamodules.splits import load_clouds
     from qs3.utils.seeding import derive
 
     folder = by_rule("pseudo_val")
-    student = metrics_of(folder)["student"]
+    student = metrics_of(folder).student
     rows = read_pseudo_labels(folder / "round_01" / "pseudo_labels.csv")
     selected = [i for i, row in enumerate(rows) if row.selected]
     labels = np.array([CLASSES.index(rows[i].label) for i in selected])
     held = hold_out(labels, [rows[i].id for i in selected], derive(0, "pseudo_val", 1))
-    assert held.sum() == student["held_out"] > 0
+    assert held.sum() == student.held_out > 0
     points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
     table = table_of(toy(), folder / "student_selected.pt", points[np.array(selected)[held]])
-    assert student["score"] == (table.argmax(axis=1) == labels[held]).mean()
+    assert student.score == (table.argmax(axis=1) == labels[held]).mean()
 
 
 def test_all_before_the_last_round_is_as_without_holding_out(by_rule, finished):
@@ -371,15 +369,15 @@ def test_two_processes_choose_one_student(toy_data, tmp_path, rule):
     assert done.returncode == 0, done.stderr
     cfg = toy_config(tmp_path, *more)
     folder = hashing.run_folder(cfg)
-    student = metrics_of(folder)["student"]
+    student = metrics_of(folder).student
     if rule in LABEL_FREE:
-        from qs3.datamodules.adaptation import load_clouds
+        from qs3.datamodules.splits import load_clouds
 
         points = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32).points
         table = table_of(cfg, folder / "student_selected.pt", points)
-        assert student["score"] == pytest.approx(LABEL_FREE[rule].score(table), abs=1e-6)
-    scores = student["scores"].values()
-    assert student["score"] == (min if rule == "entropy" else max)(scores)
+        assert student.score == pytest.approx(LABEL_FREE[rule].score(table), abs=1e-6)
+    scores = student.scores.values()
+    assert student.score == (min if rule == "entropy" else max)(scores)
 
 
 # --- errors ------------------------------------------------------------------------------------

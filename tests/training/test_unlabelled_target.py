@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ from qs3.config import hashing
 from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.errors import ConfigError
 from qs3.report.tables.aggregate import summarise
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import Selection, read_metrics
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES
 
@@ -69,19 +68,19 @@ def test_own_scans_without_labels(toy, unlabelled, finished, more):
     cfg = toy(*more)
     metrics = train(cfg)
     final = metrics.final
-    assert final["accuracy"] is final["balanced_accuracy"] is final["majority_rate"] is None
-    assert final["per_class_recall"] is final["confusion"] is final["calibration_error"] is None
-    assert final["n"] == sum(final["predicted"].values()) == 24
-    assert set(final["predicted"]) == set(CLASSES)
+    assert final.accuracy is final.balanced_accuracy is final.majority_rate is None
+    assert final.per_class_recall is final.confusion is final.calibration_error is None
+    assert final.n == sum(final.predicted.values()) == 24
+    assert set(final.predicted) == set(CLASSES)
     assert metrics.evaluation.labels is False
     assert metrics.evaluation.split == "test"
-    assert all(record["with_target_labels"] is None for record in metrics.rounds)
+    assert all(record.with_target_labels is None for record in metrics.rounds)
     if "selftraining=none" not in more:  # labels or not, training does the same
         theirs = read_metrics(finished)
-        assert final["predicted"] == theirs.final.predicted
+        assert final.predicted == theirs.final.predicted
         assert metrics.evaluation.final_over_rotations.accuracy is None
     assert "no labels to judge kinectsim10 (simulated) by; predicted " in headline(metrics)
-    assert train(cfg) == json.loads((hashing.run_folder(cfg) / "metrics.json").read_text())
+    assert train(cfg) == metrics == read_metrics(hashing.run_folder(cfg))
 
 
 def test_reports_of_such_runs(toy, unlabelled):
@@ -98,11 +97,8 @@ def test_table_of_such_runs(tmp_path):
     table = build_table("quickstart", tmp_path)
     for cell in table.cells:
         if cell is table.cells[0] or cell.overrides != table.cells[0].overrides:
-            nothing = {"accuracy": None, "balanced_accuracy": None, "majority_rate": None}
-            run_cell(
-                tmp_path, cell, final={**nothing, "n": 3},
-                selection={"teacher": "last", "student": "last", "validation": "stratified"},
-            )  # fmt: skip
+            selection = Selection(teacher="last", student="last", validation="stratified")
+            run_cell(tmp_path, cell, accuracy=None, selection=selection)
             break
     text = markdown(build_table("quickstart", tmp_path))
     assert "no target labels" in text
@@ -141,7 +137,7 @@ def test_without_a_test_split_predictions_of_the_training_clouds_are_counted(
     assert metrics.final.accuracy is None
     assert metrics.final.n == 72
     assert "no test split" in caplog.text
-    known = metrics.rounds[0]["with_target_labels"]  # they judge pseudo-labels only
+    known = metrics.rounds[0].with_target_labels  # they judge pseudo-labels only
     assert (known is not None) == labelled
 
 
@@ -150,7 +146,7 @@ def test_labels_of_some_classes_only(toy, toy_data, tmp_path):
     data = only(toy_data, tmp_path / "cut", lambda row: row.cls != "rod")
     metrics = train(toy(f"paths.data_dir={data}", "selftraining=none"))
     final = metrics.final
-    recall = final["per_class_recall"]
+    recall = final.per_class_recall
     assert recall["rod"] is None
-    assert final["balanced_accuracy"] == pytest.approx((recall["ball"] + recall["slab"]) / 2)
-    assert final["n"] == 16
+    assert final.balanced_accuracy == pytest.approx((recall["ball"] + recall["slab"]) / 2)
+    assert final.n == 16

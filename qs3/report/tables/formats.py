@@ -119,8 +119,7 @@ def seconds(group: Group) -> list[float]:
 
 def _time(group: Group) -> str:
     """Such as "3.5 min" or "3.5 to 4.1 min"."""
-    if not (found := seconds(group)):
-        return "not known"
+    found = seconds(group)
     unit, name = next(
         (u, n) for u, n in ((3600, "h"), (60, "min"), (1, "s")) if max(found) >= u or u == 1
     )

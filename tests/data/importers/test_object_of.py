@@ -5,7 +5,7 @@ from pathlib import Path
 from qs3.data.domain import Domain
 from qs3.data.importers import GraspNetPC, XyzTree
 from qs3.data.store import ManifestRow, write_pointset
-from qs3.training.fit import _objects_by_id
+from qs3.training.load import _objects_by_id
 from tests.fixtures.published import cloud
 
 

@@ -7,6 +7,7 @@ import logging
 import re
 import shutil
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from qs3.report.runs import figures as run_figures
 from qs3.report.runs.data import read_run
 from qs3.report.runs.pictures import AfterTraining, draw
 from qs3.runs.checkpoints import save
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.training.command import train
 from tests.report.made_runs import change, not_blank, table
@@ -74,7 +75,7 @@ def check_page(run, drawn):
         p.read_bytes() for p in drawn.pictures.values()
     ]
     metrics = read_metrics(run)
-    assert f"<td>{metrics['final']['accuracy']:.1%}</td>" in page
+    assert f"<td>{metrics.final.accuracy:.1%}</td>" in page
     assert "kinectsim10 (simulated)" in page
     assert "python train.py experiment=quickstart" in page
     assert "protocol.epochs: 4" in page
@@ -95,7 +96,10 @@ def test_curves_are_the_history(run):
 
 
 def test_chosen_student_is_marked(run):
-    change(run, student={"epoch": 8})
+    last = EpochScores(epoch=9, scores=read_metrics(run).final)
+    scores = {"7": 0.1, "8": 0.3, "9": 0.2}
+    student = StudentChoice(rule="snd", epoch=8, score=0.3, scores=scores, held_out=0, last=last)
+    change(run, student=student)
     axes = run_figures.curves(read_run(run)).axes
     assert line(axes[1], "student: epoch 8")[0].tolist() == [8, 8]
 
@@ -114,7 +118,7 @@ def test_confusion_is_that_of_the_predictions(run):
     final, title = read_metrics(run).final, figure.get_suptitle()
     assert "kinectsim10 (simulated)" in title
     for key in ("accuracy", "balanced_accuracy", "majority_rate"):
-        assert f"{final[key]:.1%}" in title
+        assert f"{getattr(final, key):.1%}" in title
     change(run, simulated=False)
     assert "simulated" not in run_figures.confusion(read_run(run)).get_suptitle()
 
@@ -127,16 +131,16 @@ def test_pseudo_labels_are_those_of_the_tables(run):
         kept = Counter(row["label"] for row in rows if row["selected"] == "1")
         for k, name in enumerate(CLASSES):
             assert np.array(axes[0].images[0].get_array())[k, r] == kept[name]
-            assert f"{kept[name]}/{record['confident'][name]}" in texts(axes[0])
-            assert np.array(axes[1].images[0].get_array())[k, r] == record["mu"][name]
+            assert f"{kept[name]}/{record.confident[name]}" in texts(axes[0])
+            assert np.array(axes[1].images[0].get_array())[k, r] == record.mu[name]
         assert heights(axes[2], "selected")[r] == sum(kept.values())
-        assert heights(axes[2], "confident")[r] == record["total_confident"]
+        assert heights(axes[2], "confident")[r] == record.total_confident
     assert line(axes[2], "all target clouds")[1].tolist() == [72, 72]
     theta = line(axes[3], "theta, the confidence asked for")[1]
-    assert theta.tolist() == [record["theta"] for record in records]
+    assert theta.tolist() == [record.theta for record in records]
     for key in ("precision", "recall"):
         judged = line(axes[3], f"{key} (with target labels, evaluation only)")[1]
-        assert judged.tolist() == [record["with_target_labels"][key] for record in records]
+        assert judged.tolist() == [getattr(r.with_target_labels, key) for r in records]
 
 
 def test_classes_are_counted(run):
@@ -181,16 +185,15 @@ def test_missing_round_folders(run):
     assert list(drawn.pictures) == ALL
     assert "round_00/pseudo_labels.csv is gone" in " ".join(drawn.notes)
     assert "round_00/pseudo_labels.csv is gone" in drawn.page.read_text()
-    kept = read_metrics(run).rounds[0]["selected"]
+    kept = read_metrics(run).rounds[0].selected
     axes = run_figures.pseudo_labels(read_run(run)).axes
     assert np.array(axes[0].images[0].get_array())[:, 0].tolist() == [kept[c] for c in CLASSES]
 
 
 def test_unlabelled_target(run):
     metrics = read_metrics(run)
-    unknown = dict.fromkeys(("accuracy", "balanced_accuracy", "confusion", "majority_rate"))
-    rounds = [{**record, "with_target_labels": None} for record in metrics.rounds]
-    final = {**metrics.final, **unknown, "calibration_error": None}
+    final = Scores(n=metrics.final.n, predicted=metrics.final.predicted)
+    rounds = [replace(record, with_target_labels=None) for record in metrics.rounds]
     change(run, final=final, rounds=rounds)
     rows = table(run / "predictions.csv")
     with open(run / "predictions.csv", "w", newline="") as file:
@@ -277,7 +280,7 @@ def test_embedding_needs_data_and_a_net(run, tmp_path):
     assert "tests.training.toy" in why_no_embedding(run)  # a file may not name any code
     use_real_net(run)
     assert f"its source, specklenet10, is not at {tmp_path}" in why_no_embedding(run, tmp_path)
-    change(run, data={"source": "0" * 64, "target": "0" * 64})
+    change(run, data=DataHashes(source="0" * 64, target="0" * 64))
     assert "another version of specklenet10" in why_no_embedding(run)
     (run / ".hydra" / "config.yaml").unlink()
     assert "config.yaml" in why_no_embedding(run)

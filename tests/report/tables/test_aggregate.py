@@ -1,6 +1,7 @@
 """Mean and SEM, and above all what must not be averaged."""
 
 import math
+import re
 import statistics
 
 import pytest
@@ -8,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.report.tables.aggregate import Stat, group, load_run, load_runs, summarise
-from tests.report.made_runs import write_run
+from qs3.runs.metrics import DataHashes
+from tests.report.made_runs import scores, write_run
 
 
 def test_mean_and_sem_by_hand():
@@ -36,7 +38,7 @@ def test_groups_by_hash_not_by_seed(tmp_path):
     groups = {g.hash: g for g in group(load_runs(tmp_path))}
     assert set(groups) == {"0123abcd", "ffff0000"}
     assert groups["0123abcd"].seeds == [0, 1, 2]
-    stat = groups["0123abcd"].stat("final", "accuracy")
+    stat = groups["0123abcd"].stat("accuracy")
     assert stat is not None
     assert (stat.mean, stat.n) == (pytest.approx(0.51), 3)
     assert groups["0123abcd"].problems == ()
@@ -48,16 +50,17 @@ def test_unfinished_failed_and_damaged_seeds_are_shown(tmp_path):
     begun.mkdir()
     (begun / "started.json").write_text("{}")
     (write_run(tmp_path, seed=2) / "metrics.json").write_text('{"seed": 2, "sta')
-    write_run(tmp_path, seed=3, status="failed")
+    failed = write_run(tmp_path, seed=3) / "metrics.json"
+    failed.write_text(failed.read_text().replace('"finished"', '"failed"'))
     (write_run(tmp_path, seed=4) / "metrics.json").write_text("[]")
     (found,) = group(load_runs(tmp_path))
     assert found.seeds == [0]
     text = "\n".join(found.problems)
     assert f"seed 1: unfinished ({begun})" in text
-    assert "seed 2: metrics.json is not readable" in text
-    assert "seed 3: failed" in text
-    assert "seed 4: metrics.json has no experiment" in text
-    stat = found.stat("final", "accuracy")
+    assert re.search(r"seed 2: .*metrics\.json is damaged: the file: Invalid JSON", text)
+    assert re.search(r"seed 3: .*metrics\.json is damaged: status: .*'finished'", text)
+    assert re.search(r"seed 4: .*metrics\.json is damaged: the file: ", text)
+    stat = found.stat("accuracy")
     assert stat is not None
     assert stat.n == 1
 
@@ -67,9 +70,9 @@ def test_other_data_are_not_averaged(tmp_path, role):
     write_run(tmp_path, seed=0)
     write_run(tmp_path, seed=1)
     data = {"source": "a" * 64, "target": "b" * 64, role: "c" * 64}
-    write_run(tmp_path, seed=2, data=data)
+    write_run(tmp_path, seed=2, data=DataHashes(**data))
     (found,) = group(load_runs(tmp_path))
-    assert found.stat("final", "accuracy") is None
+    assert found.stat("accuracy") is None
     assert f"the {role} dataset differs" in found.problems[0]
     assert "seeds 2: cccccccccccc" in found.problems[0]
     assert "not averaged" in summarise([r.folder for r in load_runs(tmp_path)])
@@ -79,17 +82,27 @@ def test_a_seed_twice_is_not_averaged(tmp_path):
     write_run(tmp_path / "a", seed=0)
     write_run(tmp_path / "b", seed=0)
     (found,) = group(load_runs(tmp_path))
-    assert found.stat("final", "accuracy") is None
+    assert found.stat("accuracy") is None
     assert "seeds 0 occur more than once" in found.problems[0]
 
 
-def test_values_that_are_no_numbers(tmp_path):
-    write_run(tmp_path, final={"accuracy": None, "balanced_accuracy": float("nan")})
+def test_scores_that_a_seed_lacks_have_no_mean(tmp_path):
+    write_run(tmp_path, seed=0, final=scores(0.5, calibration_error=0.25))
     (found,) = group(load_runs(tmp_path))
-    assert found.stat("final", "accuracy") is None
-    assert found.stat("final", "balanced_accuracy") is None
-    assert found.stat("final", "absent") is None
-    assert found.stat("absent", "deeper") is None
+    assert found.stat("calibration_error") == Stat(0.25, None, 1)
+    write_run(tmp_path, seed=1, accuracy=0.7)  # diverged
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("calibration_error") is None
+    assert found.stat("accuracy").mean == pytest.approx(0.6)
+    assert found.stat("accuracy", "warmup").mean == 0.5
+
+
+def test_without_labels_there_is_no_mean(tmp_path):
+    write_run(tmp_path, accuracy=None)
+    (found,) = group(load_runs(tmp_path))
+    assert found.unlabelled
+    assert found.stat("accuracy") is found.stat("balanced_accuracy") is None
+    assert "no target labels, so no accuracy" in summarise([found.finished[0].folder])
 
 
 def test_summary_of_a_multirun(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 import shlex
 import subprocess
@@ -19,7 +18,9 @@ from qs3.report.__main__ import main
 from qs3.report.tables.comparison import against, csv_text, effects, text
 from qs3.report.tables.running import Job, _chosen, launch, missing
 from qs3.report.tables.table import Table, build_table
+from qs3.runs.metrics import DataHashes
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
+from tests.report.made_runs import change
 from tests.report.tables.test_tables import run_cell
 from tests.training.toy import overrides, write_toy
 
@@ -153,20 +154,18 @@ def test_what_a_table_does_not_average_is_not_compared(tmp_path):
     shown = text(against(table, "source only"), "source only")
     assert "each counts as one of its own" in shown  # these predictions know no objects
 
-    def compared(path, target):
-        metrics = json.loads(path.read_text())
-        metrics.data.target = target
-        path.write_text(json.dumps(metrics))
+    def compared(folder, target):
+        change(folder, data=DataHashes(source="a" * 64, target=target))
         again = build_table("cad10", tmp_path)
         (one,) = (one for one in against(again, "source only") if one.name == "DANN")
         return one
 
-    paths = [run.folder / "metrics.json" for run in cells["DANN"].group.finished]
-    one = compared(paths[0], "c" * 64)
+    folders = [run.folder for run in cells["DANN"].group.finished]
+    one = compared(folders[0], "c" * 64)
     assert one.differences is None
     assert "not averaged" in one.why
-    compared(paths[1], "c" * 64)
-    one = compared(paths[2], "c" * 64)  # all of its seeds, but not the base's
+    compared(folders[1], "c" * 64)
+    one = compared(folders[2], "c" * 64)  # all of its seeds, but not the base's
     assert one.differences is None
     assert "different versions of the target" in one.why
 

@@ -17,7 +17,8 @@ from qs3.report.tables import table as tables
 from qs3.report.tables.cells import Published
 from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
 from qs3.report.tables.table import build_table
-from tests.report.made_runs import write_run
+from qs3.runs.metrics import DataHashes, EpochScores, Warmup
+from tests.report.made_runs import scores, write_run
 
 EXPECTED = ("ablation", "noise", "quickstart", "self_training", "uda")
 
@@ -66,7 +67,8 @@ def test_quickstart_filled(tmp_path):
     assert markdown(empty).count("not run") == 8
     for cell in empty.cells[:2]:
         run_cell(tmp_path, cell)
-    warmup = {"selected": {"accuracy": 0.52, "balanced_accuracy": 0.42, "epoch": 7}}
+    selected = EpochScores(epoch=7, scores=scores(0.52))
+    warmup = Warmup(selected=selected, last=selected)
     run_cell(tmp_path, empty.cells[3], seeds=(0,), accuracy=0.7, warmup=warmup)
     text = markdown(build_table("quickstart", tmp_path))
     lines = text.splitlines()
@@ -109,7 +111,7 @@ def test_paper_beside_ours(tmp_path, empty):
 def test_problems_reach_the_reader(tmp_path):
     cell = build_table("quickstart", tmp_path).cells[0]
     run_cell(tmp_path, cell, seeds=(0, 1))
-    run_cell(tmp_path, cell, seeds=(2,), data={"source": "x", "target": "y"})
+    run_cell(tmp_path, cell, seeds=(2,), data=DataHashes(source="x", target="y"))
     text = markdown(build_table("quickstart", tmp_path))
     assert "| not averaged † " in text
     assert "the source dataset differs" in text

@@ -1,0 +1,270 @@
+"""The schema of `metrics.json`: what is written is read, and nothing else is taken for a result."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import FrozenInstanceError, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from qs3.config import hashing
+from qs3.errors import DataError
+from qs3.report.__main__ import main
+from qs3.report.runs.data import read_run
+from qs3.report.tables.aggregate import load_run, summarise
+from qs3.report.tables.table import build_table, markdown
+from qs3.runs.metrics import (
+    METRICS,
+    AccuracyEstimates,
+    EpochScores,
+    Estimates,
+    Evaluated,
+    PseudoLabelScores,
+    RoundRecord,
+    RunMetrics,
+    Scores,
+    StudentChoice,
+    TrainingAccuracy,
+    Warmup,
+    read_metrics,
+    write_metrics,
+)
+from qs3.training.command import train
+from tests.report.made_runs import metrics, scores
+from tests.report.tables.test_tables import run_cell
+from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
+
+
+def whole() -> RunMetrics:
+    """A result that has everything: no figure is None."""
+    judged = scores(
+        0.75,
+        per_class_recall={"a": 0.5, "b": 1.0},
+        confusion=[[50, 50], [0, 100]],
+        calibration_error=0.125,
+    )
+    last = EpochScores(epoch=9, scores=judged)
+    shares = dict.fromkeys(("mean_confidence", "calibrated", "thresholded", "difference"), 0.25)
+    teacher = Estimates(validation_accuracy=0.5, temperature=2.0, **shares)
+    return metrics(
+        final=judged,
+        evaluation=Evaluated(
+            split="test", labels=True, rotations=12, norms="adabn",
+            final_over_rotations=judged, warmup_over_rotations=judged,
+        ),
+        warmup=Warmup(selected=last, last=last),
+        rounds=[
+            RoundRecord(
+                round=0, theta=0.5, confident={"a": 3, "b": 2}, selected={"a": 2, "b": 1},
+                mu={"a": 0.25, "b": 0.75}, thresholds={"a": 0.5, "b": 0.625}, total_confident=5,
+                total_selected=3, missing_classes=["c"], agreement=0.5,
+                with_target_labels=PseudoLabelScores(precision=0.5, recall=0.25, accuracy=0.75),
+            )
+        ],
+        student=StudentChoice(
+            rule="snd", epoch=7, score=1.5, scores={"7": 1.5, "8": 1.25}, held_out=0, last=last
+        ),
+        quality=AccuracyEstimates(
+            validation_accuracy=0.9, temperature=1.5, **shares, clouds=200,
+            validated_on="source_val", validation_clouds=40, turns_agree=0.5, teacher_agrees=0.5,
+            teacher=teacher, unlike_source=0.1, never_predicted=["c"],
+        ),
+        training=TrainingAccuracy(n=12, accuracy=1.0),
+    )  # fmt: skip
+
+
+def places(node: Any, *path: str | int) -> Iterator[tuple[str | int, ...]]:
+    """Where each value of a document is, from the outermost in."""
+    for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+        yield *path, key
+        if isinstance(value, dict | list):
+            yield from places(value, *path, key)
+
+
+def at(document: Any, path: tuple[str | int, ...]) -> Any:
+    for key in path:
+        document = document[key]
+    return document
+
+
+def refusal(folder: Path, text: str) -> str:
+    """Where the file is wrong, and how, in the words of its refusal."""
+    (folder / METRICS).write_text(text)
+    with pytest.raises(DataError) as error:
+        read_metrics(folder)
+    said = re.fullmatch(
+        rf"{re.escape(str(folder / METRICS))} is damaged: (.*); delete it and repeat the run's "
+        "command, which trains nothing again",
+        str(error.value),
+    )
+    assert said is not None, error.value
+    return said[1]
+
+
+@pytest.fixture
+def document(tmp_path) -> dict[str, Any]:
+    """The file of a result that has everything."""
+    write_metrics(tmp_path, whole())
+    return json.loads((tmp_path / METRICS).read_text())
+
+
+@pytest.mark.parametrize("made", [whole(), metrics(), metrics(accuracy=None)])
+def test_what_is_written_is_read(made, tmp_path):
+    assert read_metrics(tmp_path) is None
+    write_metrics(tmp_path, made)
+    first = (tmp_path / METRICS).read_bytes()
+    found = read_metrics(tmp_path)
+    assert found == made
+    write_metrics(tmp_path, found)
+    assert (tmp_path / METRICS).read_bytes() == first
+    assert [path.name for path in tmp_path.iterdir()] == [METRICS]
+
+
+def test_the_file_has_the_names_of_the_schema(document):
+    assert all(at(document, place) not in (None, [], {}) for place in places(document))
+    assert document["final"]["per_class_recall"] == {"a": 0.5, "b": 1.0}
+    assert document["warmup"]["selected"]["scores"] == document["final"]
+    assert document["rounds"][0]["with_target_labels"]["precision"] == 0.5
+    assert document["student"]["last"]["epoch"] == 9
+    assert document["quality"]["teacher"]["temperature"] == 2.0
+    assert document["status"] == "finished"
+
+
+def test_a_result_cannot_be_changed():
+    made = metrics()
+    with pytest.raises(FrozenInstanceError):
+        made.seed = 1  # type: ignore[misc]
+    assert replace(made, seed=1).seed == 1
+    with pytest.raises(ValidationError, match="seed"):
+        replace(made, seed="1")
+    with pytest.raises(ValidationError, match="accuracy"):
+        Scores(n=1, predicted={"a": 1}, accuracy=float("nan"))
+
+
+def test_an_unknown_key_is_named_wherever_it_is(document, tmp_path):
+    objects = [(), *(p for p in places(document) if isinstance(at(document, p), dict))]
+    assert len(objects) > 25
+    of_any_name = {"predicted", "per_class_recall", "confident", "selected", "mu", "thresholds"}
+    of_any_name |= {"versions", "validators"}  # of classes, packages, scores
+    for place in objects:
+        if place and place != ("warmup", "selected") and place[-1] in of_any_name:
+            continue
+        if place == ("student", "scores"):
+            continue
+        changed = copy.deepcopy(document)
+        at(changed, place)["speed"] = 1.0
+        said = refusal(tmp_path, json.dumps(changed))
+        assert said.startswith(".".join(map(str, (*place, "speed"))) + ": "), said
+
+
+def test_a_missing_key_is_named_or_has_a_default_that_claims_nothing(document, tmp_path):
+    left_out = set()
+    for *parents, key in places(document):
+        if isinstance(key, int) or not isinstance(at(document, tuple(parents)), dict):
+            continue
+        changed = copy.deepcopy(document)
+        del at(changed, tuple(parents))[key]
+        (tmp_path / METRICS).write_text(json.dumps(changed))
+        try:
+            found = read_metrics(tmp_path)
+        except DataError:
+            said = refusal(tmp_path, json.dumps(changed))
+            assert said.startswith(".".join(map(str, (*parents, key))) + ": "), said
+            continue
+        write_metrics(tmp_path, found)
+        again = json.loads((tmp_path / METRICS).read_text())
+        value = at(again, tuple(parents)).get(key)
+        assert value in (None, []) or (key, value) == ("status", "finished")
+        left_out.add(key)
+    assert left_out > {"student", "rounds", "accuracy", "teacher"}
+    needed = {"experiment", "hash", "seed", "final", "n", "data", "target", "theta", "epoch"}
+    assert not needed & left_out
+
+
+def test_a_value_of_another_type_is_named(document, tmp_path):
+    for place in places(document):
+        value = at(document, place)
+        others: list[Any] = [{"x": [1]}] if isinstance(value, str) else ["text"]
+        if isinstance(value, bool):
+            others += [0, "true"]
+        elif isinstance(value, int):
+            others += ["1", 1.5, True]
+        elif isinstance(value, float):
+            others += ["0.5", True]
+        elif isinstance(value, str):
+            others += [1, None]
+        for other in others:
+            changed = copy.deepcopy(document)
+            at(changed, place[:-1])[place[-1]] = other
+            said = refusal(tmp_path, json.dumps(changed))
+            assert said.startswith(".".join(map(str, place)) + ": "), (place, other, said)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_figure_that_is_no_number_is_named(document, tmp_path, value):
+    floats = [place for place in places(document) if isinstance(at(document, place), float)]
+    assert len(floats) > 40
+    for place in floats:
+        changed = copy.deepcopy(document)
+        at(changed, place[:-1])[place[-1]] = value
+        said = refusal(tmp_path, json.dumps(changed))
+        assert said.startswith(".".join(map(str, place)) + ": "), said
+        assert "finite" in said
+
+
+def test_another_status_is_no_result(document, tmp_path):
+    said = refusal(tmp_path, json.dumps({**document, "status": "failed"}))
+    assert said.startswith("status: ")
+
+
+DAMAGED = {
+    "empty": b"",
+    "cut": b'{"experiment": "exp", "ha',
+    "no object": b"[]",
+    "null": b"null",
+    "no key": b"{}",
+    "no text": b"\xff\xfe{}",
+    "deep": b"[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("how", DAMAGED)
+def test_every_reader_names_a_damaged_file(how, toy, tmp_path, capsys):  # noqa: F811
+    cell = build_table("quickstart", tmp_path / "logs").cells[0]
+    run_cell(tmp_path / "logs", cell, seeds=(0,))
+    (file,) = (tmp_path / "logs").rglob(METRICS)
+    file.write_bytes(DAMAGED[how])
+    said = rf"{re.escape(str(file))} is damaged: .*; delete it and repeat"
+    with pytest.raises(DataError, match=said):
+        read_metrics(file.parent)
+    with pytest.raises(DataError, match=said):
+        read_run(file.parent)
+    assert main(["pictures", f"run={file.parent}"]) == 1
+    assert re.search(said, capsys.readouterr().err)
+    found = load_run(file.parent)
+    assert (found.status, found.metrics) == ("damaged", None)
+    assert re.search(said, found.problem)
+    assert re.search(said, summarise([file.parent]))
+    table = build_table("quickstart", tmp_path / "logs")
+    assert re.search(said, markdown(table))
+    assert table.cells[0].ours("accuracy") is None
+
+    cfg = toy("selftraining=none")
+    own = hashing.run_folder(cfg)
+    own.mkdir(parents=True)
+    (own / METRICS).write_bytes(DAMAGED[how])
+    with pytest.raises(DataError, match=rf"{re.escape(str(own / METRICS))} is damaged: "):
+        train(cfg)
+    assert (own / METRICS).read_bytes() == DAMAGED[how]
+
+
+def test_a_file_that_cannot_be_read(tmp_path):
+    (tmp_path / METRICS).mkdir()
+    with pytest.raises(DataError, match=r"metrics\.json cannot be read .*; delete it and repeat"):
+        read_metrics(tmp_path)
