@@ -113,7 +113,7 @@ def renderer_provenance(job: Job) -> dict[str, str]:
     except BrokenProcessPool as error:
         raise RenderError(
             "the renderer's process died at its start (out of memory, killed, or a library that "
-            "does not fit): run again, and see `python -m qs3.tools.doctor` if it happens again"
+            "does not fit): run again, and see `qs3 doctor` if it happens again"
         ) from error
     # What the child found out about this machine need not be found out by every worker.
     os.environ.update(found_out)
@@ -150,7 +150,7 @@ def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]
             if len(alone) > 2 and not survived:
                 raise RenderError(
                     f"{len(alone)} objects in a row ended their worker process: this machine lacks "
-                    "memory, or the renderer does not work here (python -m qs3.tools.doctor)"
+                    "memory, or the renderer does not work here (qs3 doctor)"
                 ) from None
             for outcome in alone:
                 del left[outcome.item_id]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from hydra.core.utils import JobReturn, JobStatus
 
 from qs3.config import hashing
+from qs3.config.location import typed
 from qs3.report.tables.aggregate import align
 from qs3.sweeps.search_space import overrides
 
@@ -71,7 +72,7 @@ def report(
         kept = [word for word in fixed if not word.startswith(search)]
         command = shlex.join([*kept, *overrides(best.params), "seed=0,1,2"])
         words.append(f"Best: trial {best.number}. With several seeds:")
-        words.append(f"  python train.py -m {command}")
+        words.append(typed(f"  python train.py -m {command}"))
     elif tried:
         words.append(f"No trial has a finite {objective}, so there is no best one")
     return "\n".join(words)

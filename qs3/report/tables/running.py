@@ -10,14 +10,13 @@ import json
 import re
 import shlex
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from qs3.config.location import ROOT
+from qs3.config.location import python_command, typed
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
 from qs3.report.tables.table import Table
@@ -50,7 +49,7 @@ class Job:
     @property
     def command(self) -> str:
         """What a user would type."""
-        return f"python train.py {shlex.join(self.overrides)}"
+        return typed(f"python train.py {shlex.join(self.overrides)}")
 
 
 @dataclass
@@ -144,7 +143,7 @@ def launch(
             *settings,
             "--multirun",
         ]
-        command = [sys.executable, str(ROOT / "train.py"), *words]
+        command = [*python_command("train"), *words]
         return subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode
 
 
@@ -191,7 +190,7 @@ def run_all(
 def _start(job: Job, output: Path) -> subprocess.Popen[bytes]:
     with open(output, "wb") as file:
         return subprocess.Popen(
-            [sys.executable, str(ROOT / "train.py"), *job.overrides],
+            [*python_command("train"), *job.overrides],
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,
