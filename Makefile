@@ -5,9 +5,11 @@ RUN    := $(VENV)/bin/python
 OUT    ?= out/quickstart
 # Extra arguments for pip, e.g. an index that has CPU builds of torch.
 PIP_ARGS ?=
+# Of pytest; a file's tests run in one process, in order.
+PARALLEL ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor quickstart test test-all bench lint format clean
+.PHONY: help install doctor quickstart lint format test test-all bench clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -21,29 +23,32 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	  || { echo "The venv module is missing. On Debian and Ubuntu: apt-get install python3.11-venv"; exit 1; }
 	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) -c constraints.txt -e '.[dev]'
 	@touch $@
-	@$(RUN) -m qs3.tools.doctor --install
+	@$(RUN) -m qs3 doctor
 
 doctor: install ## what works here, and which system package would help
-	@$(RUN) -m qs3.tools.doctor
+	@$(RUN) -m qs3 doctor
 
 quickstart: install ## the main job on embedded data, about a quarter of an hour on 2 cores
-	@$(RUN) -m qs3.tools.quickstart --out $(OUT)
+	@$(RUN) -m qs3 quickstart out=$(OUT)
 
-test: install ## lint, types and all tests that are not slow
+lint: install ## style, types and who may import whom; changes nothing
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
-	$(RUN) -m pytest
+	$(VENV)/bin/lint-imports
 
-test-all: install ## the slow tests too
-	$(RUN) -m pytest -m ''
+format: install ## tidy the files
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+test: install ## all tests that are not slow, on 2 cores
+	$(RUN) -m pytest $(PARALLEL) --ignore=tests/benchmarks
+
+test-all: install ## the slow tests too, and the benchmarks once each
+	$(RUN) -m pytest $(PARALLEL) -m ''
 
 bench: install ## speed, as ratios against named baselines
 	$(RUN) -m pytest tests/benchmarks --benchmark-enable -s
-
-lint format: install
-	$(VENV)/bin/ruff check --fix .
-	$(VENV)/bin/ruff format .
 
 clean: ## remove what `make quickstart` made
 	rm -rf out

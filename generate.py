@@ -1,18 +1,6 @@
 """CAD meshes to point clouds: `python generate.py domain=specklenet10 meshes=PATH`."""
 
-import hydra
-from omegaconf import DictConfig
-
-from qs3.config.hydra import speak_plainly
-
-
-@hydra.main(version_base="1.3", config_path="conf", config_name="generate")
-def main(cfg: DictConfig) -> None:
-    """Make the dataset that the config describes, or continue it."""
-    from qs3.generation.command import generate
-
-    speak_plainly(generate, cfg)
-
+from qs3.generation.__main__ import main
 
 if __name__ == "__main__":
     main()

@@ -1,8 +1,8 @@
 """What Hydra needs from us: resolvers, instantiation, plain errors.
 
 Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
-`${qs3.tags:}` and `${qs3.gpu_in_turn:N}`, and for help texts `${qs3.choices:GROUP}` and
-`${qs3.described:GROUP}`.
+`${qs3.tags:}` and `${qs3.gpu_in_turn:N}`, and for help texts `${qs3.choices:GROUP}`,
+`${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config import hashing
-from qs3.config.location import CONF
+from qs3.config.location import CONF, typed
 from qs3.errors import ConfigError, Qs3Error
 
 
@@ -111,6 +111,7 @@ OmegaConf.register_new_resolver("qs3.described", _described, replace=True)
 OmegaConf.register_new_resolver("qs3.gpu_in_turn", _gpu_in_turn, replace=True)
 OmegaConf.register_new_resolver("qs3.tags", _tags, replace=True)
 OmegaConf.register_new_resolver("qs3.run_name", _run_name, replace=True)
+OmegaConf.register_new_resolver("qs3.typed", typed, replace=True)
 OmegaConf.register_new_resolver("qs3.wandb_id", _wandb_id, replace=True)
 
 

@@ -1,8 +1,32 @@
-"""Where the project's config files are: `conf/` of a checkout, or what a wheel installed of it."""
+"""Where the config files are, and how the two Hydra commands are started from where we are.
+
+In a checkout these are conf/, train.py and generate.py; a wheel holds conf/ as qs3/conf and
+installs the commands as qs3-train and qs3-generate.
+"""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-CONF = ROOT / "conf"
+_PACKAGE = Path(__file__).resolve().parents[1]
+_INSTALLED = (_PACKAGE / "conf").is_dir()
+_ROOT = _PACKAGE if _INSTALLED else _PACKAGE.parent
+
+CONF = _ROOT / "conf"
+
+
+def python_command(name: str) -> list[str]:
+    """Begin of a process's arguments that run `train` or `generate`, in any folder."""
+    if _INSTALLED:
+        return [sys.executable, "-m", f"qs3.{'training' if name == 'train' else 'generation'}"]
+    return [sys.executable, str(_ROOT / f"{name}.py")]
+
+
+def typed(text: str) -> str:
+    """A text with commands such as `python train.py ...` as they are typed here."""
+    if not _INSTALLED:
+        return text
+    for name in ("train", "generate"):
+        text = text.replace(f"python {name}.py", f"qs3-{name}")
+    return text

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.classes import class_list
+from qs3.config.location import typed
 from qs3.data.importers import Importer, import_into
 from qs3.data.manifest import read_manifest
 from qs3.data.store import PointSet, is_begun, is_finished, open_pointset, read_meta
@@ -134,7 +135,7 @@ class Domain:
             lines.append(f"{verb}:\n  {self.make}")
         if self.stand_in:
             lines.append(f"Or make a stand-in and use that one:\n  {self.stand_in}")
-        raise MissingDataError("\n".join(lines))
+        raise MissingDataError(typed("\n".join(lines)))
 
     def open(self, verify: bool = True) -> PointSet:
         """Open the dataset; the first time, bring the published files into the store.

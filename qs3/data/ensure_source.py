@@ -6,9 +6,8 @@ import logging
 import os
 import shlex
 import subprocess
-import sys
 
-from qs3.config.location import ROOT
+from qs3.config.location import python_command, typed
 from qs3.data.domain import Domain, check_all
 from qs3.errors import ConfigError, MissingDataError, Qs3Error
 
@@ -53,8 +52,8 @@ def make_if_missing(domain: Domain) -> None:
         )
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:
         return  # the first process makes it
-    log.info("%s is not there and is made: %s", domain.label, shlex.join(words))
-    done = subprocess.run([sys.executable, str(ROOT / words[1]), *words[2:]], check=False)
+    log.info("%s is not there and is made: %s", domain.label, typed(shlex.join(words)))
+    done = subprocess.run([*python_command("generate"), *words[2:]], check=False)
     if done.returncode:
         raise Qs3Error(
             f"domain {domain.name} could not be made (exit status {done.returncode}): see above; "

@@ -106,7 +106,7 @@ def renderer_provenance(job: Job) -> dict[str, str]:
     if outcome.result is None:
         raise RenderError(
             "the renderer's process died at its start (out of memory, killed, or a library that "
-            "does not fit): run again, and see `python -m qs3.tools.doctor` if it happens again"
+            "does not fit): run again, and see `qs3 doctor` if it happens again"
         )
     provenance, found_out = outcome.result
     # What the child found out about this machine need not be found out by every worker.
@@ -135,7 +135,7 @@ def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]
         if deaths == patience:
             raise RenderError(
                 f"{deaths} objects in a row ended their worker process: this machine lacks "
-                "memory, or the renderer does not work here (python -m qs3.tools.doctor)"
+                "memory, or the renderer does not work here (qs3 doctor)"
             )
         yield outcome.result or Outcome(outcome.name, "", None, DIED, lasting=False)
 

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from qs3.config.location import typed
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.search_space import overrides
 from qs3.utils.text_table import aligned
@@ -64,7 +65,7 @@ def report(headline: str, objective: str, tried: Sequence[Tried], fixed: Sequenc
         kept = [word for word in fixed if not word.startswith(search)]
         command = shlex.join([*kept, *overrides(best.params), "seed=0,1,2"])
         lines.append(f"Best: trial {best.number}. With several seeds:")
-        lines.append(f"  python train.py -m {command}")
+        lines.append(typed(f"  python train.py -m {command}"))
     elif tried:
         lines.append(f"No trial has a finite {objective}, so there is no best one")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What works on this machine, and which system package would help: `python -m qs3.tools.doctor`.
+"""What works on this machine, and which system package would help: `qs3 doctor`.
 
 Each check runs in a process of its own, because a library that does not fit (an unsuitable
 LLVM, a missing X library) may end the process.
@@ -6,17 +6,14 @@ LLVM, a missing X library) may end the process.
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
 
-_ABOUT = (
-    "Says what works on this machine, and which Debian package would help where something is "
-    "missing."
-)
+from qs3.utils.cli import FLAG, Command, Option
+
 BLENDER_PACKAGES = (
     "libxi6",
     "libxxf86vm1",
@@ -65,22 +62,16 @@ CHECKS = (
 )
 
 
-def main() -> None:
-    """Run the checks; with --install, install missing Debian packages where that is possible."""
-    parser = argparse.ArgumentParser(prog="python -m qs3.tools.doctor", description=_ABOUT)
-    parser.add_argument(
-        "--install", action="store_true", help="install missing Debian packages if this is root"
-    )
-    arguments = parser.parse_args()
+def _doctor(install: bool) -> None:
     for check in CHECKS:
         works, text = run(check)
-        if not works and check.packages and arguments.install and install(check.packages):
+        if not works and check.packages and install and install_packages(check.packages):
             works, text = run(check)
-        _say(f"  {check.name:24} {'ok' if works else 'MISSING'}  {text}")
+        print(f"  {check.name:24} {'ok' if works else 'MISSING'}  {text}", flush=True)
         if not works:
-            _say(f"    without it: {check.without}")
+            print(f"    without it: {check.without}")
             if check.packages:
-                _say(f"    to mend it: apt-get install {' '.join(check.packages)}")
+                print(f"    to fix it: apt-get install {' '.join(check.packages)}")
 
 
 def run(check: Check) -> tuple[bool, str]:
@@ -94,12 +85,13 @@ def run(check: Check) -> tuple[bool, str]:
     return done.returncode == 0, lines[-1] if lines else f"ended with status {done.returncode}"
 
 
-def install(packages: tuple[str, ...]) -> bool:
+def install_packages(packages: tuple[str, ...]) -> bool:
     """Try apt-get; False where it may not or cannot."""
     apt = shutil.which("apt-get")
     if apt is None or os.geteuid() != 0:
+        print("    install=true needs apt-get, and root's rights")
         return False
-    _say(f"installing {' '.join(packages)}")
+    print(f"installing {' '.join(packages)}", flush=True)
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     for arguments in (["update", "-qq"], ["install", "-y", "-qq", *packages]):
         done = subprocess.run([apt, *arguments], env=environment, capture_output=True, check=False)
@@ -108,10 +100,10 @@ def install(packages: tuple[str, ...]) -> bool:
     return True
 
 
-def _say(text: str) -> None:
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main()
+DOCTOR = Command(
+    "qs3 doctor",
+    "what works on this machine, and which system package would help",
+    _doctor,
+    (Option("install", FLAG, "install missing Debian packages, as root", False),),
+    ("qs3 doctor", "qs3 doctor install=true"),
+)

@@ -57,7 +57,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
     if path.name != LAST or not path.is_file():
         raise MissingDataError(
             f"ckpt_path={where}: no {LAST} of a run is there; name a run's folder or the {LAST} in "
-            "it (python -m qs3.inference uses finished runs)"
+            "it (qs3 predict uses finished runs)"
         )
     other = path.resolve().parent
     begun = runs.read_started(other)

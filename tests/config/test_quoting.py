@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from qs3.config.compose import composed
 from qs3.config.quoting import override, quoted
 from qs3.errors import ConfigError
-from qs3.report.__main__ import _built
+from qs3.report.cli import _built
 from qs3.report.tables.running import Job, launch
 from qs3.tools.toy import toy_overrides
 
@@ -64,12 +64,12 @@ def test_every_path_of_ours_reaches_the_config(name, tmp_path):
     assert paths == [str(folder / part) for part in ("data", "logs", "warmups")]
     assert cfg.data.target.path == str(folder / "data" / "toy_target")
     assert list(cfg.data.source.classes) == ["ball", "rod", "slab", "plank"]
-    options = {"table": "quickstart", "log_dir": str(folder), "data_dir": f"{folder}/data"}
+    options = ("quickstart", str(folder), f"{folder}/data", None, "")
     with pytest.raises(ConfigError, match="is not there; it is the paths"):
-        _built(options)
+        _built(*options)
     assert not folder.exists()
     folder.mkdir()
-    table = _built(options)
+    table = _built(*options)
     (cell, *_) = [cell for cell in table.cells if cell.runnable]
     paths = composed("train", *cell.overrides).paths
     assert (paths.log_dir, paths.data_dir) == (str(folder), f"{folder}/data")

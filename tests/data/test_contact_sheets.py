@@ -8,7 +8,7 @@ from qs3.data.contact_sheets import contact_sheet, scan_picture
 from qs3.data.store import ManifestRow, write_pointset
 from qs3.errors import DataError
 from qs3.geometry.orthographic import project
-from qs3.report.__main__ import main
+from tests.commands import main
 from tests.fixtures.published import CLASSES, cloud, write_domain
 
 
@@ -82,19 +82,20 @@ def test_command_line(tmp_path, capsys):
     for name in ("specklenet10", "kinectsim10"):
         write_domain(name, tmp_path, {"train": 1, "test": 1}, published=False)
     domains = "domains=[specklenet10,kinectsim10]"
-    assert main(["pictures", domains, f"data_dir={tmp_path}", f"out={tmp_path / 'out'}"]) == 0
+    places = [f"data_dir={tmp_path}", f"out={tmp_path / 'out'}"]
+    assert main(["report", "pictures", domains, *places]) == 0
     assert capsys.readouterr().out.splitlines() == [
         str(tmp_path / "out" / f"{name}.png")
         for name in ("specklenet10", "kinectsim10", "classes", "domains")
     ]
     alone = tmp_path / "alone" / "scans.png"
-    assert main(["pictures", domains, f"paths.data_dir={tmp_path}", f"out={alone}"]) == 0
+    assert main(["report", "pictures", domains, f"paths.data_dir={tmp_path}", f"out={alone}"]) == 0
     assert capsys.readouterr().out == f"{alone}\n"
     assert list(alone.parent.iterdir()) == [alone]
-    assert main(["pictures", "domains=[scannet10]", f"data_dir={tmp_path}"]) == 1
+    assert main(["report", "pictures", "domains=[scannet10]", f"data_dir={tmp_path}"]) == 1
     assert "MissingDataError: domain scannet10" in capsys.readouterr().err
-    assert main(["pictures", "domains=[specklenet1]", f"data_dir={tmp_path}"]) == 1
+    assert main(["report", "pictures", "domains=[specklenet1]", f"data_dir={tmp_path}"]) == 1
     assert "domains: specklenet1 is no domain (did you mean specklenet10?)" in (
         capsys.readouterr().err
     )
-    assert main(["pictures"]) == 1
+    assert main(["report", "pictures"]) == 1

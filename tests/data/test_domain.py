@@ -13,7 +13,7 @@ from hydra.utils import instantiate
 from qs3.classes import CLASSES
 from qs3.data.domain import Domain, check_all
 from qs3.data.importers import XyzTree
-from qs3.data.scannet.__main__ import parse
+from qs3.data.scannet.cli import SCANNET
 from qs3.errors import ConfigError, DataError, MissingDataError
 from tests.fixtures import published as fixtures
 
@@ -88,9 +88,9 @@ def test_every_command_that_a_message_names_composes(tmp_path, name):
     found = domain(name, tmp_path)
     for command in filter(None, (found.make, found.stand_in)):
         python, script, *overrides = command.partition("#")[0].split()
-        if script == "-m":
-            assert (python, overrides[0]) == ("python", "qs3.data.scannet")
-            assert parse(overrides[1:])["out"] == found.folder
+        if python == "qs3":
+            assert script == "scannet"
+            assert Path(SCANNET.parse(overrides)["out"]) == found.folder
             continue
         assert (python, script) == ("python", "generate.py")
         with initialize_config_dir(str(CONF), version_base="1.3"):

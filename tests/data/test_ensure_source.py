@@ -1,10 +1,9 @@
 """A source that is not there is made by its own command; nothing else is run."""
 
-import sys
-
 import numpy as np
 import pytest
 
+from qs3.config.location import python_command
 from qs3.data import ensure_source as making
 from qs3.data.domain import Domain
 from qs3.data.ensure_source import make_if_missing
@@ -33,9 +32,7 @@ def test_made_once_and_again_only_if_it_is_gone(tmp_path, monkeypatch):
     make_if_missing(one)
 
 
-@pytest.mark.parametrize(
-    "make", [None, "rm -rf x", "python train.py seed=1", "python -m qs3.data.scannet x=1"]
-)
+@pytest.mark.parametrize("make", [None, "rm -rf x", "python train.py seed=1", "qs3 scannet x=1"])
 def test_what_is_not_generated_is_refused(tmp_path, make):
     with pytest.raises(
         ConfigError, match="make_source=true, but domain modelnet10 is not generated"
@@ -79,4 +76,4 @@ def test_python_is_this_one(tmp_path, monkeypatch):
         returncode = 0
 
     make_if_missing(domain(tmp_path, "python generate.py domain=modelnet10"))
-    assert seen == [[sys.executable, str(making.ROOT / "generate.py"), "domain=modelnet10"]]
+    assert seen == [[*python_command("generate"), "domain=modelnet10"]]

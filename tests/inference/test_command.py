@@ -1,4 +1,4 @@
-"""`python -m qs3.inference`: files of every kind, damaged ones among them."""
+"""`qs3 predict`: files of every kind, damaged ones among them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import pytest
 
 import qs3
 from qs3.data.store import open_pointset
-from qs3.inference.__main__ import main
 from qs3.runs.predictions import read_predictions
+from tests.commands import main
 
 ONE = (".xyz", ".txt", ".npy", ".npz", ".ply", ".pcd", ".h5", ".hdf5")
 
@@ -61,7 +61,7 @@ def clouds(data_dir: Path) -> np.ndarray:
 
 
 def predict(run: Path, source: Path, out: Path, *more: str) -> int:
-    return main([f"ckpt={run}", f"input={source}", f"out={out}", "threads=2", *more])
+    return main(["predict", f"ckpt={run}", f"input={source}", f"out={out}", "threads=2", *more])
 
 
 def test_test_clouds_get_what_the_run_said(run, data_dir, clouds, tmp_path, capsys):
@@ -222,23 +222,29 @@ def test_up_and_flags(run, clouds, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["ckpt={run}"], "input= is missing"),
-        (["input={clouds}"], "ckpt= is missing"),
-        (["ckpt={run}", "{clouds}"], "did you mean input="),
-        (["ckpt={run}", "input={clouds}", "gravity=z"], "unknown argument"),
-        (["ckpt={run}", "input={clouds}", "out=a.txt"], "must end in .csv or .json"),
-        (["ckpt={run}", "input={clouds}", "up=w"], "up must be one of"),
-        (["ckpt={run}", "input={clouds}", "batch_size=0"], "batch_size must be"),
-        (["ckpt={run}", "input={clouds}", "threads=many"], "threads must be"),
-        (["ckpt={run}", "input={clouds}", "device=quantum"], "device=quantum"),
-        (["ckpt={run}", "input={run}/nothing"], "is not there"),
-        (["ckpt={run}", "input={empty}"], "holds no file of"),
-        (["ckpt={run}", "input={run}/metrics.json"], "metrics.json: unknown format; known are"),
+        (["predict", "ckpt={run}"], "input=PATH is missing"),
+        (["predict", "input={clouds}"], "ckpt=RUN is missing"),
+        (["predict", "ckpt={run}", "{clouds}"], "is not key=value; keys are ckpt, input"),
+        (
+            ["predict", "ckpt={run}", "input={clouds}", "gravity=z"],
+            "unknown key 'gravity'; keys are",
+        ),
+        (["predict", "ckpt={run}", "input={clouds}", "out=a.txt"], "must end in .csv or .json"),
+        (["predict", "ckpt={run}", "input={clouds}", "up=w"], "up must be one of"),
+        (["predict", "ckpt={run}", "input={clouds}", "batch_size=0"], "batch_size must be"),
+        (["predict", "ckpt={run}", "input={clouds}", "threads=many"], "threads must be"),
+        (["predict", "ckpt={run}", "input={clouds}", "device=quantum"], "device=quantum"),
+        (["predict", "ckpt={run}", "input={run}/nothing"], "is not there"),
+        (["predict", "ckpt={run}", "input={empty}"], "holds no file of"),
+        (
+            ["predict", "ckpt={run}", "input={run}/metrics.json"],
+            "metrics.json: unknown format; known are",
+        ),
         (["export", "ckpt={run}", "check={run}/nothing"], "check={run}/nothing is not there"),
         (["export", "ckpt={run}", "check={empty}"], "check={empty} holds no file of"),
-        (["ckpt={run}/nothing", "input={clouds}"], "is not there"),
+        (["predict", "ckpt={run}/nothing", "input={clouds}"], "is not there"),
         (["export", "ckpt={run}", "out=model.h5"], "must end in .onnx or .pt2"),
-        (["export"], "ckpt= is missing"),
+        (["export"], "ckpt=RUN is missing"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
@@ -264,29 +270,9 @@ def test_names_that_are_no_utf8(run, clouds, tmp_path):
     assert table(tmp_path / "said.csv")[0]["file"] == r"\xff.xyz"
 
 
-def test_help_is_short_and_light(tmp_path):
-    code = (
-        "import sys; from qs3.inference.__main__ import main; main(['--help']);"
-        "assert not {'torch', 'numpy', 'hydra'} & set(sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    lines = done.stdout.splitlines()
-    assert len(lines) < 40
-    assert max(map(len, lines)) <= 100
-    assert "up=" in done.stdout
-
-
-@pytest.mark.parametrize(
-    "words", [["export", "--help"], ["export", "ckpt=x", "-h"], ["ckpt=x", "--help"], ["help"]]
-)
-def test_help_anywhere_is_the_page(words, capsys):
-    assert main(words) == 0
-    assert "export writes the net" in capsys.readouterr().out
-
-
 def test_as_a_command(run, clouds, tmp_path):
     write(tmp_path / "a.xyz", clouds[0])
-    command = [sys.executable, "-m", "qs3.inference", f"ckpt={run}", f"input={tmp_path / 'a.xyz'}"]
+    command = [sys.executable, "-m", "qs3", "predict", f"ckpt={run}", f"input={tmp_path / 'a.xyz'}"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(table(tmp_path / "predictions.csv")) == 1

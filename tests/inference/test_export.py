@@ -17,7 +17,6 @@ from torch import nn
 
 import qs3
 from qs3.errors import ConfigError, Qs3Error
-from qs3.inference.__main__ import main
 from qs3.inference.export import Comparison, any_points, export, made_up
 from qs3.inference.export_graph import Plain
 from qs3.inference.model_file import Result
@@ -29,6 +28,7 @@ from qs3.models.pointnet import pointnet
 from qs3.models.pointnet2 import pointnet2
 from qs3.models.rscnn import rscnn
 from qs3.models.simpleview import simpleview
+from tests.commands import main
 
 # ONNX's script decorator and torch's tree of arguments use what Python and torch call old.
 pytestmark = pytest.mark.filterwarnings(

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
+from qs3.report.__main__ import main
 
 from qs3.config import hashing
 from qs3.errors import DataError
-from qs3.report.__main__ import main
 from qs3.report.runs.data import read_run
 from qs3.report.tables.aggregate import load_run, summarise
 from qs3.report.tables.table import build_table, markdown

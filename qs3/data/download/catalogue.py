@@ -205,11 +205,11 @@ downloaded from here.
   2. With it, fetch of every scene: .sens, _2d-instance-filt.zip, _2d-label-filt.zip and
      .aggregation.json, and scannetv2-labels.combined.tsv. All scenes take about 1.3 TB.
   3. scannetv2_train.txt and scannetv2_val.txt are in Tasks/Benchmark of github.com/ScanNet/ScanNet.
-  4. python -m qs3.data.scannet --help   tells how to make DepthScanNet10 (D) from them.""",
+  4. qs3 scannet --help   tells how to make DepthScanNet10 (D) from them.""",
     "shapenet": """\
 ShapeNet's meshes are given to those who sign up at https://shapenet.org (non-commercial research
 and education). The benchmark's ShapeNet10 are points sampled on them: they are in PointDA-10,
-  python -m qs3.data.download pointda10
+  qs3 download pointda10
 or put them yourself so that <data_dir>/published/shapenet10 holds
 <class>/{train,validation,test}/*.npy ([1024, 3], y up).""",
     "scanobjectnn": """\
@@ -227,8 +227,8 @@ was made from ScanNet, and its clouds fall under ScanNet's terms of use:
   http://kaldir.vc.in.tum.de/scannet/ScanNet_TOS.pdf   (non-commercial research and education)
 The clouds lie open on Google Drive, where their authors put them; that does not release you from
 those terms. Read and sign them, send them to scannet@googlegroups.com, and then say that you have:
-  python -m qs3.data.download {name} accept_terms=scannet
-Instead of these clouds, D can be made from raw ScanNet: python -m qs3.data.download scannet""",
+  qs3 download {name} accept_terms=scannet
+Instead of these clouds, D can be made from raw ScanNet: qs3 download scannet""",
 }
 """What is printed before an agreement is given, by the word of `accept_terms=`."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,45 +93,6 @@ def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
     cfg = composed(None, f"+domain={name}", "+paths=default", *words, place=f"domain={name}: ")
     domain: Domain = build(cfg.domain)
     return domain
-
-
-def parse(
-    argv: Sequence[str], own: Mapping[str, type], sides: Sequence[str] = ()
-) -> tuple[list[str], dict[str, object], list[dict[str, str]]]:
-    """The words of the command.
-
-    Args:
-        argv: names and key=value words.
-        own: keys that are not the domain's, with their types.
-        sides: prefixes of keys that are meant for one of several domains.
-
-    Returns:
-        Words without "=", the values of `own` that were given, and the overrides of each side
-        (of the one domain, without sides).
-
-    Raises:
-        ConfigError: a value of the wrong kind.
-    """
-    names: list[str] = []
-    values: dict[str, object] = {}
-    overrides: list[dict[str, str]] = [{} for _ in sides or ("",)]
-    for word in argv:
-        key, equals, value = word.partition("=")
-        if not equals:
-            names.append(word)
-        elif key in own:
-            try:
-                values[key] = own[key](value)
-            except ValueError as error:
-                raise ConfigError(f"{key} must be a whole number, got {value!r}") from error
-            if own[key] is int and int(value) < (key != "seed"):
-                raise ConfigError(f"{key} must be at least {int(key != 'seed')}, got {value}")
-        else:
-            side, _, rest = key.partition(".")
-            for number, place in enumerate(overrides):
-                if side not in sides or sides[number] == side:
-                    place[rest if side in sides else key] = value
-    return names, values, overrides
 
 
 def _opened(name: str, label: str, folder: Path, variant: str, data: PointSet) -> Opened:

@@ -189,7 +189,7 @@ def kept_object(
     if looked and not views:
         raise ConfigError(
             f"{folder} holds no views of {name}; generate it with keep_views=true, or scan the "
-            f"object again: python -m qs3.report pipeline domain=... object={name}"
+            f"object again: qs3 report pipeline domain=... object={name}"
         )
     at = data.ids.index(name)
     clean = None

@@ -156,7 +156,7 @@ class _Domains:
                 scanned.append(domain.name)
         why = "no views of its clouds were kept (generate.py keep_views=true)"
         if scanned:
-            why += f"; python -m qs3.report pipeline domain={scanned[0]} scans an object again"
+            why += f"; qs3 report pipeline domain={scanned[0]} scans an object again"
         raise NothingToDrawError(why)
 
 

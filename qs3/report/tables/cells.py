@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from qs3.config.location import typed
 from qs3.errors import ConfigError
 from qs3.report.tables.aggregate import FEW_SEEDS, Group, Stat, scores_of
 
@@ -75,7 +76,9 @@ class Cell:
     @property
     def command(self) -> str:
         """The command that fills the cell; "" if there is none."""
-        return f"python train.py {shlex.join(self.overrides)} seed={SEEDS} -m" * self.runnable
+        if not self.runnable:
+            return ""
+        return typed(f"python train.py {shlex.join(self.overrides)} seed={SEEDS} -m")
 
     @property
     def incomplete(self) -> bool:

@@ -9,13 +9,12 @@ from __future__ import annotations
 import json
 import shlex
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from qs3.config.location import ROOT
+from qs3.config.location import python_command, typed
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
 from qs3.report.tables.table import Table
@@ -45,7 +44,7 @@ class Job:
     @property
     def command(self) -> str:
         """What a user would type."""
-        return f"python train.py {shlex.join(self.overrides)}"
+        return typed(f"python train.py {shlex.join(self.overrides)}")
 
 
 def missing(
@@ -132,5 +131,5 @@ def launch(
             *settings,
             "--multirun",
         ]
-        command = [sys.executable, str(ROOT / "train.py"), *words]
+        command = [*python_command("train"), *words]
         return subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from qs3.config.location import ROOT
 from qs3.errors import MissingDataError
 from qs3.sensors.bench import real
 from qs3.sensors.bench.figures import draw_real
@@ -22,7 +21,6 @@ from qs3.utils.files import write_json
 
 log = logging.getLogger(__name__)
 
-CLOUDS = ROOT.parent / "shared" / "data" / "kinect_v1"
 FIGURE = "real.png"
 
 
@@ -51,7 +49,7 @@ class Comparison:
         return float(values.min()), float(np.median(values)), float(values.max())
 
 
-def real_clouds(folder: Path = CLOUDS) -> list[Path]:
+def real_clouds(folder: Path) -> list[Path]:
     """The files, by name.
 
     Raises:
@@ -60,7 +58,7 @@ def real_clouds(folder: Path = CLOUDS) -> list[Path]:
     found = sorted(folder.glob("*.pcd"))
     if not found:
         raise MissingDataError(
-            f"no .pcd files in {folder}: the bench leaves the comparison with real clouds out"
+            f"no .pcd files in real={folder}; without real= the bench makes no such comparison"
         )
     return found
 
@@ -71,7 +69,7 @@ def compare(
     renderer: Renderer,
     cache: Path,
     figure: Path | None,
-    folder: Path = CLOUDS,
+    folder: Path,
     scenes: int = 8,
     advance: Callable[[], None] = lambda: None,
 ) -> Comparison:

@@ -1,7 +1,7 @@
 """A camera as a few frames of a wall describe it: true depth plus fitted noise.
 
 Here noise is added to a depth map. That is all that depth frames can tell; the speckle sensors,
-whose noise comes out of matched images, need more than that. `python -m qs3.sensors.fit` writes
+whose noise comes out of matched images, need more than that. `qs3 fit` writes
 presets of this sensor.
 """
 

@@ -1,1 +1,1 @@
-"""A sensor preset from a few depth frames of a flat wall: `python -m qs3.sensors.fit --help`."""
+"""A sensor preset from a few depth frames of a flat wall: `qs3 fit --help`."""

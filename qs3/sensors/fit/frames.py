@@ -27,10 +27,10 @@ class Pinhole:
     def __post_init__(self) -> None:
         if not (self.fx_px > 0 and self.fy_px > 0):
             raise ConfigError(
-                f"--intrinsics: fx and fy must be positive, got {self.fx_px} and {self.fy_px}"
+                f"intrinsics=: fx and fy must be positive, got {self.fx_px} and {self.fy_px}"
             )
         if not np.isfinite([self.cx_px, self.cy_px]).all():
-            raise ConfigError("--intrinsics: cx and cy must be numbers")
+            raise ConfigError("intrinsics=: cx and cy must be numbers")
 
     def tangents(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """[w] and [h]: x / Z of each column and y / Z of each row."""
@@ -70,13 +70,13 @@ def read_pinhole(text: str) -> Pinhole:
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
         except OSError as error:
-            raise MissingDataError(f"--intrinsics {path}: {error.strerror or error}") from error
+            raise MissingDataError(f"intrinsics={path}: {error.strerror or error}") from error
         except ValueError as error:
-            raise DataError(f"--intrinsics {path} is not JSON: {error}") from error
+            raise DataError(f"intrinsics={path} is not JSON: {error}") from error
         values = _four(found)
         if values is None:
             raise DataError(
-                f"--intrinsics {path} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
+                f"intrinsics={path} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
             )
         return Pinhole(*values)
     try:
@@ -84,7 +84,7 @@ def read_pinhole(text: str) -> Pinhole:
     except ValueError:
         values = []
     if len(values) != 4:
-        raise ConfigError(f"--intrinsics {text!r}: write fx,fy,cx,cy in pixels, or a .json file")
+        raise ConfigError(f"intrinsics={text!r}: write fx,fy,cx,cy in pixels, or a .json file")
     return Pinhole(*values)
 
 
@@ -170,7 +170,7 @@ def _scale(name: str, middle: float, whole: bool, unit: str | None) -> tuple[flo
         except ValueError:
             scale = 0.0
         if not (scale > 0 and np.isfinite(scale)):
-            raise ConfigError(f"--unit {unit!r}: write m, mm or a number of units a metre")
+            raise ConfigError(f"unit={unit}: write m, mm or a number of units a metre")
         return scale, f"{scale:g} units a metre, as given"
     if not whole and middle < 20:
         return 1.0, f"metres, because the median is {middle:.3g}"
@@ -178,7 +178,7 @@ def _scale(name: str, middle: float, whole: bool, unit: str | None) -> tuple[flo
         return 1000.0, f"millimetres, because the median is {middle:.4g}"
     raise DataError(
         f"{name}: a median depth of {middle:.4g} may be metres, millimetres or something else; "
-        "say it: --unit m, --unit mm, or --unit N for N units a metre (5000 in TUM's images)"
+        "say it: unit=m, unit=mm, or unit=N for N units a metre (5000 in TUM's images)"
     )
 
 

@@ -99,7 +99,7 @@ class FittedPreset:
         known = any(self.bias_m)
         lines.append(
             "bias      " + (f"{_numbers(self.bias_m)} m (constant first)" if known else
-            "unknown, taken as 0: give the true distances with --distances")
+            "unknown, taken as 0: give the true distances with distances=")
         )  # fmt: skip
         return lines
 

@@ -189,4 +189,4 @@ def test_pipeline_of_a_dataset_that_kept_its_views(run, toy_data, tmp_path):
     shutil.rmtree(data_dir / "specklenet10" / "views")
     assert read_meta(data_dir / "specklenet10")["settings"]["recipe"]["sensor"]
     why = why_not(run, "pipeline", tmp_path / "q.png", data_dir)
-    assert "python -m qs3.report pipeline domain=specklenet10" in why
+    assert "qs3 report pipeline domain=specklenet10" in why

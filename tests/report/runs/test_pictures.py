@@ -18,7 +18,6 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.calibration import calibration_error, reliability
 from qs3.inference.model_file import Result, write_result
 from qs3.models.pointnet import pointnet
-from qs3.report.__main__ import main
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
 from qs3.report.runs.data import read_run
@@ -27,6 +26,7 @@ from qs3.runs.checkpoints import save
 from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.training.command import train
+from tests.commands import main
 from tests.report.made_runs import change, not_blank, table
 from tests.report.wandb_files import read
 from tests.training.toy import CLASSES
@@ -249,7 +249,7 @@ def test_damaged_files_are_named(run, name, text, capsys):
     (run / name).write_text(text)
     with pytest.raises(DataError, match=re.escape(name)):
         draw(run, embed=False)
-    assert main(["pictures", f"run={run}"]) == 1
+    assert main(["report", "page", f"run={run}"]) == 1
     assert name in capsys.readouterr().err
 
 
@@ -289,7 +289,7 @@ def test_embedding_needs_data_and_a_net(run, tmp_path):
 def test_command_line(run, toy_data, tmp_path, capsys):
     use_real_net(run)
     out = tmp_path / "out"
-    assert main([f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
+    assert main(["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
     named = [*ALL[:5], "embedding", *ALL[5:]]
     shown = [str(out / f"{name}.png") for name in named] + [str(out / "index.html")]
     lines = capsys.readouterr().out.splitlines()
@@ -315,13 +315,6 @@ def test_embedding_shows_both_domains_before_and_after(run):
     assert sample(100, 9, seed=0).tolist() != sample(100, 9, seed=1).tolist()
 
 
-def test_command_line_refuses_two_things_at_once(run, capsys):
-    assert main(["pictures", f"run={run}", "domains=[modelnet10]"]) == 1
-    assert "two commands" in capsys.readouterr().err
-    assert main(["pictures"]) == 1
-    assert "run=PATH" in capsys.readouterr().err
-
-
 def test_training_draws_and_its_hash_does_not_know(toy):
     cfg = toy("report.pictures=true", "selftraining=none")
     assert hashing.config_sha256(cfg) == hashing.config_sha256(toy("selftraining=none"))
@@ -339,7 +332,7 @@ def test_a_failed_picture_is_a_warning(run, caplog):
     with caplog.at_level(logging.WARNING):
         AfterTraining()(run)
     assert "the run is finished, but its pictures failed" in caplog.text
-    assert "python -m qs3.report run=" in caplog.text
+    assert "qs3 report page run=" in caplog.text
 
 
 def test_offline_wandb_holds_config_curves_pictures_and_table(toy):

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from qs3.config.compose import composing
 from qs3.config.hashing import config_hash
 from qs3.errors import ConfigError
-from qs3.report.__main__ import main
 from qs3.report.tables import table as tables
 from qs3.report.tables.aggregate import load_run
 from qs3.report.tables.cells import Cell, Published, Table
@@ -313,8 +312,3 @@ def test_wrong_published_entries(tmp_path, monkeypatch):
         path.write_text(text)
         with pytest.raises(ConfigError, match=message):
             build_table("x")
-
-
-def test_help_is_short(capsys):
-    assert main([]) == 0
-    assert 5 < len(capsys.readouterr().out.splitlines()) < 40

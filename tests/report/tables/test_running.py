@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.report.__main__ import main
 from qs3.report.tables.comparison import against, csv_text, effects, text
 from qs3.report.tables.running import Job, _chosen, launch, missing
 from qs3.report.tables.table import Table, build_table
 from qs3.runs.metrics import DataHashes
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
+from tests.commands import main
 from tests.report.made_runs import change
 from tests.report.tables.test_tables import run_cell
 from tests.training.toy import overrides, write_toy
@@ -79,11 +79,11 @@ def test_one_cell(tmp_path):
     [
         (["launcher=ray"], "launcher=ray; set launcher=basic|joblib|"),
         (["hydra.launcher.partition=gpu"], "partition=gpu needs a launcher; set"),
-        (["jobs=0", "launcher=joblib"], "jobs must be at least 1"),
+        (["jobs=0", "launcher=joblib"], "jobs must be a whole number of at least 1"),
     ],
 )  # fmt: skip
 def test_what_is_refused(words, message, tmp_path, capsys):
-    assert main(["run", "table=cad10", f"log_dir={tmp_path}", *words]) == 1
+    assert main(["report", "train", "table=cad10", f"log_dir={tmp_path}", *words]) == 1
     assert message in capsys.readouterr().err
 
 
@@ -224,23 +224,23 @@ def test_a_table_of_real_trainings(tmp_path):
 
     def report(*words):
         return subprocess.run(
-            [sys.executable, "-m", "qs3.report", *words, *options],
+            [sys.executable, "-m", "qs3", "report", *words, *options],
             cwd=ROOT, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
             check=False,
         )  # fmt: skip
 
-    first = report("run", "rows=speckle", "seeds=0,1", "jobs=2")
+    first = report("train", "rows=speckle", "seeds=0,1", "jobs=2")
     assert first.returncode == 0, first.stdout + first.stderr
     assert "4 runs to do" in first.stdout
     assert "n_jobs=2" in first.stdout
-    again = report("run", "rows=speckle", "seeds=0,1")
+    again = report("train", "rows=speckle", "seeds=0,1")
     assert "0 runs to do" in again.stdout
     more = ["rows=(S)", "seeds=0,1,2,3", "hydra.launcher.verbose=1"]
-    launched = report("run", *more, "launcher=joblib", "jobs=2")
+    launched = report("train", *more, "launcher=joblib", "jobs=2")
     assert launched.returncode == 0, launched.stdout + launched.stderr
     assert "n_jobs=2" in launched.stdout
     assert " 2 (!)" in launched.stdout  # the summary of the two that were missing
-    again = report("run", "rows=(S)", "seeds=0,1,2,3", "launcher=submitit_local")
+    again = report("train", "rows=(S)", "seeds=0,1,2,3", "launcher=submitit_local")
     assert again.returncode == 0
     assert "0 runs to do" in again.stdout
     compared = report("compare", "base=source only, speckle scans (S)")

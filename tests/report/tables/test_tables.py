@@ -12,12 +12,12 @@ from omegaconf import OmegaConf
 from qs3.config.compose import composing
 from qs3.config.hashing import config_hash, run_folder
 from qs3.errors import ConfigError
-from qs3.report.__main__ import main
 from qs3.report.tables import table as tables
 from qs3.report.tables.cells import Published
 from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes, EpochScores, Warmup
+from tests.commands import main
 from tests.report.made_runs import scores, write_run
 
 EXPECTED = ("ablation", "noise", "quickstart", "self_training", "uda")
@@ -162,26 +162,31 @@ def test_composing_inside_an_application():
 
 
 def test_command_line(tmp_path, capsys):
-    assert main(["table=quickstart", f"log_dir={tmp_path}"]) == 0
+    assert main(["report", "table=quickstart", f"log_dir={tmp_path}"]) == 0
     printed = capsys.readouterr().out
     saved = (tmp_path / "tables" / "quickstart.md").read_text()
     assert saved in printed
     assert {p.suffix for p in (tmp_path / "tables").iterdir()} == {".md", ".csv", ".tex"}
-    argv = ["table=quickstart", f"paths.log_dir={tmp_path}", f"paths.data_dir={tmp_path}/data"]
+    argv = [
+        "report",
+        "table=quickstart",
+        f"paths.log_dir={tmp_path}",
+        f"paths.data_dir={tmp_path}/data",
+    ]
     assert main(argv) == 0
     assert f"paths.data_dir={tmp_path}/data paths.log_dir={tmp_path}" in capsys.readouterr().out
-    assert main(["tabel=quickstart"]) == 1
-    assert "unknown argument 'tabel=quickstart'" in capsys.readouterr().err
-    assert main([f"log_dir={tmp_path}"]) == 1
-    assert "which table?" in capsys.readouterr().err
-    assert main(["--help"]) == 0
-    assert "python -m qs3.report table=" in capsys.readouterr().out
+    assert main(["report", "tabel=quickstart"]) == 1
+    assert "unknown key 'tabel'; did you mean table=?" in capsys.readouterr().err
+    assert main(["report", f"log_dir={tmp_path}"]) == 1
+    assert "table=NAME is missing: one of ablation, cad10" in capsys.readouterr().err
 
 
 def test_the_report_needs_no_torch(tmp_path):
     code = (
-        "import sys; from qs3.report.__main__ import main\n"
-        "main(['table=quickstart', 'log_dir=' + sys.argv[1]]); sys.exit('torch' in sys.modules)"
+        "import sys; from tests.commands import main\n"
+        "main(['report', 'table=quickstart', *sys.argv[1:]]); sys.exit('torch' in sys.modules)"
     )
-    result = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code, f"log_dir={tmp_path}"], capture_output=True
+    )
     assert result.returncode == 0, result.stderr

@@ -9,14 +9,15 @@ import pytest
 
 from qs3.errors import ConfigError, MissingDataError
 from qs3.sensors.bench import comparison, edges, planar, runner
-from qs3.sensors.bench.__main__ import main
 from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.targets import POSE, TiltedPlane
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.commands import main
 
+CLOUDS = Path(__file__).parents[4] / "shared" / "data" / "kinect_v1"
 KINECT = Subject("kinect_like", ReferenceSpeckle())
 STEREO = Subject("speckle_stereo", SpeckleStereo())
 PLAN = runner.Plan(tilts_deg=(60,), phases=4, repeats=3, half_px=8, edge_frames=1)
@@ -114,11 +115,11 @@ def test_a_bench_resumes_and_notices_changed_settings(renderer, tmp_path):
 
 
 def test_the_command_writes_page_numbers_and_figures(tmp_path, capsys):
-    status = main(["sensor=kinect_like", "--quick", "samples=4", f"out={tmp_path}"])
+    status = main(["bench", "sensor=kinect_like", "quick=true", "samples=4", f"out={tmp_path}"])
     said = capsys.readouterr()
     assert status == (1 if "FAIL" in said.out else 0)
     page = (tmp_path / "index.md").read_text(encoding="utf-8")
-    assert "python -m qs3.sensors.bench sensor=kinect_like samples=4 --quick\n" in page
+    assert "qs3 bench sensor=kinect_like quick=true samples=4\n" in page
     for name in ("noise-kinect.png", "subpixel.png", "fill.png", "locking.png"):
         assert f"({name})" in page
         assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
@@ -131,10 +132,14 @@ def test_the_command_writes_page_numbers_and_figures(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("word", "message"),
-    [("sensor=nothing", "unknown; there are"), ("kinect", "key=value"), ("depth=3", "known are")],
+    [
+        ("sensor=nothing", "unknown; there are"),
+        ("kinect", "key=value"),
+        ("depth=3", "keys are sensor, quick"),
+    ],
 )
 def test_wrong_arguments_are_explained(word, message, capsys):
-    assert main([word]) == 2
+    assert main(["bench", word]) == 1
     assert message in capsys.readouterr().err
 
 
@@ -146,17 +151,17 @@ def test_a_sensor_that_sees_too_little_is_refused():
 
 
 def test_without_the_real_clouds_the_comparison_says_so(tmp_path):
-    with pytest.raises(MissingDataError, match="leaves the comparison"):
+    with pytest.raises(MissingDataError, match="makes no such comparison"):
         comparison.real_clouds(tmp_path)
 
 
 def test_simulated_tables_have_the_steps_and_the_noise_of_real_ones(renderer, tmp_path):
     """kinect_v1 beside 8 real clouds; ranges, because the scenes are not the same."""
     pytest.importorskip("qs3.clouds.pcd")
-    if not comparison.CLOUDS.is_dir():
-        pytest.skip(f"{comparison.CLOUDS} is absent")
+    if not CLOUDS.is_dir():
+        pytest.skip(f"{CLOUDS} is absent")
     subject, config = runner.load("kinect_v1")
-    found = comparison.compare(subject, config, renderer, tmp_path, tmp_path / "real.png")
+    found = comparison.compare(subject, config, renderer, tmp_path, tmp_path / "real.png", CLOUDS)
     real, ours = (
         {key: found.spread(group, key)[1] for key in group[0]}
         for group in (found.real, found.simulated)
@@ -173,4 +178,4 @@ def test_simulated_tables_have_the_steps_and_the_noise_of_real_ones(renderer, tm
 
 @pytest.mark.slow
 def test_every_sensor_holds_its_bands_on_the_whole_bench(tmp_path, capsys):
-    assert main([f"out={tmp_path}"]) == 0, capsys.readouterr().out
+    assert main(["bench", f"out={tmp_path}"]) == 0, capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""`python -m qs3.sensors.fit` must find what cameras hide."""
+"""`qs3 fit` must find what cameras hide."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from qs3.geometry.cameras import look_at
 from qs3.sensors.bench.laws import nguyen_axial_m
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
-from qs3.sensors.fit.__main__ import main
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.commands import main
 from tests.sensors.devices.test_known_planes import plane
 
 POSES = [(0.9, 8), (1.4, -6), (2.0, 10), (3.0, 7), (2.0, 30), (2.0, 55)]
@@ -54,7 +54,7 @@ def camera_of(sensor):
 
 def fitted(folder, files, *arguments):
     out = folder / "found.yaml"
-    assert main([*map(str, files), "--out", str(out), *arguments]) == 0
+    assert main(["fit", *map(str, files), f"out={out}", *arguments]) == 0
     assert out.with_suffix(".png").stat().st_size > 20_000
     text = out.read_text()
     settings = yaml.safe_load(text)
@@ -72,7 +72,7 @@ def test_hidden_parameters_are_recovered(name, tmp_path):
         np.save(files[-1], wall(hidden, depth, tilt, seed=i))
     distances = ",".join(str(depth) for depth, _ in POSES)
     found, text = fitted(
-        tmp_path, files, "--intrinsics", camera_of(hidden), "--distances", distances
+        tmp_path, files, f"intrinsics={camera_of(hidden)}", f"distances={distances}"
     )
     assert found.noise_power == hidden.noise_power
     for depth in (0.9, 1.5, 2.5, 3.0):
@@ -86,7 +86,7 @@ def test_hidden_parameters_are_recovered(name, tmp_path):
         rates = [np.interp(tilt, s.tilts_deg, s.fill_rates) for s in (found, hidden)]
         assert rates[0] == pytest.approx(rates[1], abs=0.02)
     assert found.correlation_px == pytest.approx(hidden.correlation_px, rel=0.1, abs=0.05)
-    assert "python -m qs3.sensors.fit" in text
+    assert "qs3 fit" in text
 
 
 def test_other_things_before_the_wall_and_millimetre_pictures(tmp_path):
@@ -98,7 +98,7 @@ def test_other_things_before_the_wall_and_millimetre_pictures(tmp_path):
         image[:90] = np.nan
         files.append(tmp_path / f"{i}.png")
         cv2.imwrite(str(files[-1]), np.nan_to_num(image * 1000).astype(np.uint16))
-    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
     assert found.noise_law_m(2.0) == pytest.approx(0.008, rel=0.1)
     assert found.depth_step_m == pytest.approx(0.001)
     assert found.inverse_step_per_m == 0
@@ -108,7 +108,7 @@ def test_other_things_before_the_wall_and_millimetre_pictures(tmp_path):
 def test_one_distance_cannot_tell_the_law(tmp_path):
     hidden = FittedDepth(noise_factor=0.003)
     np.save(tmp_path / "a.npy", wall(hidden, 1.5, 4, seed=0))
-    found, text = fitted(tmp_path, [tmp_path / "a.npy"], "--intrinsics", camera_of(hidden))
+    found, text = fitted(tmp_path, [tmp_path / "a.npy"], f"intrinsics={camera_of(hidden)}")
     assert found.noise_power == 2
     assert found.noise_factor == pytest.approx(0.003, rel=0.05)
     assert "assumed: all walls are equally far" in text
@@ -128,7 +128,7 @@ def test_the_steps_of_a_simulated_kinect_are_found(tmp_path):
         whole[place] = np.where(frame.label == 1, frame.depth_m, np.nan)
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], whole)
-    found, _ = fitted(tmp_path, files, "--focal", "580")
+    found, _ = fitted(tmp_path, files, "focal=580")
     assert 1 / (8 * found.inverse_step_per_m) == pytest.approx(43.5, rel=0.02)
     assert found.noise_power == 2
 
@@ -141,7 +141,7 @@ def test_noise_far_below_a_step_is_found(share, tmp_path):
     for i, (depth, tilt) in enumerate(POSES[:4]):
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
     assert found.noise_law_m(2.0) == pytest.approx(hidden.noise_law_m(2.0), rel=0.05)
     assert found.correlation_px == 0
 
@@ -150,15 +150,15 @@ def test_walls_that_show_too_few_levels_are_refused(tmp_path, capsys):
     step = 1 / (8 * 43.5)
     hidden = FittedDepth(noise_factor=0.3 * step, inverse_step_per_m=step)
     np.save(tmp_path / "a.npy", wall(hidden, 1.5, 0.5, seed=0))
-    out = ["--out", str(tmp_path / "x.yaml")]
-    assert main([str(tmp_path / "a.npy"), "--focal", "580", *out]) == 2
+    out = [f"out={tmp_path / 'x.yaml'}"]
+    assert main(["fit", str(tmp_path / "a.npy"), "focal=580", *out]) == 1
     assert "turn the camera by a few degrees" in capsys.readouterr().err
     # Three such walls show the step, but two or three levels each hide noise far below it.
     quiet = FittedDepth(noise_factor=0.2 * step, inverse_step_per_m=step)
     files = [str(tmp_path / f"{i}.npy") for i in range(3)]
     for i, depth in enumerate((1.0, 1.7, 2.5)):
         np.save(files[i], wall(quiet, depth, 0.2, seed=i))
-    assert main([*files, "--focal", "580", *out]) == 2
+    assert main(["fit", *files, "focal=580", *out]) == 1
     assert "turn the camera by a few degrees" in capsys.readouterr().err
 
 
@@ -168,7 +168,7 @@ def test_a_lens_that_bends_the_wall_adds_no_noise(tmp_path):
     for i, (depth, tilt) in enumerate(POSES[:4]):
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], wall(hidden, depth, tilt, seed=i) + bend)
-    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
     for depth in (1.0, 2.0, 3.0):
         assert found.noise_law_m(depth) == pytest.approx(hidden.noise_law_m(depth), rel=0.1)
 
@@ -180,7 +180,7 @@ def test_the_true_distance_is_that_at_the_principal_point(tmp_path):
     for i, (depth, tilt) in enumerate([(1.0, 50), (1.5, -50), (2.0, 50)]):
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    camera = ["--intrinsics", camera_of(hidden), "--distances", "1,1.5,2"]
+    camera = [f"intrinsics={camera_of(hidden)}", "distances=1,1.5,2"]
     found, _ = fitted(tmp_path, files, *camera)
     for depth in (1.0, 1.5, 2.0):
         assert abs(np.polynomial.polynomial.polyval(depth, found.bias_m)) < 0.0007
@@ -195,7 +195,7 @@ def test_walls_that_face_the_camera_do_not_hide_their_steps(tmp_path):
     for i, depth in enumerate((1.0, 1.7, 2.5)):
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], wall(hidden, depth, 0.2, seed=i))
-    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
     assert found.inverse_step_per_m == pytest.approx(step, rel=0.02)
     assert found.depth_step_m == pytest.approx(0.001)
     assert found.noise_law_m(2.0) == pytest.approx(hidden.noise_law_m(2.0), rel=0.05)
@@ -210,7 +210,7 @@ def test_whole_millimetres_alone_are_no_steps_of_a_disparity(tmp_path):
     for i, depth in enumerate((1.0, 1.7, 2.5)):
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], wall(hidden, depth, 0.0, seed=i))
-    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
     assert found.inverse_step_per_m == 0
     assert found.noise_law_m(2.0) == pytest.approx(0.0035, rel=0.05)
 
@@ -224,7 +224,7 @@ def test_smooth_noise_below_a_step_is_found_to_be_smooth(size, tmp_path):
     for i, (depth, tilt) in enumerate(POSES[:4]):
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
     assert found.correlation_px == pytest.approx(size, rel=0.15)
 
 
@@ -234,7 +234,7 @@ def test_holes_of_any_size_count(rate, hole, tmp_path):
     for i, (depth, tilt) in enumerate(POSES[:4]):
         files.append(tmp_path / f"{i}.npy")
         np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    found, _ = fitted(tmp_path, files, "--intrinsics", camera_of(hidden))
+    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
     # Four frames hold some 300 holes a frame of the largest size: a few per cent of chance.
     assert np.mean(found.fill_rates) == pytest.approx(rate, abs=0.01 + 0.004 * hole)
     assert found.hole_px == pytest.approx(hole, rel=0.15)
@@ -245,14 +245,14 @@ def test_the_shadow_of_a_thing_is_no_hole_of_the_wall(tmp_path):
     image[200:300, 300:400] = 1.2
     image[200:300, 280:300] = np.nan
     np.save(tmp_path / "a.npy", image)
-    found, _ = fitted(tmp_path, [tmp_path / "a.npy"], "--focal", "580")
+    found, _ = fitted(tmp_path, [tmp_path / "a.npy"], "focal=580")
     assert min(found.fill_rates) == 1
 
 
 @pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds beside the checkout")
 def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
     files = sorted(KINECT.glob("*.pcd"))[:4]
-    found, _ = fitted(tmp_path, files, "--focal", "575")
+    found, _ = fitted(tmp_path, files, "focal=575")
     # Published geometry: 580 px, 75 mm. Files hold whole millimetres.
     assert 1 / (8 * found.inverse_step_per_m) == pytest.approx(43.5, rel=0.03)
     assert found.depth_step_m == pytest.approx(0.001)
@@ -267,25 +267,25 @@ def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
     [
         (np.full((60, 80), np.nan, np.float32), [], "no pixel"),
         (np.random.default_rng(0).uniform(1, 4, (200, 300)), [], "no plane was found"),
-        (np.full((200, 300), 60.0), [], "--unit"),
-        (np.full((200, 300), 2.0), ["--distances", "1,2"], "--distances has 2"),
-        (np.full((200, 300), 2.0), ["--intrinsics", "1,2,3"], "fx,fy,cx,cy"),
+        (np.full((200, 300), 60.0), [], "unit="),
+        (np.full((200, 300), 2.0), ["distances=1,2"], "distances= has 2"),
+        (np.full((200, 300), 2.0), ["intrinsics=1,2,3"], "fx,fy,cx,cy"),
         (np.zeros((5, 5, 3)), [], "no depth image"),
     ],
 )
 def test_errors_say_what_to_do(image, arguments, message, tmp_path, capsys):
     np.save(tmp_path / "a.npy", image)
-    camera = [] if "--intrinsics" in arguments else ["--focal", "300"]
-    out = ["--out", str(tmp_path / "x.yaml")]
-    assert main([str(tmp_path / "a.npy"), *camera, *out, *arguments]) == 2
+    camera = [] if "intrinsics=1,2,3" in arguments else ["focal=300"]
+    out = [f"out={tmp_path / 'x.yaml'}"]
+    assert main(["fit", str(tmp_path / "a.npy"), *camera, *out, *arguments]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "x.yaml").exists()
 
 
 def test_a_file_that_is_missing_and_frames_of_two_sizes(tmp_path, capsys):
-    assert main([str(tmp_path / "no.npy"), "--focal", "300", "--out", "x.yaml"]) == 2
+    assert main(["fit", str(tmp_path / "no.npy"), "focal=300", "out=x.yaml"]) == 1
     np.save(tmp_path / "a.npy", np.full((100, 100), 2.0))
     np.save(tmp_path / "b.npy", np.full((90, 100), 2.0))
     files = [str(tmp_path / name) for name in ("a.npy", "b.npy")]
-    assert main([*files, "--focal", "300", "--out", str(tmp_path / "x.yaml")]) == 2
+    assert main(["fit", *files, "focal=300", f"out={tmp_path / 'x.yaml'}"]) == 1
     assert "one size" in capsys.readouterr().err

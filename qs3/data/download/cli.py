@@ -1,0 +1,141 @@
+"""`qs3 download`: fetch a published dataset and put it where its domain looks for it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import textwrap
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from qs3.data.download.catalogue import BY_HAND, SOURCES, find
+from qs3.errors import ConfigError
+from qs3.utils.cli import FLAG, Command, Option, text
+
+MIRROR = "QS3_DOWNLOAD_MIRROR"
+_QUIET_S = 60.0  # without a terminal, seconds between two lines of progress
+
+log = logging.getLogger("qs3.data.download")
+
+
+def _download(words: Sequence[str], **given: Any) -> int:
+    if not words:
+        print(listing())
+        return 0
+    if len(words) > 1:
+        raise ConfigError(f"one dataset at a time, got {' and '.join(words)}")
+    (name,) = words
+    if name in BY_HAND:
+        print(BY_HAND[name])
+        return 1
+    from qs3.data.download.fetching import AgreementError, Options, provide
+
+    source = find(name)
+    if not given["archive"]:
+        given["mirror"] = given["mirror"] or os.environ.get(MIRROR, "")
+    try:
+        places = provide(source, Options(**given), bar=progress)
+    except AgreementError as error:
+        print(error)
+        return 1
+    for part, place in zip(source.parts, places, strict=True):
+        used = " and ".join(f"domain={domain}" for domain in part.domains)
+        print(f"{place} is there{f', for {used}' if used else ''}")
+    return 0
+
+
+def listing() -> str:
+    """All there is to fetch, for people."""
+    lines = ["qs3 download NAME   (--help for more)", ""]
+    for source in SOURCES:
+        need = f" (accept_terms={source.agreement})" if source.agreement else ""
+        lines.append(source.name)
+        for paragraph in (
+            source.title,
+            f"for {', '.join(f'domain={d}' for d in source.domains) or 'qs3-generate meshes='}",
+            f"size: {source.size_says}; file: {source.file}",
+            f"terms: {source.terms}{need}",
+        ):
+            lines += textwrap.wrap(paragraph, 96, initial_indent="    ", subsequent_indent="      ")
+    lines += ["", "By hand, after an agreement (NAME prints how): " + ", ".join(BY_HAND)]
+    return "\n".join(lines)
+
+
+@contextlib.contextmanager
+def progress(what: str) -> Iterator[Any]:
+    """A bar on a terminal; else a line a minute. Gives the function that is told of bytes."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+        TransferSpeedColumn,
+    )
+
+    console = Console(stderr=True)
+    said = time.monotonic()
+
+    def say(done: int, total: int | None) -> None:
+        nonlocal said
+        if time.monotonic() - said >= _QUIET_S:
+            said = time.monotonic()
+            of = f" of {total / 1e6:.0f}" if total else ""
+            log.info("%s: %.0f%s MB", what, done / 1e6, of)
+
+    if not console.is_terminal:
+        log.info("%s", what)
+        yield say
+        return
+    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    with Progress(TextColumn("{task.description}"), *columns, console=console) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+DOWNLOAD = Command(
+    "qs3 download",
+    "published datasets, put where their domain looks for them",
+    _download,
+    (
+        Option(
+            "into",
+            text("FOLDER"),
+            "the data folder, paths.data_dir of a run. Archives come to its downloads/, what is in "
+            "them to published/",
+            "data",
+        ),
+        Option(
+            "accept_terms",
+            text("WORD"),
+            "the agreement that you have made, for what needs one (scannet)",
+            "",
+        ),
+        Option(
+            "mirror",
+            text("ADDRESS"),
+            "base address of a copy of the archives, each under the name that the list shows; also "
+            f"taken from the environment, {MIRROR}",
+            "",
+        ),
+        Option("archive", text("FILE"), "unpack this, e.g. what your browser downloaded"),
+        Option("root", text("FOLDER"), "in the archive; to take where it cannot be found out", ""),
+        Option("keep", FLAG, "false deletes the archive when it is unpacked", True),
+    ),
+    (
+        "qs3 download                              what there is",
+        "qs3 download modelnet40_off",
+        "qs3 download scannet10 accept_terms=scannet into=data",
+    ),
+    about="""
+An interrupted download continues where it ended: run the same command again. What is in place is
+left alone. No hashes of these files were published: the first download notes size and SHA-256
+beside the archive (its name and .json), and whenever the archive is unpacked again it is compared
+with that. Nobody can tell whether the first one was right; zip and gzip have checksums of their
+own, and of ModelNet10.zip the size is known.
+""",
+    words="[NAME]",
+)

@@ -1,0 +1,70 @@
+"""`qs3 scannet`: DepthScanNet10 from raw ScanNet."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from qs3.data.scannet.settings import Extraction
+from qs3.utils.cli import FLAG, NUMBER, Command, Kind, Option, text, whole
+
+_PATHS = {
+    "scans": "folder of scenes; in scene0000_00/ lie scene0000_00.sens, "
+    "scene0000_00_2d-instance-filt.zip, scene0000_00_2d-label-filt.zip and "
+    "scene0000_00.aggregation.json. The zips stay zips; about 1.3 TB for all scenes",
+    "labels": "scannetv2-labels.combined.tsv, from the same download",
+    "train": "scannetv2_train.txt, from Tasks/Benchmark of github.com/ScanNet/ScanNet",
+    "val": 'scannetv2_val.txt, from there too; becomes the split "test", as in PointDA-10',
+    "out": "folder of the dataset; conf/domain/depthscannet10.yaml expects data/depthscannet10",
+}
+_SETTINGS = {
+    "points": "of a cloud (farthest point sampling)",
+    "min_points": "a frame counts if it shows more points of the object than this",
+    "views": "frames fused, far from each other in direction; fewer if there are fewer",
+    "stride": "look at every n-th frame only; 10 takes a tenth of the time",
+    "depth_min_m": "nearer depths are left out",
+    "depth_max_m": "farther depths are left out",
+    "margin_px": "pixels about a mask's pixel that must show the same object, too",
+    "align": "turn scenes about z by their axisAlignment (needs <scene>.txt)",
+    "column": "of the label map; or raw_category: the annotators' very words",
+}
+_DEFAULTS: dict[str, Any] = {field.name: field.default for field in fields(Extraction)}
+_KINDS: dict[type, Kind] = {bool: FLAG, int: whole(0), float: NUMBER, str: text()}
+
+
+def _extract(workers: int, force: bool, **given: Any) -> None:
+    from qs3.data.scannet.extraction import extract
+
+    settings = Extraction(**{key: given.pop(key) for key in _SETTINGS})
+    paths = {key: Path(path).expanduser() for key, path in given.items()}
+    extract(**paths, workers=workers, force=force, settings=settings)
+
+
+SCANNET = Command(
+    "qs3 scannet",
+    "DepthScanNet10 from raw ScanNet: objects cropped from the depth images",
+    _extract,
+    (
+        *(Option(key, text("PATH"), meaning, required=True) for key, meaning in _PATHS.items()),
+        Option("workers", whole(0), "processes; their number changes no byte", 1),
+        Option("force", FLAG, "delete the dataset at out first", False),
+        *(
+            Option(key, _KINDS[type(_DEFAULTS[key])], meaning, _DEFAULTS[key])
+            for key, meaning in _SETTINGS.items()
+        ),
+    ),
+    (
+        "qs3 scannet scans=SCANNET/scans labels=SCANNET/scannetv2-labels.combined.tsv \\",
+        "    train=SCANNET/scannetv2_train.txt val=SCANNET/scannetv2_val.txt "
+        "out=data/depthscannet10",
+    ),
+    about="""
+Accept ScanNet's terms of use first, http://www.scan-net.org. Defaults are those of the paper where
+it names one.
+
+Run the same command again after an interruption: it continues. Scenes that failed (scenes.csv says
+why) or came later are then extracted and added. Of the memory of a worker, one frame is the most,
+then the points of the chosen frames of one scene.
+""",
+)

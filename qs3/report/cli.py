@@ -1,0 +1,315 @@
+"""`qs3 report`: tables, what they lack, comparisons, pictures."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qs3.config.compose import choices
+from qs3.errors import ConfigError
+from qs3.utils.cli import Command, Group, Option, several, text, whole
+
+if TYPE_CHECKING:
+    from qs3.report.tables.table import Table
+
+_LAUNCHER = "hydra.launcher."
+
+
+def _built(
+    table: str,
+    log_dir: str | None,
+    data_dir: str | None,
+    target: str | None,
+    overrides: str,
+    runs: bool = True,
+) -> Table:
+    """The table that the options ask for, with our runs; `runs`: there are some, one may think."""
+    from qs3.config.quoting import override
+    from qs3.report.tables.table import build_table
+
+    extra = shlex.split(overrides)
+    extra += [override("paths.data_dir", data_dir)] if data_dir else []
+    if runs and log_dir and not Path(log_dir).is_dir():
+        raise ConfigError(f"log_dir={log_dir} is not there; it is the paths.log_dir of the runs")
+    return build_table(table, log_dir or "logs", extra, target)
+
+
+def _saved_at(table: Table, out: str | None, given: dict[str, Any]) -> Path:
+    """Where a table's files go, without their suffix."""
+    name = "-".join(filter(None, (table.name, given["target"])))
+    return Path(out or Path(given["log_dir"] or "logs") / "tables") / name
+
+
+def _table(out: str | None, **given: Any) -> None:
+    from qs3.report.tables.formats import csv_text, latex, markdown
+    from qs3.utils.files import write_text
+
+    table = _built(**given)
+    said, at = markdown(table), _saved_at(table, out, given)
+    write_text(f"{at}.md", said)
+    for suffix, write in ((".csv", csv_text), (".tex", latex)):
+        write_text(f"{at}{suffix}", write(table))
+    print(said)
+    print(f"saved {at}.md, .csv, .tex")
+
+
+def _train(
+    seeds: Sequence[int],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    jobs: int | None,
+    launcher: str | None,
+    more: Sequence[str],
+    **given: Any,
+) -> int:
+    from qs3.report.tables.running import LAUNCHERS, launch, missing
+
+    if launcher not in (*LAUNCHERS, None) or (more and launcher is None):
+        what = f"launcher={launcher}" if launcher else f"{more[0]} needs a launcher"
+        raise ConfigError(f"{what}; set launcher={'|'.join(LAUNCHERS)}")
+    table = _built(**given, runs=False)
+    todo = missing(table, seeds, rows, columns)
+    print(f"table {table.name}: {len(todo)} runs to do", flush=True)
+    launcher = launcher or ("joblib" if (jobs or 1) > 1 else "basic")
+    status = launch(todo, launcher, jobs, given["log_dir"] or "logs", more)
+    if not status:
+        print(f"next: qs3 report table={table.name}")
+    return status
+
+
+def _compare(base: str | None, out: str | None, **given: Any) -> None:
+    from qs3.report.tables import comparison
+    from qs3.utils.files import write_text
+
+    table = _built(**given)
+    if base is None:
+        raise ConfigError(f"against which row? base={'|'.join(table.rows)}")
+    found, at = comparison.against(table, base), _saved_at(table, out, given)
+    write_text(f"{at}-compared.md", comparison.text(found, base, markdown=True, table=table))
+    write_text(f"{at}-compared.csv", comparison.csv_text(found, table))
+    print(comparison.text(found, base, table=table))
+    print(f"saved {at}-compared.md, .csv")
+
+
+def _effects(out: str | None, **given: Any) -> None:
+    from qs3.report.tables import comparison
+    from qs3.utils.files import write_text
+
+    table = _built(**given)
+    found, at = comparison.effects(table), _saved_at(table, out, given)
+    if not found:
+        raise ConfigError(f"table {table.name} has no two columns or rows with runs of ours")
+    write_text(f"{at}-effects.md", comparison.text(found, markdown=True, table=table))
+    write_text(f"{at}-effects.csv", comparison.csv_text(found, table))
+    print(comparison.text(found, table=table))
+    print(f"saved {at}-effects.md, .csv")
+
+
+def _page(run: str, data_dir: str | None, out: str | None) -> None:
+    from qs3.report.runs.pictures import draw
+
+    drawn = draw(run, out, data_dir=data_dir)
+    for note in drawn.notes:
+        print(f"note: {note}")
+    for name, reason in drawn.skipped.items():
+        print(f"no {name}: {reason}")
+    for path in (*drawn.pictures.values(), drawn.page):
+        print(path)
+
+
+def _pictures(domains: Sequence[str], data_dir: str, split: str, out: str | None) -> None:
+    from hydra.utils import instantiate
+
+    from qs3.config.compose import composing
+    from qs3.config.quoting import override
+    from qs3.data.contact_sheets import class_sheet, scan_picture
+    from qs3.report.figures.class_balance import class_picture
+    from qs3.report.tables.table import check_domain
+
+    for name in domains:
+        check_domain("domains: ", name)
+    folder = Path(out or Path(data_dir) / "pictures")
+    alone = folder.suffix == ".png"
+    sets, simulated, counts = {}, [], {}
+    with composing() as compose:
+        for name in domains:
+            data_is_in = override("paths.data_dir", Path(data_dir).absolute())
+            cfg = compose("train", [f"domain@data.source={name}", data_is_in])
+            domain = instantiate(cfg.data.source)
+            data = domain.open()
+            words = f"{domain.title}{' (simulated)' if domain.simulated else ''}"
+            sets[f"{domain.symbol}: {words}"] = data
+            simulated += [domain.title] if domain.simulated else []
+            counts[domain.label] = data
+            if alone:
+                continue
+            heading = f"{domain.label}, {split}"
+            print(class_sheet(data, folder / f"{name}.png", split=split, heading=heading))
+    if not alone:
+        print(class_picture(counts, folder / "classes.png"))
+    note = f"simulated: {', '.join(simulated)}" if simulated else ""
+    print(scan_picture(sets, folder if alone else folder / "domains.png", split=split, note=note))
+
+
+def _pipeline(
+    domain: str | None,
+    dataset: str | None,
+    object: str | None,
+    mesh: str | None,
+    meshes: str | None,
+    view: int,
+    out: str,
+    more: Sequence[str],
+) -> None:
+    from qs3.config.quoting import override
+    from qs3.report.figures.pipeline import kept_object, scan_object
+    from qs3.report.figures.pipeline_figure import save_pipeline
+
+    if (domain is None) == (dataset is None):
+        raise ConfigError("of what? domain=NAME scans an object, dataset=FOLDER reads one")
+    if dataset is not None:
+        if wrong := [*(["mesh="] if mesh else []), *more]:
+            raise ConfigError(f"{wrong[0]} goes with domain=; with dataset= nothing is scanned")
+        one = kept_object(dataset, object, meshes)
+    else:
+        words = [f"domain={domain}", *([override("meshes", meshes)] if meshes else []), *more]
+        one = scan_object(words, object, mesh)
+    print(save_pipeline(one, out, view))
+
+
+_TABLE = (
+    Option(
+        "table",
+        text("NAME"),
+        "conf/table/NAME.yaml, or the path of such a file",
+        required=True,
+        choices=lambda: choices("table"),
+    ),
+    Option("log_dir", text("FOLDER"), "paths.log_dir of the runs (default logs)"),
+    Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
+    Option("target", text("NAME"), "another target domain for all of the table"),
+    Option("overrides", text('"A=B ..."'), "that the runs had beyond the table's", ""),
+)
+_OUT = Option("out", text("FOLDER"), "where the files go (default LOG_DIR/tables)")
+
+TABLE = Command(
+    "qs3 report table",
+    "a table of runs, printed and saved as .md, .csv and .tex",
+    _table,
+    (*_TABLE, _OUT),
+    (
+        "qs3 report table=uda",
+        'qs3 report table=uda target=kinectsim10 overrides="trainer=gpu data.points=512"',
+    ),
+)
+
+TRAIN = Command(
+    "qs3 report train",
+    "train what a table lacks, seed by seed; called again it goes on",
+    _train,
+    (
+        *_TABLE,
+        Option("seeds", several(whole(0)), "that each cell should have", (0, 1, 2)),
+        Option("rows", several(text("WORD")), "only rows of this name, or with it in theirs", ()),
+        Option("columns", several(text("WORD")), "likewise", ()),
+        Option("jobs", whole(), "runs at the same time (default 1, or what the launcher does)"),
+        Option("launcher", text("NAME"), "of Hydra: joblib, submitit_local or slurm"),
+    ),
+    (
+        "qs3 report train table=cad10",
+        'qs3 report train table=self_training rows=qbst columns="S -> D" seeds=0',
+        "qs3 report train table=uda launcher=joblib jobs=4",
+        "qs3 report train table=uda launcher=slurm jobs=16 hydra.launcher.partition=gpu",
+    ),
+    others={_LAUNCHER: "settings of the launcher"},
+)
+
+COMPARE = Command(
+    "qs3 report compare",
+    "the difference of each row to one row, with its interval",
+    _compare,
+    (*_TABLE, Option("base", text("ROW"), "the row that the others are compared with"), _OUT),
+    ('qs3 report compare table=cad10 base="source only"',),
+)
+
+EFFECTS = Command(
+    "qs3 report effects",
+    "differences between columns averaged over rows, and the reverse",
+    _effects,
+    (*_TABLE, _OUT),
+    ("qs3 report effects table=factorial",),
+)
+
+PAGE = Command(
+    "qs3 report page",
+    "the pictures of a run, and a page of all of them",
+    _page,
+    (
+        Option("run", text("PATH"), "the folder that training names", required=True),
+        Option("data_dir", text("FOLDER"), "where its data are now, if they have moved"),
+        Option("out", text("FOLDER"), "default RUN/pictures"),
+    ),
+    ("qs3 report page run=logs/qs3_s2d/seed0-5f0c2a71 data_dir=data",),
+    about="""
+Curves, confusion, pseudo-labels, classes, calibration; if its data are there, features and clouds
+of both domains, their class balance and the surest mistakes; if they kept their views, the
+pipeline; and a page of all, index.html.
+""",
+)
+
+PICTURES = Command(
+    "qs3 report pictures",
+    "contact sheets of domains, one that compares them, and their classes",
+    _pictures,
+    (
+        Option("domains", several(text("NAME")), "of conf/domain", required=True),
+        Option("data_dir", text("FOLDER"), "paths.data_dir of a run", "data"),
+        Option("split", text("NAME"), "train or test", "train"),
+        Option(
+            "out",
+            text("PATH"),
+            "default DATA_DIR/pictures; with NAME.png the comparison alone is drawn",
+        ),
+    ),
+    ("qs3 report pictures domains=modelnet10,specklenet10,kinectsim10",),
+)
+
+PIPELINE = Command(
+    "qs3 report pipeline",
+    "one object on its way from images to residuals",
+    _pipeline,
+    (
+        Option("domain", text("NAME"), "scans an object of this domain now"),
+        Option("dataset", text("FOLDER"), "or reads it from here, made with keep_views=true"),
+        Option("object", text("ID"), "which one (default: a chair, or the first there is)"),
+        Option("mesh", text("FILE"), "a mesh to scan in place of the domain's objects"),
+        Option("meshes", text("FOLDER"), "of the dataset's or the domain's meshes"),
+        Option("view", whole(0), "which one is shown (default 0)", 0),
+        Option("out", text("FILE"), "the picture", "pipeline.png"),
+    ),
+    (
+        "qs3 report pipeline domain=specklenet10 renderer=mitsuba object=chair/train/chair_0000",
+        "qs3 report pipeline domain=specklenet10 sensor=kinect_v1 mesh=chair.glb out=chair.png",
+        "qs3 report pipeline dataset=data/specklenet10 object=chair/train/chair_0000",
+    ),
+    others={"": "any override of qs3-generate, such as renderer=mitsuba sensor=kinect_v1"},
+)
+
+REPORT = Group(
+    "qs3 report",
+    "tables of runs, what they lack, and pictures",
+    {
+        "table": TABLE,
+        "train": TRAIN,
+        "compare": COMPARE,
+        "effects": EFFECTS,
+        "page": PAGE,
+        "pictures": PICTURES,
+        "pipeline": PIPELINE,
+    },
+    ("qs3 report table=uda", "qs3 report train table=uda", "qs3 report pipeline --help"),
+    default="table",
+    about="qs3 report table=NAME is short for qs3 report table table=NAME.",
+)

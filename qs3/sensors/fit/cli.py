@@ -1,0 +1,145 @@
+"""`qs3 fit`: a preset for one's own depth camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from qs3.config.location import CONF, typed
+from qs3.errors import ConfigError
+from qs3.utils.cli import NUMBER, Command, Option, one_of, several, text
+
+if TYPE_CHECKING:
+    from qs3.geometry.cameras import Intrinsics
+    from qs3.sensors.fit.preset import FittedPreset
+
+
+def _fit(
+    words: Sequence[str],
+    line: str,
+    out: str,
+    plot: str | None,
+    intrinsics: str | None,
+    focal: float | None,
+    unit: str | None,
+    distances: Sequence[float] | None,
+    baseline: float | None,
+    power: str | None,
+) -> None:
+    preset = fit(words, intrinsics, focal, unit, distances, baseline, power)
+    file = Path(out).expanduser()
+    preset.save(file, line)
+    picture = Path(plot or file.with_suffix(".png"))
+    preset.plot(picture)
+    for said in preset.summary():
+        print(said)
+    print(f"wrote {file} and {picture}")
+    generate = typed("python generate.py")
+    if file.resolve().parent == CONF / "sensor":
+        print(f"use it: {generate} sensor={file.stem} renderer=mitsuba")
+    else:
+        print(
+            "to use it, put it into conf/sensor, or name the folder that holds sensor/"
+            f"{file.name}: {generate} 'hydra.searchpath=[file:///FOLDER]' sensor={file.stem}"
+        )
+
+
+def fit(
+    files: Sequence[str],
+    intrinsics: str | None,
+    focal: float | None,
+    unit: str | None,
+    distances: Sequence[float] | None,
+    baseline: float | None,
+    power: str | None,
+) -> FittedPreset:
+    """All steps, from files to the preset.
+
+    Raises:
+        ConfigError, DataError: say which argument or file is to blame.
+    """
+    from qs3.sensors.fit.frames import read_frame
+    from qs3.sensors.fit.laws import find_bias, find_fill, find_noise
+    from qs3.sensors.fit.planes import find_wall
+    from qs3.sensors.fit.preset import FittedPreset
+    from qs3.sensors.fit.steps import find_steps
+
+    if not files:
+        raise ConfigError("of which frames? Name their files: qs3 fit frames/*.png ...")
+    frames = [read_frame(Path(path), unit) for path in files]
+    for frame in frames:
+        print(f"{frame.name}: {frame.unit}")
+    shapes = {frame.depth_m.shape for frame in frames}
+    if len(shapes) > 1:
+        raise ConfigError(f"frames of one camera have one size, these have {sorted(shapes)}")
+    height, width = frames[0].depth_m.shape
+    camera = _camera(intrinsics, focal, width, height)
+    if distances is not None and len(distances) != len(frames):
+        raise ConfigError(f"distances= has {len(distances)} values for {len(frames)} frames")
+    steps = find_steps(frames)
+    walls = [find_wall(frame.name, frame.depth_m, camera) for frame in frames]
+    noise = find_noise(walls, steps, float(power) if power else None)
+    return FittedPreset(
+        camera, noise, steps, find_fill(walls), find_bias(walls, distances), baseline, walls
+    )
+
+
+def _camera(intrinsics: str | None, focal: float | None, width: int, height: int) -> Intrinsics:
+    from qs3.geometry.cameras import Intrinsics
+    from qs3.sensors.fit.frames import read_pinhole
+
+    if intrinsics is None:
+        if focal is None:
+            raise ConfigError("give the camera: intrinsics=fx,fy,cx,cy, or focal=PIXELS")
+        return Intrinsics.centred(width, height, focal)
+    found = read_pinhole(intrinsics)
+    if not 0.95 < found.fx_px / found.fy_px < 1.05:
+        raise ConfigError(
+            f"intrinsics=: fx {found.fx_px} and fy {found.fy_px} differ; pixels must be square"
+        )
+    return Intrinsics(width, height, (found.fx_px + found.fy_px) / 2, found.cx_px, found.cy_px)
+
+
+FIT = Command(
+    "qs3 fit",
+    "a preset for your own depth camera, from a few frames of a flat wall",
+    _fit,
+    (
+        Option("out", text("FILE"), "the preset, conf/sensor/NAME.yaml", required=True),
+        Option("plot", text("FILE"), ".png (default: beside the preset)"),
+        Option("intrinsics", text("fx,fy,cx,cy"), "in px, or a JSON file with these keys"),
+        Option("focal", NUMBER, "px, instead; the principal point is the middle"),
+        Option("unit", text("UNIT"), "m, mm, or units a metre (default: judged by the values)"),
+        Option(
+            "distances",
+            several(NUMBER),
+            "true distances of the wall in the middle of each frame in metres: for the bias",
+        ),
+        Option(
+            "baseline",
+            NUMBER,
+            "metres from camera to projector along x (negative: to the left), for shadows",
+        ),
+        Option("power", one_of("1", "2"), "fixes the law of the noise"),
+    ),
+    (
+        "qs3 fit frames/*.png intrinsics=580,580,319.5,239.5 baseline=0.075 \\",
+        "    out=conf/sensor/my_camera.yaml plot=my_camera.png",
+        "qs3-generate domain=specklenet10 renderer=mitsuba sensor=my_camera",
+    ),
+    about="""
+FRAMES are .png (16 bits), .npy [h, w] or .pcd: three or more of a flat, matt wall, from distances
+that differ (say 1, 1.5, 2 and 3 m), turned by a few degrees so that several steps of depth are
+seen; and some at a slant (20 to 70 degrees) for the fill rate. Other things may be in view; the
+plane that covers most is the wall.
+
+What is found: noise against distance (before the quantiser; growing with Z^2 as for cameras that
+triangulate, or with Z, whichever fits better), its smoothness, steps of 1/Z or of Z, fill rate
+against the angle of incidence, and, with distances=, the bias. A preset adds these to the true
+depth; see qs3.sensors.devices.fitted.FittedDepth. The plot shows data and model: look at it.
+""",
+    words="FRAMES",
+    line=True,
+    interrupted="nothing was saved",
+)

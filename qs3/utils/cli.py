@@ -1,0 +1,331 @@
+"""The one style of command lines: `qs3 COMMAND key=value`, help at every level, plain errors.
+
+A command declares its options; what is understood, checked and shown by `--help` comes from that
+declaration. Declaring is light: a command imports what it works with when it runs.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import os
+import shlex
+import signal
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, NamedTuple
+
+from qs3.errors import ConfigError, Qs3Error
+
+INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE  # exit status, as shells say
+_HELP = ("-h", "--help")
+_WIDTH = 100
+# Of Hydra: what shows something and ends.
+_SHOWS = (*_HELP, "--hydra-help", "--version", "--cfg", "-c", "--info", "-i", "-sc")
+
+
+class Kind(NamedTuple):
+    """What a value looks like.
+
+    Attributes:
+        word: stands for it in the help.
+        read: the value of a text; ValueError if it is none.
+        must: what it has to be, for messages.
+    """
+
+    word: str
+    read: Callable[[str], Any]
+    must: str = "text"
+
+
+def text(word: str = "TEXT") -> Kind:
+    """Anything, a path for instance; `word` stands for it in the help."""
+    return Kind(word, str)
+
+
+def whole(least: int = 1) -> Kind:
+    """A whole number from `least` on."""
+
+    def read(words: str) -> int:
+        if (number := int(words)) < least:
+            raise ValueError
+        return number
+
+    return Kind("N", read, f"a whole number of at least {least}")
+
+
+NUMBER = Kind("NUMBER", float, "a number")
+
+
+def one_of(*choices: str) -> Kind:
+    """One of few words."""
+    return Kind("|".join(choices), lambda word: choices[choices.index(word)], " or ".join(choices))
+
+
+FLAG = Kind(
+    "true|false", lambda word: ("false", "true").index(word.casefold()) == 1, "true or false"
+)
+
+
+def several(kind: Kind) -> Kind:
+    """Values between commas, also in brackets as in a config."""
+
+    def read(words: str) -> tuple[Any, ...]:
+        parts = [word.strip() for word in words.removeprefix("[").removesuffix("]").split(",")]
+        return tuple(kind.read(word) for word in parts if word)
+
+    return Kind(f"{kind.word},...", read, f"{kind.must}, or several between commas")
+
+
+@dataclass(frozen=True)
+class Option:
+    """A key that a command understands.
+
+    Attributes:
+        key: what stands before the "=".
+        kind: of its value.
+        help: one sentence or two.
+        default: if it is not given; the help shows it unless it is None, empty or false.
+        required: it has to be given.
+        choices: values that there are, for help and messages.
+    """
+
+    key: str
+    kind: Kind
+    help: str
+    default: Any = None
+    required: bool = False
+    choices: Callable[[], Iterable[str]] = tuple
+
+    def read(self, words: str) -> Any:
+        """The value of a text.
+
+        Raises:
+            ConfigError: it has none.
+        """
+        try:
+            if words:
+                return self.kind.read(words)
+        except ValueError:
+            pass
+        raise ConfigError(f"{self.key} must be {self.kind.must}, got {words!r}")
+
+    def explained(self) -> str:
+        """For the help: what it means, its default and its choices."""
+        value = self.default
+        if isinstance(value, tuple):
+            value = ",".join(map(str, value))
+        notes = ["required"] * self.required + [f"default {value}"] * (
+            value not in (None, "", False)
+        )
+        choices = f"; one of {', '.join(self.choices())}" if self.choices is not tuple else ""
+        return self.help + choices + (f" ({', '.join(notes)})" if notes else "")
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command.
+
+    Attributes:
+        name: as it is typed: "qs3 predict".
+        summary: what it does, in a line.
+        run: gets the value of each option by its key; its return value is the exit status, None
+            is 0.
+        options: in the order of the help.
+        examples: lines to type.
+        about: paragraphs below the options.
+        words: what words without "=" stand for, such as "A B"; `run` gets them as `words`.
+        others: beginnings of keys that are handed on, with their help; "" for any key. `run` gets
+            these key=value words as `more`.
+        line: `run` also gets the line that was typed as `line`, to record it.
+        interrupted: what to say after Ctrl-C.
+    """
+
+    name: str
+    summary: str
+    run: Callable[..., int | None]
+    options: Sequence[Option]
+    examples: Sequence[str]
+    about: str = ""
+    words: str = ""
+    others: Mapping[str, str] = field(default_factory=dict)
+    line: bool = False
+    interrupted: str = "run the same command again and it continues"
+
+    def __call__(self, argv: Sequence[str]) -> int:
+        """Show help or run; returns the exit status."""
+        if argv[:1] == ["help"] or {*_HELP} & {*argv}:
+            print(self.help())
+            return 0
+        try:
+            return self.run(**self.parse(argv)) or 0
+        except KeyboardInterrupt:
+            print(f"\ninterrupted; {self.interrupted}", file=sys.stderr)
+            return INTERRUPTED
+
+    def parse(self, argv: Sequence[str]) -> dict[str, Any]:
+        """The arguments of `run`.
+
+        Raises:
+            ConfigError: a key that is unknown, missing or given twice; a value of the wrong kind.
+        """
+        known = {option.key: option for option in self.options}
+        given: dict[str, Any] = {}
+        words, more = [], []
+        for word in argv:
+            key, equals, value = word.partition("=")
+            option = known.get(key) or known.get(key.removeprefix("paths."))
+            if not equals and self.words:
+                words.append(word)
+            elif equals and option:
+                if option.key in given:
+                    raise ConfigError(f"{option.key}= is given twice")
+                given[option.key] = option.read(value)
+            elif equals and key.startswith((*self.others,)):
+                more.append(word)
+            else:
+                raise ConfigError(self._unknown(word, key if equals else ""))
+        missing = [o for o in self.options if o.required and o.key not in given]
+        if missing:
+            raise ConfigError(self._missing(missing, [word.split("=")[0] for word in more]))
+        given = {option.key: option.default for option in self.options} | given
+        extra: dict[str, Any] = {"words": words} if self.words else {}
+        extra |= {"more": more} if self.others else {}
+        extra |= {"line": f"{self.name} {shlex.join(argv)}"} if self.line else {}
+        return given | extra
+
+    def _unknown(self, word: str, key: str) -> str:
+        known = [*(option.key for option in self.options), *self.others]
+        what = f"unknown key {key!r}" if key else f"{word!r} is not key=value"
+        near = _near(key, known)
+        hint = f"did you mean {near}=?" if near else f"keys are {', '.join(known)}"
+        return f"{what}; {hint} (see {self.name} --help)"
+
+    def _missing(self, options: Sequence[Option], given: Sequence[str]) -> str:
+        keys = ", ".join(f"{option.key}={option.kind.word}" for option in options)
+        near = [f"; not {_near(o.key, given)}=" for o in options if _near(o.key, given)]
+        choices = [f": one of {', '.join(o.choices())}" for o in options if o.choices is not tuple]
+        return f"{keys} is missing{''.join(near or choices)} (see {self.name} --help)"
+
+    def help(self) -> str:
+        """What `--help` prints."""
+        rows = [(f"{o.key}={o.kind.word}", o.explained()) for o in self.options]
+        rows += [(f"{prefix}KEY=VALUE", meaning) for prefix, meaning in self.others.items()]
+        words = f" {self.words}" if self.words else ""
+        return _page(f"{self.name}{words}", self.summary, self.examples, rows, self.about)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Commands below a word.
+
+    Attributes:
+        name: as it is typed: "qs3 report".
+        summary: what they are for, in a line.
+        commands: by their word, each a Command, a Group, or where one is: "module:NAME".
+        examples: lines to type.
+        default: the command that is meant when a key=value follows.
+        about: a paragraph below the list.
+    """
+
+    name: str
+    summary: str
+    commands: Mapping[str, Command | Group | str]
+    examples: Sequence[str]
+    default: str = ""
+    about: str = ""
+
+    def __call__(self, argv: Sequence[str]) -> int:
+        """Show the list of commands, or hand on to one of them."""
+        first, *rest = argv or ["help"]
+        if first == "help" and rest:
+            first, *rest = *rest, "--help"
+        if first in self.commands:
+            return self.command(first)(rest)
+        if first in (*_HELP, "help"):
+            print(self.help())
+            return 0
+        if self.default and "=" in first:
+            return self.command(self.default)(argv)
+        near = _near(first, self.commands)
+        raise ConfigError(
+            f"unknown command {first!r}; "
+            + (f"did you mean {near}?" if near else f"there are {', '.join(self.commands)}")
+            + f" (see {self.name} --help)"
+        )
+
+    def command(self, word: str) -> Command | Group:
+        """The command of a word, imported."""
+        found = self.commands[word]
+        if isinstance(found, str):
+            module, _, name = found.partition(":")
+            command: Command | Group = getattr(import_module(module), name)
+            return command
+        return found
+
+    def help(self) -> str:
+        """What `--help` prints: a line for each command."""
+        rows = [(word, self.command(word).summary) for word in self.commands]
+        return _page(f"{self.name} COMMAND", self.summary, self.examples, rows, self.about)
+
+
+def run(command: Command | Group, argv: Sequence[str]) -> int:
+    """Run a command as a process does; returns the exit status.
+
+    An error meant for people is one line on stderr and status 1; a reader that has seen enough
+    (`| head`) ends it quietly.
+    """
+    try:
+        status = command(argv)
+        sys.stdout.flush()
+    except Qs3Error as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return BROKEN_PIPE
+    return status
+
+
+def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
+    """`main` of Hydra with the same manners: `help`, Ctrl-C, and `--help | head`."""
+
+    @functools.wraps(main)
+    def command() -> None:
+        if sys.argv[1:] == ["help"]:
+            sys.argv[1] = "--help"
+        if any(word.split("=")[0] in _SHOWS for word in sys.argv[1:]):
+            signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        try:
+            main()
+        except (KeyboardInterrupt, SystemExit) as error:
+            if isinstance(error, SystemExit) and not isinstance(
+                error.__context__,
+                KeyboardInterrupt,  # Lightning's way to end
+            ):
+                raise
+            print("\ninterrupted; run the same command again and it continues", file=sys.stderr)
+            sys.exit(INTERRUPTED)
+
+    return command
+
+
+def _near(word: str, known: Iterable[str]) -> str:
+    return next(iter(difflib.get_close_matches(word, list(known), n=1)), "")
+
+
+def _page(
+    name: str, summary: str, examples: Sequence[str], rows: Sequence[tuple[str, str]], about: str
+) -> str:
+    column = min(max(len(left) for left, _ in rows), 24) + 4
+    lines = [f"{name}: {summary}", "", *(f"    {example}" for example in examples), ""]
+    for left, right in rows:
+        begin = (
+            f"  {left}".ljust(column) if len(left) + 4 <= column else f"  {left}\n{' ' * column}"
+        )
+        wrapped = textwrap.wrap(right, _WIDTH - column)
+        lines.append(begin + f"\n{' ' * column}".join(wrapped))
+    return "\n".join([*lines, *(["", about.strip("\n")] if about else [])])
