@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from qs3.meshes.io import load_mesh
-from tests.meshes.written import PRIMITIVES, TRIANGLES, dae, refused, save
+from tests.meshes.written import PRIMITIVES, TRIANGLES, corners, dae, refused, save
 
 
 @pytest.mark.parametrize("kind", PRIMITIVES)
 def test_collada_primitives(tmp_path, kind):
     mesh = load_mesh(save(tmp_path, "a.dae", dae(PRIMITIVES[kind])))
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-    assert mesh.vertices.tolist() == [[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0]]
+    square = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0]])
+    assert corners(mesh).tolist() == square[[[0, 1, 2], [0, 2, 3]]].tolist()
 
 
 @pytest.mark.parametrize(
@@ -28,11 +28,13 @@ def test_collada_transforms_in_order(tmp_path):
       <node><matrix>1 0 0 1  0 1 0 0  0 0 1 3  0 0 0 1</matrix><instance_node url="#n"/></node>
       <instance_geometry url="#g"/></node>"""
     mesh = load_mesh(save(tmp_path, "a.dae", dae(nodes=nodes)))
-    here, inner = mesh.vertices[:4] * 2, mesh.vertices[4:] * 2
-    np.testing.assert_allclose(here[[1, 3]], [[10, 2, 0], [6, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(inner[[1, 3]], [[10, 4, 3], [6, 2, 3]], atol=1e-12)
+    # each square's corners are 0, 1, 2 and 0, 2, 3; the inner node comes first
+    inner, here = (mesh.vertices * 2).reshape(2, 6, 3)
+    np.testing.assert_allclose(here[[1, 5]], [[10, 2, 0], [6, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(inner[[1, 5]], [[10, 4, 3], [6, 2, 3]], atol=1e-6)
 
 
+LOOKAT = '<node><lookat>1</lookat><instance_geometry url="#g"/></node>'
 LAUGHS = """<!DOCTYPE lolz [<!ENTITY a "haha"><!ENTITY b "&a;&a;&a;&a;">]>"""
 
 
@@ -46,15 +48,15 @@ LAUGHS = """<!DOCTYPE lolz [<!ENTITY a "haha"><!ENTITY b "&a;&a;&a;&a;">]>"""
         (dae(nodes='<node><instance_geometry url="other.dae#g"/></node>'), "not in this file"),
         (dae(nodes='<node><instance_controller url="#g"/></node>'), "skinned"),
         (dae(nodes="<node/>"), "no faces"),
-        (dae(nodes="<node><lookat>1</lookat></node>"), "lookat"),
-        (dae(TRIANGLES.replace("3 9<", "4 9<")), "vertex that is not among 4"),
-        (dae(TRIANGLES.replace("3 9<", "-1 9<")), "vertex that is not among 4"),
+        (dae(nodes=LOOKAT), "lookat"),
+        (dae(TRIANGLES.replace("3 9<", "4 9<")), "beyond the limits"),
+        (dae(TRIANGLES.replace("3 9<", "-1 9<")), "negative vertex"),
         (dae(TRIANGLES.replace(" 3 9<", "<")), "add up|COLLADA|DAE"),
         (dae(TRIANGLES.replace("triangles", "tristrips")), "tristrips"),
         (dae().replace('count="4"', 'count="40"'), "fewer coordinates"),
         ("<COLLADA/>", "no visual scene"),
-        ("<html/>", "no COLLADA"),
-        ("hello", "no XML"),
+        ("<html/>", "not a COLLADA"),
+        ("hello", "not XML"),
     ],
 )
 def test_broken_collada_is_refused_with_the_reason(tmp_path, content, reason):
