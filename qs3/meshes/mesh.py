@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -61,7 +61,8 @@ class Mesh:
         import trimesh
 
         if isinstance(solid, trimesh.Scene):
-            return merge([cls.from_trimesh(part) for part in solid.dump() if _has_faces(part)])
+            parts = [part for part in solid.dump() if isinstance(part, trimesh.Trimesh)]
+            return merge([cls.from_trimesh(part) for part in parts if len(part.faces)])
         if not isinstance(solid, trimesh.Trimesh):
             raise MeshError(f"expected a trimesh.Trimesh or Scene, got {type(solid).__name__}")
         return cls(np.array(solid.vertices), np.array(solid.faces))
@@ -89,10 +90,6 @@ class Mesh:
     def transformed(self, matrix: np.ndarray) -> Mesh:
         """Apply a 4x4 homogeneous matrix to the vertices."""
         return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
-
-
-def _has_faces(part: Any) -> bool:
-    return len(getattr(part, "faces", ())) > 0
 
 
 def merge(meshes: list[Mesh]) -> Mesh:

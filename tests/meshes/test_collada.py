@@ -34,6 +34,46 @@ def test_collada_transforms_in_order(tmp_path):
     np.testing.assert_allclose(inner[[1, 5]], [[10, 4, 3], [6, 2, 3]], atol=1e-6)
 
 
+def test_a_scene_a_node_and_a_geometry_may_share_an_id(tmp_path):
+    """As 132 of 140 sound files of a collection do."""
+    nodes = '<node id="s"><instance_geometry url="#s"/><instance_node url="#g"/></node>'
+    content = dae(nodes=nodes).replace('geometry id="g"', 'geometry id="s"')
+    content = content.replace('<node id="n"><instance_geometry url="#g"/>', LIBRARY_NODE)
+    mesh = load_mesh(save(tmp_path, "a.dae", content))
+    assert corners(mesh)[:, :, 2].tolist() == [[0, 0, 0]] * 2 + [[1, 1, 1]] * 2
+
+
+def test_what_pycollada_would_misread(tmp_path):
+    """Two lists of triangles, a polygon of two corners, normals that do not exist, a camera."""
+    plain = corners(load_mesh(save(tmp_path, "a.dae", dae()))).tolist()
+    two = TRIANGLES.replace(" 0 9 2 9 3 9", "</p><p>0 9 2 9 3 9")
+    thin = PRIMITIVES["polylist"].replace("<vcount>4<", "<vcount>2 4 1<")
+    thin = thin.replace("<p>", "<p>7 1 7 3 ").replace("</p>", " 7 2</p>")
+    camera = '<node><lookat>1</lookat><instance_camera url="#gone"/></node>'
+    bare = '<polygons count="0"><input semantic="VERTEX" source="#v" offset="0"/></polygons>'
+    for content in (
+        dae(two),
+        dae(thin),
+        dae(TRIANGLES + bare),
+        dae(TRIANGLES.replace('NORMAL" source="#v"', 'NORMAL" source="#gone"')),
+        dae(nodes=camera + '<node><instance_geometry url="#g"/></node>'),
+    ):
+        assert corners(load_mesh(save(tmp_path, "a.dae", content))).tolist() == plain
+    refused(tmp_path, "a.dae", dae().replace("1 1 0 0", "1 nan 0 0"), "not finite")
+
+
+def test_nodes_unfolded_without_end(tmp_path):
+    """2^40 instances of a square, by forty nodes that hold the next one twice."""
+    twice = "".join(
+        f'<node id="n{i}">' + f'<instance_node url="#n{i + 1}"/>' * 2 + "</node>" for i in range(40)
+    )
+    content = dae(nodes='<node><instance_node url="#n0"/></node>').replace(
+        "<library_nodes>", f'<library_nodes>{twice}<node id="n40"/>'
+    )
+    refused(tmp_path, "a.dae", content, "more than 100000 parts")
+
+
+LIBRARY_NODE = '<node id="g"><translate>0 0 2</translate><instance_geometry url="#s"/>'
 LOOKAT = '<node><lookat>1</lookat><instance_geometry url="#g"/></node>'
 LAUGHS = """<!DOCTYPE lolz [<!ENTITY a "haha"><!ENTITY b "&a;&a;&a;&a;">]>"""
 
