@@ -70,7 +70,7 @@ def _triangles(text: bytes, binary: bytes | None, folder: Path, colliders: Colli
         "asset": {"version": "2.0"},
         "scenes": [{"nodes": _roots(tree)[::-1]}],
         "nodes": nodes,
-        "meshes": list(surfaces.meshes.values()),
+        "meshes": surfaces.meshes,
         "bufferViews": tree.get("bufferViews", []),
         "accessors": [
             accessor if index in surfaces.accessors else _UNUSED
@@ -146,24 +146,26 @@ class _Surfaces:
     """The meshes that the scene uses, without all but their positions and corners.
 
     Attributes:
-        meshes: by their index in the file.
+        meshes: in the order of their first use.
         accessors: the indices of those that the meshes use.
         largest: for each primitive what its integers are divided by, or None.
     """
 
     def __init__(self, tree: dict[str, Any]) -> None:
         self.tree = tree
-        self.meshes: dict[int, dict[str, Any]] = {}
+        self.meshes: list[dict[str, Any]] = []
+        self.places: dict[int, int] = {}
         self.accessors: set[int] = set()
         self.largest: list[int | None] = []
 
     def place(self, index: int) -> int:
         """Where in `meshes` the mesh with this index in the file is, or comes to be."""
-        if index not in self.meshes:
+        if index not in self.places:
             parts = self.tree["meshes"][index]["primitives"]
             surfaces = [part for part in parts if part.get("mode", _TRIANGLES) >= _TRIANGLES]
-            self.meshes[index] = {"primitives": [self._primitive(part) for part in surfaces]}
-        return list(self.meshes).index(index)
+            self.meshes.append({"primitives": [self._primitive(part) for part in surfaces]})
+            self.places[index] = len(self.meshes) - 1
+        return self.places[index]
 
     def _primitive(self, primitive: dict[str, Any]) -> dict[str, Any]:
         mode = primitive.get("mode", _TRIANGLES)
