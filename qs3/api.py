@@ -3,6 +3,7 @@
 import qs3
 
 qs3.generate("domain=modelnet10", "limit=5", "paths.data_dir=data")
+scan = qs3.generate(trimesh.load("chair.glb"), "domain=specklenet10", "renderer=mitsuba")
 folder = qs3.train("experiment=quickstart", "seed=1", "paths.data_dir=data")
 predictor = qs3.load(folder)
 """
@@ -10,15 +11,16 @@ predictor = qs3.load(folder)
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, overload
 
 if TYPE_CHECKING:
     import torch
     from omegaconf import DictConfig
 
     from qs3.data.store import PointSet
+    from qs3.generation.scan import Scan, Solid
     from qs3.inference.predictor import Predictor
 
 
@@ -48,15 +50,51 @@ def train(*overrides: str) -> Path:
     return folder
 
 
-def generate(*overrides: str) -> PointSet:
-    """Make a dataset as `python generate.py <overrides>` does; see there.
+@overload
+def generate(*overrides: str) -> PointSet: ...
+@overload
+def generate(meshes: Solid, /, *overrides: str) -> Scan: ...
+@overload
+def generate(meshes: Sequence[Solid], /, *overrides: str) -> list[Scan]: ...
+@overload
+def generate(meshes: Mapping[str, Solid], /, *overrides: str) -> dict[str, Scan]: ...
+def generate(*arguments: Any) -> Any:
+    """Make a dataset as `python generate.py <overrides>` does, or scan meshes from memory.
 
-    Workers are processes of their own; workers=0 uses this one.
+        qs3.generate("domain=modelnet10", "limit=5")                     # a dataset on disk
+        scan = qs3.generate(mesh, "domain=specklenet10", "views=3")      # one mesh, from memory
+        scan.points, scan.clean                                          # [2048, 3] float32 each
+
+    A dataset: workers are processes of their own; workers=0 uses this one.
+
+    Meshes: first one `trimesh.Trimesh`, `trimesh.Scene` or `qs3.meshes.mesh.Mesh`, or a list or a
+    dict of them, then the words. They are metres with z up, as they stand (trimesh leaves glTF
+    files y up). Everything happens in this process, and nothing is written. An object's bytes
+    depend on the seed and on its id: the key of a dict, "object" for a single mesh, "0", "1", ...
+    in a list. With the id of a dataset's object they are those of the dataset.
+
+    Returns:
+        Of words the dataset; of a mesh a `qs3.generation.scan.Scan`; of a list or dict one each.
+
+    Raises:
+        ConfigError: a setting is wrong.
+        MeshError, DataError: a mesh is empty or gives too few points; names its id.
+        RenderError: the renderer cannot be used here.
     """
-    from qs3.config.compose import composed
-    from qs3.generation.command import generate as made
+    if not arguments or isinstance(arguments[0], str):
+        from qs3.config.compose import composed
+        from qs3.generation.command import generate as made
 
-    return made(composed("generate", *overrides))
+        return made(composed("generate", *arguments))
+    from qs3.generation.scan import scan_meshes
+
+    solids, *overrides = arguments
+    if isinstance(solids, Mapping):
+        return scan_meshes(solids, overrides)
+    if isinstance(solids, list | tuple):
+        named = {str(number): solid for number, solid in enumerate(solids)}
+        return list(scan_meshes(named, overrides).values())
+    return scan_meshes({"object": solids}, overrides)["object"]
 
 
 def load(

@@ -39,7 +39,7 @@ class ManifestRow:
         valid_points: number of measured points before sampling to P; for an imported cloud the
             number of rows in its file (fewer than P: the rest repeats them).
         status: "ok", or a word for what went wrong ("failed", "skipped").
-        reason: why it is not ok.
+        reason: why it is not ok; of one that is, what was left out of its file, if anything.
         index: row of the arrays; set by `write_pointset`, None if not ok.
     """
 

@@ -199,7 +199,7 @@ def _write(
             views=outcome.cloud.views if outcome.cloud else None,
             valid_points=outcome.cloud.valid_points if outcome.cloud else None,
             status="ok" if outcome.cloud else "failed",
-            reason=_without_root(outcome.reason, cfg),
+            reason=_without_root(outcome.reason, cfg) or outcome.note,
         )
         for item, outcome in zip(items, outcomes, strict=True)
     ]
@@ -251,6 +251,10 @@ def _report(
     if len(failures) > _FAILURES_SHOWN:
         more = len(failures) - _FAILURES_SHOWN
         log.warning("and %d more: %s says why", more, folder / "manifest.csv")
+    if noted := sum(bool(outcome.note) for outcome in outcomes):
+        log.info(
+            "%d files hold colliders, which were left out (manifest.csv); colliders=keep", noted
+        )
     if kind := pointset.meta.get("benchmark"):
         log.info("this is %s", kind)
     pictures = " and ".join(n for n in (CLOUDS, INFRARED) if (folder / n).is_file())

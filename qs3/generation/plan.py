@@ -29,6 +29,7 @@ from qs3.utils.version import VERSION
 
 _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
+COLLIDERS = ("skip", "keep")
 _SWITCHES = ("provenance", "keep_views", "force", "strict")
 # Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
 _OF_LOOKING = ("scene", "tracking", "crop")
@@ -53,6 +54,8 @@ def check(cfg: DictConfig) -> None:
     for key in _SWITCHES:
         if not isinstance(cfg[key], bool):
             raise ConfigError(f"{key} must be true or false, got {cfg[key]!r}")
+    if cfg.colliders not in COLLIDERS:
+        raise ConfigError(f"colliders must be skip or keep, got {cfg.colliders!r}")
     if cfg.paths.data_dir is None or not str(cfg.paths.data_dir).strip():
         raise ConfigError(f"paths.data_dir must name a folder, got {cfg.paths.data_dir!r}")
     if cfg.meshes is None and cfg.half != "all":
@@ -108,6 +111,7 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
             test_fraction=cfg.test_fraction,
             half=cfg.half,
             known=known_classes(cfg),
+            keep_colliders=cfg.colliders == "keep",
         ).items()
     kept = _first_of_each(items, cfg.limit, cfg.fraction)
     return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]
@@ -163,6 +167,7 @@ def settings(cfg: DictConfig) -> dict[str, Any]:
         "seed": plain["seed"],
         "recipe": _with_content_of_poses(plain["recipe"]),
         "meshes": "folder" if plain["meshes"] else plain["catalogue"],
+        **({"colliders": "keep"} if plain["colliders"] == "keep" else {}),
     }
     if plain["renderer"]:
         chosen["renderer"] = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}

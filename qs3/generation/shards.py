@@ -54,6 +54,7 @@ class Parts:
             "item_id": outcome.item_id,
             "mesh_sha256": outcome.mesh_sha256,
             "reason": outcome.reason,
+            "note": outcome.note,
             "views": cloud.views if cloud else 0,
             "valid_points": cloud.valid_points if cloud else 0,
         }
@@ -86,7 +87,9 @@ class Parts:
         cloud = None
         if arrays:
             cloud = Cloud(arrays, note["views"], note["valid_points"], preview=preview)
-        return Outcome(note["item_id"], note["mesh_sha256"], cloud, note["reason"])
+        return Outcome(
+            note["item_id"], note["mesh_sha256"], cloud, note["reason"], note=note["note"]
+        )
 
     def done(self, item_id: str) -> bool:
         """Whether an outcome is saved."""

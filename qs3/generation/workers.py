@@ -39,6 +39,7 @@ class Outcome:
         reason: why it failed; empty if it did not.
         lasting: whether it would fail again: the object is to blame, and not the machine or a
             defect of ours. Other failures are tried again at the next start.
+        note: what else its manifest row should say of an object that did not fail.
         saved: the worker has saved it (`Job.save`); then `cloud` is None here.
     """
 
@@ -47,6 +48,7 @@ class Outcome:
     cloud: Cloud | None
     reason: str
     lasting: bool = True
+    note: str = ""
     saved: bool = False
 
 
@@ -81,7 +83,8 @@ def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
         mesh = item.load()
         sha256 = mesh.sha256
         cloud = job.recipe.make(mesh, item.id, job.seed, renderer, job.keep)
-        return Outcome(item.id, sha256, replace(cloud, frames=()), "")
+        note = f"colliders left out: {mesh.colliders}" if mesh.colliders else ""
+        return Outcome(item.id, sha256, replace(cloud, frames=()), "", note=note)
     except DiskError:
         raise
     except Qs3Error as error:

@@ -52,6 +52,7 @@ class MeshFolder:
             that a source and a target domain made from one folder share no shape.
         skip: stems of files to leave out, as if they were not there.
         known: the classes of the dataset, in label order.
+        keep_colliders: as `load_mesh`.
     """
 
     path: Path
@@ -60,6 +61,7 @@ class MeshFolder:
     half: str = "all"
     skip: tuple[str, ...] = ()
     known: tuple[str, ...] = CLASSES
+    keep_colliders: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
@@ -203,7 +205,7 @@ class MeshFolder:
             id=f"{cls}/{split}/{stem}",
             cls=cls,
             split=split,
-            load=partial(load_mesh, file),
+            load=partial(load_mesh, file, keep_colliders=self.keep_colliders),
             origin=self._origin(file),
             path=file,
         )

@@ -1,10 +1,13 @@
 """Read one CAD file as a `Mesh`, or say what is wrong with it.
 
+trimesh reads STL, glTF, COLLADA and 3MF. OFF, OBJ and PLY are read here, because trimesh 5.2 gives
+other triangles or none: see the modules of `qs3.meshes.formats`, which say what and why.
+
 Files are untrusted: sizes are limited, nothing outside of the file's folder is opened, and
 whatever a reader stumbles over becomes a MeshError that names the file.
 
-Axes and units are the file's own, with one exception: glTF and COLLADA say which axis is up,
-so their meshes are turned to z up (and COLLADA's are scaled to metres).
+Axes and units are the file's own, with one exception: glTF, COLLADA and 3MF say which axis is up,
+so their meshes are turned to z up (and COLLADA's and 3MF's are scaled to metres).
 """
 
 from __future__ import annotations
@@ -15,39 +18,46 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats import collada, gltf, obj, off, ply, stl
+from qs3.meshes.formats import collada, gltf, obj, off, ply, stl, threemf
 from qs3.meshes.formats.arrays import Triangles, check_counts
+from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.mesh import Mesh
 
 MAX_BYTES = 1 << 30
 
-_READERS: dict[str, Callable[[bytes, Path], Triangles]] = {
-    ".off": lambda data, _: off.read(data),
-    ".obj": lambda data, _: obj.read(data),
-    ".ply": lambda data, _: ply.read(data),
-    ".stl": lambda data, _: stl.read(data),
+_READERS: dict[str, Callable[[bytes, Path, Colliders], Triangles]] = {
+    ".off": lambda data, *_: off.read(data),
+    ".obj": lambda data, *_: obj.read(data),
+    ".ply": lambda data, *_: ply.read(data),
+    ".stl": lambda data, *_: stl.read(data),
     ".glb": gltf.read_glb,
     ".gltf": gltf.read_gltf,
-    ".dae": lambda data, _: collada.read(data),
+    ".dae": lambda data, _, colliders: collada.read(data, colliders),
+    ".3mf": lambda data, _, colliders: threemf.read(data, colliders),
 }
 
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """Of the files that `load_mesh` reads, in lower case."""
 
 
-def load_mesh(path: Path) -> Mesh:
+def load_mesh(path: str | Path, keep_colliders: bool = False) -> Mesh:
     """Read a mesh; polygons are cut into triangles, the parts of a scene are put together.
 
     Duplicate faces and faces of either orientation are accepted, and vertices are not merged.
+
+    Args:
+        path: of a file with one of `SUFFIXES`, in any case.
+        keep_colliders: keep a scene's nodes that stand for collisions and that nobody sees (see
+            `qs3.meshes.formats.colliders`); else they are left out, and counted in the mesh.
 
     Raises:
         MeshError: the file is missing, empty, truncated, too large or damaged, or holds no
             surface; the message names the file and the reason.
     """
-    path = Path(path)
+    path, colliders = Path(path), Colliders(skip=not keep_colliders)
     try:
         with np.errstate(all="ignore"):  # what is not finite is found and named below
-            return _checked(*_read(path))
+            return _checked(*_read(path, colliders), colliders.count)
     except MeshError as error:
         raise MeshError(f"{path}: {error}. Export the mesh again or remove the file") from error
     except MemoryError as error:
@@ -59,29 +69,30 @@ def load_mesh(path: Path) -> Mesh:
         ) from error
 
 
-def _read(path: Path) -> Triangles:
+def _read(path: Path, colliders: Colliders) -> Triangles:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise MeshError(f"is of no known format ({', '.join(SUFFIXES)})")
+        raise MeshError(f"is not of a known format ({', '.join(SUFFIXES)})")
     if not path.is_file():
-        raise MeshError("is no file" if path.exists() else "does not exist")
+        raise MeshError("is not a file" if path.exists() else "does not exist")
     size = path.stat().st_size
     if size == 0:
         raise MeshError("is empty")
     if size > MAX_BYTES:
         raise MeshError(f"has {size / 2**30:.1f} GiB, more than the limit of {MAX_BYTES >> 30}")
-    return reader(path.read_bytes(), path.parent)
+    return reader(path.read_bytes(), path.parent, colliders)
 
 
-def _checked(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+def _checked(vertices: np.ndarray, faces: np.ndarray, colliders: int) -> Mesh:
     if len(faces) == 0:
-        raise MeshError("has no faces")
+        but = f" but in {colliders} colliders, which are left out: colliders=keep keeps them"
+        raise MeshError("has no faces" + (but if colliders else ""))
     check_counts(len(vertices), len(faces))
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= len(vertices):  # before Mesh makes them 32 bits wide
         bad = low if low < 0 else high
         raise MeshError(f"has a face with vertex {bad}, but there are {len(vertices)} vertices")
-    mesh = Mesh(vertices, faces)
+    mesh = Mesh(vertices, faces, colliders)
     if not _has_area(mesh):
         raise MeshError("has no surface: all its faces have zero area")
     return mesh

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from qs3.errors import MeshError
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,10 +21,12 @@ class Mesh:
     Attributes:
         vertices: [V, 3] float64.
         faces: [F, 3] int32, indices into `vertices`; orientation is not relied upon.
+        colliders: invisible nodes that were left out when it was read from a file.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
+    colliders: int = 0
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -42,6 +48,30 @@ class Mesh:
         faces.flags.writeable = False
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+
+    @classmethod
+    def from_trimesh(cls, solid: trimesh.Trimesh | trimesh.Scene) -> Mesh:
+        """The triangles of a mesh of trimesh, or of a scene put together, as they stand.
+
+        z is up here and lengths are metres; nothing is turned or scaled.
+
+        Raises:
+            MeshError: it has no triangles, or is neither of the two.
+        """
+        import trimesh
+
+        if isinstance(solid, trimesh.Scene):
+            parts = [part for part in solid.dump() if isinstance(part, trimesh.Trimesh)]
+            return merge([cls.from_trimesh(part) for part in parts if len(part.faces)])
+        if not isinstance(solid, trimesh.Trimesh):
+            raise MeshError(f"expected a trimesh.Trimesh or Scene, got {type(solid).__name__}")
+        return cls(np.array(solid.vertices), np.array(solid.faces))
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """The same triangles in the same order, unprocessed, in arrays of their own."""
+        import trimesh
+
+        return trimesh.Trimesh(self.vertices.copy(), self.faces.copy(), process=False)
 
     @property
     def bounds(self) -> np.ndarray:

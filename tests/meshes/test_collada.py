@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from qs3.meshes.io import load_mesh
-from tests.meshes.written import PRIMITIVES, TRIANGLES, dae, refused, save
+from tests.meshes.written import PRIMITIVES, TRIANGLES, corners, dae, refused, save
 
 
 @pytest.mark.parametrize("kind", PRIMITIVES)
 def test_collada_primitives(tmp_path, kind):
     mesh = load_mesh(save(tmp_path, "a.dae", dae(PRIMITIVES[kind])))
-    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
-    assert mesh.vertices.tolist() == [[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0]]
+    square = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0]])
+    assert corners(mesh).tolist() == square[[[0, 1, 2], [0, 2, 3]]].tolist()
 
 
 @pytest.mark.parametrize(
@@ -28,11 +28,53 @@ def test_collada_transforms_in_order(tmp_path):
       <node><matrix>1 0 0 1  0 1 0 0  0 0 1 3  0 0 0 1</matrix><instance_node url="#n"/></node>
       <instance_geometry url="#g"/></node>"""
     mesh = load_mesh(save(tmp_path, "a.dae", dae(nodes=nodes)))
-    here, inner = mesh.vertices[:4] * 2, mesh.vertices[4:] * 2
-    np.testing.assert_allclose(here[[1, 3]], [[10, 2, 0], [6, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(inner[[1, 3]], [[10, 4, 3], [6, 2, 3]], atol=1e-12)
+    # each square's corners are 0, 1, 2 and 0, 2, 3; the inner node comes first
+    inner, here = (mesh.vertices * 2).reshape(2, 6, 3)
+    np.testing.assert_allclose(here[[1, 5]], [[10, 2, 0], [6, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(inner[[1, 5]], [[10, 4, 3], [6, 2, 3]], atol=1e-6)
 
 
+def test_a_scene_a_node_and_a_geometry_may_share_an_id(tmp_path):
+    """As 132 of 140 sound files of a collection do."""
+    nodes = '<node id="s"><instance_geometry url="#s"/><instance_node url="#g"/></node>'
+    content = dae(nodes=nodes).replace('geometry id="g"', 'geometry id="s"')
+    content = content.replace('<node id="n"><instance_geometry url="#g"/>', LIBRARY_NODE)
+    mesh = load_mesh(save(tmp_path, "a.dae", content))
+    assert corners(mesh)[:, :, 2].tolist() == [[0, 0, 0]] * 2 + [[1, 1, 1]] * 2
+
+
+def test_what_pycollada_would_misread(tmp_path):
+    """Two lists of triangles, a polygon of two corners, normals that do not exist, a camera."""
+    plain = corners(load_mesh(save(tmp_path, "a.dae", dae()))).tolist()
+    two = TRIANGLES.replace(" 0 9 2 9 3 9", "</p><p>0 9 2 9 3 9")
+    thin = PRIMITIVES["polylist"].replace("<vcount>4<", "<vcount>2 4 1<")
+    thin = thin.replace("<p>", "<p>7 1 7 3 ").replace("</p>", " 7 2</p>")
+    camera = '<node><lookat>1</lookat><instance_camera url="#gone"/></node>'
+    bare = '<polygons count="0"><input semantic="VERTEX" source="#v" offset="0"/></polygons>'
+    for content in (
+        dae(two),
+        dae(thin),
+        dae(TRIANGLES + bare),
+        dae(TRIANGLES.replace('NORMAL" source="#v"', 'NORMAL" source="#gone"')),
+        dae(nodes=camera + '<node><instance_geometry url="#g"/></node>'),
+    ):
+        assert corners(load_mesh(save(tmp_path, "a.dae", content))).tolist() == plain
+    refused(tmp_path, "a.dae", dae().replace("1 1 0 0", "1 nan 0 0"), "not finite")
+
+
+def test_nodes_unfolded_without_end(tmp_path):
+    """2^40 instances of a square, by forty nodes that hold the next one twice."""
+    twice = "".join(
+        f'<node id="n{i}">' + f'<instance_node url="#n{i + 1}"/>' * 2 + "</node>" for i in range(40)
+    )
+    content = dae(nodes='<node><instance_node url="#n0"/></node>').replace(
+        "<library_nodes>", f'<library_nodes>{twice}<node id="n40"/>'
+    )
+    refused(tmp_path, "a.dae", content, "more than 100000 parts")
+
+
+LIBRARY_NODE = '<node id="g"><translate>0 0 2</translate><instance_geometry url="#s"/>'
+LOOKAT = '<node><lookat>1</lookat><instance_geometry url="#g"/></node>'
 LAUGHS = """<!DOCTYPE lolz [<!ENTITY a "haha"><!ENTITY b "&a;&a;&a;&a;">]>"""
 
 
@@ -46,15 +88,15 @@ LAUGHS = """<!DOCTYPE lolz [<!ENTITY a "haha"><!ENTITY b "&a;&a;&a;&a;">]>"""
         (dae(nodes='<node><instance_geometry url="other.dae#g"/></node>'), "not in this file"),
         (dae(nodes='<node><instance_controller url="#g"/></node>'), "skinned"),
         (dae(nodes="<node/>"), "no faces"),
-        (dae(nodes="<node><lookat>1</lookat></node>"), "lookat"),
-        (dae(TRIANGLES.replace("3 9<", "4 9<")), "vertex that is not among 4"),
-        (dae(TRIANGLES.replace("3 9<", "-1 9<")), "vertex that is not among 4"),
+        (dae(nodes=LOOKAT), "lookat"),
+        (dae(TRIANGLES.replace("3 9<", "4 9<")), "beyond the limits"),
+        (dae(TRIANGLES.replace("3 9<", "-1 9<")), "negative vertex"),
         (dae(TRIANGLES.replace(" 3 9<", "<")), "add up|COLLADA|DAE"),
         (dae(TRIANGLES.replace("triangles", "tristrips")), "tristrips"),
         (dae().replace('count="4"', 'count="40"'), "fewer coordinates"),
         ("<COLLADA/>", "no visual scene"),
-        ("<html/>", "no COLLADA"),
-        ("hello", "no XML"),
+        ("<html/>", "not a COLLADA"),
+        ("hello", "not XML"),
     ],
 )
 def test_broken_collada_is_refused_with_the_reason(tmp_path, content, reason):

@@ -32,10 +32,10 @@ def test_files_that_are_none(tmp_path):
     (tmp_path / "folder.off").mkdir()
     os.mkfifo(tmp_path / "fifo.off")
     for name, reason in [
-        ("folder.off", "is no file"),
-        ("fifo.off", "is no file"),
+        ("folder.off", "is not a file"),
+        ("fifo.off", "is not a file"),
         ("gone.off", "does not exist"),
-        ("a.step", "no known format"),
+        ("a.step", "not of a known format"),
     ]:
         with pytest.raises(MeshError, match=reason):
             load_mesh(tmp_path / name)

@@ -45,6 +45,8 @@ def z_up(mesh):
 def export(name):
     """Bytes of the pyramid in a format of trimesh's, by file name."""
     kind = name.rpartition(".")[2]
+    if kind == "3mf":  # trimesh says millimetres, whatever they are
+        return PYRAMID.copy().apply_scale(1000).export(file_type=kind)
     if name == "ascii.ply":
         return PYRAMID.export(file_type="ply", encoding="ascii")
     if name == "ascii.stl":
@@ -53,7 +55,7 @@ def export(name):
     return content.encode() if isinstance(content, str) else content
 
 
-EXPORTS = ["a.off", "a.ply", "ascii.ply", "a.stl", "ascii.stl", "a.obj", "a.glb"]
+EXPORTS = ["a.off", "a.ply", "ascii.ply", "a.stl", "ascii.stl", "a.obj", "a.glb", "a.3mf"]
 
 
 def mixed_ply(order, extras=b""):
@@ -76,9 +78,9 @@ def mixed_ply(order, extras=b""):
 
 
 def gltf(**changes):
-    """A square as triangles, strip and fan, in one mesh, placed by two nodes."""
+    """A square as triangles and two strips, in one mesh, placed by two nodes."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype="<f4")
-    indices = np.array([0, 1, 2, 2, 1, 3, 0, 1, 2, 3, 0, 1, 3, 2], dtype="<u2")
+    indices = np.array([0, 1, 2, 2, 1, 3, 0, 1, 2, 3, 1, 0, 3, 2], dtype="<u2")
     blob = points.tobytes() + indices.tobytes()
     accessor = {"bufferView": 1, "componentType": 5123, "type": "SCALAR"}
     tree = {
@@ -95,7 +97,7 @@ def gltf(**changes):
                 "primitives": [
                     {"attributes": {"POSITION": 0}, "indices": 1},
                     {"attributes": {"POSITION": 0}, "indices": 2, "mode": 5},
-                    {"attributes": {"POSITION": 0}, "indices": 3, "mode": 6},
+                    {"attributes": {"POSITION": 0}, "indices": 3, "mode": 5},
                     {"attributes": {"POSITION": 0}, "mode": 0},
                 ]
             }

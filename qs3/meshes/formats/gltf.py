@@ -1,8 +1,9 @@
 """glTF 2.0 and its binary form GLB: the triangles of the scene, turned to z up.
 
-trimesh is not used here: it drops nodes that carry a camera, and triangle fans, and it reads
-sparse and compressed vertices as zeros, all without a word. It would also have to be kept
-from files elsewhere and from instances without end, by as many checks as this reader has.
+trimesh decodes it, from a copy of the JSON that holds the scene's surfaces and nothing else. Of a
+whole file it drops nodes that carry a camera, triangle fans, and scenes that are not listed; it
+reads sparse, compressed and normalised vertices as other numbers; it visits nodes in another
+order; and it decodes and allocates what no surface needs. All that without a word.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
@@ -12,7 +13,6 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -20,31 +20,25 @@ from urllib.parse import unquote
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats.arrays import (
-    Y_UP_TO_Z_UP,
-    Triangles,
-    check_counts,
-    fan,
-    joined,
-    transformed,
-    used_part,
-)
+from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts
+from qs3.meshes.formats.by_trimesh import MAX_PARTS, assembled, loaded
+from qs3.meshes.formats.colliders import Colliders
 
 MAX_BUFFER_BYTES = 1 << 30
 
-_POINTS_AND_LINES, _TRIANGLES, _STRIP, _FAN = range(4), 4, 5, 6
-_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3}
+_TRIANGLES, _STRIP = 4, 5  # below them: points and lines; above: fans
+_LARGEST = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}  # normalised, these mean 1
+_UNUSED = {"componentType": 5121, "type": "SCALAR", "count": 0}
 _EXTENSIONS = (
     "KHR_mesh_quantization",  # understood; the others do not touch the surface
     *("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_"),
 )
 
 
-def read_glb(data: bytes, folder: Path) -> Triangles:
+def read_glb(data: bytes, folder: Path, colliders: Colliders) -> Triangles:
     """Read GLB: a header, a JSON chunk and, in most files, a binary chunk."""
     if len(data) < 20 or data[:4] != b"glTF":
-        raise MeshError("is no GLB file, or cut within its header")
+        raise MeshError("is not a GLB file, or cut within its header")
     version, length, json_length, kind = struct.unpack_from("<4xIII4s", data)
     if version != 2:
         raise MeshError(f"is glTF {version}, but only version 2 is read")
@@ -56,134 +50,177 @@ def read_glb(data: bytes, folder: Path) -> Triangles:
         binary_length, kind = struct.unpack_from("<I4s", data, end)
         if kind == b"BIN\0":
             binary = data[end + 8 : min(end + 8 + binary_length, length)]
-    return _Document(data[20:end], binary, folder).triangles()
+    return _triangles(data[20:end], binary, folder, colliders)
 
 
-def read_gltf(data: bytes, folder: Path) -> Triangles:
+def read_gltf(data: bytes, folder: Path, colliders: Colliders) -> Triangles:
     """Read the JSON form; its buffers lie within it, or in files of the same folder."""
-    return _Document(data, None, folder).triangles()
+    return _triangles(data, None, folder, colliders)
 
 
-class _Document:
-    def __init__(self, text: bytes, binary: bytes | None, folder: Path) -> None:
-        try:
-            self.tree = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise MeshError("is truncated or no glTF: its JSON cannot be parsed") from error
-        if not isinstance(self.tree, dict) or "asset" not in self.tree:
-            raise MeshError("is no glTF: its JSON does not describe an asset")
-        if not str(self.tree["asset"].get("version", "")).startswith("2."):
-            raise MeshError("is no glTF of version 2")
-        required = [str(name) for name in self.tree.get("extensionsRequired", [])]
-        foreign = [name for name in required if not name.startswith(_EXTENSIONS)]
-        if foreign:
-            raise MeshError(f"needs {', '.join(foreign)}, which is not read: export without")
-        self.binary = binary
-        self.folder = folder.resolve()
-        self.buffers: dict[int, bytes] = {}
-        self.shapes: dict[int, Triangles] = {}
+def _triangles(text: bytes, binary: bytes | None, folder: Path, colliders: Colliders) -> Triangles:
+    tree = _parsed(text)
+    nodes = _nodes(tree, colliders)
+    surfaces = _Surfaces(tree)
+    for node in nodes:
+        if "mesh" in node:
+            node["mesh"] = surfaces.place(node["mesh"])
+    buffers = _buffers(tree, binary, folder.resolve())
+    prepared = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": _roots(tree)[::-1]}],
+        "nodes": nodes,
+        "meshes": surfaces.meshes,
+        "bufferViews": tree.get("bufferViews", []),
+        "accessors": [
+            accessor if index in surfaces.accessors else _UNUSED
+            for index, accessor in enumerate(tree.get("accessors", []))
+        ],
+        "buffers": [{"uri": name} for name in buffers],
+    }
+    found = loaded("gltf", json.dumps(prepared).encode(), resolver=buffers)
+    for shape, largest in zip(found["geometry"].values(), surfaces.largest, strict=True):
+        if largest:
+            shape["vertices"] = np.maximum(shape["vertices"] / largest, -1.0)
+    vertices, faces = assembled(found)
+    return vertices @ Y_UP_TO_Z_UP.T, faces
 
-    def triangles(self) -> Triangles:
-        vertices, faces = joined(self._parts())
-        return vertices @ Y_UP_TO_Z_UP.T, faces
 
-    def _parts(self) -> Iterator[Triangles]:
-        """Walk the nodes without recursion, in the order of the file."""
-        nodes = self.tree.get("nodes", [])
-        stack = [(index, np.eye(4)) for index in reversed(self._roots(nodes))]
-        visited: set[int] = set()
-        while stack:
-            index, parent = stack.pop()
-            if index in visited:
-                raise MeshError("has a node in two places, or within itself")
-            visited.add(index)
-            node = nodes[index]
-            matrix = parent @ _transform(node)
-            stack += [(child, matrix) for child in reversed(node.get("children", []))]
-            if "mesh" in node:
-                if "skin" in node:
-                    raise MeshError("has a skinned mesh, which is not read: export it unskinned")
-                yield transformed(self._shape(node["mesh"]), matrix)
+def _parsed(text: bytes) -> dict[str, Any]:
+    try:
+        tree = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MeshError("is truncated or not glTF: its JSON cannot be parsed") from error
+    if not isinstance(tree, dict) or "asset" not in tree:
+        raise MeshError("is not glTF: its JSON does not describe an asset")
+    if not str(tree["asset"].get("version", "")).startswith("2."):
+        raise MeshError("is not glTF of version 2")
+    required = [str(name) for name in tree.get("extensionsRequired", [])]
+    foreign = [name for name in required if not name.startswith(_EXTENSIONS)]
+    if foreign:
+        raise MeshError(f"needs {', '.join(foreign)}, which is not read: export without")
+    return tree
 
-    def _roots(self, nodes: list[dict[str, Any]]) -> list[int]:
-        if "scenes" in self.tree:
-            return self.tree["scenes"][self.tree.get("scene", 0)].get("nodes", [])
-        children = {child for node in nodes for child in node.get("children", [])}
-        return [index for index in range(len(nodes)) if index not in children]
 
-    def _shape(self, index: int) -> Triangles:
-        if index not in self.shapes:
-            primitives = self.tree["meshes"][index]["primitives"]
-            self.shapes[index] = joined(
-                self._primitive(primitive)
-                for primitive in primitives
-                if primitive.get("mode", _TRIANGLES) not in _POINTS_AND_LINES
-            )
-        return self.shapes[index]
+def _roots(tree: dict[str, Any]) -> list[int]:
+    if "scenes" in tree:
+        return tree["scenes"][tree.get("scene", 0)].get("nodes", [])
+    nodes = tree.get("nodes", [])
+    children = {child for node in nodes for child in node.get("children", [])}
+    return [index for index in range(len(nodes)) if index not in children]
 
-    def _primitive(self, primitive: dict[str, Any]) -> Triangles:
-        vertices = self._array(primitive["attributes"]["POSITION"], "VEC3")
-        if "indices" in primitive:
-            corners = self._array(primitive["indices"], "SCALAR")[:, 0].astype(np.int64)
-        else:
-            corners = np.arange(len(vertices))
+
+def _nodes(tree: dict[str, Any], colliders: Colliders) -> list[dict[str, Any]]:
+    """What trimesh shall see of each node; of those outside of the scene and colliders, nothing.
+
+    Children stand in reverse, for trimesh visits the last one first. A node's matrix is made here:
+    trimesh normalises its quaternion, which changes the last digits.
+    """
+    nodes = tree.get("nodes", [])
+    prepared: list[dict[str, Any]] = [{} for _ in nodes]
+    waiting = list(_roots(tree))
+    visited: set[int] = set()
+    while waiting:
+        index = waiting.pop()
+        if index in visited:
+            raise MeshError("has a node in two places, or within itself")
+        visited.add(index)
+        node = nodes[index]
+        if len(visited) > MAX_PARTS:
+            raise MeshError(f"has more than {MAX_PARTS} nodes")
+        if colliders.left_out(node.get("name")):
+            continue
+        children = node.get("children", [])
+        waiting += children
+        matrix = _transform(node).T.ravel().tolist()  # column-major
+        prepared[index] = {"children": children[::-1], "matrix": matrix}
+        if "mesh" in node:
+            if "skin" in node:
+                raise MeshError("has a skinned mesh, which is not read: export it unskinned")
+            if not colliders.left_out(tree["meshes"][node["mesh"]].get("name")):
+                prepared[index]["mesh"] = node["mesh"]
+    return prepared
+
+
+class _Surfaces:
+    """The meshes that the scene uses, without all but their positions and corners.
+
+    Attributes:
+        meshes: in the order of their first use.
+        accessors: the indices of those that the meshes use.
+        largest: for each primitive what its integers are divided by, or None.
+    """
+
+    def __init__(self, tree: dict[str, Any]) -> None:
+        self.tree = tree
+        self.meshes: list[dict[str, Any]] = []
+        self.places: dict[int, int] = {}
+        self.accessors: set[int] = set()
+        self.largest: list[int | None] = []
+
+    def place(self, index: int) -> int:
+        """Where in `meshes` the mesh with this index in the file is, or comes to be."""
+        if index not in self.places:
+            parts = self.tree["meshes"][index]["primitives"]
+            surfaces = [part for part in parts if part.get("mode", _TRIANGLES) >= _TRIANGLES]
+            self.meshes.append({"primitives": [self._primitive(part) for part in surfaces]})
+            self.places[index] = len(self.meshes) - 1
+        return self.places[index]
+
+    def _primitive(self, primitive: dict[str, Any]) -> dict[str, Any]:
         mode = primitive.get("mode", _TRIANGLES)
-        if mode == _TRIANGLES:
-            faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
-        elif mode == _STRIP:
-            faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-        elif mode == _FAN:
-            faces = fan(np.array([len(corners)]), corners)
-        else:
-            raise MeshError(f"has a primitive of the unknown mode {mode}")
-        return used_part(vertices, faces)
+        if mode > _STRIP:
+            what = "triangle fans" if mode == 6 else f"primitives of the unknown mode {mode}"
+            raise MeshError(f"has {what}, which are not read: export triangles")
+        position = primitive["attributes"]["POSITION"]
+        accessor = self._accessor(position, "VEC3")
+        normalised = accessor.get("normalized")
+        self.largest.append(_LARGEST[accessor["componentType"]] if normalised else None)
+        made = {"mode": mode, "attributes": {"POSITION": position}}
+        if "indices" in primitive:
+            self._accessor(primitive["indices"], "SCALAR")
+            made["indices"] = primitive["indices"]
+        return made
 
-    def _array(self, index: int, kind: str) -> np.ndarray:
-        """[count, width] of one accessor."""
+    def _accessor(self, index: int, kind: str) -> dict[str, Any]:
         accessor = self.tree["accessors"][index]
         if "bufferView" not in accessor or "sparse" in accessor:
             raise MeshError("has sparse or compressed vertices, which are not read")
         if accessor["type"] != kind:
             raise MeshError(f"has an accessor of type {accessor['type']}, expected {kind}")
         view = self.tree["bufferViews"][accessor["bufferView"]]
-        start, length = view.get("byteOffset", 0), view["byteLength"]
-        data = memoryview(self._buffer(view["buffer"]))[start : start + length]
-        dtype, width = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind]
-        stride = view.get("byteStride", dtype.itemsize * width)
+        offsets = accessor.get("byteOffset", 0), view.get("byteOffset", 0)
+        if min(accessor["count"], *offsets, view.get("byteStride", 4) - 4) < 0:
+            raise MeshError("has a count, an offset or a stride that glTF does not allow")
         check_counts(accessor["count"] // 3, 0)  # also of indices: three to a face
-        if start < 0 or len(data) < length or stride < dtype.itemsize * width:
-            raise MeshError("is truncated: a buffer is shorter than what should be in it")
-        values: np.ndarray = np.ndarray(  # raises if it does not fit into data
-            (accessor["count"], width),
-            dtype,
-            data,
-            accessor.get("byteOffset", 0),
-            (stride, dtype.itemsize),
-        )
-        if accessor.get("normalized"):
-            return np.maximum(values / np.iinfo(dtype).max, -1.0)
-        return values
+        self.accessors.add(index)
+        return accessor
 
-    def _buffer(self, index: int) -> bytes:
-        if index not in self.buffers:
-            self.buffers[index] = self._load(self.tree["buffers"][index].get("uri"))
-        return self.buffers[index]
 
-    def _load(self, uri: str | None) -> bytes:
-        if uri is None:
-            if self.binary is None:
-                raise MeshError("has a buffer without data")
-            return self.binary
-        if uri.startswith("data:"):
-            return base64.b64decode(uri.partition("base64,")[2], validate=True)
-        path = (self.folder / unquote(uri)).resolve()
-        if not path.is_relative_to(self.folder):
-            raise MeshError(f"refers to {uri!r}, which lies outside of its folder")
-        if not path.is_file():
-            raise MeshError(f"refers to {uri!r}, which is not there: put it beside the mesh")
-        if sum(map(len, self.buffers.values())) + path.stat().st_size > MAX_BUFFER_BYTES:
-            raise MeshError(f"refers to more than {MAX_BUFFER_BYTES} bytes in other files")
-        return path.read_bytes()
+def _buffers(tree: dict[str, Any], binary: bytes | None, folder: Path) -> dict[str, bytes]:
+    buffers: dict[str, bytes] = {}
+    for index, buffer in enumerate(tree.get("buffers", [])):
+        left = MAX_BUFFER_BYTES - sum(map(len, buffers.values()))
+        buffers[str(index)] = _buffer(buffer.get("uri"), binary, folder, left)
+    return buffers
+
+
+def _buffer(uri: str | None, binary: bytes | None, folder: Path, most: int) -> bytes:
+    """At most `most` bytes of a file in the folder, or of the file itself."""
+    if uri is None:
+        if binary is None:
+            raise MeshError("has a buffer without data")
+        return binary
+    if uri.startswith("data:"):
+        return base64.b64decode(uri.partition("base64,")[2], validate=True)
+    path = (folder / unquote(uri)).resolve()
+    if not path.is_relative_to(folder):
+        raise MeshError(f"refers to {uri!r}, which lies outside of its folder")
+    if not path.is_file():
+        raise MeshError(f"refers to {uri!r}, which is not there: put it beside the mesh")
+    if path.stat().st_size > most:
+        raise MeshError(f"refers to more than {MAX_BUFFER_BYTES} bytes in other files")
+    return path.read_bytes()
 
 
 def _transform(node: dict[str, Any]) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Wavefront OBJ: its vertices and polygons. Materials are not even opened.
 
-trimesh is not used here: it takes indices relative to the end of the list so far ("f -3 -2
--1") as relative to the end of the file.
+trimesh 5.2 is not used here: it takes indices relative to the end of the list so far ("f -3 -2
+-1") as relative to the end of the file, and orders faces by material.
 
 The format has no counts, so a file that was cut between two faces is not noticed.
 """

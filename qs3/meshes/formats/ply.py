@@ -1,7 +1,7 @@
 """PLY, text and binary of either byte order, with polygons of any and of mixed sizes.
 
-trimesh is not used here: it refuses binary files in which triangles and quads are mixed,
-which is what Blender writes.
+trimesh 5.2 is not used here: it refuses binary files in which triangles and quads are mixed,
+which is what Blender writes, and divides quads in another order.
 """
 
 from __future__ import annotations

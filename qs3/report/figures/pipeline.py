@@ -132,20 +132,18 @@ def scan_object(
         MeshError, RenderError, DataError: it cannot be scanned.
     """
     from qs3.config.hydra import build
-    from qs3.generation.plan import check, check_recipe
+    from qs3.generation.scan import Scanner, composed_recipe
 
-    cfg = _composed(overrides)
-    check(cfg)
-    item = _item_of_file(mesh, object_id) if mesh is not None else _item(cfg, object_id)
-    recipe, domain = build(cfg.recipe), build(cfg.domain)
-    check_recipe(recipe, cfg)
+    cfg = composed_recipe(overrides)
+    scanner = Scanner(cfg)
+    recipe, domain = scanner.recipe, build(cfg.domain)
+    item = _item_of_file(cfg, mesh, object_id) if mesh is not None else _item(cfg, object_id)
     looks = recipe.needs_renderer
-    renderer = build(cfg.renderer) if looks else None
     loaded = item.load()
     placed = recipe.placing.place(loaded, object_rng(cfg.seed, item.id, 0), item.id)
     with tempfile.TemporaryDirectory(prefix="qs3-pipeline-") as folder:
         keep = Keep(views=Path(folder)) if looks else Keep()
-        made = recipe.make(loaded, item.id, cfg.seed, renderer, keep)
+        made = scanner.cloud(loaded, item.id, keep)
         views = load_views(Path(folder), item.id)
     told = ("domain=", "renderer=", "paths.", "workers=")
     changed = [word for word in overrides if not word.startswith(told)]
@@ -214,21 +212,6 @@ def kept_object(
     )
 
 
-def _composed(overrides: Sequence[str]) -> Any:
-    from qs3.config.compose import composed
-
-    try:
-        return composed("generate", *overrides)
-    except ConfigError as error:
-        missing = str(getattr(error.__cause__, "missing_cfg_file", ""))
-        if not missing.startswith("synthesis/"):
-            raise
-        raise ConfigError(
-            f"domain={missing.partition('/')[2]} is published, not generated: nothing is known of "
-            "how its objects were scanned; choose another, such as domain=specklenet10"
-        ) from error
-
-
 def _item(cfg: Any, object_id: str | None) -> MeshItem:
     from qs3.generation.plan import mesh_items
 
@@ -240,7 +223,7 @@ def _item(cfg: Any, object_id: str | None) -> MeshItem:
     return items[object_id]
 
 
-def _item_of_file(path: str | Path, object_id: str | None) -> MeshItem:
+def _item_of_file(cfg: Any, path: str | Path, object_id: str | None) -> MeshItem:
     path = Path(path).expanduser()
     if path.is_dir():
         raise ConfigError(
@@ -249,7 +232,8 @@ def _item_of_file(path: str | Path, object_id: str | None) -> MeshItem:
         )
     if not path.is_file():
         raise MissingDataError(f"mesh={path}: there is no such file")
-    return MeshItem(object_id or path.stem, "", "train", partial(load_mesh, path), path.name, path)
+    load = partial(load_mesh, path, keep_colliders=cfg.colliders == "keep")
+    return MeshItem(object_id or path.stem, "", "train", load, path.name, path)
 
 
 def _near(name: str, known: Any) -> str:

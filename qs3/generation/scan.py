@@ -1,0 +1,125 @@
+"""Meshes from memory through a domain's recipe: what `qs3.generate(mesh, ...)` and figures use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from qs3.config.hydra import build
+from qs3.errors import ConfigError, DataError
+from qs3.generation.plan import check, check_recipe
+from qs3.generation.provenance import Keep
+from qs3.generation.recipes import Cloud
+from qs3.meshes.mesh import Mesh
+from qs3.sensors.base import DepthFrame
+
+if TYPE_CHECKING:
+    import trimesh
+    from omegaconf import DictConfig
+
+    Solid = Mesh | trimesh.Trimesh | trimesh.Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What a domain's recipe made of one mesh.
+
+    Attributes:
+        id: of the object; its bytes depend on it and on the seed.
+        points: [P, 3] float32, metres, z up: fused and sampled, as training gets it.
+        clean: [P, 3] float32, the twin from the true depth; None where the domain has none.
+        views: frames that gave points; 0 where the domain looks at nothing.
+        valid_points: measured points before sampling to P.
+        frames: the depth frames of all views; empty where the domain looks at nothing.
+        provenance: with provenance=true [P, 5], see `qs3.generation.provenance`; else None.
+    """
+
+    id: str
+    points: np.ndarray
+    clean: np.ndarray | None
+    views: int
+    valid_points: int
+    frames: tuple[DepthFrame, ...] = ()
+    provenance: np.ndarray | None = None
+
+
+class Scanner:
+    """A recipe and, where it looks at meshes, its renderer, in this process.
+
+    Raises:
+        ConfigError: a setting is wrong.
+        RenderError: the renderer cannot be used here.
+    """
+
+    def __init__(self, cfg: DictConfig) -> None:
+        check(cfg)
+        self.recipe: Any = build(cfg.recipe)  # a Recipe, with the fields of its class
+        check_recipe(self.recipe, cfg)
+        self.seed: int = cfg.seed
+        self.renderer = build(cfg.renderer) if self.recipe.needs_renderer else None
+
+    def cloud(self, mesh: Mesh, object_id: str, keep: Keep | None = None) -> Cloud:
+        """The bytes that generate.py makes of the mesh under this id and seed."""
+        return self.recipe.make(mesh, object_id, self.seed, self.renderer, keep or Keep())
+
+
+def composed_recipe(overrides: Sequence[str]) -> DictConfig:
+    """The config of generate.py with these words.
+
+    Raises:
+        ConfigError: a word is wrong, or the domain is published and not generated.
+    """
+    from qs3.config.compose import composed
+
+    try:
+        return composed("generate", *overrides)
+    except ConfigError as error:
+        missing = str(getattr(error.__cause__, "missing_cfg_file", ""))
+        if not missing.startswith("synthesis/"):
+            raise
+        raise ConfigError(
+            f"domain={missing.partition('/')[2]} is published, not generated: nothing is known of "
+            "how its objects were scanned; choose another, such as domain=specklenet10"
+        ) from error
+
+
+def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[str, Scan]:
+    """Scan meshes from memory, one after the other, in this process; nothing is written.
+
+    Args:
+        solids: by id.
+        overrides: of generate.py, such as ["domain=specklenet10", "renderer=mitsuba"].
+
+    Raises:
+        ConfigError: a setting is wrong, or says something about files only.
+        MeshError, DataError, RenderError: a mesh cannot be scanned; the message names it.
+    """
+    cfg = composed_recipe(overrides)
+    for key, nothing in (("meshes", None), ("keep_views", False)):
+        if cfg[key] != nothing:
+            raise ConfigError(
+                f"{key}= is for files: a scan of meshes from memory has no use for it"
+            )
+    scanner = Scanner(cfg)
+    keep = Keep(provenance=cfg.provenance)
+    return {name: _scan(scanner, name, solid, keep) for name, solid in solids.items()}
+
+
+def _scan(scanner: Scanner, name: str, solid: Any, keep: Keep) -> Scan:
+    try:
+        mesh = solid if isinstance(solid, Mesh) else Mesh.from_trimesh(solid)
+        cloud = scanner.cloud(mesh, name, keep)
+    except DataError as error:
+        raise type(error)(f"{name}: {error}") from error
+    return Scan(
+        id=name,
+        points=cloud.arrays["points"],
+        clean=cloud.arrays.get("points_clean"),
+        views=cloud.views,
+        valid_points=cloud.valid_points,
+        frames=cloud.frames,
+        provenance=cloud.arrays.get("provenance"),
+    )

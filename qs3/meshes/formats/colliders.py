@@ -1,0 +1,39 @@
+"""Nodes of a scene that stand for collisions and that nobody sees.
+
+A game engine's invisible hulls come along in its exports. Scanned as if they were furniture, they
+fill the legs of a chair. Known by the name of the node or of its mesh, in any case:
+
+- `chair_collider`, `chair_collision`, also with a number behind: what exporters write;
+- UCX_, UBX_, UCP_, USP_ and MCDCX_ before the name: Unreal Engine's static mesh pipeline;
+- `-colonly` and `-convcolonly` behind it: Godot (its `-col` keeps the mesh visible).
+"""
+
+from __future__ import annotations
+
+import re
+
+_NAME = re.compile(
+    r"^(UCX|UBX|UCP|USP|MCDCX)_"
+    r"|(^|[_\-. ])(colliders?|collisions?)([_\-. ]?\d+)*$"
+    r"|-(conv)?colonly([_\-. ]?\d+)*$",
+    re.IGNORECASE,
+)
+
+
+class Colliders:
+    """Says which nodes are left out of a file, and counts them.
+
+    Attributes:
+        skip: False leaves none out.
+        count: nodes left out so far.
+    """
+
+    def __init__(self, skip: bool = True) -> None:
+        self.skip = skip
+        self.count = 0
+
+    def left_out(self, *names: str | None) -> bool:
+        """Whether a node with one of these names is left out; if so, it is counted."""
+        found = self.skip and any(_NAME.search(str(name)) for name in names if name)
+        self.count += found
+        return found

@@ -1,0 +1,67 @@
+"""Nodes that nobody sees: left out, counted, kept on demand."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.meshes.formats.colliders import Colliders
+from qs3.meshes.io import load_mesh
+from tests.meshes.written import PYRAMID, corners, dae, gltf, refused, save
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("chair_collider", "Chair_Collider.001", "COLLIDER", "leg-collision_2", "legs colliders"),
+        *("UCX_chair_01", "ubx_a", "UCP_a", "USP_a", "MCDCX_a", "a-colonly", "a-ConvColOnly_1"),
+    ],
+)
+def test_names_of_colliders(name):
+    colliders = Colliders()
+    assert colliders.left_out("node", name)
+    assert colliders.left_out(name, None)
+    assert colliders.count == 2
+    assert not Colliders(skip=False).left_out(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["collidercoaster", "a-col", "UCXchair", "a_UCX_b", "recollision", "collider_of", "", 7]
+)
+def test_names_of_others(name):
+    assert not Colliders().left_out(name, None)
+
+
+@pytest.mark.parametrize("kind", ["glb", "3mf"])
+def test_a_scene_with_a_collider(tmp_path, kind):
+    scene = trimesh.Scene()
+    scene.add_geometry(PYRAMID, node_name="chair", geom_name="chair")
+    hull = trimesh.creation.box((9, 9, 9))
+    scene.add_geometry(hull, node_name="Chair_Collider", geom_name="hull_collider")
+    path = save(tmp_path, f"a.{kind}", scene.export(file_type=kind))
+    plain = save(tmp_path, f"b.{kind}", trimesh.Scene(PYRAMID).export(file_type=kind))
+    seen, kept = load_mesh(path), load_mesh(path, keep_colliders=True)
+    np.testing.assert_array_equal(corners(seen), corners(load_mesh(plain)))
+    assert (seen.colliders, kept.colliders, load_mesh(plain).colliders) == (1, 0, 0)
+    assert len(kept.faces) == len(PYRAMID.faces) + 12
+    np.testing.assert_array_equal(corners(kept)[: len(seen.faces)], corners(seen))
+
+
+def test_what_hangs_below_a_collider_goes_too_and_a_mesh_may_be_one(tmp_path):
+    tree, _ = gltf()
+    tree["nodes"][0]["name"] = "all_collider"
+    path = save(tmp_path, "a.gltf", json.dumps(tree))
+    assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (6, 1)
+    tree["meshes"][0]["name"] = "square_collider"
+    path = save(tmp_path, "b.gltf", json.dumps(tree))
+    refused(tmp_path, "b.gltf", json.dumps(tree), "no faces but in 2 colliders.*colliders=keep")
+    assert len(load_mesh(path, keep_colliders=True).faces) == 12
+
+
+def test_collada(tmp_path):
+    square = '<instance_geometry url="#g"/>'
+    nodes = f'<node>{square}<node name="UCX_a">{square}<node>{square}</node></node></node>'
+    path = save(tmp_path, "a.dae", dae(nodes=nodes))
+    assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (2, 1)
+    assert len(load_mesh(path, keep_colliders=True).faces) == 6

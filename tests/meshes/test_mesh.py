@@ -1,0 +1,39 @@
+"""The mesh itself: to trimesh and back."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.errors import MeshError
+from qs3.meshes.mesh import Mesh
+from tests.meshes.written import PYRAMID, corners
+
+
+def test_there_and_back_nothing_changes():
+    mesh = Mesh([*PYRAMID.vertices, [9, 9, 9]], [*PYRAMID.faces[::-1], [0, 0, 1]])
+    solid = mesh.to_trimesh()
+    assert isinstance(solid, trimesh.Trimesh)
+    assert Mesh.from_trimesh(solid).sha256 == mesh.sha256
+    solid.apply_scale(2)  # its own arrays
+    assert mesh.vertices.max() == 9
+
+
+def test_a_scene_is_put_together():
+    scene = trimesh.Scene(PYRAMID)
+    scene.add_geometry(PYRAMID, transform=trimesh.transformations.translation_matrix((0, 0, 5)))
+    scene.add_geometry(trimesh.PointCloud([[7, 7, 7]]))
+    both = np.concatenate([corners(PYRAMID), corners(PYRAMID) + np.array([0, 0, 5])])
+    np.testing.assert_allclose(corners(Mesh.from_trimesh(scene)), both)
+
+
+@pytest.mark.parametrize(
+    ("solid", "reason"),
+    [
+        (trimesh.Trimesh(), "no faces"),
+        (trimesh.Scene(), "nothing to merge"),
+        (np.zeros((3, 3)), "expected a trimesh.Trimesh or Scene, got ndarray"),
+    ],
+)
+def test_what_is_no_mesh(solid, reason):
+    with pytest.raises(MeshError, match=reason):
+        Mesh.from_trimesh(solid)
