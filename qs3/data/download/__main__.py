@@ -14,21 +14,17 @@
   keep=          false deletes the archive when it is unpacked
 
 An interrupted download continues where it ended: run the same command again. What is in place is
-left alone. No hashes of these files were published: the first download notes size and SHA-256
-beside the archive (its name and .json), and whenever the archive is unpacked again it is compared
-with that. Nobody can tell whether the first one was right; zip and gzip have checksums of their
-own, and of ModelNet10.zip the size is known.
+left alone. No hashes of these files were published; zip and gzip have checksums of their own, of
+ModelNet10.zip the size is known, and .download.json in the folder notes the SHA-256 of the archive.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import sys
 import textwrap
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,30 +32,24 @@ from qs3.data.download.catalogue import BY_HAND, SOURCES, find
 from qs3.errors import ConfigError, Qs3Error
 
 MIRROR = "QS3_DOWNLOAD_MIRROR"
-_QUIET_S = 60.0  # without a terminal, seconds between two lines of progress
-
-log = logging.getLogger("qs3.data.download")
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit status: 0 if the data are in place afterwards."""
-    if argv and argv[0] in ("-h", "--help", "help"):
-        print(__doc__)
-        return 0
-    if not argv:
-        print(listing())
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(__doc__ if argv else listing())
         return 0
     try:
         name, options = parse(argv)
         if name in BY_HAND:
             print(BY_HAND[name])
             return 1
-        from qs3.data.download.fetching import AgreementError, Options, provide
-
         source = find(name)
+        from qs3.data.download.provide import AgreementError, provide
+
         logging.basicConfig(level=logging.INFO, format="%(message)s")
         try:
-            places = provide(source, Options(**options), bar=progress)
+            places = provide(source, **options)
         except AgreementError as error:
             print(error)
             return 1
@@ -76,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def parse(argv: Sequence[str]) -> tuple[str, dict[str, Any]]:
-    """The name, and key=value words as arguments of `Options`.
+    """The name, and key=value words as arguments of `provide`.
 
     Raises:
         ConfigError: an unknown key, or a value of the wrong kind.
@@ -95,13 +85,11 @@ def parse(argv: Sequence[str]) -> tuple[str, dict[str, Any]]:
             )
         if not value:
             raise ConfigError(f"{key}= has no value")
-        options[key] = value
+        options[key] = Path(value) if key in ("into", "archive") else value
     if "keep" in options:
         if options["keep"].casefold() not in ("true", "false"):
             raise ConfigError(f"keep must be true or false, got {options['keep']!r}")
         options["keep"] = options["keep"].casefold() == "true"
-    for key in {"into", "archive"} & options.keys():
-        options[key] = Path(options[key])
     if "archive" not in options and (mirror := os.environ.get(MIRROR)):
         options.setdefault("mirror", mirror)
     return name, options
@@ -117,44 +105,12 @@ def listing() -> str:
             source.title,
             f"for {', '.join(f'domain={d}' for d in source.domains) or 'generate.py meshes='}",
             f"size: {source.size_says}; file: {source.file}",
+            f"from: {source.address}",
             f"terms: {source.terms}{need}",
         ):
             lines += textwrap.wrap(text, 96, initial_indent="    ", subsequent_indent="      ")
     lines += ["", "By hand, after an agreement (NAME prints how): " + ", ".join(BY_HAND)]
     return "\n".join(lines)
-
-
-@contextlib.contextmanager
-def progress(what: str) -> Iterator[Any]:
-    """A bar on a terminal; else a line a minute. Gives the function that is told of bytes."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-        TransferSpeedColumn,
-    )
-
-    console = Console(stderr=True)
-    said = time.monotonic()
-
-    def say(done: int, total: int | None) -> None:
-        nonlocal said
-        if time.monotonic() - said >= _QUIET_S:
-            said = time.monotonic()
-            of = f" of {total / 1e6:.0f}" if total else ""
-            log.info("%s: %.0f%s MB", what, done / 1e6, of)
-
-    if not console.is_terminal:
-        log.info("%s", what)
-        yield say
-        return
-    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    with Progress(TextColumn("{task.description}"), *columns, console=console) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 if __name__ == "__main__":
