@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from qs3.report.__main__ import main
+from tests.commands import main
 
 from qs3.config import hashing
 from qs3.errors import DataError

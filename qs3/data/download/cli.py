@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
 import textwrap
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from qs3.data.download.catalogue import BY_HAND, SOURCES, find
@@ -15,9 +13,6 @@ from qs3.errors import ConfigError
 from qs3.utils.cli import FLAG, Command, Option, text
 
 MIRROR = "QS3_DOWNLOAD_MIRROR"
-_QUIET_S = 60.0  # without a terminal, seconds between two lines of progress
-
-log = logging.getLogger("qs3.data.download")
 
 
 def _download(words: Sequence[str], **given: Any) -> int:
@@ -30,13 +25,16 @@ def _download(words: Sequence[str], **given: Any) -> int:
     if name in BY_HAND:
         print(BY_HAND[name])
         return 1
-    from qs3.data.download.fetching import AgreementError, Options, provide
+    from qs3.data.download.provide import AgreementError, provide
 
     source = find(name)
-    if not given["archive"]:
+    given["into"] = Path(given["into"])
+    if given["archive"]:
+        given["archive"] = Path(given["archive"])
+    else:
         given["mirror"] = given["mirror"] or os.environ.get(MIRROR, "")
     try:
-        places = provide(source, Options(**given), bar=progress)
+        places = provide(source, **given)
     except AgreementError as error:
         print(error)
         return 1
@@ -56,44 +54,12 @@ def listing() -> str:
             source.title,
             f"for {', '.join(f'domain={d}' for d in source.domains) or 'qs3-generate meshes='}",
             f"size: {source.size_says}; file: {source.file}",
+            f"from: {source.address}",
             f"terms: {source.terms}{need}",
         ):
             lines += textwrap.wrap(paragraph, 96, initial_indent="    ", subsequent_indent="      ")
     lines += ["", "By hand, after an agreement (NAME prints how): " + ", ".join(BY_HAND)]
     return "\n".join(lines)
-
-
-@contextlib.contextmanager
-def progress(what: str) -> Iterator[Any]:
-    """A bar on a terminal; else a line a minute. Gives the function that is told of bytes."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-        TransferSpeedColumn,
-    )
-
-    console = Console(stderr=True)
-    said = time.monotonic()
-
-    def say(done: int, total: int | None) -> None:
-        nonlocal said
-        if time.monotonic() - said >= _QUIET_S:
-            said = time.monotonic()
-            of = f" of {total / 1e6:.0f}" if total else ""
-            log.info("%s: %.0f%s MB", what, done / 1e6, of)
-
-    if not console.is_terminal:
-        log.info("%s", what)
-        yield say
-        return
-    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    with Progress(TextColumn("{task.description}"), *columns, console=console) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 DOWNLOAD = Command(
@@ -132,10 +98,8 @@ DOWNLOAD = Command(
     ),
     about="""
 An interrupted download continues where it ended: run the same command again. What is in place is
-left alone. No hashes of these files were published: the first download notes size and SHA-256
-beside the archive (its name and .json), and whenever the archive is unpacked again it is compared
-with that. Nobody can tell whether the first one was right; zip and gzip have checksums of their
-own, and of ModelNet10.zip the size is known.
+left alone. No hashes of these files were published; zip and gzip have checksums of their own, of
+ModelNet10.zip the size is known, and .download.json in the folder notes the SHA-256 of the archive.
 """,
     words="[NAME]",
 )

@@ -1,200 +1,228 @@
-"""From a source's name to the folder that an importer reads: fetch, check, unpack, put in place."""
+"""One file over HTTP or from Google Drive: pooch checks and places it, what is cut off is resumed.
+
+pooch itself begins an interrupted file from its first byte; the downloader here goes on where it
+ended. Files on Google Drive are left to gdown, which knows Drive's pages.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import json
 import logging
 import os
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+import re
+import time
 from pathlib import Path
+from typing import Any, ClassVar
 
-from qs3.data.download import drive, layouts, transfer, unpack
-from qs3.data.download.catalogue import AGREEMENTS, Part, Source
-from qs3.data.download.receipts import Receipt, read_json
-from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.utils.files import make_folder, sha256_file, write_json
+import pooch
+import requests
+from tqdm import tqdm
+
+from qs3.errors import Qs3Error
+from qs3.utils.files import write_json
 from qs3.utils.locks import locked
 
 log = logging.getLogger(__name__)
 
-MARK = ".download.json"
-"""In a folder that was put in place: where it came from. Importers pass over hidden files."""
-
-_UNPACKED = 4  # times the archive's size: what text takes unpacked, for the check of free space
-
-Bar = Callable[[str], AbstractContextManager[transfer.Report]]
+_CHUNK = 1 << 16  # what is lost at most when a connection breaks off
+_BUSY = (408, 425, 429, 500, 502, 503, 504)
+_DROPPED = (requests.ConnectionError, requests.Timeout, requests.exceptions.ChunkedEncodingError)
 
 
-@dataclass(frozen=True)
-class Options:
-    """How to fetch.
+class DownloadError(Qs3Error):
+    """A file could not be fetched, or is not the one that was wanted; says what to do."""
 
-    Attributes:
-        into: the data folder, `paths.data_dir` of a run.
-        accept_terms: the agreement that the person has made, e.g. "scannet"; "" for none.
-        mirror: base address of a copy of the archives; each lies there as `Source.file`.
-        archive: an archive that is here already, e.g. downloaded with a browser.
-        root: folder in the archive to take, where it cannot be found out.
-        keep: keep the archive after unpacking; it is then not fetched again when a folder is lost.
-        drive_server: of Google Drive.
-        patience: see `transfer.Patience`.
-    """
-
-    into: Path = Path("data")
-    accept_terms: str = ""
-    mirror: str = ""
-    archive: Path | None = None
-    root: str = ""
-    keep: bool = True
-    drive_server: str = drive.SERVER
-    patience: transfer.Patience = field(default_factory=transfer.Patience)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "into", Path(self.into))
-        if self.archive is not None:
-            object.__setattr__(self, "archive", Path(self.archive))
-        if self.archive is not None and self.mirror:
-            raise ConfigError("give archive= or mirror=, not both")
+    def __init__(self, what: str, page: str) -> None:
+        super().__init__(
+            f"{what}. Run the same command again: what came is kept, and it continues. If that "
+            f"does not help, open {page} in a browser and give the file with archive=PATH"
+        )
 
 
-@contextlib.contextmanager
-def _silent(what: str) -> Iterator[transfer.Report]:
-    yield lambda done, total: None
+def fetch(
+    url: str, path: Path, *, sha256: str | None = None, size: int | None = None, drive: str = ""
+) -> Path:
+    """Bring a file to `path`; one that is there already is checked and left alone.
 
+    Two processes that fetch one file take turns. An interrupted one is continued by the next call.
 
-class AgreementError(Qs3Error):
-    """Terms have to be accepted first; the message says which and how."""
-
-
-def provide(source: Source, options: Options | None = None, bar: Bar = _silent) -> list[Path]:
-    """Bring the folders of a source to where their importers look; what is there stays.
-
-    Nothing is fetched if all its folders are in place. An interruption at any moment leaves no
-    half folder: the same call again continues.
-
-    Returns:
-        The folders, in the order of `source.parts`; those that somebody else had put there before
-        are among them, untouched.
+    Args:
+        url: of the file (http, https), or of its page for people where `drive` is given.
+        path: where it shall lie.
+        sha256: hex digits, if they are known; a file that has others is fetched again.
+        size: bytes, if they are known.
+        drive: its id on Google Drive.
 
     Raises:
-        AgreementError: `source.agreement` was not accepted.
-        DataError: what came is not the published file, or is not to be trusted, or a folder is in
-            the way.
-        Qs3Error: network, disk.
+        DownloadError: network, or the server does not give that file.
+        Qs3Error: the folder cannot be written.
     """
-    options = options or Options()
-    if source.agreement and options.accept_terms != source.agreement:
-        text = AGREEMENTS[source.agreement]
-        raise AgreementError(text.format(name=source.name, title=source.title))
-    if options.root and len(source.parts) > 1:
-        raise ConfigError(f"{source.name} has several parts, so root= cannot be given")
-    published = options.into / "published"
-    places = [published / part.folder for part in source.parts]
-    with locked(_downloads(options) / f".{source.name}.lock"):
-        missing = [
-            (part, place)
-            for part, place in zip(source.parts, places, strict=True)
-            if not _is_in_place(place, source)
-        ]
-        if not missing:
-            return places
-        archive, receipt, ours = _archive(source, options, bar)
-        _place(source, missing, archive, receipt, options, bar)
-        if ours and not options.keep:
-            archive.unlink()
-    return places
-
-
-def _is_in_place(place: Path, source: Source) -> bool:
-    """Whether the folder is there; says so if it did not come from this source."""
-    if not os.path.lexists(place) or (place.is_dir() and not any(place.iterdir())):
-        return False
-    origin = read_json(place / MARK).get("source")
-    if origin != source.name:
-        log.warning(
-            "%s is there already (%s) and is left alone; move it away to have it from %s",
-            place,
-            f"from {origin}" if origin else "not put there by this command",
-            source.name,
-        )
-    return True
-
-
-def _downloads(options: Options) -> Path:
-    return make_folder(options.into / "downloads")
-
-
-def _archive(source: Source, options: Options, bar: Bar) -> tuple[Path, Receipt, bool]:
-    """The archive, its receipt, and whether it lies in our folder of downloads."""
-    if options.archive is not None:
-        path = options.archive
-        if not path.is_file():
-            raise ConfigError(f"archive={path}: there is no such file")
-        return path, Receipt(str(path), path.stat().st_size, sha256_file(path)), False
-    path = _downloads(options) / source.file
-    by_drive = bool(source.drive_id) and not options.mirror
-    wanted = transfer.Wanted(
-        source.url(options.mirror, options.drive_server),
-        path,
-        size=source.size,
-        page=drive.page_of(source.drive_id) if by_drive else None,
-    )
-    with bar(f"fetching {source.file}") as report:
-        receipt = transfer.fetch(wanted, options.patience, report)
-    log.info("%s: %d bytes, SHA-256 %s", path, receipt.size, receipt.sha256)
-    return path, receipt, True
-
-
-def _place(
-    source: Source,
-    missing: list[tuple[Part, Path]],
-    archive: Path,
-    receipt: Receipt,
-    options: Options,
-    bar: Bar,
-) -> None:
-    """Unpack into a folder beside the final ones, find the parts, and rename them into place."""
-    published = make_folder(options.into / "published")
-    building = published / f".{source.name}.unpacking"
-    unpack.delete(building)  # what a killed run left
-    free, needed = shutil.disk_usage(published).free, _UNPACKED * receipt.size
-    if needed > free:
-        raise Qs3Error(
-            f"{published} has {free / 1e9:.1f} GB free, unpacking {archive} takes about "
-            f"{needed / 1e9:.1f} GB: free some space or choose another folder with into="
-        )
-    try:
-        with bar(f"unpacking {archive.name}") as report:
-            unpack.unpack(archive, building, report=report)
-        files = layouts.files_below(building)
-        for part, place, root in _found(missing, files, archive, options.root):
-            folder = building / root if root else building
-            write_json(folder / MARK, {"source": source.name, "root": root, **receipt._asdict()})
-            make_folder(place.parent)
-            if place.is_dir():
-                place.rmdir()  # empty, see `_is_in_place`
-            os.rename(folder, place)
-            log.info("%s: %s", place, part.layout.says)
-    finally:
-        unpack.delete(building)
-
-
-def _found(
-    missing: list[tuple[Part, Path]], files: list[str], archive: Path, root: str
-) -> list[tuple[Part, Path, str]]:
-    """Each part with its folder in the archive; all are found before the first is moved."""
-    found = []
-    for part, place in missing:
+    pooch.get_logger().setLevel(logging.WARNING)
+    downloader = Drive(drive, path) if drive else Resuming(path, size)
+    with locked(path.with_name(f".{path.name}.lock")):
         try:
-            inside = layouts.chosen(root, files) if root else part.layout.find(files)
-        except Qs3Error as error:
-            raise DataError(
-                f"{archive}: {error}. It holds\n{layouts.outline(files)}\nThe archive is kept; "
-                "take a folder of it with root=FOLDER, or unpack it yourself (and archives in it, "
-                f"if any) so that {place} holds {part.layout.says}"
+            pooch.retrieve(url, sha256, path.name, path.parent, downloader=downloader)
+        except (requests.RequestException, ValueError) as error:  # ValueError: another hash
+            raise DownloadError(f"{url}: {error}", url) from error
+        except OSError as error:
+            raise Qs3Error(
+                f"cannot write {path}: {error.strerror or error}. Free some space or choose "
+                "another folder with into=, and run the same command again; what came is kept"
             ) from error
-        found.append((part, place, inside))
-    return found
+        if size is not None and (found := path.stat().st_size) != size:
+            raise DownloadError(f"{path} has {found} bytes, expected {size}; delete it", url)
+    return path
+
+
+class Resuming:
+    """A downloader for pooch that continues where an earlier attempt or process ended.
+
+    While it comes the file is `name.part`, and `name.part.json` says what the server called it: the
+    rest of another version is never put behind the beginning of this one.
+    """
+
+    tries: ClassVar[int] = 8  # in a row that bring no byte
+    wait_s: ClassVar[float] = 1.0  # before the second one; doubled each time
+    timeout_s: ClassVar[float] = 60.0  # without a byte
+
+    def __init__(self, path: Path, size: int | None = None) -> None:
+        self.part = path.with_name(f"{path.name}.part")
+        self.note = path.with_name(f"{path.name}.part.json")
+        self.size = size
+
+    def __call__(self, url: str, output_file: str, pooch: Any) -> None:
+        """Fetch `url` to `output_file`."""
+        failures = 0
+        while True:
+            before = self._done()
+            try:
+                self._attempt(url)
+                break
+            except _DROPPED as error:
+                failures = 1 if self._done() > before else failures + 1
+                if failures >= self.tries:
+                    raise DownloadError(
+                        f"{url}: {error}, {failures} times in a row", url
+                    ) from error
+                wait_s = min(self.wait_s * 2 ** (failures - 1), 60.0)
+                log.warning("%s: %s; next try in %.0f s", url, error, wait_s)
+                time.sleep(wait_s)
+        self.note.unlink(missing_ok=True)
+        if self.size not in (None, done := self._done()):
+            self.part.unlink()
+            raise DownloadError(f"{url}: has {done} bytes, expected {self.size}; deleted", url)
+        os.replace(self.part, output_file)
+
+    def _attempt(self, url: str) -> None:
+        """Ask once, and write what comes to the part; returns when the part is whole."""
+        note = self._read_note(url)
+        done, headers = self._done() if note else 0, {"Accept-Encoding": "identity"}
+        if done:
+            headers["Range"] = f"bytes={done}-"
+            weak = (note["etag"] or "W/").startswith("W/")  # RFC 9110, 13.1.5
+            if validator := note["modified"] if weak else note["etag"]:
+                headers["If-Range"] = validator
+        with requests.get(url, headers=headers, stream=True, timeout=self.timeout_s) as answer:
+            start, total = _extent(answer)
+            if done and answer.status_code == 416 and total == done:
+                return  # nothing is missing
+            says = {"url": url, "size": total}
+            says |= {"etag": answer.headers.get("ETag")}
+            says |= {"modified": answer.headers.get("Last-Modified")}
+            other = start != done or (done and says != note)
+            if other and answer.status_code in (206, 416):
+                self.note.unlink(missing_ok=True)
+                raise requests.ConnectionError("the server's file is another one, starting over")
+            self._check(answer, url, total)
+            if start == 0:
+                write_json(self.note, says)
+            self._write(answer, start, total)
+
+    def _check(self, answer: requests.Response, url: str, total: int | None) -> None:
+        """Refuse what is not (the rest of) the file."""
+        kind = answer.headers.get("Content-Type", "")
+        wrong = ""
+        if answer.status_code in _BUSY:
+            raise requests.ConnectionError(f"the server answered {answer.status_code}")
+        if answer.status_code not in (200, 206):
+            wrong = f"the server answered {answer.status_code} {answer.reason}"
+        elif kind.startswith(("text/html", "application/xhtml")):
+            wrong = "the server gave a web page instead of the file"
+        elif answer.headers.get("Content-Encoding", "identity") != "identity":
+            wrong = "the server packs the file although it was asked not to"
+        elif self.size is not None and total is not None and total != self.size:
+            wrong = f"the server's file has {total} bytes, expected {self.size}"
+        if wrong:
+            raise DownloadError(f"{url}: {wrong}", url)
+
+    def _write(self, answer: requests.Response, start: int, total: int | None) -> None:
+        bar = tqdm(
+            desc=self.part.stem,
+            total=total,
+            initial=start,
+            unit="B",
+            unit_scale=True,
+            disable=None,  # where there is no terminal
+        )
+        with bar, open(self.part, "r+b" if start else "wb") as file:
+            file.seek(start)
+            for chunk in answer.iter_content(_CHUNK):
+                file.write(chunk)
+                file.flush()
+                bar.update(len(chunk))
+            done = file.tell()
+        if total is not None and done != total:
+            raise requests.ConnectionError(f"the connection ended after {done} of {total} bytes")
+
+    def _done(self) -> int:
+        return self.part.stat().st_size if self.part.exists() else 0
+
+    def _read_note(self, url: str) -> dict[str, Any]:
+        """What the server said of the part; {} if that is not known."""
+        try:
+            note = json.loads(self.note.read_bytes())
+            return (
+                note
+                if note.keys() == {"url", "size", "etag", "modified"} and note["url"] == url
+                else {}
+            )
+        except (OSError, ValueError, AttributeError):
+            return {}
+
+
+def _extent(answer: requests.Response) -> tuple[int, int | None]:
+    """First byte that is sent (-1: the answer does not say), and bytes of the whole file."""
+    if answer.status_code in (206, 416):
+        says = answer.headers.get("Content-Range", "")
+        found = re.fullmatch(r"bytes (?:(\d+)-\d+|\*)/(\d+|\*)", says)
+        if not found:
+            return -1, None
+        return int(found[1] or 0), None if found[2] == "*" else int(found[2])
+    length = answer.headers.get("Content-Length", "")
+    return 0, int(length) if length.isdigit() else None
+
+
+class Drive:
+    """A downloader for pooch that leaves a file on Google Drive, and its resuming, to gdown."""
+
+    def __init__(self, file_id: str, path: Path) -> None:
+        self.file_id, self.whole = file_id, path.with_name(f"{path.name}.drive")
+
+    def __call__(self, url: str, output_file: str, pooch: Any) -> None:
+        """Fetch the file to `output_file`; `url` is its page for people, for messages."""
+        import gdown
+
+        try:
+            gdown.download(
+                id=self.file_id,
+                output=str(self.whole),
+                quiet=not os.isatty(2),
+                use_cookies=False,
+                resume=True,
+                timeout=Resuming.timeout_s,
+                retries=Resuming.tries,
+            )
+        except gdown.exceptions.DownloadError as error:
+            why = " ".join(str(error).split())
+            raise DownloadError(f"Google Drive does not give {url}: {why}", url) from error
+        os.replace(self.whole, output_file)

@@ -2,8 +2,6 @@
 
 import contextlib
 import re
-import socket
-import struct
 import threading
 import time
 from dataclasses import dataclass, field
@@ -20,15 +18,14 @@ class File:
         ranges: whether a Range is honoured.
         ignores_if_range: gives the rest even of another file.
         drops: after how many bytes of the body the first, second, ... answer breaks off.
-        reset: break off by a reset instead of a plain end.
         statuses: of the first answers, before the file is given.
         headers: sent with every answer.
+        kind: of the content.
         chunked: send no length.
-        stall_s: waits so long before the body of the first answer.
+        stall_s: waits so long before the body of each answer.
         change: called after an answer has broken off.
         shift: begin so many bytes after the one that was asked for.
         redirect: answer with this address instead.
-        status: instead of 200.
     """
 
     content: bytes
@@ -36,7 +33,6 @@ class File:
     ranges: bool = True
     ignores_if_range: bool = False
     drops: list = field(default_factory=list)
-    reset: bool = False
     statuses: list = field(default_factory=list)
     headers: dict = field(default_factory=dict)
     kind: str = "application/octet-stream"
@@ -45,7 +41,6 @@ class File:
     change: object = None
     shift: int = 0
     redirect: str | None = None
-    status: int = 200
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -59,38 +54,31 @@ class Handler(BaseHTTPRequestHandler):
         site.requests.append((self.path, dict(self.headers)))
         file = site.files.get(self.path)
         if file is None:
-            self.page(404, "<html><body>Not found</body></html>")
+            self.short(404, {}, b"<html><body>Not found</body></html>")
         elif file.statuses:
-            self.page(file.statuses.pop(0), "<html>busy</html>", file.headers)
+            self.short(file.statuses.pop(0), file.headers)
         elif file.redirect:
-            self.send_response(302)
-            self.send_header("Location", file.redirect)
-            self.send_header("Content-Length", "0")
-            self.end_headers()
+            self.short(302, {"Location": file.redirect})
         else:
             self.give(file)
 
-    def page(self, status, text, headers=()):
+    def short(self, status, headers, body=b""):
         self.send_response(status)
-        self.send_header("Content-Type", "text/html; charset=utf-8")
-        self.send_header("Content-Length", str(len(text)))
-        for key, value in dict(headers).items():
+        for key, value in {"Content-Type": "text/html", **headers}.items():
             self.send_header(key, value)
+        self.send_header("Content-Length", str(len(body)))
         self.end_headers()
-        self.wfile.write(text.encode())
+        self.wfile.write(body)
 
     def give(self, file):
         total = len(file.content)
-        start, status = 0, file.status
+        start, status = 0, 200
         asked = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
         same = file.ignores_if_range or self.headers.get("If-Range") in (None, file.etag)
         if asked and file.ranges and same:
             start, status = int(asked[1]) + file.shift, 206
         if start >= total > 0:
-            self.send_response(416)
-            self.send_header("Content-Range", f"bytes */{total}")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
+            self.short(416, {"Content-Range": f"bytes */{total}"})
             return
         body = file.content[start:]
         self.send_response(status)
@@ -106,14 +94,15 @@ class Handler(BaseHTTPRequestHandler):
         for key, value in file.headers.items():
             self.send_header(key, value)
         self.end_headers()
-        if file.stall_s:
-            stall, file.stall_s = file.stall_s, 0.0
-            time.sleep(stall)
+        time.sleep(file.stall_s)
         with contextlib.suppress(OSError):
             drop = file.drops.pop(0) if file.drops else None
             self.send_body(body[:drop], file.chunked, whole=drop is None)
             if drop is not None:
-                self.break_off(file)
+                self.wfile.flush()
+                self.close_connection = True
+                if file.change:
+                    file.change(file)
 
     def send_body(self, body, chunked, whole):
         if not chunked:
@@ -124,16 +113,6 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(b"%x\r\n%b\r\n" % (len(piece), piece))
         if whole:
             self.wfile.write(b"0\r\n\r\n")
-
-    def break_off(self, file):
-        self.wfile.flush()
-        if file.reset:  # RST instead of FIN
-            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            time.sleep(0.1)  # or the bytes sent before are lost with it
-            self.connection.close()
-        self.close_connection = True
-        if file.change:
-            file.change(file)
 
 
 class Site:

@@ -1,318 +1,281 @@
-"""From a name to the folder that a domain reads; archives as they might be published."""
+"""One file over real sockets: whole, broken off, exchanged, refused."""
 
-import io
+import hashlib
 import json
-import logging
-import re
+import multiprocessing
+import os
+import socket
 import subprocess
 import sys
-import tarfile
-import zipfile
+import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
+import requests
 
-from qs3.data.download import catalogue, fetching
-from qs3.data.download.catalogue import SOURCES, find
-from qs3.data.download.cli import listing, progress
-from qs3.data.download.fetching import AgreementError, Options, provide
-from qs3.data.download.transfer import Patience
-from qs3.data.importers import NpyTree, PointDAH5, XyzTree
-from qs3.errors import ConfigError, DataError, Qs3Error
-from tests.commands import main
+from qs3.data.download.fetching import DownloadError, Resuming, fetch
+from qs3.errors import Qs3Error
 from tests.data.download.server import File
-from tests.fixtures import published as fixtures
 
-FAST = Patience(tries=3, wait_s=0.01, timeout_s=5.0)
-SPLITS = {"train": 2, "test": 1}
-
-
-def zipped(folder, inside=""):
-    """A folder's files as the bytes of a .zip, below `inside`."""
-    memory = io.BytesIO()
-    with zipfile.ZipFile(memory, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                archive.write(path, inside + str(path.relative_to(folder)))
-    return memory.getvalue()
+DATA = np.random.default_rng(0).bytes(3_000_000)
+OTHER = np.random.default_rng(1).bytes(3_000_000)
 
 
-@pytest.fixture
-def speckle(tmp_path_factory):
-    """SpeckleNet10 as an archive with a folder too many, a list and Mac OS's companions."""
-    folder = tmp_path_factory.mktemp("author")
-    fixtures.write_xyz_tree(folder / "sim2real" / "raw_pc_multiview_point_at", SPLITS)
-    (folder / "sim2real" / "list.txt").write_text("a list")
-    (folder / "__MACOSX").mkdir()
-    (folder / "__MACOSX" / "._list.txt").write_text("")
-    return zipped(folder)
+LOST = 1 << 16  # bytes at most, when a connection breaks off
 
 
-def options(site, folder, **more):
-    return Options(**{"into": folder, "mirror": site.address, "patience": FAST, **more})
+def sha(data):
+    return hashlib.sha256(data).hexdigest()
 
 
-def visible(folder):
-    return sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
+def get(site, folder, **more):
+    return fetch(f"{site.address}/a.zip", folder / "a.zip", **more).read_bytes()
 
 
-def test_from_the_server_to_the_domain(site, tmp_path, speckle):
-    site.files["/specklenet10.zip"] = File(speckle, drops=[len(speckle) // 2])
-    (place,) = provide(find("specklenet10"), options(site, tmp_path))
-    assert place == tmp_path / "published" / "specklenet10"
-    _, rows = XyzTree(place).read(fixtures.CLASSES)
-    assert len(rows) == 30
-    assert visible(tmp_path / "published") == ["specklenet10"]
-    assert visible(tmp_path / "downloads") == ["specklenet10.zip", "specklenet10.zip.json"]
-    note = json.loads((place / fetching.MARK).read_text())
-    assert note["root"] == "sim2real/raw_pc_multiview_point_at"
-    assert note["size"] == len(speckle)
+def names(folder):
+    return sorted(path.name for path in folder.iterdir() if not path.name.endswith(".lock"))
 
 
-def test_a_second_run_does_nothing(site, tmp_path, speckle):
-    site.files["/specklenet10.zip"] = File(speckle)
-    provide(find("specklenet10"), options(site, tmp_path))
-    stamp = (tmp_path / "published" / "specklenet10").stat().st_mtime_ns
-    provide(find("specklenet10"), options(site, tmp_path))
+def test_whole_and_a_second_run_asks_nothing(site, tmp_path):
+    site.files["/a.zip"] = File(DATA)
+    for _ in range(2):
+        assert get(site, tmp_path, sha256=sha(DATA).upper(), size=len(DATA)) == DATA
+    assert names(tmp_path) == ["a.zip"]
     assert len(site.requests) == 1
-    assert (tmp_path / "published" / "specklenet10").stat().st_mtime_ns == stamp
+    assert site.requests[0][1]["Accept-Encoding"] == "identity"
 
 
-def test_a_lost_folder_comes_from_the_archive_that_was_kept(site, tmp_path, speckle):
-    site.files["/specklenet10.zip"] = File(speckle)
-    (place,) = provide(find("specklenet10"), options(site, tmp_path))
-    place.rename(tmp_path / "attic")
-    assert provide(find("specklenet10"), options(site, tmp_path)) == [place]
-    assert len(site.requests) == 1
-    place.rename(tmp_path / "attic2")
-    (tmp_path / "downloads" / "specklenet10.zip").write_bytes(speckle[:-5] + b"12345")
-    with pytest.raises(DataError, match=r"specklenet10\.zip has the SHA-256"):
-        provide(find("specklenet10"), options(site, tmp_path))
-    assert visible(tmp_path / "published") == []
-
-
-def test_the_archive_need_not_be_kept(site, tmp_path, speckle):
-    site.files["/specklenet10.zip"] = File(speckle)
-    provide(find("specklenet10"), options(site, tmp_path, keep=False))
-    assert visible(tmp_path / "downloads") == ["specklenet10.zip.json"]
-
-
-def test_what_somebody_put_there_is_left_alone(site, tmp_path, caplog):
-    mine = tmp_path / "published" / "specklenet10" / "chair"
-    mine.mkdir(parents=True)
-    provide(find("specklenet10"), options(site, tmp_path))
-    assert "specklenet10 is there already (not put there by this command)" in caplog.text
+def test_what_is_there_is_compared_with_what_is_known(site, tmp_path):
+    site.files["/a.zip"] = File(DATA)
+    (tmp_path / "a.zip").write_bytes(OTHER)
+    assert get(site, tmp_path) == OTHER  # nothing is known of it
     assert site.requests == []
-    assert mine.is_dir()
+    assert get(site, tmp_path, sha256=sha(DATA)) == DATA
+    with pytest.raises(DownloadError, match=r"a\.zip has 3000000 bytes, expected 5; delete it"):
+        get(site, tmp_path, size=5)
 
 
-def test_an_empty_folder_is_not_in_the_way(site, tmp_path, speckle):
-    site.files["/specklenet10.zip"] = File(speckle)
-    (tmp_path / "published" / "specklenet10").mkdir(parents=True)
-    (place,) = provide(find("specklenet10"), options(site, tmp_path))
-    assert len(XyzTree(place).read(fixtures.CLASSES)[1]) == 30
+def test_drops_are_resumed_where_they_broke_off(site, tmp_path):
+    site.files["/a.zip"] = File(DATA, drops=[1_000_000, 700_000])
+    assert get(site, tmp_path) == DATA
+    first, *later = site.ranges("/a.zip")
+    assert first is None
+    second, third = (int(asked.removeprefix("bytes=")[:-1]) for asked in later)
+    assert 1_000_000 - LOST <= second <= 1_000_000
+    assert second + 700_000 - LOST <= third <= second + 700_000
+    assert site.requests[1][1]["If-Range"] == '"one"'
 
 
-def test_scannet_needs_an_agreement(site, tmp_path, speckle):
-    site.files["/depthscannet10.zip"] = File(speckle)
-    for word in ("", "yes"):
-        with pytest.raises(AgreementError, match=r"(?s)ScanNet_TOS\.pdf.*accept_terms=scannet"):
-            provide(find("depthscannet10"), options(site, tmp_path, accept_terms=word))
-    assert site.requests == []
-    assert list(tmp_path.iterdir()) == []
-    (place,) = provide(find("depthscannet10"), options(site, tmp_path, accept_terms="scannet"))
-    assert place.name == "depthscannet10"
+def starts_anew(file):
+    file.ranges = False
 
 
-def test_whatever_is_made_from_scannet_needs_it():
-    need = {source.name for source in SOURCES if source.agreement}
-    assert need == {"depthscannet10", "scannet10", "pointda10"}
-    assert all("scannet" not in d for s in SOURCES if not s.agreement for d in s.domains)
+def another(file):
+    file.content, file.etag = OTHER, '"two"'
 
 
-def test_pointda_is_taken_apart(site, tmp_path, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("author") / "PointDA_data"
-    fixtures.write_npy_tree(folder / "modelnet", SPLITS)
-    three = {"validation": 1, **SPLITS}
-    fixtures.write_npy_tree(folder / "shapenet", three, points=1024, up="y")
-    fixtures.write_pointda_h5(folder / "scannet", SPLITS)
-    memory = io.BytesIO()
-    with tarfile.open(fileobj=memory, mode="w:gz") as archive:
-        archive.add(folder, "PointDA_data")
-    site.files["/pointda10.zip"] = File(memory.getvalue())
-    places = provide(find("pointda10"), options(site, tmp_path, accept_terms="scannet"))
-    assert [place.name for place in places] == ["modelnet10", "shapenet10", "scannet10"]
-    assert len(NpyTree(places[0]).read(fixtures.CLASSES)[1]) == 30
-    assert len(NpyTree(places[1], points=1024).read(fixtures.CLASSES)[1]) == 40
-    assert len(PointDAH5(places[2]).read(fixtures.CLASSES)[1]) == 30
+def shorter(file):
+    file.content = OTHER[:2_000_000]
 
 
-def test_another_archive_is_refused_and_shown(site, tmp_path, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("author")
-    fixtures.write_npy_tree(folder / "a", SPLITS)
-    site.files["/specklenet10.zip"] = File(zipped(folder))
-    with pytest.raises(DataError, match=r"(?s)no folder holds <class>.*a/chair/train: 2 files"):
-        provide(find("specklenet10"), options(site, tmp_path))
-    assert visible(tmp_path / "published") == []
+def elsewhere(file):
+    file.shift = -1000
 
 
-def test_several_trees_in_one_archive(site, tmp_path, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("author")
-    for name in ("noisy", "clean"):
-        fixtures.write_xyz_tree(folder / name, SPLITS)
-    site.files["/specklenet10.zip"] = File(zipped(folder))
-    with pytest.raises(DataError, match=r"several folders hold .*: 'clean/', 'noisy/'.*root="):
-        provide(find("specklenet10"), options(site, tmp_path))
-    with pytest.raises(DataError, match="root=noise: the archive has no such folder"):
-        provide(find("specklenet10"), options(site, tmp_path, root="noise"))
-    (place,) = provide(find("specklenet10"), options(site, tmp_path, root="noisy/"))
-    assert json.loads((place / fetching.MARK).read_text())["root"] == "noisy"
-    assert len(site.requests) == 1
-    with pytest.raises(ConfigError, match="several parts"):
-        provide(find("pointda10"), options(site, tmp_path, root="a", accept_terms="scannet"))
+@pytest.mark.parametrize("etag", ['"one"', 'W/"one"', None])
+@pytest.mark.parametrize(
+    ("served", "change"),
+    [
+        ({}, None),
+        ({"chunked": True}, None),
+        ({}, starts_anew),
+        ({}, another),
+        ({"ignores_if_range": True}, another),
+        ({}, shorter),
+        ({"headers": {"Last-Modified": "Wed, 21 Oct 2015 07:28:00 GMT"}}, shorter),
+        ({}, elsewhere),
+    ],
+)
+def test_whatever_happens_between_two_tries_nothing_is_mixed(site, tmp_path, etag, served, change):
+    file = File(DATA, etag, drops=[1_000_000], change=change, **served)
+    site.files["/a.zip"] = file
+    assert get(site, tmp_path) == file.content
+    assert names(tmp_path) == ["a.zip"]
+    assert len(site.requests) <= 4
 
 
-def test_an_unsafe_archive_leaves_nothing(site, tmp_path):
-    memory = io.BytesIO()
-    with zipfile.ZipFile(memory, "w") as archive:
-        archive.writestr("chair/train/a.xyz", "1 2 3")
-        archive.writestr("../../evil", "evil")
-    site.files["/specklenet10.zip"] = File(memory.getvalue())
-    with pytest.raises(DataError, match="leads out of the folder"):
-        provide(find("specklenet10"), options(site, tmp_path))
-    assert list((tmp_path / "published").iterdir()) == []
+def test_a_killed_process_continues(site, tmp_path):
+    stall = lambda file: setattr(file, "stall_s", 30.0)  # noqa: E731
+    site.files["/a.zip"] = File(DATA, drops=[1_500_000], change=stall)
+    code = (
+        "from pathlib import Path; from qs3.data.download.fetching import *\n"
+        f"fetch({site.address + '/a.zip'!r}, Path({str(tmp_path / 'a.zip')!r}))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "no_proxy": "*"})
+    while len(site.requests) < 2:
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    left = (tmp_path / "a.zip.part").read_bytes()
+    assert len(left) >= 1_500_000 - LOST
+    site.files["/a.zip"].stall_s = 0.0
+    assert get(site, tmp_path) == DATA
+    assert site.ranges("/a.zip")[-1] == f"bytes={len(left)}-"
 
 
-def test_what_a_killed_run_left_is_cleared(site, tmp_path, speckle):
-    site.files["/specklenet10.zip"] = File(speckle)
-    left = tmp_path / "published" / ".specklenet10.unpacking" / "sim2real"
-    left.mkdir(parents=True)
-    (left / "half").write_text("")
-    provide(find("specklenet10"), options(site, tmp_path))
-    assert [p.name for p in (tmp_path / "published").iterdir()] == ["specklenet10"]
+def test_parts_that_an_earlier_process_left(site, tmp_path):
+    site.files["/a.zip"] = File(DATA)
+    part, note = tmp_path / "a.zip.part", tmp_path / "a.zip.part.json"
+    says = {"url": f"{site.address}/a.zip", "size": len(DATA), "etag": '"one"', "modified": None}
+    for content, known, asked in (
+        (DATA, says, f"bytes={len(DATA)}-"),  # whole: answered by 416
+        (DATA[:9], says, "bytes=9-"),
+        (OTHER[:9], None, None),  # nothing is known of it
+        (OTHER[:9], {**says, "url": "http://elsewhere/a.zip"}, None),
+        (OTHER[:9], [], None),
+        (OTHER[:9], {**says, "etag": '"two"'}, "bytes=9-"),  # of an older version
+        (DATA + b"more", says, f"bytes={len(DATA) + 4}-"),  # cannot be its beginning
+    ):
+        part.write_bytes(content)
+        note.write_text(json.dumps(known))
+        site.requests.clear()
+        assert get(site, tmp_path) == DATA
+        assert site.ranges("/a.zip")[0] == asked
+        (tmp_path / "a.zip").unlink()
+    assert names(tmp_path) == []
 
 
-def test_a_disk_without_room(site, tmp_path, speckle, monkeypatch):
-    site.files["/specklenet10.zip"] = File(speckle)
-    monkeypatch.setattr(fetching, "_UNPACKED", 1e12)
-    with pytest.raises(Qs3Error, match=r"unpacking .*specklenet10\.zip takes about"):
-        provide(find("specklenet10"), options(site, tmp_path))
-    assert visible(tmp_path / "published") == []
+def test_giving_up_keeps_what_came(site, tmp_path):
+    site.files["/a.zip"] = File(DATA, drops=[1_000_000, 0, 0, 0, 0])
+    with pytest.raises(DownloadError, match=r"4 times in a row\. Run the same command again: what"):
+        get(site, tmp_path)
+    left = (tmp_path / "a.zip.part").read_bytes()
+    assert len(left) >= 1_000_000 - LOST
+    assert DATA.startswith(left)
 
 
-def test_an_archive_of_ones_own(tmp_path, speckle, capsys):
-    (tmp_path / "from browser.zip").write_bytes(speckle)
-    words = [f"into={tmp_path}", f"archive={tmp_path / 'from browser.zip'}"]
-    assert main(["download", "specklenet10", *words, "keep=false"]) == 0
-    assert "specklenet10 is there, for domain=specklenet10" in capsys.readouterr().out
-    assert (tmp_path / "from browser.zip").exists()
-    assert visible(tmp_path / "downloads") == []
-    with pytest.raises(ConfigError, match="there is no such file"):
-        provide(find("specklenet40"), Options(into=tmp_path, archive=tmp_path / "no"))
-    with pytest.raises(ConfigError, match="not both"):
-        Options(archive=tmp_path, mirror="http://a")
-
-
-def test_drive_is_asked_without_a_mirror(site, tmp_path, speckle):
-    source = find("specklenet10")
-    page = f"/download?id={source.drive_id}&export=download&confirm=t"
-    site.files[page] = File(b"<html>Quota exceeded</html>", kind="text/html")
-    plain = Options(into=tmp_path, drive_server=site.address, patience=FAST)
-    with pytest.raises(DataError, match="daily quota"):
-        provide(source, plain)
-    site.files[page] = File(speckle)
-    provide(source, plain)
-
-
-def test_the_command(site, tmp_path, speckle, monkeypatch, capsys):
-    monkeypatch.setenv("QS3_DOWNLOAD_MIRROR", site.address)
-    site.files["/specklenet10.zip"] = File(speckle)
-    assert main(["download", "specklenet10", f"into={tmp_path}"]) == 0
-    assert f"{tmp_path}/published/specklenet10 is there" in capsys.readouterr().out
-    assert main(["download", "specklenet40", f"into={tmp_path}"]) == 1
-    assert "answered 404" in capsys.readouterr().err
-    assert main(["download", "scannet10", f"into={tmp_path}"]) == 1
-    assert "accept_terms=scannet" in capsys.readouterr().out
-    assert main(["download", "chair"]) == 1
-    assert "known are modelnet40_off" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ["scannet", "shapenet", "scanobjectnn"])
-def test_what_is_fetched_by_hand(name, capsys):
-    assert main(["download", name]) == 1
-    text = capsys.readouterr().out
-    assert "http" in text
-    assert "qs3 scannet" in text or "qs3 download" in text or "domain scanobjectnn" in text
-
-
-def test_list_and_help(capsys):
-    assert main(["download"]) == 0
-    text = capsys.readouterr().out
-    assert text.strip() == listing().strip()
-    for source in SOURCES:
-        assert f"\n{source.name}\n" in text
-        assert source.terms.split()[0] in text
+def test_busy_servers_are_asked_again(site, tmp_path):
+    site.files["/a.zip"] = File(DATA, statuses=[503, 429, 500])
+    assert get(site, tmp_path) == DATA
+    site.files["/a.zip"] = File(DATA, statuses=[503] * 4)
+    with pytest.raises(DownloadError, match=r"the server answered 503, 4 times in a row"):
+        get(site, tmp_path / "other")
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("file", "known", "message"),
     [
-        (["a", "b"], "one dataset at a time, got a and b"),
-        (["a", "to=b"], "unknown key 'to'"),
-        (["a", "into="], "into must be text, got ''"),
-        (["a", "keep=no"], "keep must be true or false"),
+        (None, {}, r"answered 404 Not Found\. Run .* open http.* in a browser .* archive=PATH"),
+        (File(DATA, statuses=[403]), {}, "answered 403"),
+        (File(b"<html>", kind="text/html; charset=utf-8"), {}, "a web page instead of the file"),
+        (File(DATA, headers={"Content-Encoding": "gzip"}), {}, "packs the file although"),
+        (File(DATA), {"size": 9}, "the server's file has 3000000 bytes, expected 9"),
+        (File(DATA, redirect="file:///etc/passwd"), {}, "No connection adapters"),
     ],
 )
-def test_wrong_words(words, message, capsys):
-    assert main(["download", *words]) == 1
-    assert message in capsys.readouterr().err
+def test_answers_that_another_try_will_not_change(site, tmp_path, file, known, message):
+    if file:
+        site.files["/a.zip"] = file
+    with pytest.raises(DownloadError, match=message):
+        get(site, tmp_path, **known)
+    assert len(site.requests) == 1
+    assert names(tmp_path) == []
 
 
-def test_names_and_files_are_unique():
-    for field in ("name", "file"):
-        values = [getattr(source, field) for source in SOURCES]
-        assert len(set(values)) == len(values)
-    assert not {source.name for source in SOURCES} & set(catalogue.BY_HAND)
-    assert all(bool(source.drive_id) != bool(source.pyg) for source in SOURCES)
-    assert all(source.agreement in ("", *catalogue.AGREEMENTS) for source in SOURCES)
+def test_another_hash_or_size_than_it_must_have_leaves_no_file(site, tmp_path):
+    site.files["/a.zip"] = File(DATA, chunked=True)  # says no size
+    with pytest.raises(DownloadError, match=r"hash of downloaded file.*expected 000"):
+        get(site, tmp_path, sha256="00" * 32)
+    assert names(tmp_path) == []
+    site.files["/b.zip"] = site.files["/a.zip"]
+    with pytest.raises(DownloadError, match="has 3000000 bytes, expected 7; deleted"):
+        fetch(f"{site.address}/b.zip", tmp_path / "b.zip", size=7)
+    assert names(tmp_path) == []
 
 
-def test_addresses_of_modelnet_are_those_of_pyg():
-    from torch_geometric.datasets import ModelNet
-
-    for name in ("10", "40"):
-        source = find(f"modelnet{name}_off")
-        assert source.url() == ModelNet.urls[name]
-        assert source.url().endswith("/" + source.file)
-        assert source.url("http://here/") == f"http://here/{source.file}"
-
-
-def test_the_list_is_light():
-    code = (
-        "import sys\n"
-        "from qs3.data.download.cli import listing\n"
-        "listing()\n"
-        "heavy = {'torch', 'torch_geometric', 'rich', 'h5py', 'lightning'}\n"
-        "sys.exit(', '.join(sorted(heavy & set(sys.modules))) or 0)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+def test_a_server_that_stalls_and_one_that_is_not_there(site, tmp_path, monkeypatch):
+    monkeypatch.setattr(Resuming, "timeout_s", 0.2)
+    site.files["/a.zip"] = File(DATA, stall_s=1.0)
+    with pytest.raises(DownloadError, match=r"timed out.*4 times in a row"):
+        get(site, tmp_path)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{taken.getsockname()[1]}/a.zip"
+        with pytest.raises(DownloadError, match=r"refused.*4 times in a row"):
+            fetch(url, tmp_path / "a.zip")
 
 
-def test_nothing_in_a_run_imports_the_download():
-    root = Path(__file__).parents[3]
-    files = [*root.glob("*.py"), *(root / "qs3").rglob("*.py")]
-    assert len(files) > 100
-    own = root / "qs3" / "data" / "download"
-    imports = re.compile(
-        r"^\s*(from|import) +qs3\.data(\.download| import .*download)", re.MULTILINE
-    )
-    using = {file for file in files if imports.search(file.read_text())}
-    assert using
-    assert all(file.is_relative_to(own) for file in using)
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_disk_that_fills_up(site, tmp_path):
+    site.files["/a.zip"] = File(DATA)
+    (tmp_path / "a.zip.part").symlink_to("/dev/full")
+    with pytest.raises(Qs3Error, match=r"No space left .*what came is kept"):
+        get(site, tmp_path)
 
 
-def test_progress_without_a_terminal(caplog):
-    with caplog.at_level(logging.INFO), progress("fetching a") as report:
-        report(1, 2)
-    assert caplog.messages == ["fetching a"]
+def _fetch(url, path):
+    os.environ["no_proxy"] = "*"
+    return fetch(url, path).stat().st_size
+
+
+def test_two_processes_fetch_once(site, tmp_path):
+    site.files["/a.zip"] = File(DATA, stall_s=0.5)
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        sizes = pool.starmap(_fetch, [(f"{site.address}/a.zip", tmp_path / "a.zip")] * 2)
+    assert sizes == [len(DATA)] * 2
+    assert len(site.requests) == 1
+
+
+WARNING = (  # in one line, as Google has it
+    "<!DOCTYPE html><html><head><title>Google Drive - Virus scan warning</title></head><body>"
+    '<form id="download-form" action="https://drive.usercontent.google.com/download" method="get">'
+    '<input type="hidden" name="id" value="abc"><input type="hidden" name="confirm" value="t">'
+    "</form></body></html>"
+)
+
+
+@pytest.fixture
+def drive(site, monkeypatch):
+    """Google's addresses lead to the local server; everything else is gdown's own way."""
+    send = requests.adapters.HTTPAdapter.send
+
+    def redirected(adapter, request, **more):
+        if urlsplit(request.url).hostname.endswith(".google.com"):
+            request.url = site.address + request.path_url
+        return send(adapter, request, **more)
+
+    monkeypatch.setattr(requests.adapters.HTTPAdapter, "send", redirected)
+    monkeypatch.setattr("random.uniform", lambda low, high: 0.0)  # gdown waits at random
+    page = "https://drive.google.com/file/d/abc/view"
+    return lambda path: fetch(page, path, drive="abc").read_bytes()
+
+
+def test_drive_asks_for_a_confirmation_and_breaks_off(site, drive, tmp_path):
+    named = {"Content-Disposition": 'attachment; filename="x.zip"'}
+    site.files["/uc?id=abc"] = File(WARNING.encode(), kind="text/html; charset=utf-8")
+    second = "/download?id=abc&confirm=t"
+    site.files[second] = File(DATA, headers=named, drops=[1_000_000])
+    assert drive(tmp_path / "a.zip") == DATA
+    assert names(tmp_path) == ["a.zip"]
+    first, resumed = site.ranges(second)
+    assert first is None
+    assert int(resumed[6:-1]) > 0
+    site.files[second].drops = [2_000_000, 0, 0, 0, 0, 0, 0]
+    with pytest.raises(DownloadError, match=r"Download is incomplete.*archive=PATH"):
+        drive(tmp_path / "b.zip")
+    site.files[second].drops = []
+    site.requests.clear()
+    assert drive(tmp_path / "b.zip") == DATA
+    assert int(site.ranges(second)[-1][6:-1]) > 1_000_000
+
+
+def test_drive_gives_a_page_instead_of_the_file(site, drive, tmp_path):
+    page = '<p class="uc-error-subcaption">Too many users have viewed this file</p>'
+    site.files["/uc?id=abc"] = File(page.encode(), kind="text/html")
+    with pytest.raises(
+        DownloadError, match=r"Too many users have.*open https://drive\.google\.com/f"
+    ):
+        drive(tmp_path / "a.zip")
+    assert names(tmp_path) == []

@@ -1,0 +1,168 @@
+"""Archives of strangers: unpacked into one new folder, and the wanted folder found in them.
+
+Refused as a whole: names that lead out of the folder, links, devices, encryption, and archives that
+unpack to far more than they are (a "bomb"). Nothing is taken over but names and contents: no
+owners, rights or dates.
+"""
+
+from __future__ import annotations
+
+import lzma
+import re
+import shutil
+import stat
+import tarfile
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path, PurePosixPath
+from typing import IO, NamedTuple
+
+from tqdm import tqdm
+
+from qs3.errors import DataError, Qs3Error
+
+MAX_MEMBERS = 2_000_000
+MAX_BYTES = 200 << 30
+MAX_RATIO = 100  # of what comes out to what goes in, from 64 MiB on: text packs to a tenth
+
+_DAMAGE = (  # RuntimeError: zipfile wants a password; NotImplementedError: another compression
+    EOFError,
+    RuntimeError,
+    NotImplementedError,
+    ValueError,
+    lzma.LZMAError,
+    tarfile.TarError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+class _Member(NamedTuple):
+    name: str
+    size: int
+    plain: bool
+    open: Callable[[], IO[bytes] | None]
+
+
+def unpack(archive: Path, into: Path) -> list[str]:
+    """Unpack into the new folder `into`.
+
+    Mac OS's companions (`__MACOSX`, `._name`) are left out.
+
+    Args:
+        archive: .zip, .tar, .tar.gz, .tar.bz2 or .tar.xz, whatever its name.
+        into: must not exist; after an error it holds a part, which the caller deletes.
+
+    Returns:
+        The files, relative to `into`, with slashes.
+
+    Raises:
+        DataError: damaged, or not to be trusted; names the member.
+        Qs3Error: the disk is full or not writable.
+    """
+    most = min(MAX_BYTES, max(64 << 20, MAX_RATIO * archive.stat().st_size))
+    files, total = [], 0
+    members = _zip_members if zipfile.is_zipfile(archive) else _tar_members
+    try:
+        into.mkdir(parents=True)
+        for count, member in enumerate(tqdm(members(archive), into.name, disable=None)):
+            where = f"{archive}, member {member.name!r}"
+            path = _safe_path(member.name, where)
+            if not member.plain:
+                raise DataError(f"{where}: a link, a device or a sparse file; refused")
+            total += member.size
+            if total > most or count >= MAX_MEMBERS:
+                raise DataError(
+                    f"{where}: the archive unpacks to more than {most / 1e9:.2f} GB or "
+                    f"{MAX_MEMBERS} files; refused"
+                )
+            if "__MACOSX" in path.parts or path.name.startswith("._"):
+                continue
+            source = member.open()
+            assert source is not None  # a regular file
+            (into / path).parent.mkdir(parents=True, exist_ok=True)
+            with source, open(into / path, "xb") as file:
+                shutil.copyfileobj(source, file, 1 << 20)
+            files.append(str(path))
+    except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+        raise DataError(f"{archive}: two members have the name {error.filename}") from error
+    except (*_DAMAGE, OSError) as error:
+        if getattr(error, "errno", None):  # the packers' own errors, also OSError, have none
+            raise Qs3Error(f"cannot unpack {archive}: {error}; free some space") from error
+        why = str(error).partition("\n")[0].rstrip(":")
+        raise DataError(
+            f"{archive} is damaged, or is no .zip and no .tar ({type(error).__name__}: {why}). "
+            "Delete it and fetch it again; files in another format you can unpack yourself, pack "
+            "as .zip, and give with archive=PATH"
+        ) from error
+    return files
+
+
+def _safe_path(name: str, where: str) -> PurePosixPath:
+    """A member's path below the folder that is unpacked into.
+
+    Raises:
+        DataError: it could lead out of that folder, on this system or another.
+    """
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or re.search(r"[\x00-\x1f\x7f\\]|^[^/]*:", name):
+        raise DataError(f"{where}: the name leads out of the folder, or has odd signs; refused")
+    return path
+
+
+def _zip_members(archive: Path) -> Iterator[_Member]:
+    with zipfile.ZipFile(archive) as file:
+        for info in file.infolist():
+            plain = stat.S_IFMT(info.external_attr >> 16) in (0, stat.S_IFREG, stat.S_IFDIR)
+            if info.is_dir() and plain:
+                continue
+            # orig_filename: ZipInfo cuts names at a NUL. What is read is never more than file_size.
+            yield _Member(info.orig_filename, info.file_size, plain, lambda i=info: file.open(i))  # type: ignore[misc]
+
+
+def _tar_members(archive: Path) -> Iterator[_Member]:
+    with tarfile.open(archive) as file:
+        while (info := file.next()) is not None:
+            file.members.clear()  # type: ignore[attr-defined]  # or millions pile up
+            if info.isdir():
+                continue
+            plain = info.isreg() and not info.issparse()
+            yield _Member(info.name, info.size, plain, lambda i=info: file.extractfile(i))  # type: ignore[misc]
+        while file.fileobj.read(1 << 20):  # type: ignore[union-attr]
+            pass  # to where the checksum of what was packed is compared
+
+
+def find_folder(files: Iterable[str], holds: str, named: str = "", at_least: int = 10) -> str:
+    """The folder of an unpacked archive that an importer reads: nobody promises how it is nested.
+
+    Args:
+        files: of the archive, relative to its top, with slashes.
+        holds: a regular expression that the files' paths, relative to the folder, match.
+        named: a regular expression for the folder's own name; "" if any will do.
+        at_least: files that must match.
+
+    Returns:
+        The folder, relative to the top ("" is the top itself).
+
+    Raises:
+        DataError: there is none, or there are several.
+    """
+    name = rf"(?:.*/)?(?i:{named})/" if named else r"(?:.*/)?"
+    pattern = re.compile(rf"(?P<root>{name}){holds}")
+    roots = Counter(found["root"] for file in files if (found := pattern.fullmatch(file)))
+    large = sorted(root for root, count in roots.items() if count >= at_least)
+    if len(large) > 1:
+        raise DataError(f"several folders could be meant, {', '.join(large[:8])}: give root=FOLDER")
+    if not large:
+        raise DataError("no folder with the wanted files")
+    return large[0].rstrip("/")
+
+
+def outline(files: Iterable[str], most: int = 12) -> str:
+    """What an archive holds, for a message: folders down to the third level, with counts."""
+    counts = Counter("/".join(file.split("/")[:-1][:3]) or "." for file in files)
+    lines = [f"  {folder}: {count} files" for folder, count in sorted(counts.items())]
+    more = [f"  ... and {len(lines) - most} folders more"] if len(lines) > most else []
+    return "\n".join([*lines[:most], *more])

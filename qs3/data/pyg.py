@@ -1,0 +1,244 @@
+"""Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
+
+    from qs3.data.pyg import from_pyg, knn_graph, to_pyg
+
+    train = to_pyg("specklenet10", "train", transform=SamplePoints(1024))  # a domain of conf/domain
+    loader = DataLoader(train, batch_size=32, shuffle=True)                # PyG's own
+    from_pyg({"train": mine, "test": my_test}, "data/mine", classes=["box", "cup"])
+
+    python train.py domain@data.target=own data.target.path=data/mine data.target.classes=[box,cup]
+
+PyG is imported here and by nobody else in qs3.data: import this module when you want it. Its own
+neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges from ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch_geometric.data import Data, Dataset, InMemoryDataset
+
+from qs3.classes import class_list
+from qs3.data.domain import Domain
+from qs3.data.manifest import ManifestRow
+from qs3.data.store import PointSet, is_begun, is_finished, write_pointset
+from qs3.errors import ConfigError, DataError
+from qs3.geometry.neighbours import knn
+from qs3.geometry.sampling import farthest_point_sampling_np
+
+
+class Clouds(InMemoryDataset):
+    """Clouds as PyG has them: `Data(pos=[P, 3] float32, y=[1] int64, id=str)`, in our order.
+
+    Without labels there is no `y`. Pickles, slices, and takes a `transform` like any of PyG's.
+
+    Attributes:
+        classes: names; `y` is a position in this tuple.
+        name: of the dataset.
+    """
+
+    def __init__(self, clouds: PointSet, transform: Callable[[Data], Data] | None = None) -> None:
+        super().__init__(None, transform)
+        self.classes, self.name = clouds.classes, clouds.name
+        points = torch.from_numpy(np.array(clouds.points, dtype=np.float32))
+        items = []
+        for cloud, label, name in zip(points, clouds.labels.tolist(), clouds.ids, strict=True):
+            label_of = {"y": torch.tensor([label])} if clouds.labelled else {}
+            items.append(Data(pos=cloud, id=name, **label_of))
+        self.data, self.slices = self.collate(items)
+
+    @property
+    def num_classes(self) -> int:
+        """Also of classes that do not occur."""
+        return len(self.classes)
+
+
+def to_pyg(
+    source: PointSet | Domain | str,
+    split: str | None = None,
+    transform: Callable[[Data], Data] | None = None,
+) -> Clouds:
+    """A dataset of ours, in memory, for PyG's loaders, transforms and nets.
+
+    Args:
+        source: an open dataset, a domain, or the name of a domain in conf/domain.
+        split: "train", "validation" or "test"; None: all clouds.
+        transform: applied whenever a cloud is taken.
+
+    Raises:
+        MissingDataError, DataError, ConfigError: as `Domain.open`; or there is no such split.
+    """
+    if isinstance(source, str):
+        from qs3.data.inspection.open_dataset import compose_domain
+
+        source = compose_domain(source, {})
+    clouds = source.open() if isinstance(source, Domain) else source
+    return Clouds(clouds.split(split) if split else clouds, transform)
+
+
+def from_pyg(
+    datasets: Mapping[str, Dataset | Sequence[Data]],
+    folder: str | Path,
+    *,
+    classes: Sequence[str] | None = None,
+    points: int | None = None,
+    name: str | None = None,
+) -> PointSet:
+    """Write datasets of PyG as one of ours, which a domain can name by its `path`.
+
+    Their transforms are applied once. z should be up (`Domain.gravity`).
+
+    Args:
+        datasets: by split ("train", "validation", "test"). Each cloud has `pos` [n, 3], and all or
+            none of them a `y` of one whole number; `id` names it, if it has one.
+        folder: of the new dataset.
+        classes: names in the order of `y`; None: `classes` of the first dataset, if it has any;
+            without labels the benchmark's ten.
+        points: number of points a cloud; larger clouds are thinned to their farthest points, one
+            after another from their first one. None: all clouds must have the same.
+        name: of the new dataset; None: that of the folder.
+
+    Returns:
+        The dataset, opened. Points are kept bit by bit where they are float32 and not thinned.
+
+    Raises:
+        ConfigError: there is something in the folder, or the classes are not known.
+        DataError: a cloud does not fit; names split and position.
+    """
+    folder = Path(folder)
+    if is_finished(folder) or is_begun(folder):
+        raise ConfigError(f"{folder} holds something already; delete it or choose another folder")
+    taken = [
+        (split, number, _read(item, f"cloud {number} of {split!r}"))
+        for split, dataset in datasets.items()
+        for number, item in enumerate(_items(dataset))
+    ]
+    if not taken:
+        raise DataError("there are no clouds in these datasets")
+    names = _classes(classes, next(iter(datasets.values())), [y for *_, (_, y, _) in taken])
+    sizes = [len(pos) for *_, (pos, _, _) in taken]
+    if points is None and len(set(sizes)) > 1:
+        raise DataError(
+            f"the clouds have {min(sizes)} to {max(sizes)} points: give points=, to which larger "
+            "ones are thinned"
+        )
+    points = points or sizes[0]
+    clouds, rows = [], []
+    for split, number, (pos, y, key) in taken:
+        if len(pos) < points:
+            raise DataError(
+                f"cloud {number} of {split!r} has {len(pos)} points, fewer than points={points}; "
+                "leave it out or give a smaller number"
+            )
+        thinned = farthest_point_sampling_np(pos, points) if len(pos) > points else slice(None)
+        clouds.append(pos[thinned])
+        cls = "" if y is None else names[y]
+        key = key or f"{cls or 'cloud'}/{split}/{number:06d}"
+        rows.append(ManifestRow(id=key, cls=cls, split=split, valid_points=len(pos)))
+    return write_pointset(
+        folder,
+        name=name or folder.name,
+        classes=names,
+        arrays={"points": clouds},
+        rows=rows,
+        meta={"made_from": "a dataset of torch_geometric"},
+    )
+
+
+def _items(dataset: Any) -> Iterable[Any]:
+    """Not `iter(dataset)`: PyG's old way of iterating ends at an IndexError only."""
+    return (dataset[i] for i in range(len(dataset)))
+
+
+def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str]:
+    """Points [n, 3] float32, label and id of one cloud, checked."""
+    pos, y, key = (getattr(item, key, None) for key in ("pos", "y", "id"))
+    if getattr(item, "face", None) is not None:
+        raise DataError(f"{where} is a mesh: give the dataset transform=SamplePoints(n)")
+    if not isinstance(pos, Tensor) or pos.ndim != 2 or pos.shape[1] != 3 or len(pos) == 0:
+        raise DataError(f"{where} has no points: pos is {_shape(pos)}, expected [n, 3]")
+    label = None
+    if y is not None:
+        y = torch.as_tensor(y)
+        if y.numel() != 1 or y.is_floating_point() or y.is_complex():
+            raise DataError(f"{where}: y is {_shape(y)}, expected one whole number, the class")
+        label = int(y)
+    points = pos.detach().cpu().numpy().astype(np.float32)
+    if not np.isfinite(points).all():
+        raise DataError(f"{where} has points that are NaN or infinite")
+    return points, label, key if isinstance(key, str) else ""
+
+
+def _shape(value: Any) -> str:
+    return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else repr(value)[:40]
+
+
+def _classes(given: Sequence[str] | None, dataset: Any, labels: list[int | None]) -> list[str]:
+    known = [label for label in labels if label is not None]
+    if known and len(known) < len(labels):
+        raise DataError(f"{len(labels) - len(known)} of {len(labels)} clouds have no label y")
+    names = given if given is not None else getattr(dataset, "classes", None)
+    if names is None and known:
+        raise ConfigError(f"give classes=: {max(known) + 1} names or more, in the order of y")
+    names = [str(name) for name in (class_list(None) if names is None else names)]
+    if known and not 0 <= min(known) <= max(known) < len(names):
+        raise DataError(
+            f"labels are {min(known)} to {max(known)}, but there are {len(names)} classes"
+        )
+    return names
+
+
+def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) -> Tensor:
+    """Edges from the k nearest neighbours of each point to it, as PyG's `knn_graph` has them.
+
+    For nets of PyG's layers (EdgeConv, PointNetConv, ...). Batches of clouds of one size take one
+    search; others one a cloud.
+
+    Args:
+        x: [n, c] positions or features of all clouds of a batch, on any device.
+        batch: [n] int64, sorted: which cloud each point belongs to; None: one cloud.
+        k: neighbours of a point; a cloud of fewer has edges to all that there are.
+        loop: whether a point is a neighbour of itself.
+
+    Returns:
+        [2, edges] int64: neighbours (sources) in the first row, points (targets) in the second,
+        points in order, and the neighbours of each from the nearest on.
+
+    Raises:
+        DataError: `batch` is not sorted, or does not fit.
+    """
+    if x.ndim != 2 or k < 1 or (batch is not None and batch.shape != x.shape[:1]):
+        raise DataError(f"knn_graph wants x [n, c], batch [n] and k >= 1, got x {list(x.shape)}")
+    if batch is None:
+        sizes = [len(x)]
+    elif (batch.diff() < 0).any():
+        raise DataError("knn_graph wants the points of each cloud together: batch is not sorted")
+    else:
+        sizes = batch.unique_consecutive(return_counts=True)[1].tolist()
+    if len(set(sizes)) == 1 and len(x):
+        return _edges(x.view(len(sizes), sizes[0], -1), k, loop)
+    starts = np.cumsum([0, *sizes])
+    parts = [
+        _edges(x[start : start + size][None], k, loop) + int(start)
+        for start, size in zip(starts, sizes, strict=False)
+    ]
+    return torch.cat([x.new_empty((2, 0), dtype=torch.int64), *parts], dim=1)
+
+
+def _edges(x: Tensor, k: int, loop: bool) -> Tensor:
+    """[2, edges] of clouds of one size, [b, n, c]."""
+    b, n, _ = x.shape
+    own = torch.arange(n, device=x.device)[None, :, None]
+    index = knn(x, min(k + (not loop), n))
+    if not loop:  # of copies of a point, another one may be found first, and itself not at all
+        other = index != own
+        other[..., -1] &= ~other.all(-1)
+        index = index[other].view(b, n, -1)
+    index = index + (torch.arange(b, device=x.device) * n)[:, None, None]
+    target = torch.arange(b * n, device=x.device).view(b, n, 1).expand_as(index)
+    return torch.stack([index.flatten(), target.flatten()])
