@@ -52,6 +52,7 @@ def write_outcome(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> R
 def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMetrics:
     cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
     over, before = outcome.turned
+    names = called(cfg)
     return RunMetrics(
         experiment=cfg.experiment_name,
         hash=hashing.config_hash(cfg),
@@ -60,7 +61,9 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
         source=data.labelled_domain.domain.name,
         target=run.target.name,
         simulated=bool(run.target.simulated),
-        **called(cfg),
+        method=names["method"],
+        selftraining=names["selftraining"],
+        model=names["model"],
         selection=_selection(run, loaded, built, outcome),
         loading=Loading(
             points=cfg.data.points,

@@ -21,7 +21,7 @@ def test_every_file_loads_without_unpickling_objects(finished):  # noqa: F811
         torch.serialization.add_safe_globals(added)
 
 
-def test_the_student_s_weights_are_those_of_the_result_and_of_the_last_checkpoint(finished):
+def test_the_student_s_weights_are_those_of_the_result_and_of_the_last_checkpoint(finished):  # noqa: F811
     student = torch.load(finished / "student.pt", weights_only=True)
     result = torch.load(finished / "result.pt", weights_only=True)["weights"]
     last = torch.load(finished / "last.ckpt", weights_only=True)["state_dict"]
