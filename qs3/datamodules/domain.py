@@ -31,6 +31,7 @@ from qs3.datamodules.splits import (
     with_labels,
 )
 from qs3.datamodules.validation_split import RULES
+from qs3.errors import DataError
 
 SAMPLERS = ("shuffled", "balanced")
 
@@ -63,6 +64,7 @@ class DomainData(LightningDataModule):
 
     Raises:
         ConfigError: no such domain, rule or sampler; labels are asked for and there are none.
+        DataError: from a loader, if its clouds have not been set up or there is no such split.
         MissingDataError: from `prepare_data`, if there are no files; says how to get them.
     """
 
@@ -176,7 +178,10 @@ class DomainData(LightningDataModule):
         self, part: Labelled | Unlabelled | None, batch_size: int, shuffle: bool = False
     ) -> Loader:
         if part is None:
-            raise RuntimeError(f"{self.domain.name}: no such clouds; call setup() first")
+            raise DataError(
+                f"domain {self.domain.name}: these clouds are not loaded; call setup() for this "
+                "stage first. If that was done, its dataset has no such split"
+            )
         labels = {"labels": part.labels} if isinstance(part, Labelled) else {}
         balance = "labels" if labels and shuffle and self.sampler == "balanced" else None
         trainer = self.trainer

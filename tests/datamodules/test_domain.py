@@ -1,0 +1,423 @@
+"""One domain for anybody's LightningModule: what its loaders give, and in which order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from lightning.pytorch import LightningModule, Trainer
+from torch import nn
+
+from qs3.data.domain import Domain
+from qs3.data.store import PointSet, open_pointset
+from qs3.datamodules.adaptation import AdaptationData
+from qs3.datamodules.augment import Augment
+from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
+from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.splits import Labelled, Unlabelled
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.geometry.sampling import unit_ball
+from tests.training.search import Truth, search
+from tests.training.test_target_labels import TEST, TRAIN, truth_of, write_shuffled_target
+from tests.training.toy import CLASSES, TinyNet, write_domain
+
+# Lightning 2.6.6 asks torch 2.13 in an old way; not ours to mend.
+pytestmark = pytest.mark.filterwarnings("ignore:.*LeafSpec.* is deprecated:FutureWarning")
+
+
+class Mine(LightningModule):
+    """Somebody's own: it knows Lightning, and the two keys of a batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net, self.seen = TinyNet(3), []
+
+    def training_step(self, batch: dict[str, Any], batch_idx: int) -> torch.Tensor:
+        self.seen.append((self.current_epoch, batch))
+        loss = nn.functional.cross_entropy(self.net(batch["points"]), batch["labels"])
+        self.log("loss", loss, on_epoch=True)
+        return loss
+
+    def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        self.judge("val", batch)
+
+    def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
+        self.judge("test", batch)
+
+    def judge(self, name: str, batch: dict[str, Any]) -> None:
+        right = (self.net(batch["points"]).argmax(1) == batch["labels"]).float().mean()
+        self.log(f"{name}/acc", right)
+
+    def predict_step(self, batch: dict[str, Any], batch_idx: int) -> torch.Tensor:
+        return self.net(batch["points"]).argmax(1)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.parameters(), 0.02)
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """24 training and 8 test clouds of each of three classes, in two domains."""
+    folder = tmp_path_factory.mktemp("data")
+    write_domain(folder, "specklenet10", noise=0.05)
+    write_domain(folder, "kinectsim10", noise=0.15)
+    return folder
+
+
+@pytest.fixture
+def trainer(tmp_path: Path) -> Trainer:
+    return trainer_of(tmp_path)
+
+
+def trainer_of(folder: Path, epochs: int = 2) -> Trainer:
+    return Trainer(
+        max_epochs=epochs, accelerator="cpu", logger=False, default_root_dir=folder,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+
+
+def made(data_dir: Path, **settings: Any) -> DomainData:
+    """Ready for everything, without a trainer."""
+    settings = {"points": 32, "batch_size": 8, **settings}
+    data = DomainData(settings.pop("domain", "specklenet10"), data_dir=data_dir, **settings)
+    data.prepare_data()
+    data.setup()
+    return data
+
+
+def clouds_of(batches: Any) -> torch.Tensor:
+    return torch.cat([batch["points"] for batch in batches])
+
+
+def turn_of(a: dict[str, Any], b: dict[str, Any]) -> torch.Tensor:
+    """By which angle about z each cloud of `b` is turned against the one of `a`."""
+    x, y = (batch["points"][:, 0, :2] for batch in (a, b))
+    return torch.atan2(x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0], (x * y).sum(1))
+
+
+def labels_of(batches: Any) -> list[int]:
+    return torch.cat([batch["labels"] for batch in batches]).tolist()
+
+
+# --- with a trainer ----------------------------------------------------------------------------
+
+
+def test_five_lines_train_test_and_predict(data_dir, trainer):
+    data = SpeckleNetData(points=32, batch_size=8, data_dir=data_dir)
+    module = Mine()
+    trainer.fit(module, data)
+    assert trainer.callback_metrics["val/acc"] > 0.6
+    (tested,) = trainer.test(module, data, verbose=False)
+    predicted = torch.cat(trainer.predict(module, data))
+    right = predicted == torch.tensor(labels_of(data.test_dataloader()))
+    assert tested["test/acc"] == pytest.approx(right.float().mean().item())
+    assert len(predicted) == 24
+
+    parts = [[batch for epoch, batch in module.seen if epoch == e] for e in (0, 1)]
+    assert [len(part) for part in parts] == [8, 8]  # of 58 clouds
+    assert {tuple(batch) for part in parts for batch in part} == {("points", "labels")}
+    assert sorted(labels_of(parts[0])) == sorted(data.train.labels.tolist())
+    assert labels_of(parts[0]) != labels_of(parts[1])
+
+
+def test_epochs_are_a_function_of_seed_and_number_with_and_without_a_trainer(data_dir, tmp_path):
+    settings: dict[str, Any] = {"points": 32, "batch_size": 8, "data_dir": data_dir}
+
+    def trained(**more: Any) -> list[torch.Tensor]:
+        module = Mine()
+        trainer_of(tmp_path).fit(module, SpeckleNetData(**settings, **more))
+        return [clouds_of(b for epoch, b in module.seen if epoch == e) for e in (0, 1)]
+
+    def by_hand(**more: Any) -> list[torch.Tensor]:
+        data = SpeckleNetData(**settings, **more)
+        data.setup("fit")
+        return [clouds_of(data.train_dataloader()) for _ in range(2)]
+
+    first, second = trained()
+    assert not torch.equal(first, second)
+    for others in (trained(), by_hand()):
+        assert torch.equal(first, others[0])
+        assert torch.equal(second, others[1])
+    loader = made(data_dir).train_dataloader()  # one for all epochs is the same
+    assert len(loader) == len(loader) == 8
+    for epoch in (first, second):
+        assert torch.equal(clouds_of(loader), epoch)
+    assert not torch.equal(first, by_hand(seed=1)[0])
+
+
+def test_a_resumed_training_goes_on_with_the_epochs_of_an_uninterrupted_one(data_dir, tmp_path):
+    settings: dict[str, Any] = {"points": 32, "batch_size": 8, "data_dir": data_dir}
+    whole, begun, resumed = Mine(), Mine(), Mine()
+    trainer_of(tmp_path, 3).fit(whole, SpeckleNetData(**settings))
+    first = trainer_of(tmp_path, 1)
+    first.fit(begun, SpeckleNetData(**settings))
+    first.save_checkpoint(tmp_path / "one.ckpt")
+    trainer_of(tmp_path, 3).fit(
+        resumed, SpeckleNetData(**settings), ckpt_path=tmp_path / "one.ckpt", weights_only=True
+    )
+    assert {epoch for epoch, _ in resumed.seen} == {1, 2}
+    ours = [batch["points"] for _, batch in [*begun.seen, *resumed.seen]]
+    theirs = [batch["points"] for _, batch in whole.seen]
+    assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+
+
+def test_clouds_are_augmented_while_training_and_then_alone(data_dir, tmp_path):
+    turn = Augment(jitter_sigma=0.0)
+    settings: dict[str, Any] = {"points": 32, "batch_size": 8, "fps_starts": 1}
+    plain, turned, again, own = Mine(), Mine(), Mine(), {}
+    for module, augment in ((plain, None), (turned, turn), (again, turn)):
+        data = SpeckleNetData(**settings, augment=augment, data_dir=data_dir)
+        fitting = trainer_of(tmp_path)
+        fitting.fit(module, data)
+        data.setup("test")
+        own[module] = clouds_of(data.val_dataloader()), clouds_of(data.test_dataloader())
+    for (_, a), (_, b), (_, c) in zip(plain.seen, turned.seen, again.seen, strict=True):
+        assert torch.equal(b["points"], c["points"])
+        assert torch.equal(a["labels"], b["labels"])
+        assert torch.equal(a["points"][..., 2], b["points"][..., 2])  # gravity stays
+        moved = (a["points"] - b["points"]).abs().amax(dim=(1, 2))
+        assert (moved > 1e-3).float().mean() > 0.9
+    turns = [turn_of(a, b) for (_, a), (_, b) in zip(plain.seen, turned.seen, strict=True)]
+    assert len({round(turn, 4) for turn in torch.cat(turns).tolist()}) > 100  # of 2 times 58
+    for a, b in zip(own[plain], own[turned], strict=True):
+        assert torch.equal(a, b)
+
+    shown: list[torch.Tensor] = []
+
+    class Shown(Mine):
+        def judge(self, name: str, batch: dict[str, Any]) -> None:
+            shown.append(batch["points"])
+
+    module, data = Shown(), SpeckleNetData(**settings, augment=turn, data_dir=data_dir)
+    fitting = trainer_of(tmp_path, 1)
+    fitting.fit(module, data)  # with Lightning's two batches before the first epoch
+    for batch in shown:
+        assert any(torch.equal(batch, b["points"]) for b in data.val_dataloader())
+    shown.clear()
+    fitting.test(module, data, verbose=False)
+    assert torch.equal(torch.cat(shown), own[plain][1])
+
+
+def test_a_module_that_only_predicts_takes_a_domain_without_labels(data_dir, trainer):
+    data = DomainData("kinectsim10", points=32, labels=False, data_dir=data_dir)
+    predicted = torch.cat(trainer.predict(Mine(), data))
+    assert len(predicted) == 24
+    assert data.train is None  # it was not asked for
+
+
+# --- what the loaders give ---------------------------------------------------------------------
+
+
+def test_batches_are_the_clouds_of_the_store(data_dir):
+    data = made(data_dir, points=64, fps_starts=1)
+    store = open_pointset(data_dir / "specklenet10")
+    assert (data.classes, data.sha256) == (store.classes, store.sha256)
+    for part, split in ((data.whole, "train"), (data.test, "test")):
+        assert part.ids == store.split(split).ids
+        assert part.labels.tolist() == store.split(split).labels.tolist()
+    (batch,) = data.test_dataloader()
+    assert batch["points"].dtype == torch.float32
+    assert batch["labels"].dtype == torch.int64
+    expected = np.stack([unit_ball(cloud) for cloud in store.split("test").points])
+    np.testing.assert_array_equal(batch["points"].numpy(), expected)
+    assert torch.equal(clouds_of(data.predict_dataloader()), clouds_of(data.test_dataloader()))
+
+
+def test_training_clouds_are_divided_once(data_dir):
+    data = made(data_dir)
+    assert len(data.train.ids) + len(data.validation.ids) == len(data.whole.ids) == 72
+    assert set(data.train.ids) | set(data.validation.ids) == set(data.whole.ids)
+    assert sorted(labels_of(data.train_dataloader())) == sorted(data.train.labels.tolist())
+    assert labels_of(data.val_dataloader()) == data.validation.labels.tolist()
+    other = made(data_dir, val="stratified")
+    assert set(other.validation.ids) != set(data.validation.ids)
+
+
+def test_setup_is_harmless_when_it_is_repeated(data_dir):
+    data = made(data_dir)
+    held = (data.whole, data.train, data.validation, data.test)
+    epoch = clouds_of(made(data_dir).train_dataloader())
+    for stage in ("fit", "validate", "test", "predict", None):
+        data.setup(stage)
+    data.prepare_data()
+    assert all(a is b for a, b in zip(held, (data.whole, data.train, data.validation, data.test),
+                                      strict=True))  # fmt: skip
+    assert torch.equal(clouds_of(data.train_dataloader()), epoch)
+
+
+@pytest.mark.parametrize(
+    ("stage", "ready"), [("fit", "train val"), ("validate", "train val"), ("test", "test predict")]
+)
+def test_a_stage_loads_what_it_needs(data_dir, stage, ready):
+    data = SpeckleNetData(points=32, data_dir=data_dir)
+    for name in ("train", "test", "predict"):
+        with pytest.raises(DataError, match=r"specklenet10: .* not loaded; call setup\(\)"):
+            getattr(data, f"{name}_dataloader")()
+    data.setup(stage)
+    for name in ready.split():
+        assert len(list(getattr(data, f"{name}_dataloader")())) > 0
+    assert (data.train is None) == ("train" not in ready)
+    assert (data.test is None) == ("test" not in ready)
+
+
+def test_a_domain_without_a_test_split_says_so(tmp_path, trainer):
+    write_domain(tmp_path, "specklenet10", noise=0.05, test=0)
+    data = SpeckleNetData(points=32, data_dir=tmp_path)
+    trainer.fit(Mine(), data)
+    with pytest.raises(DataError, match=r"domain specklenet10: .* its dataset has no such split"):
+        trainer.test(Mine(), data)
+
+
+def test_without_labels_there_are_none_anywhere(tmp_path):
+    """Classes in a random order, so that a search can tell; it finds them where they are asked."""
+    write_shuffled_target(tmp_path, class_in_id=False)
+    truth = truth_of(tmp_path)
+    hidden = made(tmp_path, domain="kinectsim10", labels=False)
+    assert isinstance(hidden.train, Unlabelled)
+    assert hidden.train is hidden.whole
+    assert isinstance(hidden.test, Unlabelled)
+    assert hidden.validation is None
+    assert hidden.val_dataloader() == []
+    batches = [*hidden.train_dataloader(), *hidden.test_dataloader()]
+    assert sum(len(batch["points"]) for batch in batches) == TRAIN + TEST
+    assert not any("labels" in batch for batch in batches)
+    assert search({"data": hidden, "batches": batches}, truth) == []
+    shown = made(tmp_path, domain="kinectsim10")
+    assert isinstance(shown.train, Labelled)
+    found = {path.rpartition(": ")[2] for path in search({"data": shown}, truth)}
+    assert {"train labels", "test labels"} <= found
+    dataset = open_pointset(tmp_path / "kinectsim10")
+    assert isinstance(dataset, PointSet)
+    assert search({"dataset": dataset}, Truth({}, kinds=(PointSet,))) == ["dataset: PointSet"]
+
+
+def test_balanced_draws_each_class_alike(tmp_path):
+    write_domain(tmp_path, "specklenet10", noise=0.05, train=40)
+    data = made(tmp_path, sampler="balanced", clouds_a_split=None)
+    few = data.train.at(np.flatnonzero((data.train.labels.numpy() > 0) | (np.arange(96) < 4)))
+    data.train = few  # four clouds of the first class, all of the others
+    counts = np.bincount(few.labels)
+    assert counts[0] == 4
+    drawn = [labels_of(data.train_dataloader()) for _ in range(20)]
+    assert {len(epoch) for epoch in drawn} == {len(few.ids)}
+    shares = np.bincount(np.concatenate(drawn)) / (20 * len(few.ids))
+    np.testing.assert_allclose(shares, 1 / 3, atol=0.05)
+    assert labels_of(data.val_dataloader()) == data.validation.labels.tolist()  # these are not
+    plain = made(tmp_path)
+    assert np.bincount(labels_of(plain.train_dataloader())).tolist() == [32, 32, 32]
+
+
+def test_a_few_clouds_of_each_split_or_class(data_dir, tmp_path):
+    few = made(data_dir, clouds_a_split=9, cache_dir=tmp_path)
+    assert (len(few.whole.ids), len(few.test.ids)) == (9, 9)
+    assert np.bincount(few.whole.labels).tolist() == [3, 3, 3]
+    assert few.sha256 == made(data_dir, cache_dir=tmp_path / "c").sha256
+    assert not list(tmp_path.glob("*.npy"))  # what is cached are whole splits
+    assert list((tmp_path / "c").glob("*.npy"))
+    first = made(data_dir, clouds_a_class=5)
+    assert first.whole.ids == tuple(f"{cls}/train/{i:03d}" for cls in CLASSES for i in range(5))
+    assert len(first.test.ids) == 24
+
+
+def test_cached_points_are_the_same_points(data_dir, tmp_path):
+    plain = clouds_of(made(data_dir).train_dataloader())
+    for _ in range(2):
+        cached = made(data_dir, cache_dir=tmp_path)
+        assert torch.equal(clouds_of(cached.train_dataloader()), plain)
+
+
+# --- names, configs, errors --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        (SpeckleNetData, "specklenet10"),
+        (ModelNetData, "modelnet10"),
+        (DepthScanNetData, "depthscannet10"),
+    ],
+)
+def test_each_has_its_domain_and_says_what_is_missing(kind, name, tmp_path):
+    data = kind(data_dir=tmp_path)
+    assert data.domain.name == name
+    assert data.domain.folder == tmp_path / name
+    with pytest.raises(MissingDataError, match=rf"{name}(.|\n)*meta\.yaml"):
+        data.prepare_data()
+
+
+def test_hydra_builds_one_by_its_name(data_dir):
+    target = "qs3.datamodules.domain.SpeckleNetData"
+    augment = {"_target_": "qs3.datamodules.augment.Augment", "jitter_sigma": 0.02}
+    words = {"points": 32, "batch_size": 8, "data_dir": str(data_dir), "augment": augment}
+    data = instantiate({"_target_": target, **words})
+    assert isinstance(data, SpeckleNetData)
+    assert data.augment == Augment(jitter_sigma=0.02)
+    data.setup("fit")
+    assert torch.equal(
+        clouds_of(data.train_dataloader()), clouds_of(made(data_dir).train_dataloader())
+    )
+
+
+def test_a_domain_of_ones_own(data_dir):
+    own = Domain("mine", "M", "Mine", data_dir / "kinectsim10", simulated=True)
+    assert len(made(data_dir, domain=own).whole.ids) == 72
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"domain": "nowhere10"}, "domain=nowhere10 is unknown; there are .*specklenet10"),
+        ({"val": "other"}, "val must be one of .*lineage.*'other'"),
+        ({"sampler": "other"}, "sampler must be one of .*balanced.*'other'"),
+        ({"points": 65}, "points is 65"),
+    ],
+)
+def test_wrong_settings_are_errors_for_people(data_dir, settings, message):
+    with pytest.raises(ConfigError, match=message):
+        made(data_dir, **settings)
+
+
+# --- two of them -------------------------------------------------------------------------------
+
+
+def adaptation(data_dir: Path, **settings: Any) -> AdaptationData:
+    domains = (Domain(name, "X", name, data_dir / name) for name in ("specklenet10", "kinectsim10"))
+    data = AdaptationData(
+        *domains, phases=Phases(2), scheme=Scheme(), augment=Augment(), batch_size=8, seed=0,
+        points=32, **settings,
+    )  # fmt: skip
+    data.prepare_data()
+    data.setup("fit")
+    return data
+
+
+def test_the_targets_training_clouds_are_what_the_adaptation_predicts(data_dir):
+    data = adaptation(data_dir)
+    target = made(data_dir, domain="kinectsim10", labels=False)
+    assert data.target.ids == target.train.ids
+    batches = list(data.predict_dataloader())
+    assert {tuple(batch["target"]) for batch in batches} == {("points",)}
+    found = torch.cat([batch["target"]["points"] for batch in batches])
+    assert torch.equal(found, data.target.points)
+    assert torch.equal(found, target.train.points)
+
+
+def test_the_adaptation_has_the_source_s_labels_and_no_test_clouds(data_dir):
+    data = adaptation(data_dir)
+    source = made(data_dir)
+    for ours, theirs in (
+        (data.labelled, source.train),
+        (data.validation, source.validation),
+        (data.all_labelled, source.whole),
+    ):
+        assert ours.ids == theirs.ids
+        assert torch.equal(ours.labels, theirs.labels)
+    assert data.labelled_domain.test is data.target_domain.test is None
+    assert isinstance(data.target_domain.whole, Unlabelled)
+    bound = adaptation(data_dir, owner="target_train")
+    assert bound.labelled_domain.domain.name == "kinectsim10"
+    assert isinstance(bound.target_domain.train, Unlabelled)
