@@ -170,7 +170,7 @@ def test_random_numbers_of_the_caller_are_left_alone(run):
 def test_missing_runs_are_told_apart(run, tmp_path):
     with pytest.raises(MissingDataError, match="is not there"):
         qs3.load(tmp_path / "nothing")
-    with pytest.raises(MissingDataError, match=r"it holds 1 of them: .*seed0"):
+    with pytest.raises(MissingDataError, match=r"a finished run, e\.g\. .*seed0"):
         qs3.load(run.parent)
     with pytest.raises(MissingDataError, match=r"has no result\.pt"):
         qs3.load(tmp_path)
