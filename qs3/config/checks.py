@@ -66,8 +66,9 @@ def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
 
 
 def _inside(value: Any, allowed: str) -> bool:
-    if type(value) is bool or not np.isscalar(value) or isinstance(value, str):
+    if isinstance(value, bool | str) or not np.isscalar(value):
         return False
+    value = float(value)  # type: ignore[arg-type]
     if allowed.startswith("odd "):
         return bool(value % 2 == 1) and _inside(value, allowed.removeprefix("odd "))
     if allowed[0] in "[(":

@@ -33,7 +33,7 @@ from qs3.generation.plan import (
     stored_config,
 )
 from qs3.generation.provenance import PROVENANCE
-from qs3.generation.shards import Parts, check_same_recipe
+from qs3.generation.shards import Parts
 from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import write_text
@@ -86,7 +86,7 @@ def generate(cfg: DictConfig) -> PointSet:
             delete_dataset(folder)
         recipe = describe(cfg, items, renderer_provenance(job))
         if is_finished(folder):
-            check_same_recipe(folder, recipe)
+            parts.check(recipe)
             parts.clear()  # a kill after the last write leaves them
             log.info("%s is already there: %s", domain.label, folder)
             pointset = open_pointset(folder, domain.variant)

@@ -109,7 +109,7 @@ def extract(
 
 def _results(job: Job, found: Found, workers: int) -> list[SceneResult]:
     """One a scene, by name: from the parts, which are made where they are not there yet."""
-    todo = [files for files in found.scenes if not job.parts.has(files)]
+    todo = [files for files in found.scenes if not job.parts.done(files)]
     total = len(found.scenes)
     failed = {}
     with progress_bar("scenes", total=total, done=total - len(todo)) as advance:
