@@ -288,12 +288,12 @@ def _hdf5(path: Path) -> CloudFile:
 
     try:
         with h5py.File(path, "r") as file:
-            data = _own_dataset(file, ("data", "points"), path)
+            data = own_dataset(file, ("data", "points"), path)
             if data is None:
                 raise DataError(f"{path} has no dataset 'data' or 'points'")
             if data.size * data.dtype.itemsize > MAX_BYTES:
                 raise DataError(f"{path}: data {data.shape} is larger than {MAX_BYTES} bytes")
-            label = _own_dataset(file, ("label", "labels"), path)
+            label = own_dataset(file, ("label", "labels"), path)
             array = np.asarray(data[...])
             labels = None if label is None else np.asarray(label[...]).reshape(-1)
     except (OSError, RuntimeError, ValueError, KeyError, MemoryError) as error:
@@ -301,7 +301,7 @@ def _hdf5(path: Path) -> CloudFile:
     return _of_array(path, array, labels)
 
 
-def _own_dataset(file: Any, names: tuple[str, ...], path: Path) -> Any:
+def own_dataset(file: Any, names: tuple[str, ...], path: Path) -> Any:
     """The first of the named datasets whose numbers are in this very file; None if there is none.
 
     Raises:

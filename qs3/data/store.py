@@ -37,6 +37,7 @@ from qs3.data.manifest import (
     to_csv,
 )
 from qs3.errors import DataError, MissingDataError
+from qs3.utils import text_table
 from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
 from qs3.utils.version import VERSION
 
@@ -44,6 +45,7 @@ __all__ = [
     "SPLITS",
     "ManifestRow",
     "PointSet",
+    "counts_text",
     "is_begun",
     "is_finished",
     "open_pointset",
@@ -131,6 +133,23 @@ class PointSet:
             for split in SPLITS
             if np.any(self.splits == split)
         }
+
+
+def counts_text(data: PointSet, without: str, missing: Mapping[str, int]) -> list[str]:
+    """Lines of a table for the log: clouds by class and split, and objects without one.
+
+    Args:
+        data: the dataset.
+        without: heading of the last column: "failed".
+        missing: by class, how many objects gave no cloud.
+    """
+    counts = data.counts()
+    rows = [["clouds", *counts, without]]
+    numbers = {name: [*(of[name] for of in counts.values()), missing.get(name, 0)]
+               for name in data.classes}  # fmt: skip
+    rows += [[name, *map(str, of)] for name, of in numbers.items() if any(of)]
+    total = (str(sum(column)) for column in zip(*numbers.values(), strict=True))
+    return text_table.aligned([*rows, ["all", *total]], numbers=True, rule=False)
 
 
 def is_finished(folder: str | Path) -> bool:

@@ -17,7 +17,14 @@ from omegaconf import DictConfig, OmegaConf
 from qs3.config.hydra import build
 from qs3.data.dataset_folder import CLOUDS, CONFIG, INFRARED, delete_dataset
 from qs3.data.domain import Domain
-from qs3.data.store import ManifestRow, PointSet, is_finished, open_pointset, write_pointset
+from qs3.data.store import (
+    ManifestRow,
+    PointSet,
+    counts_text,
+    is_finished,
+    open_pointset,
+    write_pointset,
+)
 from qs3.errors import DataError
 from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
 from qs3.generation.disk import check_folder, disk_errors_told
@@ -33,7 +40,7 @@ from qs3.generation.plan import (
     stored_config,
 )
 from qs3.generation.provenance import PROVENANCE
-from qs3.generation.shards import Parts, check_same_recipe
+from qs3.generation.shards import Parts
 from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import write_text
@@ -86,7 +93,7 @@ def generate(cfg: DictConfig) -> PointSet:
             delete_dataset(folder)
         recipe = describe(cfg, items, renderer_provenance(job))
         if is_finished(folder):
-            check_same_recipe(folder, recipe)
+            parts.check(recipe)
             parts.clear()  # a kill after the last write leaves them
             log.info("%s is already there: %s", domain.label, folder)
             pointset = open_pointset(folder, domain.variant)
@@ -238,14 +245,8 @@ def _report(
     """Counts a class, failures with their reasons, where things are, and the content hash."""
     failures = [o for o in outcomes if o.cloud is None]
     failed = Counter(item.cls for item, o in zip(items, outcomes, strict=True) if o.cloud is None)
-    counts = pointset.counts()
-    log.info("%-10s %s %7s", "clouds", " ".join(f"{split:>7}" for split in counts), "failed")
-    for name in pointset.classes:
-        row = [counts[split][name] for split in counts]
-        if any(row) or failed[name]:
-            log.info("%-10s %s %7d", name, " ".join(f"{n:>7d}" for n in row), failed[name])
-    total = [sum(counts[split].values()) for split in counts]
-    log.info("%-10s %s %7d", "all", " ".join(f"{n:>7d}" for n in total), len(failures))
+    for line in counts_text(pointset, "failed", failed):
+        log.info("%s", line)
     for outcome in failures[:_FAILURES_SHOWN]:
         log.warning("failed: %s: %s", outcome.item_id, outcome.reason)
     if len(failures) > _FAILURES_SHOWN:

@@ -13,10 +13,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from qs3.clouds.files import own_dataset
 from qs3.data.importers.base import Importer, Item, inside, y_up_to_z_up
 from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
@@ -85,7 +85,9 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
 
     try:
         with h5py.File(path, "r") as file:
-            data, label = _dataset(file, "data", path), _dataset(file, "label", path)
+            data, label = (own_dataset(file, (key,), path) for key in ("data", "label"))
+            if data is None or label is None:
+                raise DataError(f"{path}: there are no datasets 'data' and 'label'")
             if data.ndim != 3 or data.shape[2] not in (3, 6) or data.dtype.kind != "f":
                 raise DataError(
                     f"{path}: data is {data.dtype} {data.shape}, expected floats [n, P, 3 or 6]"
@@ -108,16 +110,3 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _same(cloud: np.ndarray) -> np.ndarray:
     return cloud
-
-
-def _dataset(file: Any, key: str, path: Path) -> Any:
-    """A dataset whose numbers are in this very file (HDF5 can point into others)."""
-    import h5py
-
-    link = file.get(key, getlink=True)
-    found = file[key] if isinstance(link, h5py.HardLink) else None
-    if not isinstance(found, h5py.Dataset):
-        raise DataError(f"{path}: there is no dataset {key!r} in the file itself")
-    if found.external or found.is_virtual:
-        raise DataError(f"{path}: {key!r} takes its numbers from other files; refused")
-    return found

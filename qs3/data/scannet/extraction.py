@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -28,7 +29,14 @@ from qs3.data.scannet.pool import Job, all_scenes
 from qs3.data.scannet.scene import SceneResult
 from qs3.data.scannet.scene_parts import SceneParts
 from qs3.data.scannet.settings import Extraction
-from qs3.data.store import PointSet, is_finished, open_pointset, read_meta, write_pointset
+from qs3.data.store import (
+    PointSet,
+    counts_text,
+    is_finished,
+    open_pointset,
+    read_meta,
+    write_pointset,
+)
 from qs3.errors import DataError
 from qs3.utils.files import make_folder, sha256_file, write_text
 from qs3.utils.locks import locked
@@ -109,7 +117,7 @@ def extract(
 
 def _results(job: Job, found: Found, workers: int) -> list[SceneResult]:
     """One a scene, by name: from the parts, which are made where they are not there yet."""
-    todo = [files for files in found.scenes if not job.parts.has(files)]
+    todo = [files for files in found.scenes if not job.parts.done(files)]
     total = len(found.scenes)
     failed = {}
     with progress_bar("scenes", total=total, done=total - len(todo)) as advance:
@@ -225,14 +233,9 @@ def _say_found(found: Found) -> None:
 
 def _report(pointset: PointSet, results: Sequence[SceneResult], found: Found, out: Path) -> None:
     """Counts a class, what was left out, and the content hash."""
-    counts = pointset.counts()
-    missed = [o.labelled.cls for result in results for o in result.objects if o.cloud is None]
-    log.info("%-10s %s %7s", "clouds", " ".join(f"{split:>7}" for split in counts), "skipped")
-    for name in pointset.classes:
-        row = [counts[split][name] for split in counts]
-        log.info("%-10s %s %7d", name, " ".join(f"{n:>7d}" for n in row), missed.count(name))
-    total = [sum(counts[split].values()) for split in counts]
-    log.info("%-10s %s %7d", "all", " ".join(f"{n:>7d}" for n in total), len(missed))
+    missed = (o.labelled.cls for result in results for o in result.objects if o.cloud is None)
+    for line in counts_text(pointset, "skipped", Counter(missed)):
+        log.info("%s", line)
     lost = sum(result.frames_lost for result in results)
     log.info("%d frames were left out for their pose", lost)
     failed = [result for result in results if result.reason]

@@ -15,7 +15,6 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from types import TracebackType
 
 import cv2
 import numpy as np
@@ -73,12 +72,7 @@ class MaskArchive:
     def __enter__(self) -> MaskArchive:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._zip.close()
 
     def read(self, frame: int) -> np.ndarray:

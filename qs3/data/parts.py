@@ -1,0 +1,153 @@
+"""The unfinished dataset: one file an object or scene, so that an interruption loses at most one.
+
+recipe.json    what the parts were made with; another recipe is refused
+parts/         <name>.npz: the arrays, and a line of JSON with the rest
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qs3.data.dataset_folder import PARTS, RECIPE
+from qs3.errors import ConfigError, DataError
+from qs3.utils.files import make_folder, remove_leftovers, write_bytes, write_json
+
+_MOST_LINES = 12
+
+
+class PartFiles:
+    """The parts in one dataset's folder.
+
+    Args:
+        folder: of the dataset.
+        elsewhere: the setting that names another folder, for messages: "out".
+    """
+
+    def __init__(self, folder: Path, elsewhere: str) -> None:
+        self.folder = folder
+        self._elsewhere = elsewhere
+        self._parts = folder / PARTS
+
+    @property
+    def are_there(self) -> bool:
+        """Whether there is a folder of parts."""
+        return self._parts.is_dir()
+
+    @property
+    def have_recipe(self) -> bool:
+        """Whether it is known what the parts, or the dataset, were made with."""
+        return (self.folder / RECIPE).is_file()
+
+    def check(self, recipe: Mapping[str, Any]) -> None:
+        """Check that the folder was begun with the same recipe.
+
+        Raises:
+            ConfigError: lists what differs, and says what to do.
+            DataError: there is no recipe that can be read.
+        """
+        path = self.folder / RECIPE
+        try:
+            there = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise DataError(
+                f"{path} cannot be read ({error}): use force=true to start over"
+            ) from error
+        found = _differences(there, json.loads(json.dumps(recipe)))
+        if found:
+            lines = [f"  {key}: {old} there, {new} now" for key, old, new in found]
+            raise ConfigError(
+                f"{self.folder} was made with other settings or versions, and mixing them is "
+                "refused:\n" + "\n".join(lines[:_MOST_LINES]) + "\nUse the same settings, another "
+                f"{self._elsewhere}, or force=true to start over."
+            )
+
+    def begin(self, recipe: Mapping[str, Any]) -> None:
+        """Start, or continue what was made with the same recipe.
+
+        Raises:
+            ConfigError, DataError: as `check`.
+        """
+        if self.have_recipe:
+            self.check(recipe)
+        else:
+            self.clear()  # parts without a recipe: nobody knows what they were made with
+            write_json(self.folder / RECIPE, recipe)
+        make_folder(self._parts)
+        self.tidy()
+
+    def tidy(self) -> None:
+        """Remove what killed processes left half written; nobody may be writing."""
+        remove_leftovers(self.folder)
+        remove_leftovers(self._parts)
+
+    def write(self, name: str, note: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Write one part, atomically; `note` is what JSON can hold."""
+        text = np.frombuffer(json.dumps(note).encode(), dtype=np.uint8)
+        # In memory first: a zip file that a full disk breaks off complains once more at its end.
+        file = io.BytesIO()
+        np.savez(file, note=text, **arrays)
+        write_bytes(self._path(name), file.getvalue())
+
+    def read(self, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """The note and the arrays of one part.
+
+        Raises:
+            DataError: it is damaged, or not there.
+        """
+        path = self._path(name)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                note = json.loads(file["note"].tobytes())
+                return note, {key: file[key] for key in file.files if key != "note"}
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
+
+    def has(self, name: str) -> bool:
+        """Whether a part is written."""
+        return self._path(name).is_file()
+
+    def count(self) -> int:
+        """How many parts are written."""
+        return len(list(self._parts.glob("*.npz")))
+
+    def clear(self) -> None:
+        """Remove the parts; the recipe stays."""
+        if self._parts.is_dir():
+            shutil.rmtree(self._parts)
+
+    def _path(self, name: str) -> Path:
+        return self._parts / f"{name}.npz"
+
+
+def _differences(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        out = []
+        for name in [*old, *(n for n in new if n not in old)]:
+            inner = f"{key}.{name}" if key else name
+            out += _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
+        return out
+    if old == new:
+        return []
+    if isinstance(old, list) and isinstance(new, list) and key == "objects":
+        gone, come = sorted(set(old) - set(new)), sorted(set(new) - set(old))
+        return [
+            (
+                key,
+                f"{len(old)}{f', among them {gone[0]!r}' if gone else ''}",
+                f"{len(new)}{f', among them {come[0]!r}' if come else ''}",
+            )
+        ]
+    return [(key, _short(old), _short(new))]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else text[:77] + "..."
