@@ -16,17 +16,22 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from qs3.errors import DataError
-from qs3.geometry.neighbours import takes_numpy
+from qs3.geometry.neighbours import exporting, takes_numpy
 
 _BLOCK = 1 << 26  # distances held at once on a device: 256 MB in float32
 _CPU_BLOCK = 1 << 18  # 1 MB in float32, to stay in the cache
 
 
 def ball_query(
-    points: Float[Tensor, "b n 3"], centres: Float[Tensor, "b m 3"], radius: float, count: int
+    points: Float[Tensor, "b n 3"],
+    centres: Float[Tensor, "b m 3"],
+    radius: float,
+    count: int,
+    *,
+    punctured: bool = False,
 ) -> Int[Tensor, "b m k"]:
     """Indices of the first `count` points of each ball; see `ball_queries`."""
-    return ball_queries(points, centres, [radius], [count])[0]
+    return ball_queries(points, centres, [radius], [count], punctured=punctured)[0]
 
 
 def ball_queries(
@@ -34,6 +39,8 @@ def ball_queries(
     centres: Float[Tensor, "b m 3"],
     radii: Sequence[float],
     counts: Sequence[int],
+    *,
+    punctured: bool = False,
 ) -> list[Int[Tensor, "b m k"]]:
     """Balls of several radii about the same centres; distances are computed once.
 
@@ -43,10 +50,11 @@ def ball_queries(
         centres: of the balls.
         radii: one a query, in the same unit, > 0.
         counts: indices in a ball of each query, >= 1.
+        punctured: points at distance 0 of a centre are not in its balls.
 
     Returns:
-        For each query [B, M, count] int64. A ball without points (impossible if the centres are
-        points) holds the index of the point nearest to its centre.
+        For each query [B, M, count] int64. A ball without points holds the index of the point
+        nearest to its centre.
 
     Raises:
         DataError: radii and counts do not fit together, or are out of range.
@@ -56,6 +64,10 @@ def ball_queries(
     with torch.no_grad(), torch.autocast(points.device.type, enabled=False):
         if points.dtype in (torch.float16, torch.bfloat16):
             points, centres = points.float(), centres.float()
+        if exporting():  # blocks would bind the graph to a number of clouds
+            squares = _squared_distances(points, centres)
+            queries = zip(radii, counts, strict=True)
+            return [_first(_inside(squares, r, punctured), squares, k) for r, k in queries]
         b, n, _ = points.shape
         m = centres.shape[1]
         out = [torch.empty(b, m, k, dtype=torch.int64, device=points.device) for k in counts]
@@ -69,9 +81,14 @@ def ball_queries(
                 )
                 for index, radius, k in zip(out, radii, counts, strict=True):
                     first = _first_on_cpu if on_cpu else _first
-                    inside = squares < radius * radius
+                    inside = _inside(squares, radius, punctured)
                     index[i : i + clouds, j : j + rows] = first(inside, squares, k)
         return out
+
+
+def _inside(squares: Tensor, radius: float, punctured: bool) -> Tensor:
+    inside = squares < radius * radius
+    return inside & (squares > 0) if punctured else inside
 
 
 def _squared_distances(points: Tensor, centres: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 torch hands float32 products on the CPU to MKL, which does not use AVX-512 on processors of other
 makers; oneDNN does, and is there about twice as fast. The operator that reaches it is one that
 torch's compiler uses; where it is missing, or for other types and devices, these are the plain
-products. `times` and `outer` are for the inside of autograd functions, `linear` for outside.
+products. `matmul_t` and `t_matmul` are for the inside of autograd functions, `linear` for outside.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def _applies(x: Tensor) -> bool:
     return x.dtype == torch.float32 and x.device.type == "cpu" and x.numel() > 0
 
 
-def times(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+def matmul_t(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """The product x W' + bias: [..., k], [c, k] and [c] to [..., c]."""
     if _applies(x):
         return _LINEAR(x, weight, bias, "none", [], "")
@@ -45,26 +45,26 @@ def times(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     return product if bias is None else product.add_(bias)
 
 
-def outer(x: Tensor, y: Tensor) -> Tensor:
+def t_matmul(x: Tensor, y: Tensor) -> Tensor:
     """X'Y, the sum of the outer products of rows: [r, c] and [r, k] to [c, k]."""
-    return times(x.T, y.T)
+    return matmul_t(x.T, y.T)
 
 
 class _Linear(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
         ctx.save_for_backward(x, weight)
-        return times(x, weight)
+        return matmul_t(x, weight)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
         x, weight = ctx.saved_tensors
         grad = grad.contiguous()
-        dx = times(grad, weight.T.contiguous()) if ctx.needs_input_grad[0] else None
+        dx = matmul_t(grad, weight.T.contiguous()) if ctx.needs_input_grad[0] else None
         dweight = None
         if ctx.needs_input_grad[1]:
-            dweight = outer(grad.flatten(0, -2), x.flatten(0, -2))
+            dweight = t_matmul(grad.flatten(0, -2), x.flatten(0, -2))
         return dx, dweight
 
 

@@ -5,13 +5,15 @@ Written here because torch-cluster is deprecated and pyg-lib is not on PyPI.
 
 from __future__ import annotations
 
+from typing import no_type_check
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from qs3.geometry.matmul import times
+from qs3.geometry.matmul import matmul_t
 from qs3.geometry.sampling import farthest_point_sampling_np
 
 _BLOCK = 1 << 26  # distances held at once: 256 MB in float32
@@ -49,6 +51,8 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
     b, n, _ = x.shape
     squares = x.square().sum(2)[:, None]  # [b, 1, n]
     scaled = -2 * x
+    if exporting():  # blocks would bind the graph to a number of clouds
+        return _smallest(x @ scaled.transpose(1, 2) + squares, k)
     on_cpu = takes_numpy(x)
     block = _CPU_BLOCK if on_cpu else _BLOCK
     smallest = _smallest_on_cpu if on_cpu else _smallest
@@ -60,7 +64,7 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
         for j in range(0, n, rows):
             part = out[c, j : j + rows]
             if clouds == 1:
-                distance = times(x[i, j : j + rows], scaled[i])[None].add_(squares[c])
+                distance = matmul_t(x[i, j : j + rows], scaled[i])[None].add_(squares[c])
             else:
                 distance = (x[c, j : j + rows] @ scaled[c].transpose(1, 2)).add_(squares[c])
             part.copy_(smallest(distance.view(-1, n), k).view(part.shape))
@@ -68,7 +72,7 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
 
 
 def _smallest(values: Tensor, k: int) -> Tensor:
-    """Columns of the k smallest values of each row, smallest first: [r, n] -> [r, k]."""
+    """Columns of the k smallest values of each row, smallest first: [..., n] -> [..., k]."""
     return values.topk(k, largest=False)[1]
 
 
@@ -103,6 +107,10 @@ def _smallest_on_cpu(values: Tensor, k: int) -> Tensor:
 def gather(x: Tensor, index: Int[Tensor, "b ..."]) -> Tensor:
     """Rows of each cloud: x [b, n, c], index [b, *rest] -> [b, *rest, c]."""
     flat = index.flatten(1)  # [b, r]
+    if exporting():  # runtimes take whole rows several times faster than value after value
+        first = x.shape[1] * torch.arange(x.shape[0], device=x.device)
+        rows = x.flatten(0, 1).index_select(0, (flat + first[:, None]).flatten())
+        return rows.view(*index.shape, x.shape[2])
     rows = torch.gather(x, 1, flat[:, :, None].expand(-1, -1, x.shape[2]))
     return rows.view(*index.shape, x.shape[2])
 
@@ -132,21 +140,36 @@ def _farthest_points(x: Tensor, n: int, start: Int[Tensor, " b"] | int = 0) -> T
         return _farthest_points(x, total, start)[:, index]
     x = x.detach().float()
     x = x - x.mean(dim=1, keepdim=True)
-    out = torch.empty(b, n, dtype=torch.int64, device=x.device)
     last = torch.as_tensor(start, device=x.device, dtype=torch.int64).expand(b)[:, None]  # [b, 1]
-    nearest = x.new_full((b, total), torch.inf)
+    state = torch.full_like(x[:, :, 0], torch.inf), last.clone()  # squared distances, [b, total]
+
+    @no_type_check  # torch's compiler goes through it, and cannot through checks of shapes
+    def step(state, _=None):
+        nearest, last = state
+        taken = x.gather(1, last[:, :, None].expand(-1, -1, 3))
+        distance = (x - taken).square().sum(-1)
+        nearest = torch.minimum(nearest, distance).scatter(1, last, -1.0)  # never again
+        return (nearest, nearest.argmax(1, keepdim=True)), last.clone()
+
+    if exporting():
+        from torch._higher_order_ops.scan import scan  # a loop that a graph can hold
+
+        _, taken = scan(step, state, torch.arange(n, device=x.device))
+        return taken[:, :, 0].T  # [b, n]
+    out = torch.empty(b, n, dtype=torch.int64, device=x.device)
     for i in range(n):
+        state, last = step(state)
         out[:, i] = last[:, 0]
-        distance = (x - gather(x, last)).square().sum(-1)  # [b, total]
-        nearest = torch.minimum(nearest, distance).scatter_(1, last, -1.0)  # never again
-        last = nearest.argmax(1, keepdim=True)
     return out
 
 
 def takes_numpy(x: Tensor) -> bool:
-    """On the CPU, and not while `torch.export` writes down what is done to `x`.
+    """On the CPU, unless an export writes down what is done to `x`: other devices' way is torch."""
+    return x.device.type == "cpu" and not exporting()
 
-    Then the way of other devices is taken, which is plain torch and gives the same.
-    """
-    exporting = getattr(torch.compiler, "is_exporting", None)  # since torch 2.7
-    return x.device.type == "cpu" and not (exporting is not None and exporting())
+
+def exporting() -> bool:
+    """Whether `torch.export` (of `torch.onnx.export` too) is making a graph of what is done."""
+    if hasattr(torch.compiler, "is_exporting"):  # since torch 2.7
+        return torch.compiler.is_exporting()
+    return torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from qs3.clouds.files import measured, parse_clouds
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.inference.export_graph import Plain, least_points
 from qs3.inference.predictor import Predictor, load
 from qs3.models.base import PointClassifier
 from qs3.models.norms import norms_for, use_domain
@@ -147,7 +146,7 @@ def export(
         check_packages()
     clouds = made_up(predictor.points) if clouds is None else clouds
     # A copy that nobody trains: some operations of the graph have no gradients.
-    net = copy.deepcopy(predictor.net).cpu().requires_grad_(False)
+    net = copy.deepcopy(predictor.net).cpu().requires_grad_(False).eval()
     # Two, also where there is one: torch takes a size of 1 for one that never changes.
     example = clouds[:1].repeat(2, 1, 1)
     make_folder(out.parent)
@@ -157,7 +156,7 @@ def export(
         write: Callable[..., Any] = _write_onnx if out.suffix == ".onnx" else _write_pt2
         with atomic_path(out) as temporary:
             try:
-                run = write(Plain(net).eval(), example, predictor, temporary)
+                run = write(net, example, predictor, temporary)
             except Exception as error:  # torch raises dozens of kinds
                 raise _cannot(predictor, error) from error
             ours = np.concatenate([net(part).numpy() for part in clouds.split(16)])
@@ -172,7 +171,7 @@ def export(
 def any_points(predictor: Predictor) -> bool:
     """Whether the exported net takes clouds of any number of points (from some number on)."""
     net = predictor.net
-    return isinstance(net, PointClassifier) and predictor.points >= least_points(net.backbone)
+    return isinstance(net, PointClassifier) and predictor.points >= net.backbone.least_points
 
 
 def clouds_of(predictor: Predictor, place: str | Path) -> Float[Tensor, "n m 3"]:
@@ -253,13 +252,13 @@ def _shapes(predictor: Predictor) -> tuple[dict[int, Any]]:
     free: dict[int, Any] = {0: torch.export.Dim("clouds", min=1, max=_MOST_CLOUDS)}
     if any_points(predictor):
         net: Any = predictor.net
-        least = least_points(net.backbone)
+        least = net.backbone.least_points
         free[1] = torch.export.Dim("points", min=least, max=_MOST_POINTS)
     return (free,)
 
 
 def _write_pt2(
-    net: Plain, example: Tensor, predictor: Predictor, path: Path
+    net: nn.Module, example: Tensor, predictor: Predictor, path: Path
 ) -> Callable[[Tensor], np.ndarray]:
     """Returns the net as read back."""
     graph = torch.export.export(
@@ -271,7 +270,7 @@ def _write_pt2(
 
 
 def _write_onnx(
-    net: Plain, example: Tensor, predictor: Predictor, path: Path
+    net: nn.Module, example: Tensor, predictor: Predictor, path: Path
 ) -> Callable[[Tensor], np.ndarray]:
     """Returns the net as onnxruntime reads and runs it."""
     import onnxruntime  # type: ignore[import-untyped]

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import DataError
+from qs3.geometry.neighbours import exporting
 from qs3.models.norms import head_norm, make_norm
 
 
@@ -27,9 +28,16 @@ class Features(NamedTuple):
 
 
 class Backbone(nn.Module):
-    """Clouds [B, N, 3] to `Features`; subclasses set `feature_dim`."""
+    """Clouds [B, N, 3] to `Features`; subclasses set `feature_dim`.
+
+    Attributes:
+        feature_dim: D of `Features.global_`.
+        least_points: with how many points at least it does the same whatever their number; a net
+            exported for as many takes clouds of any number from there on.
+    """
 
     feature_dim: int
+    least_points: int = 1
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Features of each cloud; the order of its points does not matter."""
@@ -104,10 +112,11 @@ def check_points(points: Tensor) -> None:
 
     A training step on a device would wait for the answer in each of its passes, so there values
     are looked at on the CPU and in evaluation alone: what is trained on was checked by the store.
+    An exported net does not look at them.
     """
     if points.ndim != 3 or points.shape[2] != 3 or points.shape[1] == 0:
         raise DataError(f"expected points [B, N >= 1, 3], got {list(points.shape)}")
-    if points.device.type != "cpu" and torch.is_grad_enabled():
+    if exporting() or (points.device.type != "cpu" and torch.is_grad_enabled()):
         return
     if torch.isfinite(points).all():
         return

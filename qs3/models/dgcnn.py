@@ -11,22 +11,70 @@ Three variants, chosen by `variant`; parameters are with the class head for 10 c
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
-from qs3.geometry.matmul import linear, times
+from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import gather, knn
+from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.fast.edgeconv import EdgeConv, max_over_rows
-from qs3.models.norms import head_norm, make_norm
+from qs3.models.fast.edgeconv import edge_conv
+from qs3.models.fast.pointwise_max import max_over_rows, pooled_linear
+from qs3.models.norms import head_norm, make_norm, normed, uses_batch
 
 VARIANTS = ("uda", "simpleview", "defrec")
+
+
+class EdgeConv(nn.Module):
+    """Equation 8: max_j LeakyReLU(norm(W (x_j - x_i, x_i))) over the neighbours j of a point i.
+
+    [B, N, Cin] and neighbours [B, N, k] to [B, N, Cout].
+
+    Args:
+        in_channels, out_channels: Cin, Cout.
+        norm: see `qs3.models.norms`; "batch" is over all edges of the batch, "instance" over the
+            edges of each cloud, in eval too.
+        negative_slope: of LeakyReLU.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        *,
+        norm: str = "batch",
+        negative_slope: float = 0.2,
+    ) -> None:
+        super().__init__()
+        self.negative_slope = negative_slope
+        self.linear = nn.Linear(2 * in_channels, out_channels, bias=False)
+        self.norm = make_norm(norm, out_channels)
+
+    def forward(
+        self, x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]
+    ) -> Float[Tensor, "b n d"]:
+        """The layer's output; edges are in float32 under autocast as well."""
+        weight = self.linear.weight
+        with torch.autocast(x.device.type, enabled=False):
+            x = x.to(weight.dtype)
+            if fast.usable(traceable=not uses_batch(self.norm)):
+                return edge_conv(x, index, weight, self.norm, self.negative_slope)
+            z = normed(self.norm, self.linear(edges_of(x, index)))  # [b, n, k, d]
+            return F.leaky_relu(z, self.negative_slope).max(2)[0]
+
+    def extra_repr(self) -> str:
+        """Shown by print(model)."""
+        return f"negative_slope={self.negative_slope}"
+
+
+def edges_of(x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]) -> Float[Tensor, "b n k 2*c"]:
+    """Edges (x_j - x_i, x_i) from each point i to its neighbours j."""
+    neighbour = gather(x, index)  # [b, n, k, c]
+    centre = x[:, :, None].expand_as(neighbour)
+    return torch.cat([neighbour - centre, centre], dim=3)
 
 
 class EdgeTNet(nn.Module):
@@ -52,9 +100,7 @@ class EdgeTNet(nn.Module):
     def forward(self, points: Float[Tensor, "b n 3"], k: int) -> Float[Tensor, "b 3 3"]:
         """The matrix that multiplies column vectors from the left."""
         b, n, _ = points.shape
-        neighbour = gather(points, knn(points, k))  # [b, n, k, 3]
-        centre = points[:, :, None].expand_as(neighbour)
-        edges = torch.cat([neighbour - centre, centre], dim=3)
+        edges = edges_of(points, knn(points, k))  # [b, n, k, 6]
         x = self.edges(edges.flatten(0, 2)).view(b * n, k, -1).amax(1)
         x = self.points(x).view(b, n, -1).amax(1)
         return self.cloud(x).view(b, 3, 3) + torch.eye(3, dtype=x.dtype, device=x.device)
@@ -89,6 +135,7 @@ class DGCNN(Backbone):
             raise ConfigError(f"k must be at least 1, got {k}")
         self.k = k
         self.variant = variant
+        self.least_points = k
         self.feature_dim = embedding if variant == "defrec" else 2 * embedding
         self.transform = EdgeTNet(norm) if variant == "defrec" else None
         self.edge_convs = nn.ModuleList(
@@ -99,66 +146,24 @@ class DGCNN(Backbone):
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
         """[B, N, 3] to the pooled conv5, and the EdgeConvs' outputs per point."""
-        k = min(self.k, points.shape[1])
+        n = points.shape[1]
+        k = n if n < self.k else self.k  # a number in an export too; min() would be a symbol
         x, levels = points, []
         if self.transform is not None:
             x = points @ self.transform(points, k).transpose(1, 2)
-        for edge_conv in self.edge_convs:
-            x = edge_conv(x, knn(x, k))
+        for layer in self.edge_convs:
+            x = layer(x, knn(x, k))
             levels.append(x)
         per_point = torch.cat(levels, dim=2)  # [B, N, 512]
-        if self.norm5 is None:
+        if self.norm5 is None and fast.usable():
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
-        y = F.leaky_relu(self._normed(linear(per_point, self.conv5.weight)), 0.2)  # [B, N, 1024]
-        most, _ = max_over_rows(y)
+        y = linear(per_point, self.conv5.weight)  # [B, N, 1024]
+        if self.norm5 is not None:
+            y = F.leaky_relu(normed(self.norm5, y), 0.2)
+        most, _ = max_over_rows(y) if fast.usable() else y.max(1)
         if self.variant == "defrec":
             return Features(most, per_point)
         return Features(torch.cat([most, y.mean(1)], dim=1), per_point)
-
-    def _normed(self, y: Tensor) -> Tensor:
-        """norm5 of [B, N, D], as rows where it can be: twice as fast as in [B, D, N]."""
-        assert self.norm5 is not None
-        if isinstance(self.norm5, nn.InstanceNorm1d):
-            return self.norm5(y.transpose(1, 2)).transpose(1, 2)
-        return self.norm5(y.flatten(0, 1)).view_as(y)
-
-
-class _PooledLinear(torch.autograd.Function):
-    """Its gradient needs no [B, N, D]: the maximum's is one row of x and of weight per channel."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
-        b, n, _ = x.shape
-        d = weight.shape[0]
-        out = x.new_empty(b, 2 * d)
-        where = torch.empty(b, d, dtype=torch.int64, device=x.device)
-        step = max(1, (1 << 22) // (n * d))  # 16 MB of float32
-        for i in range(0, b, step):
-            y = times(x[i : i + step], weight)  # [step, n, d]
-            out[i : i + step, :d], where[i : i + step] = max_over_rows(y)
-        centre = x.mean(1)  # [b, c]
-        torch.mm(centre, weight.T, out=out[:, d:])
-        ctx.save_for_backward(x, weight, where, centre)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
-        x, weight, where, centre = ctx.saved_tensors
-        most, mean = grad.chunk(2, dim=1)  # [b, d] each
-        dx = (mean @ weight / x.shape[1])[:, None].expand_as(x).contiguous()
-        dweight = mean.T @ centre
-        for x_i, dx_i, most_i, where_i in zip(x, dx, most[:, :, None], where, strict=True):
-            dx_i.index_add_(0, where_i, most_i * weight)
-            dweight.addcmul_(most_i, x_i.index_select(0, where_i))
-        return dx, dweight
-
-
-def pooled_linear(
-    x: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]
-) -> Float[Tensor, "b 2*d"]:
-    """Maximum and mean over the points of a linear map without bias."""
-    return _PooledLinear.apply(x, weight)
 
 
 def dgcnn(

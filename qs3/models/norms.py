@@ -5,7 +5,6 @@
   In class heads, where a cloud is one vector and has no statistics, it is batch norm.
 - "domain": a whole batch norm for each domain, statistics and affine, as in DSBN (Chang et al.,
   "Domain-Specific Batch Normalization for Unsupervised Domain Adaptation", CVPR 2019, eq. 3).
-- "domain_statistics": statistics for each domain, one affine for both.
 
 Which domain a pass is on is said around it: `with use_domain(net, "target"): net(points)`.
 """
@@ -22,7 +21,7 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError
 
-KINDS = ("batch", "instance", "domain", "domain_statistics")
+KINDS = ("batch", "instance", "domain")
 DOMAINS = ("source", "target")
 _Norm = nn.modules.batchnorm._NormBase
 _BatchNorm = nn.modules.batchnorm._BatchNorm
@@ -34,16 +33,13 @@ class DomainNorm(nn.Module):
 
     Args:
         channels: C, of [R, C] or [B, C, N].
-        shared_affine: the domains share scale and shift (and both names hold the same parameter).
         images: it is for [B, C, H, W] instead.
     """
 
-    def __init__(self, channels: int, *, shared_affine: bool = False, images: bool = False) -> None:
+    def __init__(self, channels: int, *, images: bool = False) -> None:
         super().__init__()
         plain = nn.BatchNorm2d if images else nn.BatchNorm1d
         self.source, self.target = plain(channels), plain(channels)
-        if shared_affine:
-            self.target.weight, self.target.bias = self.source.weight, self.source.bias
         self.domain = "source"
 
     @property
@@ -71,9 +67,8 @@ def make_norm(kind: str, channels: int, *, images: bool = False) -> nn.Module:
     if kind == "instance":
         plain = nn.InstanceNorm2d if images else nn.InstanceNorm1d
         return plain(channels, affine=True)
-    if kind in KINDS:
-        shared = kind == "domain_statistics"
-        return DomainNorm(channels, shared_affine=shared, images=images)
+    if kind == "domain":
+        return DomainNorm(channels, images=images)
     names = ", ".join(f"'{k}'" for k in KINDS)
     raise ConfigError(f"norm must be one of {names}, got {kind!r}")
 
@@ -90,11 +85,11 @@ def active(norm: nn.Module) -> _Norm:
     return found
 
 
-def norm_rows(norm: nn.Module, rows: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:
-    """Rows [R, C] through a norm; of an instance norm they are the places of one cloud."""
-    if isinstance(norm, nn.InstanceNorm1d):
-        return norm(rows.T).T  # it takes [c, r]
-    return norm(rows)
+def normed(norm: nn.Module, x: Float[Tensor, "b *places c"]) -> Float[Tensor, "b *places c"]:
+    """A norm of the last axis; an instance norm has statistics of each cloud's places."""
+    if isinstance(norm, nn.InstanceNorm1d):  # takes [b, c, n]
+        return norm(x.flatten(1, -2).transpose(1, 2)).transpose(1, 2).view(x.shape)
+    return norm(x.flatten(0, -2)).view(x.shape)
 
 
 def uses_batch(norm: nn.Module) -> bool:

@@ -65,7 +65,7 @@ class NodeModule(nn.Module):
     def forward(self, x: Float[Tensor, "b n 3"], f: Float[Tensor, "b n c"]) -> Nodes:
         """Points [B, N, 3] and their features [B, N, C] to `Nodes`."""
         b, n, _ = x.shape
-        k = min(self.neighbours, n)
+        k = n if n < self.neighbours else self.neighbours  # as in DGCNN
         # Another start each time in training (torch's generator, as for dropout), none in eval.
         start = torch.randint(n, (b,), device=x.device) if self.training else 0
         index = farthest_point_sampling(x, self.nodes, start)  # [b, m]
@@ -106,6 +106,7 @@ class PointDanBackbone(Backbone):
         self.node_module = NodeModule(64, nodes, neighbours, radius, norm)
         self.last = PointMLP(128, 128, 1024, norm=norm)
         self.norm = make_norm(head_norm(norm), 1024)
+        self.least_points = max(nodes, neighbours)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
         """One vector a cloud; per point 128 features."""

@@ -18,9 +18,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError
+from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.models.fast.pointwise_max import normed_maximum
-from qs3.models.norms import head_norm, make_norm
+from qs3.models.norms import head_norm, make_norm, normed
 
 VARIANTS = ("simpleview", "uda", "basic")
 
@@ -47,17 +48,15 @@ class PointMLP(nn.Module):
 
     def forward(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b n d"]:
         """The same map at every point."""
-        if not self.by_cloud:
-            return self.layers(x.flatten(0, 1)).unflatten(0, x.shape[:2])
         for layer in self.layers:
-            normed = isinstance(layer, nn.InstanceNorm1d)  # takes [b, c, n]
-            x = layer(x.transpose(1, 2)).transpose(1, 2) if normed else layer(x)
+            acts_on_values = isinstance(layer, nn.Linear | nn.ReLU)
+            x = layer(x) if acts_on_values else normed(layer, x)
         return x
 
     def maximum(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
-        """`self(x).amax(1)`; on the CPU without the last layer's output at every point."""
+        """`self(x).max(1)[0]`; on the CPU without the last layer's output at every point."""
         plain = self.by_cloud or x.device.type != "cpu" or torch.is_autocast_enabled("cpu")
-        if plain or torch.compiler.is_compiling():
+        if plain or torch.compiler.is_compiling() or not fast.usable():
             return self(x).max(1)[0]
         last_relu = isinstance(self.layers[-1], nn.ReLU)
         layers = list(self.layers)[: -1 if last_relu else None]

@@ -9,17 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_queries
 from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.grouped import GroupedMLP
+from qs3.models.fast.grouped_mlp_max import grouped_mlp_max
+from qs3.models.norms import make_norm, normed
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,47 @@ MSG = (
         ),
     ),
 )
+
+
+class GroupedMLP(nn.Module):
+    """Linear - norm - ReLU for each width, on the members of each group, then the maximum.
+
+    Args:
+        channels: C of the points' features, 0 if they have none.
+        widths: of the layers, at least two.
+        norm: see `qs3.models.norms`; statistics are of all members of all groups, of the batch or
+            ("instance") of each cloud.
+    """
+
+    def __init__(self, channels: int, widths: Sequence[int], *, norm: str = "batch") -> None:
+        super().__init__()
+        sizes = (3 + channels, *widths)
+        self.linears = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in pairwise(sizes))
+        self.norms = nn.ModuleList(make_norm(norm, width) for width in widths)
+        for linear in self.linears:
+            assert isinstance(linear, nn.Linear)
+            nn.init.kaiming_normal_(linear.weight)
+
+    def forward(
+        self,
+        xyz: Float[Tensor, "b n 3"],
+        features: Float[Tensor, "b n c"] | None,
+        centres: Float[Tensor, "b m 3"],
+        index: Int[Tensor, "b m k"],
+    ) -> Float[Tensor, "b m d"]:
+        """The maximum over each group of the mapped (x_j - c_i, f_j), in float32 at least."""
+        weights: list[Any] = [linear.weight for linear in self.linears]
+        with torch.autocast(xyz.device.type, enabled=False):
+            xyz, centres = xyz.to(weights[0].dtype), centres.to(weights[0].dtype)
+            features = None if features is None else features.to(weights[0].dtype)
+            if fast.usable():
+                return grouped_mlp_max(xyz, features, centres, index, weights, list(self.norms))
+            x = gather(xyz, index) - centres[:, :, None]  # [b, m, k, 3]
+            if features is not None:
+                x = torch.cat([x, gather(features, index)], dim=3)  # [b, m, k, 3 + c]
+            for linear, norm in zip(self.linears, self.norms, strict=True):
+                x = normed(norm, linear(x)).relu()
+            return x.max(2)[0]
 
 
 class SetAbstraction(nn.Module):
@@ -93,6 +137,7 @@ class PointNet2(Backbone):
     """
 
     feature_dim = 1024
+    least_points = 513  # more than there are centres: fewer start over
 
     def __init__(self, *, variant: str = "msg", norm: str = "batch") -> None:
         super().__init__()

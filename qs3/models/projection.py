@@ -69,25 +69,20 @@ def depth_images(
 
 
 def _draw(axes: Tensor, size: int, views: Sequence[int], pixel: str) -> Tensor:
-    _, b, n = axes.shape
     table = torch.tensor([_TABLE[v] for v in views], device=axes.device)  # [v, 3, 2]
     rows, columns, depth = (axes[table[:, :, 0]] * table[:, :, 1, None, None]).unbind(1)
     depth = depth + CAMERA_DISTANCE  # [v, b, n]
-    row = ((rows / (depth + _TINY) + 1) * size / 2 - 0.5).ceil_()
-    column = ((columns / (depth + _TINY) + 1) * size / 2 - 0.5).ceil_()
+    row = ((rows / (depth + _TINY) + 1) * size / 2 - 0.5).ceil()
+    column = ((columns / (depth + _TINY) + 1) * size / 2 - 0.5).ceil()
     seen = (row >= 0) & (row < size) & (column >= 0) & (column < size) & (depth >= 0)
-    image = (torch.arange(b, device=axes.device)[:, None] * len(views)) + torch.arange(
-        len(views), device=axes.device
-    )[:, None, None]  # [v, b, 1]
-    depth = depth[seen]  # [p]
-    where = image.expand(-1, -1, n)[seen] * size**2 + (row[seen] * size + column[seen]).long()
-    pixels = b * len(views) * size**2
+    where = torch.where(seen, row * size + column, size**2).long()  # the last one is none of them
+    empty = torch.zeros_like(depth[:, :, :1]).repeat(1, 1, size**2 + 1)
     if pixel == "nearest":
-        flat = depth.new_full((pixels,), torch.inf).scatter_reduce_(0, where, depth, "amin")
+        flat = (empty + torch.inf).scatter_reduce(2, where, depth, "amin")
         flat = torch.where(flat == torch.inf, 0, flat)
     else:
-        weight = 1 / (depth + _TINY)
-        total = depth.new_zeros(pixels).scatter_add_(0, where, weight)
-        flat = depth.new_zeros(pixels).scatter_add_(0, where, depth * weight)
-        flat /= torch.where(total == 0, 1, total)
-    return flat.view(b, len(views), size, size)
+        weight = torch.where(seen, 1 / (depth + _TINY), 0)
+        total = empty.scatter_add(2, where, weight)
+        flat = empty.scatter_add(2, where, depth * weight)
+        flat = flat / torch.where(total == 0, 1, total)
+    return flat[:, :, :-1].transpose(0, 1).unflatten(2, (size, size)).contiguous()

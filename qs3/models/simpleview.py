@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError
 from qs3.models.base import Backbone, Features, PointClassifier
-from qs3.models.fast.resnet_cpu import can_step, step
 from qs3.models.norms import head_norm, make_norm
 from qs3.models.projection import VIEWS, depth_images
 from qs3.models.resnet import ResNet18
@@ -63,10 +62,8 @@ class SimpleView(Backbone):
         images = depth_images(
             points, self.image_size, views=self.views, up=self.up, pixel=self.pixel
         )
-        images = images.flatten(0, 1)[:, None]  # [b * v, 1, h, w]
-        net = self.images
-        features = step(net, images) if can_step(net, images) else net(images)
-        return Features(features.view(len(points), -1), None)
+        features = self.images(images.flatten(0, 1)[:, None])  # [b * v, 128] of [b * v, 1, h, w]
+        return Features(features.view(points.shape[0], -1), None)
 
 
 class FusionHead(nn.Module):

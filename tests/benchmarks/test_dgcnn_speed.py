@@ -13,8 +13,7 @@ from torch.nn import functional as F
 from torch_geometric.nn import EdgeConv as PygEdgeConv
 
 from qs3.geometry.neighbours import knn
-from qs3.models.dgcnn import dgcnn
-from qs3.models.fast.edgeconv import EdgeConv
+from qs3.models.dgcnn import EdgeConv, dgcnn
 from tests.models.fast.test_edgeconv_pyg import edges
 from tests.models.reference import NaiveDGCNN
 

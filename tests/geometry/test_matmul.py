@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from qs3.geometry import matmul as products
-from qs3.geometry.matmul import linear, outer, times
+from qs3.geometry.matmul import linear, matmul_t, t_matmul
 
 
 @pytest.mark.parametrize("operator", [True, False])
@@ -21,13 +21,13 @@ def test_equal_to_matmul(
     rows, k, c = shape
     x, weight, bias = (torch.randn(*s, dtype=dtype) for s in ((rows, k), (c, k), (c,)))
     close = {"rtol": 1e-5, "atol": 1e-5}
-    torch.testing.assert_close(times(x, weight), x @ weight.T, **close)
-    torch.testing.assert_close(times(x, weight, bias), x @ weight.T + bias, **close)
-    torch.testing.assert_close(times(x[:, None], weight), (x @ weight.T)[:, None], **close)
+    torch.testing.assert_close(matmul_t(x, weight), x @ weight.T, **close)
+    torch.testing.assert_close(matmul_t(x, weight, bias), x @ weight.T + bias, **close)
+    torch.testing.assert_close(matmul_t(x[:, None], weight), (x @ weight.T)[:, None], **close)
     y = torch.randn(rows, c, dtype=dtype)
-    torch.testing.assert_close(outer(x, y), x.T @ y, **close)
+    torch.testing.assert_close(t_matmul(x, y), x.T @ y, **close)
     strided = torch.randn(k, rows, dtype=dtype).T
-    torch.testing.assert_close(times(strided, weight), strided @ weight.T, **close)
+    torch.testing.assert_close(matmul_t(strided, weight), strided @ weight.T, **close)
 
 
 @pytest.mark.parametrize("operator", [True, False])

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.models.base import PointClassifier
-from qs3.models.fast.edgeconv import EdgeConv
+from qs3.models.dgcnn import EdgeConv
 
 
 def knn_reference(x: Tensor, k: int) -> Tensor:

@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling
 from qs3.models.base import PointClassifier
-from qs3.models.grouped import GroupedMLP
+from qs3.models.pointnet2 import GroupedMLP
 
 
 def take(x: Tensor, index: Tensor) -> Tensor:
@@ -42,7 +42,7 @@ class StraightMLP(nn.Module):
             o, i = linear.weight.shape
             convolution = nn.Conv2d(i, o, 1, bias=False, dtype=dtype)
             convolution.weight.data.copy_(linear.weight[:, :, None, None])
-            if twin.norm == "batch":
+            if isinstance(norm, nn.BatchNorm1d):
                 copy: nn.Module = nn.BatchNorm2d(o, dtype=dtype)
                 copy.load_state_dict(norm.state_dict())
             else:

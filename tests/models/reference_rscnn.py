@@ -10,9 +10,8 @@ from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.base import PointClassifier
-from qs3.models.fast.rsconv import RSConv
 from qs3.models.norms import active
-from qs3.models.rscnn import LEVELS, group
+from qs3.models.rscnn import LEVELS, RSConv, group
 
 
 def _conv(x: Tensor, layer: nn.Linear) -> Tensor:

@@ -39,13 +39,6 @@ def test_parameters_of_a_domain() -> None:
 
     channels = 64 + 64 + 128 + 256 + 512 + 256
     assert count("domain") == count("batch") + 2 * channels
-    assert count("domain_statistics") == count("batch")
-
-
-def test_shared_affine_stays_shared_in_a_copy_and_after_loading() -> None:
-    norm = copy.deepcopy(DomainNorm(4, shared_affine=True))
-    norm.load_state_dict(DomainNorm(4, shared_affine=True).state_dict())
-    assert norm.source.weight is norm.target.weight
 
 
 def test_domain_comes_back_after_an_error_and_nested() -> None:
@@ -82,7 +75,7 @@ def test_track_is_what_torch_does(momentum: float | None) -> None:
 
 
 def test_unknown_norm() -> None:
-    with pytest.raises(ConfigError, match="'domain', 'domain_statistics', got 'layer'"):
+    with pytest.raises(ConfigError, match="'instance', 'domain', got 'layer'"):
         make_norm("layer", 4)
 
 

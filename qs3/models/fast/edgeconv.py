@@ -1,8 +1,6 @@
-"""EdgeConv without its edges (Wang et al., "Dynamic Graph CNN", TOG 2019, eq. 8).
+"""EdgeConv without its edges (`qs3.models.dgcnn.EdgeConv` has it as published).
 
-The layer as published: for each point i and neighbour j the edge (x_j - x_i, x_i), a linear
-map without bias, batch norm, LeakyReLU, maximum over j. With the weight split into
-W = [W1 | W2] an edge becomes
+With the weight split into W = [W1 | W2] an edge (x_j - x_i, x_i) becomes
 
     z_ij = W1 x_j + (W2 - W1) x_i = P_j + Q_i,
 
@@ -30,20 +28,11 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.geometry.matmul import linear
-from qs3.models.norms import active, make_norm, track, uses_batch
+from qs3.geometry.neighbours import exporting
+from qs3.models.fast.pointwise_max import max_over_rows
+from qs3.models.norms import active, track, uses_batch
 
 _GATHERED = 1 << 20  # values gathered at once: 4 MB in float32
-
-
-def max_over_rows(x: Float[Tensor, "b n c"]) -> tuple[Float[Tensor, "b c"], Int[Tensor, "b c"]]:
-    """`x.max(1)`: values and the first rows that have them, about ten times faster on the CPU.
-
-    Pooling of an image in channels-last layout is the only maximum of torch on the CPU that is
-    vectorised and tells where it was.
-    """
-    image = x[:, :, None].permute(0, 3, 1, 2)  # [b, c, n, 1]
-    best, where = F.max_pool2d(image, (x.shape[1], 1), return_indices=True)
-    return best.flatten(1), where.flatten(1)
 
 
 class _NeighbourMax(torch.autograd.Function):
@@ -107,6 +96,8 @@ class _Moments(torch.autograd.Function):
 
 def neighbour_max(x: Float[Tensor, "p c"], index: Int[Tensor, "q k"]) -> Float[Tensor, "q c"]:
     """Maximum over each row's neighbours, per channel."""
+    if exporting():  # where blocks would bind the graph to a number of points
+        return x.index_select(0, index.flatten()).view(*index.shape, x.shape[1]).amax(1)
     return _NeighbourMax.apply(x, index)
 
 
@@ -117,72 +108,53 @@ def _product(x: Tensor, weight: Tensor) -> Tensor:
     return x @ weight.transpose(1, 2)
 
 
-class EdgeConv(nn.Module):
-    """One EdgeConv layer: [B, N, Cin] and neighbours [B, N, k] to [B, N, Cout].
+def edge_conv(
+    x: Float[Tensor, "b n c"],
+    index: Int[Tensor, "b n k"],
+    weight: Float[Tensor, "d 2*c"],
+    norm: nn.Module,
+    negative_slope: float,
+) -> Float[Tensor, "b n d"]:
+    """The layer's output; traceable unless the norm `uses_batch`. It is `track`ed, never called.
 
     Args:
-        in_channels, out_channels: Cin, Cout.
-        norm: see `qs3.models.norms`; "batch" is over all edges of the batch, "instance" over the
-            edges of each cloud, in eval too.
+        x: features of the points, in the dtype of `weight`.
+        index: neighbours of each.
+        weight: [W1 | W2].
+        norm: from `make_norm`.
         negative_slope: of LeakyReLU.
     """
+    b, n, c = x.shape
+    k = index.shape[2]
+    first = torch.arange(b, device=x.device)[:, None, None] * n
+    flat = (index + first).view(b * n, k)  # rows of all clouds put together
+    w1, w2 = weight.split(c, dim=1)  # [d, c] each
+    e = w2 - w1
+    norm = active(norm)
+    rows = x.reshape(b if isinstance(norm, nn.InstanceNorm1d) else 1, -1, c)  # [g, r, c]
+    if uses_batch(norm):
+        # about the mean, lest E[z^2] - E[z]^2 cancel; z only changes by W2 centre
+        centre = rows.detach().mean(1, keepdim=True)
+        rows = rows - centre
+        mean, var = _statistics(rows, flat, w1, e)  # [g, d]
+        track(norm, mean[0] + centre[0, 0] @ w2.T, var[0], b * n * k)
+    else:
+        assert norm.running_mean is not None
+        assert norm.running_var is not None
+        mean, var = norm.running_mean[None], norm.running_var[None]
+    h = norm.weight * torch.rsqrt(var + norm.eps)
+    shift = norm.bias - h * mean
+    p = _product(rows, h[:, :, None] * w1)  # [g, r, d]
+    q = _product(rows, h[:, :, None] * e) + shift[:, None]
+    best = neighbour_max(p.flatten(0, 1), flat).view_as(q)
+    return F.leaky_relu(best + q, negative_slope).view(b, n, -1)
 
-    def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        *,
-        norm: str = "batch",
-        negative_slope: float = 0.2,
-    ) -> None:
-        super().__init__()
-        self.negative_slope = negative_slope
-        self.linear = nn.Linear(2 * in_channels, out_channels, bias=False)  # [W1 | W2]
-        self.norm = make_norm(norm, out_channels)  # never called: holds parameters and statistics
 
-    def forward(
-        self, x: Float[Tensor, "b n c"], index: Int[Tensor, "b n k"]
-    ) -> Float[Tensor, "b n d"]:
-        """The layer's output; statistics are kept in float32 under autocast as well."""
-        with torch.autocast(x.device.type, enabled=False):
-            return self._forward(x.to(self.linear.weight.dtype), index)
-
-    def _forward(self, x: Tensor, index: Tensor) -> Tensor:
-        b, n, c = x.shape
-        k = index.shape[2]
-        first = torch.arange(b, device=x.device)[:, None, None] * n
-        flat = (index + first).view(b * n, k)  # rows of all clouds put together
-        w1, w2 = self.linear.weight.split(c, dim=1)  # [d, c] each
-        e = w2 - w1
-        norm = active(self.norm)
-        rows = x.reshape(b if isinstance(norm, nn.InstanceNorm1d) else 1, -1, c)  # [g, r, c]
-        if uses_batch(norm):
-            # about the mean, lest E[z^2] - E[z]^2 cancel; z only changes by W2 centre
-            centre = rows.detach().mean(1, keepdim=True)
-            rows = rows - centre
-            mean, var = self._statistics(rows, flat, w1, e)  # [g, d]
-            track(norm, mean[0] + centre[0, 0] @ w2.T, var[0], b * n * k)
-        else:
-            assert norm.running_mean is not None
-            assert norm.running_var is not None
-            mean, var = norm.running_mean[None], norm.running_var[None]
-        h = norm.weight * torch.rsqrt(var + norm.eps)
-        shift = norm.bias - h * mean
-        p = _product(rows, h[:, :, None] * w1)  # [g, r, d]
-        q = _product(rows, h[:, :, None] * e) + shift[:, None]
-        best = neighbour_max(p.flatten(0, 1), flat).view_as(q)
-        return F.leaky_relu(best + q, self.negative_slope).view(b, n, -1)
-
-    @staticmethod
-    def _statistics(x: Tensor, flat: Tensor, w1: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and biased variance of z over the edges of each group: [g, d] each."""
-        k = flat.shape[1]
-        edges = x.shape[1] * k
-        xd, x1, xdx, xax, xx = _Moments.apply(x, flat)
-        mean = (xd @ w1.T + k * (x1 @ e.T)) / edges
-        square = ((w1 @ xdx + 2 * (e @ xax)) * w1).sum(2) + k * ((e @ xx) * e).sum(2)
-        return mean, (square / edges - mean.square()).clamp_min(0)
-
-    def extra_repr(self) -> str:
-        """Shown by print(model)."""
-        return f"negative_slope={self.negative_slope}"
+def _statistics(x: Tensor, flat: Tensor, w1: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and biased variance of z over the edges of each group: [g, d] each."""
+    k = flat.shape[1]
+    edges = x.shape[1] * k
+    xd, x1, xdx, xax, xx = _Moments.apply(x, flat)
+    mean = (xd @ w1.T + k * (x1 @ e.T)) / edges
+    square = ((w1 @ xdx + 2 * (e @ xax)) * w1).sum(2) + k * ((e @ xx) * e).sum(2)
+    return mean, (square / edges - mean.square()).clamp_min(0)

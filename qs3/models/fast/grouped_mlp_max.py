@@ -1,8 +1,7 @@
 """Shared MLPs over groups of neighbours without the tensors that they are published with.
 
-A set abstraction of PointNet++ maps every member j of a group i by layers of 1x1 convolution, batch
-norm and ReLU, and takes the maximum over the members. Written out that is a [B, C, M, K] tensor or
-four for each layer. Here, with the same sums:
+`qs3.models.pointnet2.GroupedMLP` has them as published: a [B, M, K, C] tensor or four for each
+layer. Here, with the same sums:
 
 - The first convolution is linear in (x_j - c_i, f_j), so z_ij = Wx (x_j - c_i) + P_j with one
   product a point for the features. Members gather P, and gather again where z is needed once more.
@@ -26,42 +25,69 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from torch import Tensor
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from qs3.geometry.matmul import outer, times
-from qs3.models.fast.edgeconv import max_over_rows
+from qs3.geometry.matmul import matmul_t, t_matmul
+from qs3.models.fast.pointwise_max import max_over_rows
+from qs3.models.norms import active, track, uses_batch
 
 _AT_ONCE = 1 << 18  # values of a layer worked on at once: 1 MB in float32
 
 
-def grouped_maximum(
+def grouped_mlp_max(
+    xyz: Float[Tensor, "b n 3"],
+    features: Float[Tensor, "b n c"] | None,
+    centres: Float[Tensor, "b m 3"],
+    index: Int[Tensor, "b m k"],
+    weights: Sequence[Tensor],
+    norms: Sequence[nn.Module],
+) -> Float[Tensor, "b m d"]:
+    """The maximum over each group of its members mapped by all layers, each with a ReLU.
+
+    Args:
+        xyz: the points.
+        features: of the points, in the dtype of the weights as all others.
+        centres: of the groups.
+        index: members of each.
+        weights: [D, C] of each layer, at least two; the first one's C is 3 + that of `features`.
+        norms: of each layer, from `make_norm`.
+    """
+    p = None if features is None else features @ weights[0][:, 3:].T
+    weights = [weights[0][:, :3], *weights[1:]]
+    if isinstance(norms[0], nn.InstanceNorm1d):
+        parts = zip(xyz, centres, [None] * len(xyz) if p is None else p, index, strict=True)
+        return torch.stack([_groups(*cloud, weights, norms) for cloud in parts])
+    first = torch.arange(len(xyz), device=xyz.device)[:, None, None] * xyz.shape[1]
+    flat = None if p is None else p.flatten(0, 1)
+    rows = (index + first).flatten(0, 1)
+    out = _groups(xyz.flatten(0, 1), centres.flatten(0, 1), flat, rows, weights, norms)
+    return out.unflatten(0, centres.shape[:2])
+
+
+def _groups(
     xyz: Tensor,
     centres: Tensor,
     p: Tensor | None,
     index: Tensor,
-    eps: float,
-    running: Sequence[tuple[Tensor, Tensor] | None],
-    *parameters: Tensor,
-) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-    """The maximum over each group of its mapped members.
-
-    Args:
-        xyz: [R, 3] points of all clouds in one list.
-        centres: [G, 3] of the groups.
-        p: [R, C] the first convolution of the points' features, or None if they have none.
-        index: [G, K] int64 rows of `xyz` and `p`.
-        eps: of the norms.
-        running: for each norm its mean and variance [C] (evaluation), or None: the members'.
-        *parameters: weight [C', C], gamma and beta of each layer, at least two; the first weight
-            is [C, 3], of the coordinates.
-
-    Returns:
-        [G, D], and mean and biased variance of each norm's input, without gradient.
-    """
-    out, *statistics = _GroupedMaximum.apply(xyz, centres, p, index, eps, running, *parameters)
-    return out, list(zip(statistics[::2], statistics[1::2], strict=True))
+    weights: Sequence[Tensor],
+    norms: Sequence[nn.Module],
+) -> Tensor:
+    """The same of points [R, 3] and groups [G] of all clouds in one list: [G, D]."""
+    plain = [active(norm) for norm in norms]
+    running = [None if uses_batch(n) else (n.running_mean, n.running_var) for n in plain]
+    parameters = [
+        part
+        for weight, norm in zip(weights, plain, strict=True)
+        for part in (weight, norm.weight, norm.bias)
+    ]
+    eps = plain[0].eps
+    out, *found = _GroupedMaximum.apply(xyz, centres, p, index, eps, running, *parameters)
+    for norm, mean, var in zip(plain, found[::2], found[1::2], strict=True):
+        track(norm, mean, var, index.numel())
+    return out
 
 
 @dataclass(frozen=True)
@@ -148,7 +174,13 @@ class _Moments:
 
 
 class _GroupedMaximum(torch.autograd.Function):
-    """See the module. All rows lie as [groups, members, channels]."""
+    """See the module. All rows lie as [groups, members, channels].
+
+    From the points [R, 3], the groups' centres [G, 3], the first convolution of the points'
+    features [R, C] or None, the groups' rows [G, K], the norms' eps, for each norm its mean and
+    variance or None (then the members'), and each layer's weight, gamma and beta. To [G, D], and
+    mean and biased variance of each norm's input, without gradient.
+    """
 
     @staticmethod
     def forward(
@@ -182,7 +214,7 @@ class _GroupedMaximum(torch.autograd.Function):
             moments, make = _Moments(), _maker(source, layers, z, parts)
             after = []
             for i in range(len(parts)):
-                after.append(times(make(i), weight))
+                after.append(matmul_t(make(i), weight))
                 if training[level]:
                     moments.add(after[i])
             z += after
@@ -195,7 +227,7 @@ class _GroupedMaximum(torch.autograd.Function):
         covariance, make = _Covariance(), _maker(source, layers, z, parts)
         for i, part in enumerate(parts):
             y = make(i)
-            best[part], where[part] = max_over_rows(times(y, signed))
+            best[part], where[part] = max_over_rows(matmul_t(y, signed))
             if training[-1]:
                 covariance.add(y)
         best *= sign
@@ -244,7 +276,7 @@ class _GroupedMaximum(torch.autograd.Function):
         dy: list[Tensor] = []
         for i, part in enumerate(parts):
             y = make(i)
-            out = times(y, product, bias) if ctx.training[-1] else torch.zeros_like(y)
+            out = matmul_t(y, product, bias) if ctx.training[-1] else torch.zeros_like(y)
             _at_maxima(out, dweight, y, weight, at_max[part], where[part])
             out.mul_(y > 0)
             sums.add(out, z[len(z) - len(parts) + i] if z else source(part))
@@ -261,8 +293,8 @@ class _GroupedMaximum(torch.autograd.Function):
             for i, part in enumerate(parts):
                 dz = _dz(dy[i], here[i], affine, ctx.training[level])
                 y = make(i)
-                dweight += outer(dz.flatten(0, 1), y.flatten(0, 1))
-                out = times(dz, transposed).mul_(y > 0)
+                dweight += t_matmul(dz.flatten(0, 1), y.flatten(0, 1))
+                out = matmul_t(dz, transposed).mul_(y > 0)
                 sums.add(out, z[len(z) - len(parts) + i] if z else source(part))
                 dy[i] = out
             grads += [dbeta, dgamma, dweight]
@@ -277,7 +309,7 @@ class _GroupedMaximum(torch.autograd.Function):
             relative = source.relative(part)
             z_first = source.first(part, relative)
             dz = _dz(dy[i], z_first, affine, ctx.training[0]).flatten(0, 1)
-            dweight += outer(dz, relative)
+            dweight += t_matmul(dz, relative)
             if dxyz is not None or dcentres is not None:
                 drelative = dz @ weights[0]  # [g * k, 3]
                 if dxyz is not None:

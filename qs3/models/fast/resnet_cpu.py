@@ -1,4 +1,4 @@
-"""A training step of `ResNet18` on the CPU with few passes over memory and over empty pixels.
+"""A training step of `qs3.models.resnet` on the CPU with few passes over memory and empty pixels.
 
 The same sums as the plain network. What differs is what is computed, stored and when:
 - Depth images are mostly empty: a stage works on windows of them and on one empty image where
@@ -30,7 +30,6 @@ from torch.nn import functional as F
 
 from qs3.models.fast.active_windows import Layout, cut, reach, recut, recut_back, whole, windows
 from qs3.models.norms import active, track
-from qs3.models.resnet import ConvNorm, ResNet18
 
 _AT_ONCE = 1 << 19  # values of a map worked on at once: 2 MB in float32
 _WIDE = 512  # values of a row; short rows are slow, so several pixels make one
@@ -56,7 +55,7 @@ class _Layer:
     """A convolution and its norm: the convolution's output, and what the norm makes of it."""
 
     def __init__(
-        self, modules: ConvNorm, parameters: Iterator[Tensor], room: _Room, layout: Layout
+        self, modules: Any, parameters: Iterator[Tensor], room: _Room, layout: Layout
     ) -> None:
         self.norm, self.room, self.layout = active(modules.norm), room, layout
         self.stride, self.padding = modules.conv.stride, modules.conv.padding
@@ -212,7 +211,7 @@ class _Block:
 
 class _Step(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, images: Tensor, net: ResNet18, *parameters: Tensor) -> Tensor:
+    def forward(ctx: Any, images: Tensor, net: Any, *parameters: Tensor) -> Tensor:
         given, room, stages = iter(parameters), _Room(), _stages(net)
         layouts = _layouts(images[:, 0] != 0, net)
         stem = _Layer(net.stem, given, room, layouts[0])
@@ -269,17 +268,17 @@ def _one_part(layout: Layout) -> Layout:
     return whole(layout.images, layout.h, layout.w, layout.images * layout.h * layout.w)
 
 
-def _stages(net: ResNet18) -> list[list[Any]]:
+def _stages(net: Any) -> list[list[Any]]:
     """Blocks whose outputs are of one size."""
     stages: list[list[Any]] = [[]]
     for block in net.blocks:
-        if block.first.conv.stride[0] > 1:  # type: ignore[union-attr, index]
+        if block.first.conv.stride[0] > 1:
             stages.append([])
         stages[-1].append(block)
     return stages
 
 
-def _layouts(filled: Tensor, net: ResNet18) -> list[Layout]:
+def _layouts(filled: Tensor, net: Any) -> list[Layout]:
     """How each stage's maps are kept: windows as long as they are worth it, then whole images."""
     images, h, w = filled.shape
     rows, columns = reach(filled.any(2)), reach(filled.any(1))
@@ -329,26 +328,31 @@ def _mask(g: Tensor, out: Tensor) -> Tensor:
     return torch.ops.aten.threshold_backward.grad_input(g, out, 0, grad_input=g)
 
 
-def _layers(block: nn.Module) -> tuple[ConvNorm, ConvNorm, ConvNorm | None]:
-    return block.first, block.second, block.shortcut  # type: ignore[return-value]
+def _layers(block: Any) -> tuple[Any, Any, Any]:
+    """Convolutions with their norms; the last one, of the shortcut, may be None."""
+    return block.first, block.second, block.shortcut
 
 
-def can_step(net: ResNet18, images: Tensor) -> bool:
-    """Whether `step` gives what `net(images)` does: batch norms in training, on the CPU."""
-    norms = [active(m.norm) for m in net.modules() if isinstance(m, ConvNorm)]
+def _modules(net: Any) -> list[Any]:
+    """All of them, in the order of their parameters here."""
+    return [net.stem, *(m for block in net.blocks for m in _layers(block) if m)]
+
+
+def can_step(net: nn.Module, images: Tensor) -> bool:
+    """Whether `step` gives what the plain net does: batch norms in training, on the CPU."""
+    norms = [active(module.norm) for module in _modules(net)]
     plain = all(
         type(n) is nn.BatchNorm2d and n.training and n.affine and n.track_running_stats
         for n in norms
     )  # fmt: skip
-    same = images.device.type == "cpu" and images.dtype == net.stem.conv.weight.dtype
+    same = images.device.type == "cpu" and images.dtype == norms[0].weight.dtype
     return plain and same and not torch.is_autocast_enabled("cpu") and not images.requires_grad
 
 
-def step(net: ResNet18, images: Tensor) -> Tensor:
-    """`net(images)` in train mode: [I, 1, H, W] to [I, D]. The images get no gradient."""
-    modules = [net.stem, *(m for block in net.blocks for m in _layers(block) if m)]
-    norms = [active(m.norm) for m in modules]
-    parameters = [
-        p for m, n in zip(modules, norms, strict=True) for p in (m.conv.weight, n.weight, n.bias)
-    ]
+def step(net: nn.Module, images: Tensor) -> Tensor:
+    """The features of a `ResNet18` in train mode: [I, 1, H, W] to [I, D], no gradient of images."""
+    parameters = []
+    for module in _modules(net):
+        norm = active(module.norm)
+        parameters += [module.conv.weight, norm.weight, norm.bias]
     return _Step.apply(images, net, *parameters)

@@ -1,8 +1,7 @@
-"""Relation-shape convolution (Liu et al., "Relation-Shape CNN", CVPR 2019, eq. 4) on unique pairs.
+"""Relation-shape convolution on unique pairs (`qs3.models.rscnn.RSConv` has it as published).
 
-As published: for each centre i and slot j of its ball, w_ij = M(h_ij) with M two linear layers and
-a norm and ReLU between, p_ij = w_ij * x_ij, then norm, ReLU and the maximum over j. Written out,
-those are a dozen tensors [B, C, M, K]. Here, with the same sums:
+Written out, h_ij, w_ij = M(h_ij), p_ij = w_ij * x_ij and what comes between them are a dozen
+tensors [B, M, K, C]. Here, with the same sums:
 
 - Slots that repeat a ball's first member are computed once and weigh as much as there are of them
   in statistics. Balls are put together by size, so that there are hardly any other copies.
@@ -26,8 +25,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from qs3.models.fast.edgeconv import max_over_rows
-from qs3.models.norms import active, make_norm, norm_rows, track, uses_batch
+from qs3.models.fast.pointwise_max import max_over_rows
+from qs3.models.norms import active, track, uses_batch
 
 _AT_ONCE = 1 << 18  # values of p worked on at once: 1 MB in float32
 _STEP = 4  # sizes of balls are rounded up to multiples of it
@@ -225,54 +224,43 @@ class _Moments:
         return self.mean.to(dtype), (self.squares / max(self.total, 1)).to(dtype)
 
 
-class RSConv(nn.Module):
-    """One layer: features at the centres from those of the points in their balls.
+def rs_conv(
+    relations: Relations,
+    features: Tensor | None,
+    relation: str,
+    *,
+    mapping: tuple[nn.Linear, nn.Module],
+    weighing: nn.Linear,
+    raising: tuple[nn.Linear, nn.Module] | None,
+    norm: nn.Module,
+) -> Tensor:
+    """max_j relu(norm(M(h_ij) * x_ij)) of each ball: [count, C].
 
     Args:
-        channels: of the points' features; 0 at the first layer, which raises d to 16 channels.
-        hidden: channels between the two layers of M.
-        out_channels: of the result.
-        norm: see `qs3.models.norms`; with "instance" it must be given one cloud at a time.
+        relations: the balls of all clouds.
+        features: [P, C'] of the points of all clouds; None if `raising` makes x of d.
+        relation: of `relations`.
+        mapping, weighing: M is `weighing` of relu of `mapping`, a layer and its norm.
+        raising: x is relu of this layer and norm, or (d, features) if None.
+        norm: of the products. With instance norms give one cloud at a time.
     """
-
-    def __init__(
-        self, channels: int, hidden: int, out_channels: int, *, norm: str = "batch"
-    ) -> None:
-        super().__init__()
-        inner = channels + 3 if channels else 16
-        self.raising = None if channels else nn.Linear(3, inner)
-        self.raising_norm = None if channels else make_norm(norm, inner)
-        self.mapping, self.weighing = nn.Linear(10, hidden), nn.Linear(hidden, inner)  # M
-        self.mapping_norm, self.norm = make_norm(norm, hidden), make_norm(norm, inner)
-        self.channel_raising = nn.Linear(inner, out_channels)
-        self.channel_norm = make_norm(norm, out_channels)
-        for module in self.modules():
-            if isinstance(module, nn.Linear):
-                nn.init.kaiming_normal_(module.weight)
-                nn.init.zeros_(module.bias)
-
-    def forward(self, features: Tensor | None, relations: Relations, relation: str) -> Tensor:
-        """Features [P, channels] of the points of all clouds to [centres, out_channels]."""
-        moments = relations.moments()
-        slots = relations.slots
-        mapping = _in_u(self.mapping, relation)
-        mapping = _fold(mapping, self.mapping_norm, moments, slots)
-        raising = None
-        if self.raising is not None:
-            assert self.raising_norm is not None
-            weight, bias = self.raising.weight, self.raising.bias
-            none = weight.new_zeros(len(weight), 4)
-            raising = torch.cat([none, weight, bias[:, None]], dim=1)  # [16, 8]
-            raising = _fold(raising, self.raising_norm, moments, slots)
-        gamma = active(self.norm).weight
-        sign = torch.where(gamma < 0, -1.0, 1.0).to(gamma.dtype)
-        best, mean, var = _LargestProduct.apply(
-            relations, features, mapping, raising,
-            self.weighing.weight * sign[:, None], self.weighing.bias * sign, uses_batch(self.norm),
-        )  # fmt: skip
-        h, shift = _affine(self.norm, sign * mean, var, slots)
-        out = self.channel_raising((best * (sign * h) + shift).relu())
-        return norm_rows(self.channel_norm, out).relu()
+    moments = relations.moments()
+    slots = relations.slots
+    first = _fold(_in_u(mapping[0], relation), mapping[1], moments, slots)
+    raised = None
+    if raising is not None:
+        weight, bias = raising[0].weight, raising[0].bias
+        none = weight.new_zeros(len(weight), 4)
+        raised = torch.cat([none, weight, bias[:, None]], dim=1)  # [16, 8]
+        raised = _fold(raised, raising[1], moments, slots)
+    gamma = active(norm).weight
+    sign = torch.where(gamma < 0, -1.0, 1.0).to(gamma.dtype)
+    best, mean, var = _LargestProduct.apply(
+        relations, features, first, raised,
+        weighing.weight * sign[:, None], weighing.bias * sign, uses_batch(norm),
+    )  # fmt: skip
+    h, shift = _affine(norm, sign * mean, var, slots)
+    return (best * (sign * h) + shift).relu()
 
 
 def _in_u(layer: nn.Linear, relation: str) -> Tensor:

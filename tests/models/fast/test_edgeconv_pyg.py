@@ -6,7 +6,7 @@ from torch import nn
 from torch_geometric.nn import EdgeConv as PygEdgeConv
 
 from qs3.geometry.neighbours import knn
-from qs3.models.fast.edgeconv import EdgeConv
+from qs3.models.dgcnn import EdgeConv
 
 
 def pyg_twin(ours, in_channels):
