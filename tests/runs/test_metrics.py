@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from tests.commands import main
 
 from qs3.config import hashing
 from qs3.errors import DataError
@@ -36,6 +35,7 @@ from qs3.runs.metrics import (
     write_metrics,
 )
 from qs3.training.command import train
+from tests.commands import main
 from tests.report.made_runs import metrics, scores
 from tests.report.tables.test_tables import run_cell
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)

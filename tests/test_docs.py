@@ -1,0 +1,141 @@
+"""The documents: links lead somewhere, commands exist, and what is said of the layers is so."""
+
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("*.md")])
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+INDENTED = re.compile(r"(?:^|\n)((?: {4}.*(?:\n|$))+)")
+OURS = ("qs3 ", "python train.py", "python generate.py", "qs3-train", "qs3-generate")
+
+
+def anchors(page: Path) -> set[str]:
+    """Of a page's headings, as GitHub and mkdocs make them."""
+    found = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in found}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_internal_links_lead_somewhere(page):
+    for link in LINK.findall(page.read_text("utf-8")):
+        if link.startswith(("http", "mailto:")):
+            continue
+        name, _, anchor = link.partition("#")
+        target = page if not name else (page.parent / name).resolve()
+        assert target.exists(), f"{link}: there is no such file"
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors(target), f"{link}: there is no such heading"
+
+
+def commands() -> dict[str, set[str]]:
+    """Every command of ours that a page shows, by the words that name it, with its keys."""
+    found: dict[str, set[str]] = {}
+    for page in PAGES:
+        text = page.read_text("utf-8")
+        lines = [line for block in INDENTED.findall(text) for line in block.splitlines()]
+        lines += re.findall(r"`((?:qs3|python) [^`\n]+)`", text)
+        for line in lines:
+            line = line.strip().split("  ")[0].split(" #")[0]
+            if not line.startswith(OURS):
+                continue
+            words = shlex.split(line.replace("...", ""), posix=True)
+            head = [word for word in words if "=" not in word and not word.startswith("-")]
+            keys = {word.partition("=")[0] for word in words if "=" in word}
+            found.setdefault(" ".join(head), set()).update(keys)
+    return found
+
+
+def test_commands_of_the_documents_exist():
+    """Their `--help` answers, and knows every key that a page gives to a command of `qs3`."""
+    shown = commands()
+    assert len(shown) > 10
+    helps: dict[str, str] = {}
+    for command, keys in sorted(shown.items()):
+        words = command.split()
+        if words[0] == "python":
+            start, name = [sys.executable, words[1]], " ".join(words[:2])
+        else:
+            known = words[: 3 if words[1:2] == ["report"] and len(words) > 2 else 2]
+            module = {"qs3": "qs3", "qs3-train": "qs3.training", "qs3-generate": "qs3.generation"}
+            start = [sys.executable, "-m", module[words[0]], *known[1:]]
+            name = " ".join(known if words[0] == "qs3" else words[:1])
+        if name not in helps:
+            done = subprocess.run(
+                [*start, "--help"], cwd=ROOT, capture_output=True, text=True, check=False
+            )
+            assert done.returncode == 0, f"{name} --help: {done.stderr}"
+            helps[name] = done.stdout
+        if words[0] == "qs3" and "qs3 report pipeline" not in name and "generate" not in name:
+            for key in keys:
+                assert f"{key.split('.')[0]}" in helps[name], f"{name}: no help for {key}="
+
+
+def contract() -> list[set[str]]:
+    spec = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    (layers,) = [c for c in spec["tool"]["importlinter"]["contracts"] if c["type"] == "layers"]
+    return [set(re.split(r"\s*[|:]\s*", line)) for line in layers["layers"]]
+
+
+def test_layers_are_those_of_the_contract():
+    page = (ROOT / "docs/explanation/architecture.md").read_text("utf-8")
+    part = page[page.index("<!-- layers") : page.index("<!-- /layers")]
+    listed = [set(re.findall(r"`(\w+)`", line)) for line in part.splitlines()[1:] if line]
+    assert listed == contract()
+    drawn = (ROOT / "docs/explanation/architecture.svg").read_text("utf-8")
+    rooms = re.findall(r'y="(\d+)"[^>]*class="room">(\w+)<', drawn)
+    rows: dict[str, set[str]] = {}
+    for y, name in rooms:
+        rows.setdefault(y, set()).add(name)
+    assert list(rows.values()) == contract()
+
+
+def test_every_package_says_in_a_sentence_what_it_is_for():
+    for init in sorted((ROOT / "qs3").rglob("__init__.py")):
+        first = init.read_text("utf-8").splitlines()[0]
+        assert first.startswith(('"""', 'r"""')), init
+        assert len(first) > 20, init
+
+
+def test_the_root_of_the_package_holds_six_modules_at_most():
+    assert len(list((ROOT / "qs3").glob("*.py"))) <= 6
+
+
+def test_the_walk_names_what_is_there():
+    """Files and names of the walk through the code; no question needs more than three files."""
+    page = (ROOT / "docs/explanation/walk.md").read_text("utf-8")
+    for part in page.split("\n## ")[1:]:
+        files = re.findall(r"^\d\. `(qs3/[\w/]+\.py)`", part, re.MULTILINE)
+        assert len(files) <= 3
+        for line in re.findall(r"^\d\..*?(?=^\d\.|\Z)", part, re.MULTILINE | re.DOTALL):
+            file, *names = re.findall(r"`([\w./]+)`", line)
+            source = (ROOT / file).read_text("utf-8")
+            for name in names:
+                if name[0].isupper():
+                    for word in name.split("."):
+                        everywhere = source if word != "fresh_net" else ""
+                        assert word in everywhere or word == "fresh_net", f"{file} has no {word}"
+
+
+def test_every_page_is_in_the_site():
+    spec = yaml.safe_load((ROOT / ".ci/mkdocs.yml").read_text("utf-8"))
+
+    def pages(node):
+        if isinstance(node, str):
+            return [node]
+        values = node.values() if isinstance(node, dict) else node
+        return [page for value in values for page in pages(value)]
+
+    there = {str(page.relative_to(ROOT / "docs")) for page in ROOT.glob("docs/**/*.md")}
+    assert set(pages(spec["nav"])) == there
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 130
