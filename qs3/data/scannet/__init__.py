@@ -13,7 +13,7 @@ of PointDA-10's ScanNet10. What is not, is decided in `extraction.py` and `objec
     scene.py          one scene to its objects
     extraction.py     all scenes: parts, resume, the dataset
     pool.py           scenes in several processes
-    __main__.py       the command: qs3 scannet --help
+    cli.py            the command: qs3 scannet --help
 
 Facts about ScanNet's files were taken from its public tools (github.com/ScanNet/ScanNet:
 SensReader, AnnotationTools, BenchmarkScripts) and README; PointDA-10's names from
