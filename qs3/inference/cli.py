@@ -7,12 +7,8 @@ from typing import Any
 
 from qs3.utils.cli import Command, Option, text, whole
 
-_CKPT = Option(
-    "ckpt", text("RUN"), "the folder of a finished run, or its result.pt alone", required=True
-)
-_THREADS = Option(
-    "threads", whole(), "batches at the same time, each on one thread; by default one a processor"
-)
+_CKPT = Option("ckpt", text("RUN"), "a finished run's folder, or its result.pt", required=True)
+_THREADS = Option("threads", whole(), "batches at the same time (default: one a processor)")
 
 
 def _predict(threads: int | None, **given: Any) -> int:
@@ -39,27 +35,9 @@ PREDICT = Command(
     _predict,
     (
         _CKPT,
-        Option(
-            "input",
-            text("PATH"),
-            "a file of clouds, or a folder with any depth of folders: .xyz .txt .npy .npz .ply "
-            ".pcd .h5 .hdf5. Any number of points, any unit, any place; other files are passed "
-            "over",
-            required=True,
-        ),
-        Option(
-            "out",
-            text("FILE"),
-            ".csv or .json; the line at the end says so if it replaced a file",
-            "predictions.csv",
-        ),
-        Option(
-            "up",
-            text("AXIS"),
-            "the axis that points up in your files: x y z -x -y -z. Which way is up is not "
-            "guessed, and the wrong axis costs most of the accuracy",
-            "z",
-        ),
+        Option("input", text("PATH"), "a file of clouds, or a folder of them", required=True),
+        Option("out", text("FILE"), ".csv or .json", "predictions.csv"),
+        Option("up", text("AXIS"), "which points up in your files: x y z -x -y -z", "z"),
         Option("batch_size", whole(), "clouds that the net sees at a time", 16),
         _THREADS,
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
@@ -69,14 +47,18 @@ PREDICT = Command(
         "qs3 predict ckpt=result.pt input=scans out=predictions.json up=y device=cuda",
     ),
     about="""
+Clouds are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of points,
+any unit, any place. Other files are passed over. Which way is up is not guessed, and the wrong axis
+costs most of the accuracy.
+
 A row for each cloud: file (name[3] is cloud 3 of a file that holds several), status, class,
 confidence, points, dropped, out_of_range, reason, and p_<class>, a probability for each class.
 Points that are NaN or infinite are left out: dropped counts them, points the others.
 
 out_of_range=yes: a cloud unlike all those of training (fewer points than the net samples and than
 training had; spacing, flatness, height or stray points outside what 99.8 % of them had); the reason
-says in what. It guarantees nothing:
-an object of no known class also gets a class, often with high confidence.
+says in what. It guarantees nothing: an object of no known class also gets a class, often with high
+confidence.
 
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.
 """,
@@ -89,18 +71,8 @@ EXPORT = Command(
     _export,
     (
         _CKPT,
-        Option(
-            "out",
-            text("FILE"),
-            ".onnx for onnxruntime and others, .pt2 for torch.export.load",
-            "model.onnx",
-        ),
-        Option(
-            "check",
-            text("PATH"),
-            "clouds to compare the written net's logits with the net's on, z up; made-up ones by "
-            "default, and damaged ones are left out",
-        ),
+        Option("out", text("FILE"), ".onnx, or .pt2 for torch.export.load", "model.onnx"),
+        Option("check", text("PATH"), "clouds, z up, to compare the written net with the net on"),
         _THREADS,
     ),
     (
@@ -109,7 +81,8 @@ EXPORT = Command(
     ),
     about="""
 It takes prepared clouds [clouds, points, 3] and gives logits; how a cloud is prepared, and the
-names of the classes, stand in the .onnx file's metadata.
+names of the classes, stand in the .onnx file's metadata. The written net is run and its logits
+compared with the net's, on made-up clouds or on those of check=; damaged ones are left out.
 """,
     interrupted="nothing was saved",
 )

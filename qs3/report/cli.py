@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,30 +82,32 @@ def _train(
 
 def _compare(base: str | None, out: str | None, **given: Any) -> None:
     from qs3.report.tables import comparison
-    from qs3.utils.files import write_text
 
     table = _built(**given)
     if base is None:
         raise ConfigError(f"against which row? base={'|'.join(table.rows)}")
     found, at = comparison.against(table, base), _saved_at(table, out, given)
-    write_text(f"{at}-compared.md", comparison.text(found, base, markdown=True, table=table))
-    write_text(f"{at}-compared.csv", comparison.csv_text(found, table))
-    print(comparison.text(found, base, table=table))
-    print(f"saved {at}-compared.md, .csv")
+    _save(f"{at}-compared", table, found, base)
 
 
 def _effects(out: str | None, **given: Any) -> None:
     from qs3.report.tables import comparison
-    from qs3.utils.files import write_text
 
     table = _built(**given)
     found, at = comparison.effects(table), _saved_at(table, out, given)
     if not found:
         raise ConfigError(f"table {table.name} has no two columns or rows with runs of ours")
-    write_text(f"{at}-effects.md", comparison.text(found, markdown=True, table=table))
-    write_text(f"{at}-effects.csv", comparison.csv_text(found, table))
-    print(comparison.text(found, table=table))
-    print(f"saved {at}-effects.md, .csv")
+    _save(f"{at}-effects", table, found)
+
+
+def _save(at: str, table: Table, found: Sequence[Any], base: str = "") -> None:
+    from qs3.report.tables.comparison import csv_text, text
+    from qs3.utils.files import write_text
+
+    write_text(f"{at}.md", text(found, base, markdown=True, table=table))
+    write_text(f"{at}.csv", csv_text(found, table))
+    print(text(found, base, table=table))
+    print(f"saved {at}.md, .csv")
 
 
 def _page(run: str, data_dir: str | None, out: str | None) -> None:
@@ -181,11 +184,7 @@ def _pipeline(
 
 _TABLE = (
     Option(
-        "table",
-        text("NAME"),
-        "conf/table/NAME.yaml, or the path of such a file",
-        required=True,
-        choices=lambda: choices("table"),
+        "table", text("NAME"), "of conf/table, or a file", None, True, partial(choices, "table")
     ),
     Option("log_dir", text("FOLDER"), "paths.log_dir of the runs (default logs)"),
     Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
@@ -267,11 +266,7 @@ PICTURES = Command(
         Option("domains", several(text("NAME")), "of conf/domain", required=True),
         Option("data_dir", text("FOLDER"), "paths.data_dir of a run", "data"),
         Option("split", text("NAME"), "train or test", "train"),
-        Option(
-            "out",
-            text("PATH"),
-            "default DATA_DIR/pictures; with NAME.png the comparison alone is drawn",
-        ),
+        Option("out", text("PATH"), "default DATA_DIR/pictures; NAME.png: the comparison alone"),
     ),
     ("qs3 report pictures domains=modelnet10,specklenet10,kinectsim10",),
 )

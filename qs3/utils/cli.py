@@ -16,6 +16,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from qs3.errors import ConfigError, Qs3Error
@@ -42,8 +43,13 @@ class Kind(NamedTuple):
 
 
 def text(word: str = "TEXT") -> Kind:
-    """Anything, a path for instance; `word` stands for it in the help."""
+    """Anything; `word` stands for it in the help."""
     return Kind(word, str)
+
+
+def path(word: str = "PATH") -> Kind:
+    """A file or folder; ~ is the home folder."""
+    return Kind(word, lambda words: Path(words).expanduser(), "a path")
 
 
 def whole(least: int = 1) -> Kind:
@@ -116,9 +122,9 @@ class Option:
     def explained(self) -> str:
         """For the help: what it means, its default and its choices."""
         value = self.default
-        if isinstance(value, tuple):
-            value = ",".join(map(str, value))
-        notes = ["required"] * self.required + [f"default {value}"] * (
+        shown = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        notes = ["required"] * self.required
+        notes += [f"default {'true' if value is True else shown}"] * (
             value not in (None, "", False)
         )
         choices = f"; one of {', '.join(self.choices())}" if self.choices is not tuple else ""

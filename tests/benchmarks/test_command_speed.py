@@ -27,10 +27,10 @@ def _run(folder: Path, *words: str) -> None:
         (str(ROOT / "train.py"), "--help"),
         (str(ROOT / "train.py"), "experiment=qs3_s2d"),  # its data are not there
         (str(ROOT / "generate.py"), "--help"),
-        ("-m", "qs3.inference", "--help"),
-        ("-m", "qs3.report", "--help"),
+        ("-m", "qs3", "predict", "--help"),
+        ("-m", "qs3", "--help"),
     ],
-    ids=["train --help", "train without data", "generate --help", "predict --help", "report"],
+    ids=["train --help", "train without data", "generate --help", "predict --help", "qs3 --help"],
 )
 def test_first_answer(
     words: tuple[str, ...], benchmark: BenchmarkFixture, tmp_path: Path,

@@ -107,7 +107,7 @@ def test_table_of_such_runs(tmp_path):
 
 def test_the_command_of_the_report(toy, unlabelled, tmp_path):
     train(toy("selftraining=none"))
-    command = [sys.executable, "-m", "qs3.report", f"log_dir={tmp_path / 'logs'}"]
+    command = [sys.executable, "-m", "qs3", "report", f"log_dir={tmp_path / 'logs'}"]
     result = subprocess.run(
         [*command, "table=quickstart", f"out={tmp_path / 'out'}"],
         capture_output=True, text=True, check=False,

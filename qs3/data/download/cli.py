@@ -67,28 +67,11 @@ DOWNLOAD = Command(
     "published datasets, put where their domain looks for them",
     _download,
     (
-        Option(
-            "into",
-            text("FOLDER"),
-            "the data folder, paths.data_dir of a run. Archives come to its downloads/, what is in "
-            "them to published/",
-            "data",
-        ),
-        Option(
-            "accept_terms",
-            text("WORD"),
-            "the agreement that you have made, for what needs one (scannet)",
-            "",
-        ),
-        Option(
-            "mirror",
-            text("ADDRESS"),
-            "base address of a copy of the archives, each under the name that the list shows; also "
-            f"taken from the environment, {MIRROR}",
-            "",
-        ),
+        Option("into", text("FOLDER"), "the data folder, paths.data_dir of a run", "data"),
+        Option("accept_terms", text("WORD"), "the agreement that you have made, e.g. scannet", ""),
+        Option("mirror", text("ADDRESS"), f"of a copy of the archives (default ${MIRROR})", ""),
         Option("archive", text("FILE"), "unpack this, e.g. what your browser downloaded"),
-        Option("root", text("FOLDER"), "in the archive; to take where it cannot be found out", ""),
+        Option("root", text("FOLDER"), "of the archive, to take if it cannot be found out", ""),
         Option("keep", FLAG, "false deletes the archive when it is unpacked", True),
     ),
     (
@@ -97,6 +80,9 @@ DOWNLOAD = Command(
         "qs3 download scannet10 accept_terms=scannet into=data",
     ),
     about="""
+Archives come to downloads/ in the data folder, what is in them to published/. On a mirror each lies
+under the name that the list shows.
+
 An interrupted download continues where it ended: run the same command again. What is in place is
 left alone. No hashes of these files were published; zip and gzip have checksums of their own, of
 ModelNet10.zip the size is known, and .download.json in the folder notes the SHA-256 of the archive.

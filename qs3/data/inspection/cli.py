@@ -6,32 +6,36 @@ from collections.abc import Sequence
 from typing import Any
 
 from qs3.errors import ConfigError
-from qs3.utils.cli import Command, Option, text, whole
+from qs3.utils.cli import Command, Option, path, text, whole
 
 _COMMON = (
     Option("data_dir", text("FOLDER"), "paths.data_dir of a run"),
     Option("sample", whole(), "clouds measured one by one; larger sets are drawn from", 3000),
     Option("seed", whole(0), "of all draws (default 0)", 0),
-    Option(
-        "meshes",
-        text("FOLDER"),
-        "of the meshes that a dataset was generated from, if not from the catalogue",
-    ),
+    Option("meshes", path("FOLDER"), "that it was generated from, if not from the catalogue"),
 )
 _KEYS = "of the domain's config, e.g. variant=points_clean path=PATH published.folder=PATH"
 
 
-def _inspect(domain: str, data_dir: str | None, more: Sequence[str], **given: Any) -> None:
-    from qs3.data.inspection.command import inspect_command
+def _inspect(
+    domain: str, data_dir: str | None, out: str | None, more: Sequence[str], **given: Any
+) -> None:
+    from qs3.data.inspection.command import Bounds, inspect_command
 
-    print(inspect_command(domain, _overrides(data_dir, more), **given))
+    print(inspect_command(domain, _overrides(data_dir, more), Bounds(**given), out))
 
 
-def _compare(words: Sequence[str], data_dir: str | None, more: Sequence[str], **given: Any) -> None:
+def _compare(
+    words: Sequence[str],
+    data_dir: str | None,
+    out: str | None,
+    more: Sequence[str],
+    **given: Any,
+) -> None:
     if len(words) != 2:
         got = " ".join(words) or "none"
         raise ConfigError(f"compare takes two domains, names or folders: compare A B; got {got}")
-    from qs3.data.inspection.command import compare_command
+    from qs3.data.inspection.command import Bounds, compare_command
 
     sides: dict[str, dict[str, str]] = {"a": {}, "b": {}}
     for key, value in _overrides(data_dir, more).items():
@@ -39,7 +43,7 @@ def _compare(words: Sequence[str], data_dir: str | None, more: Sequence[str], **
         for name in [side] if side in sides else sides:
             sides[name][rest if side in sides else key] = value
     a, b = zip(words, sides.values(), strict=True)
-    print(compare_command(a, b, **given))
+    print(compare_command(a, b, Bounds(**given), out))
 
 
 def _overrides(data_dir: str | None, more: Sequence[str]) -> dict[str, str]:
@@ -52,12 +56,7 @@ INSPECT = Command(
     "what a dataset is like, before training on it",
     _inspect,
     (
-        Option(
-            "domain",
-            text("NAME"),
-            "a domain (conf/domain), or the folder of a dataset (with a / in it)",
-            required=True,
-        ),
+        Option("domain", text("NAME"), "of conf/domain, or a dataset's folder", required=True),
         *_COMMON,
         Option("out", text("FOLDER"), "out/inspection/NAME by default"),
     ),

@@ -16,26 +16,19 @@ OUT = Path("out/inspection")
 
 
 def inspect_command(
-    domain: str,
-    overrides: Mapping[str, str],
-    *,
-    sample: int = Bounds.sample,
-    seed: int = Bounds.seed,
-    meshes: str | None = None,
-    out: str | None = None,
+    domain: str, overrides: Mapping[str, str], bounds: Bounds, out: str | None = None
 ) -> str:
     """Inspect one domain and save what was found.
 
     Args:
         domain, overrides: see `open_named`.
-        sample, seed, meshes: see `Bounds`.
+        bounds: how much is looked at.
         out: folder of the results.
 
     Returns:
         The text for the terminal.
     """
     opened = open_named(domain, overrides)
-    bounds = _bounds(sample, seed, meshes)
     steps = min(bounds.sample, len(opened.data))
     with progress_bar(f"inspecting {opened.name}", total=steps) as advance:
         facts = inspect(opened, bounds, advance)
@@ -52,15 +45,11 @@ def inspect_command(
 def compare_command(
     one: tuple[str, Mapping[str, str]],
     other: tuple[str, Mapping[str, str]],
-    *,
-    sample: int = Bounds.sample,
-    seed: int = Bounds.seed,
-    meshes: str | None = None,
+    bounds: Bounds,
     out: str | None = None,
 ) -> str:
     """Compare two domains, each with its overrides, and save what was found; as above."""
     a, b = (open_named(name, overrides) for name, overrides in (one, other))
-    bounds = _bounds(sample, seed, meshes)
     with progress_bar(f"comparing {a.name} and {b.name}", total=COMPARE_STEPS) as advance:
         facts = compare(a, b, bounds, advance)
     folder = make_folder(out or OUT / f"{_file_name(a)}-{_file_name(b)}")
@@ -73,10 +62,6 @@ def compare_command(
     text = of_pair(facts, markdown=False)
     picture = " and clouds.png" if split else ""
     return f"{text}\nsaved comparison.json, comparison.md{picture} in {folder}"
-
-
-def _bounds(sample: int, seed: int, meshes: str | None) -> Bounds:
-    return Bounds(sample, seed, Path(meshes).expanduser() if meshes else None)
 
 
 def _file_name(opened: Opened) -> str:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 from qs3.data.scannet.settings import Extraction
-from qs3.utils.cli import FLAG, NUMBER, Command, Kind, Option, text, whole
+from qs3.utils.cli import FLAG, NUMBER, Command, Kind, Option, path, text, whole
 
 _PATHS = {
     "scans": "folder of scenes; in scene0000_00/ lie scene0000_00.sens, "
@@ -37,8 +36,7 @@ def _extract(workers: int, force: bool, **given: Any) -> None:
     from qs3.data.scannet.extraction import extract
 
     settings = Extraction(**{key: given.pop(key) for key in _SETTINGS})
-    paths = {key: Path(path).expanduser() for key, path in given.items()}
-    extract(**paths, workers=workers, force=force, settings=settings)
+    extract(**given, workers=workers, force=force, settings=settings)
 
 
 SCANNET = Command(
@@ -46,7 +44,7 @@ SCANNET = Command(
     "DepthScanNet10 from raw ScanNet: objects cropped from the depth images",
     _extract,
     (
-        *(Option(key, text("PATH"), meaning, required=True) for key, meaning in _PATHS.items()),
+        *(Option(key, path(), meaning, required=True) for key, meaning in _PATHS.items()),
         Option("workers", whole(0), "processes; their number changes no byte", 1),
         Option("force", FLAG, "delete the dataset at out first", False),
         *(

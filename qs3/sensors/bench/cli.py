@@ -2,26 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from qs3.utils.cli import FLAG, Command, Option, several, text, whole
-
-
-class _Progress:
-    """A line on stderr every few seconds."""
-
-    def __init__(self, total: int) -> None:
-        self.total, self.done, self.said = total, 0, time.monotonic()
-
-    def __call__(self) -> None:
-        """One step more."""
-        self.done += 1
-        if time.monotonic() - self.said > 5 or self.done == self.total:
-            self.said = time.monotonic()
-            print(f"bench: {self.done} of {self.total} conditions", file=sys.stderr)
 
 
 def _bench(
@@ -36,6 +20,7 @@ def _bench(
     from qs3.sensors.bench import bands, comparison, figures, page, runner
     from qs3.sensors.renderers.mitsuba import MitsubaRenderer
     from qs3.utils.files import make_folder, write_json, write_text
+    from qs3.utils.progress import progress_bar
 
     if real is not None:
         comparison.real_clouds(Path(real))  # said before hours of measuring
@@ -45,10 +30,9 @@ def _bench(
     cache = folder / "cache"
     write_text(cache / ".gitignore", "*\n")  # a page may be committed, its cache not
     renderer = MitsubaRenderer(samples=samples)
-    advance = _Progress(sum(len(plan.conditions(subject)) for subject, _ in subjects))
-    results = [
-        runner.run(subject, config, renderer, cache, plan, advance) for subject, config in subjects
-    ]
+    total = sum(len(plan.conditions(subject)) for subject, _ in subjects)
+    with progress_bar("conditions", total=total) as advance:
+        results = [runner.run(*subject, renderer, cache, plan, advance) for subject in subjects]
     captions = figures.draw_all(results, folder)
     beside = None
     for subject, config in subjects:

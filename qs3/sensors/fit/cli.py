@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from qs3.config.location import CONF, typed
 from qs3.errors import ConfigError
@@ -15,19 +15,8 @@ if TYPE_CHECKING:
     from qs3.sensors.fit.preset import FittedPreset
 
 
-def _fit(
-    words: Sequence[str],
-    line: str,
-    out: str,
-    plot: str | None,
-    intrinsics: str | None,
-    focal: float | None,
-    unit: str | None,
-    distances: Sequence[float] | None,
-    baseline: float | None,
-    power: str | None,
-) -> None:
-    preset = fit(words, intrinsics, focal, unit, distances, baseline, power)
+def _fit(words: Sequence[str], line: str, out: str, plot: str | None, **given: Any) -> None:
+    preset = fit(words, **given)
     file = Path(out).expanduser()
     preset.save(file, line)
     picture = Path(plot or file.with_suffix(".png"))
@@ -111,16 +100,8 @@ FIT = Command(
         Option("intrinsics", text("fx,fy,cx,cy"), "in px, or a JSON file with these keys"),
         Option("focal", NUMBER, "px, instead; the principal point is the middle"),
         Option("unit", text("UNIT"), "m, mm, or units a metre (default: judged by the values)"),
-        Option(
-            "distances",
-            several(NUMBER),
-            "true distances of the wall in the middle of each frame in metres: for the bias",
-        ),
-        Option(
-            "baseline",
-            NUMBER,
-            "metres from camera to projector along x (negative: to the left), for shadows",
-        ),
+        Option("distances", several(NUMBER), "true ones of each frame's middle, m: for the bias"),
+        Option("baseline", NUMBER, "m to the projector along x (negative: to the left): shadows"),
         Option("power", one_of("1", "2"), "fixes the law of the noise"),
     ),
     (

@@ -30,7 +30,7 @@ def test_kill_at_random_instants_changes_no_byte(recorded, tmp_path, victim):
     whole = contents(tmp_path / "whole" / "d")
     assert len(whole) == 24 + 5
     command = [
-        sys.executable, "-m", "qs3.data.scannet", f"scans={tmp_path}/scans", f"out={out}",
+        sys.executable, "-m", "qs3", "scannet", f"scans={tmp_path}/scans", f"out={out}",
         f"labels={tmp_path}/labels.tsv", f"train={tmp_path}/train.txt",
         f"val={tmp_path}/val.txt", "workers=2", "min_points=600",
     ]  # fmt: skip
