@@ -9,7 +9,7 @@ PIP_ARGS ?=
 PARALLEL ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor quickstart lint format test test-all bench clean
+.PHONY: help install doctor quickstart lint format test test-all bench docs clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -49,6 +49,10 @@ test-all: install ## the slow tests too, and the benchmarks once each
 
 bench: install ## speed, as ratios against named baselines
 	$(RUN) -m pytest tests/benchmarks --benchmark-enable -s
+
+docs: install ## the docs as a site, in out/site
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build -q -f .ci/mkdocs.yml
+	@echo "open out/site/index.html"
 
 clean: ## remove what `make quickstart` made
 	rm -rf out

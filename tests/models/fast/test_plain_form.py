@@ -148,7 +148,16 @@ def test_kernel_equals_formula(layer: Callable[[Draw, str], Case], data: st.Data
 
 
 def test_plain_ends_with_its_block() -> None:
-    with pytest.raises(RuntimeError, match="x"), plain(), plain():
+    with plain():
+        with plain():
+            assert not usable()
         assert not usable()
-        raise RuntimeError("x")
+    assert usable()
+
+    def fail() -> None:
+        with plain():
+            raise RuntimeError("x")
+
+    with pytest.raises(RuntimeError, match="x"):
+        fail()
     assert usable()
