@@ -130,7 +130,7 @@ def _tar_members(archive: Path) -> Iterator[_Member]:
                 continue
             plain = info.isreg() and not info.issparse()
             yield _Member(info.name, info.size, plain, lambda i=info: file.extractfile(i))  # type: ignore[misc]
-        while file.fileobj.read(1 << 20):  # type: ignore[union-attr]
+        while file.fileobj.read(1 << 20):
             pass  # to where the checksum of what was packed is compared
 
 
