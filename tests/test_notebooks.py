@@ -15,7 +15,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "notebooks"
-NAMES = ("01_sensor", "02_qbst", "03_results")
+NAMES = ("01_sensor", "02_qbst", "03_results", "04_pyg")
 
 
 def read(name):
@@ -127,3 +127,14 @@ def test_03_results_of_own_runs(tmp_path):
     text = printed(done)
     assert f"runs of {tmp_path / 'logs'}" in text
     assert "no finished run is in this table" in text
+
+
+def test_04_pyg():
+    done = run("04_pyg", FOLDER)
+    text = printed(done)
+    assert "18 clouds of 512 points" in text
+    assert "pos=[2304, 3]" in text  # nine clouds of 256 points
+    assert float(re.search(r"training (\d+\.\d)%", text)[1]) > 80
+    assert "the same bytes: True" in text
+    assert "the same labels: True" in text
+    assert printed(done, "stderr") == ""

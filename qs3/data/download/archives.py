@@ -67,7 +67,7 @@ def unpack(archive: Path, into: Path) -> list[str]:
     members = _zip_members if zipfile.is_zipfile(archive) else _tar_members
     try:
         into.mkdir(parents=True)
-        for count, member in enumerate(tqdm(members(archive), into.name, disable=None)):
+        for count, member in enumerate(tqdm(members(archive), archive.name, disable=None)):
             where = f"{archive}, member {member.name!r}"
             path = _safe_path(member.name, where)
             if not member.plain:
@@ -93,7 +93,7 @@ def unpack(archive: Path, into: Path) -> list[str]:
             raise Qs3Error(f"cannot unpack {archive}: {error}; free some space") from error
         why = str(error).partition("\n")[0].rstrip(":")
         raise DataError(
-            f"{archive} is damaged, or is no .zip and no .tar ({type(error).__name__}: {why}). "
+            f"{archive} is damaged, or is not a .zip or .tar file ({type(error).__name__}: {why}). "
             "Delete it and fetch it again; files in another format you can unpack yourself, pack "
             "as .zip, and give with archive=PATH"
         ) from error
@@ -130,7 +130,7 @@ def _tar_members(archive: Path) -> Iterator[_Member]:
                 continue
             plain = info.isreg() and not info.issparse()
             yield _Member(info.name, info.size, plain, lambda i=info: file.extractfile(i))  # type: ignore[misc]
-        while file.fileobj.read(1 << 20):  # type: ignore[union-attr]
+        while file.fileobj.read(1 << 20):
             pass  # to where the checksum of what was packed is compared
 
 

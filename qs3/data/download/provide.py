@@ -63,12 +63,10 @@ def provide(
         raise AgreementError(text.format(name=source.name, title=source.title))
     if root and len(source.parts) > 1:
         raise ConfigError(f"{source.name} has several parts, so root= cannot be given")
-    if archive is not None and (mirror or not archive.is_file()):
-        raise ConfigError(
-            "give archive= or mirror=, not both"
-            if mirror
-            else f"archive={archive}: there is no such file"
-        )
+    if archive is not None and mirror:
+        raise ConfigError("give archive= or mirror=, not both")
+    if archive is not None and not archive.is_file():
+        raise ConfigError(f"archive={archive}: there is no such file")
     downloads = make_folder(into / "downloads")
     published = into / "published"
     places = {part: published / part.folder for part in source.parts}

@@ -18,7 +18,7 @@ import numpy as np
 from qs3.errors import DataError
 
 MAX_BYTES = 1 << 20
-_NAMES = (  # instructions of protocols 2 to 4 for plain values, and calls
+_NAMES = (  # instructions of protocols 3 and 4 for plain values, and calls
     "PROTO FRAME STOP MARK MEMOIZE BINPUT LONG_BINPUT BINGET LONG_BINGET NONE NEWTRUE NEWFALSE "
     "BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE SHORT_BINUNICODE BINBYTES SHORT_BINBYTES "
     "EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST APPEND APPENDS EMPTY_DICT SETITEM SETITEMS "
@@ -79,7 +79,7 @@ class _Type:
 
 
 class _Array(np.ndarray):
-    def __setstate__(self, state: tuple) -> None:  # type: ignore[override]
+    def __setstate__(self, state: tuple) -> None:
         _, shape, kind, column_major, content = state
         dtype, sides = kind.dtype, [*shape, 1]
         if dtype.hasobject:
@@ -102,7 +102,11 @@ class _Memo(dict):
         return value
 
 
-class _Unpickler(pickle._Unpickler):  # Python's own: that in C reserves what a length promises
+# Python's own: that in C reserves whatever a length promises. Any: its parts have no types.
+_PythonUnpickler: Any = pickle._Unpickler
+
+
+class _Unpickler(_PythonUnpickler):
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file)
         self.memo = _Memo()
@@ -118,7 +122,7 @@ class _Unpickler(pickle._Unpickler):  # Python's own: that in C reserves what a 
     def load_build(self) -> None:
         if not isinstance(self.stack[-2], _Type | _Array):
             raise DataError("a state for what has none")
-        pickle._Unpickler.load_build(self)
+        super().load_build()
 
-    dispatch = {code: pickle._Unpickler.dispatch[code] for code in _CODES}  # noqa: RUF012
+    dispatch = {code: _PythonUnpickler.dispatch[code] for code in _CODES}  # noqa: RUF012
     dispatch[pickle.BUILD[0]] = load_build

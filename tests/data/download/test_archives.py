@@ -160,7 +160,9 @@ def test_damage_is_an_error_that_names_the_archive(tmp_path, mode):
 )
 def test_other_files(tmp_path, content):
     (tmp_path / "a").write_bytes(content)
-    with pytest.raises(DataError, match=r"is no \.zip and no \.tar .* in another format you can"):
+    with pytest.raises(
+        DataError, match=r"is not a \.zip or \.tar file .* in another format you can"
+    ):
         unpack(tmp_path / "a", tmp_path / "out")
 
 

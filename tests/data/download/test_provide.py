@@ -10,13 +10,14 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from qs3.data.download.__main__ import listing, main, parse
 
 from qs3.data.download import catalogue
 from qs3.data.download.catalogue import SOURCES, find
+from qs3.data.download.cli import listing
 from qs3.data.download.provide import MARK, AgreementError, provide
 from qs3.data.importers import NpyTree, PointDAH5, XyzTree
 from qs3.errors import ConfigError, DataError
+from tests.commands import main
 from tests.data.download.server import File
 from tests.fixtures import published as fixtures
 
@@ -191,7 +192,7 @@ def test_what_a_killed_run_left_is_cleared(site, tmp_path, speckle):
 def test_an_archive_of_ones_own(tmp_path, speckle, capsys):
     (tmp_path / "from browser.zip").write_bytes(speckle)
     words = [f"into={tmp_path}", f"archive={tmp_path / 'from browser.zip'}"]
-    assert main(["specklenet10", *words, "keep=false"]) == 0
+    assert main(["download", "specklenet10", *words, "keep=false"]) == 0
     assert "specklenet10 is there, for domain=specklenet10" in capsys.readouterr().out
     assert (tmp_path / "from browser.zip").exists()
     assert visible(tmp_path / "downloads") == []
@@ -204,52 +205,33 @@ def test_an_archive_of_ones_own(tmp_path, speckle, capsys):
 def test_the_command(site, tmp_path, speckle, monkeypatch, capsys):
     monkeypatch.setenv("QS3_DOWNLOAD_MIRROR", site.address)
     site.files["/specklenet10.zip"] = File(speckle)
-    assert main(["specklenet10", f"into={tmp_path}"]) == 0
+    assert main(["download", "specklenet10", f"into={tmp_path}"]) == 0
     assert f"{tmp_path}/published/specklenet10 is there" in capsys.readouterr().out
-    assert main(["specklenet40", f"into={tmp_path}"]) == 1
+    assert main(["download", "specklenet40", f"into={tmp_path}"]) == 1
     assert "answered 404" in capsys.readouterr().err
-    assert main(["scannet10", f"into={tmp_path}"]) == 1
+    assert main(["download", "scannet10", f"into={tmp_path}"]) == 1
     assert "accept_terms=scannet" in capsys.readouterr().out
-    assert main(["chair"]) == 1
+    assert main(["download", "chair"]) == 1
     assert "known are modelnet40_off" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["scannet", "shapenet", "scanobjectnn"])
 def test_what_is_fetched_by_hand(name, capsys):
-    assert main([name]) == 1
+    assert main(["download", name]) == 1
     text = capsys.readouterr().out
     assert "http" in text
-    assert "python -m qs3.data" in text or "domain scanobjectnn" in text
+    assert "qs3 " in text or "domain scanobjectnn" in text
 
 
 def test_list_and_help(capsys):
-    assert main([]) == 0
+    assert main(["download"]) == 0
     text = capsys.readouterr().out
     assert text.strip() == listing().strip()
     for source in SOURCES:
         assert f"\n{source.name}\n" in text
         assert source.terms.split()[0] in text
-    assert main(["--help"]) == 0
+    assert main(["download", "--help"]) == 0
     assert "accept_terms=" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["a", "b"], "unknown argument 'b'"),
-        (["a", "to=b"], "unknown argument 'to=b'"),
-        (["into=b"], "the name comes first"),
-        (["a", "into="], "into= has no value"),
-        (["a", "keep=no"], "keep must be true or false"),
-    ],
-)
-def test_wrong_words(words, message):
-    with pytest.raises(ConfigError, match=message):
-        parse(words)
-
-
-def test_words():
-    assert parse(["a", "into=b", "keep=False"]) == ("a", {"into": Path("b"), "keep": False})
 
 
 def test_names_and_files_are_unique():
@@ -273,7 +255,7 @@ def test_addresses_of_modelnet_are_those_of_pyg():
 def test_the_list_is_light():
     code = (
         "import sys\n"
-        "from qs3.data.download.__main__ import listing\n"
+        "from qs3.data.download.cli import listing\n"
         "listing()\n"
         "heavy = {'torch', 'torch_geometric', 'rich', 'h5py', 'lightning'}\n"
         "sys.exit(', '.join(sorted(heavy & set(sys.modules))) or 0)"
