@@ -65,7 +65,7 @@ LOOP = '<object id="2"><components><component objectid="2"/></components></objec
         (archive(model(unit='unit="ell"')), "unknown unit 'ell'"),
         (archive(model(RESOURCES.replace('v3="2"', 'v3="3"'))), "not among 3"),
         (archive(model(RESOURCES.replace('x="1"', 'x="one"'))), "3MF"),
-        (archive(model(item="7")), "no faces"),
+        (archive(model(item="7")), "object '7', which is not in"),
         (archive(model()[:-20]), "3MF"),
     ],
 )

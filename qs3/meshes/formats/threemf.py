@@ -68,4 +68,6 @@ def _check(model: bytes) -> None:
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.StartDoctypeDeclHandler = start, doctype
     parser.Parse(model, True)
+    for name in {name for names in children.values() for name in names} - set(children):
+        raise MeshError(f"refers to the object {name!r}, which is not in this file")
     check_instances(children, "")
