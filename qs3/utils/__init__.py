@@ -1,1 +1,1 @@
-"""Parts that any program needs: atomic files, locks, processes, progress bars, seeds, text."""
+"""Parts that any program needs: atomic files, locks, processes, progress, text tables, figures, seeds."""
