@@ -24,14 +24,27 @@ def check_int(key: str, value: Any, least: int) -> int:
     return value
 
 
-def check_float(key: str, value: Any) -> float:
-    """The value, if it is a number.
+def check_float(key: str, value: Any, allowed: str = "") -> float:
+    """The value, if it is a number, and within `allowed` if that is given; see `check_ranges`.
 
     Raises:
         ConfigError: it is not.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ConfigError(f"{key} must be a number, got {value!r}")
+    if allowed:
+        _check_range(key, value, allowed)
+    return value
+
+
+def check_bool(key: str, value: Any) -> bool:
+    """The value, if it is true or false.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if not isinstance(value, bool):
+        raise ConfigError(f"{key} must be true or false, got {value!r}")
     return value
 
 
@@ -59,10 +72,14 @@ def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
         ConfigError: names the first that is outside.
     """
     for name, allowed in ranges.items():
-        value = getattr(settings, name)
-        if value is not None and not _inside(value, allowed):
-            word = "in " if allowed[0] in "[(" else ""
-            raise ConfigError(f"{prefix}{name} must be {word}{allowed}, got {value!r}")
+        if (value := getattr(settings, name)) is not None:
+            _check_range(f"{prefix}{name}", value, allowed)
+
+
+def _check_range(key: str, value: Any, allowed: str) -> None:
+    if not _inside(value, allowed):
+        word = "in " if allowed[0] in "[(" else ""
+        raise ConfigError(f"{key} must be {word}{allowed}, got {value!r}")
 
 
 def _inside(value: Any, allowed: str) -> bool:

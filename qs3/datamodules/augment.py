@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.errors import ConfigError
+from qs3.config.checks import check_ranges
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,8 @@ class Augment:
     jitter_clip: float = 0.05
 
     def __post_init__(self) -> None:
-        if self.scale < 1.0 or min(self.shift, self.jitter_sigma, self.jitter_clip) < 0.0:
-            raise ConfigError(
-                "protocol.augment needs scale >= 1 and shift, jitter_sigma, jitter_clip >= 0, "
-                f"got {self}"
-            )
+        noise = dict.fromkeys(("shift", "jitter_sigma", "jitter_clip"), ">= 0")
+        check_ranges(self, "protocol.augment.", scale=">= 1", **noise)
 
     def __call__(
         self, points: Float[Tensor, "b n 3"], generator: torch.Generator

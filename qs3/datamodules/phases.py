@@ -109,13 +109,10 @@ class Scheme:
         check_int("selftraining.batch_size", self.batch_size, 2)  # batch norm needs two clouds
         check_choice("selftraining.init", self.init, ("scratch", "continue", "persistent"))
         check_choice("selftraining.missing_class", self.missing_class, ("warn", "error"))
-        check_float("selftraining.theta", self.theta)
         check_float("selftraining.epsilon", self.epsilon)
         free = bool(getattr(self.selector, "own_thresholds", False)) and self.theta == 0
-        if not (0.0 < self.theta < 1.0 or free):
-            raise ConfigError(f"selftraining.theta must lie in (0, 1), got {self.theta}")
-        if check_float("selftraining.mrkld", self.mrkld) < 0:
-            raise ConfigError(f"selftraining.mrkld must be >= 0, got {self.mrkld}")
+        check_float("selftraining.theta", self.theta, "" if free else "(0, 1)")
+        check_float("selftraining.mrkld", self.mrkld, ">= 0")
         epochs = self.rounds * self.epochs
         step = check_float("selftraining.weight_step", self.weight_step)
         if not 0.0 <= step * (epochs - 1) < 1.0:

@@ -16,7 +16,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.classes import CLASSES, class_list
-from qs3.config.checks import check_int
+from qs3.config.checks import check_bool, check_choice, check_float, check_int
 from qs3.config.hydra import build
 from qs3.data.dataset_folder import VIEWS
 from qs3.errors import ConfigError
@@ -43,8 +43,7 @@ def check(cfg: DictConfig) -> None:
     for key, least in _WHOLE.items():
         if cfg[key] is not None or key != "limit":
             check_int(key, cfg[key], least)
-    if not isinstance(cfg.fraction, int | float) or not 0 < cfg.fraction <= 1:
-        raise ConfigError(f"fraction must be in (0, 1], got {cfg.fraction!r}")
+    check_float("fraction", cfg.fraction, "(0, 1]")
     if cfg.classes is not None:
         if not isinstance(cfg.classes, ListConfig):
             raise ConfigError(f"classes is a list: classes=[{cfg.classes}]")
@@ -52,10 +51,8 @@ def check(cfg: DictConfig) -> None:
         if unknown := sorted(set(cfg.classes) - set(known)):
             raise ConfigError(f"classes: {unknown} are not among the known {', '.join(known)}")
     for key in _SWITCHES:
-        if not isinstance(cfg[key], bool):
-            raise ConfigError(f"{key} must be true or false, got {cfg[key]!r}")
-    if cfg.colliders not in COLLIDERS:
-        raise ConfigError(f"colliders must be skip or keep, got {cfg.colliders!r}")
+        check_bool(key, cfg[key])
+    check_choice("colliders", cfg.colliders, COLLIDERS)
     if cfg.paths.data_dir is None or not str(cfg.paths.data_dir).strip():
         raise ConfigError(f"paths.data_dir must name a folder, got {cfg.paths.data_dir!r}")
     if cfg.meshes is None and cfg.half != "all":

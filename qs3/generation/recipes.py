@@ -14,6 +14,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
 from qs3.generation.provenance import Keep, preview_of, provenance_of
@@ -183,8 +184,7 @@ class Mesh2Point:
     needs_renderer: bool = True
 
     def __post_init__(self) -> None:
-        if self.points < 1:
-            raise ConfigError(f"points must be at least 1, got {self.points}")
+        check_ranges(self, points=">= 1")
         if self.poses is not None:
             object.__setattr__(self, "placing", self.poses.placing)
             object.__setattr__(self, "views", self.poses.views(self.views.count))

@@ -78,9 +78,7 @@ def class_loss(
 
 def weight(key: str, value: float) -> float:
     """A loss's weight from `method.<key>`: any finite number >= 0; 0 switches the loss off."""
-    if check_float(f"method.{key}", value) < 0:
-        raise ConfigError(f"method.{key} must be >= 0, got {value}; 0 switches its loss off")
-    return float(value)
+    return float(check_float(f"method.{key}", value, ">= 0"))
 
 
 @torch.no_grad()

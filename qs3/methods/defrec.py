@@ -53,8 +53,7 @@ class DefRec(Method):
         dropout: float = 0.5,
     ) -> None:
         super().__init__()
-        if not 0 <= check_float("method.defrec_weight", defrec_weight) <= 1:
-            raise ConfigError(f"method.defrec_weight must lie in [0, 1], got {defrec_weight}")
+        check_float("method.defrec_weight", defrec_weight, "[0, 1]")
         self.defrec_weight, self.scale = defrec_weight, weight("scale", scale)
         self.min_points = check_int("method.min_points", min_points, 1)
         self.pcm, self.on_source, self.dropout = pcm, on_source, dropout

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.config.checks import check_choice, check_float
+from qs3.config.checks import check_choice, check_float, check_ranges
 from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, TeacherPredictions
 
@@ -80,10 +80,7 @@ class Cbst:
             raise ConfigError(
                 f"{_KEY}: 0 < portion <= most <= 1, got portion={self.portion}, most={self.most}"
             )
-        if self.step < 0 or self.alpha <= 0:
-            raise ConfigError(
-                f"{_KEY}: step >= 0 and alpha > 0, got step={self.step}, alpha={self.alpha}"
-            )
+        check_ranges(self, f"{_KEY}.", step=">= 0", alpha="> 0")
 
     def portion_of(self, round_: int) -> float:
         """min(portion + round step, most), in decimal arithmetic."""

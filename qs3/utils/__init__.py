@@ -1,1 +1,1 @@
-"""Parts that any program needs: atomic files, locks, processes, progress bars, seeds, text."""
+"""Parts that any program needs: files, locks, processes, progress, tables, figures, seeds."""

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from qs3.config.checks import check_choice, check_float, check_int, check_ranges
+from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_ranges
 from qs3.errors import ConfigError
 
 
@@ -47,3 +47,12 @@ def test_ranges(allowed, good, bad):
             check_ranges(SimpleNamespace(a_m=value), "sensor.", a_m=allowed)
         word = "in " if allowed[0] in "[(" else ""
         assert str(error.value) == f"sensor.a_m must be {word}{allowed}, got {value!r}"
+
+
+def test_bool_and_float_in_a_range():
+    assert check_bool("a.b", False) is False
+    with pytest.raises(ConfigError, match=r"a\.b must be true or false, got 'yes'"):
+        check_bool("a.b", "yes")
+    assert check_float("a.b", 0.5, "[0, 1]") == 0.5
+    with pytest.raises(ConfigError, match=r"a\.b must be in \[0, 1\], got 2"):
+        check_float("a.b", 2, "[0, 1]")

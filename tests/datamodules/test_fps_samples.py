@@ -1,16 +1,9 @@
 from __future__ import annotations
 
 import logging
-import os
-import signal
-import subprocess
-import sys
-import time
 from multiprocessing.context import SpawnProcess
-from pathlib import Path
 
 import numpy as np
-import pytest
 
 import qs3.datamodules.fps_samples
 from qs3.datamodules.fps_samples import sample, sample_all, start_points
@@ -67,52 +60,3 @@ def test_if_there_can_be_no_processes_this_one_does_it(monkeypatch, caplog):
         order = sample_all(CLOUDS, 10, 3, processes=2)
     assert np.array_equal(order, sample(CLOUDS, 10, 3))
     assert "temporarily unavailable" in caplog.text
-
-
-_SLOW = """
-import signal, numpy as np
-from qs3.datamodules.fps_samples import sample_all
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored if tests run behind an &
-    sample_all(np.random.default_rng(0).normal(size=(20_000, 2048, 3)).astype("f4"), 1024, 4, 2)
-"""
-
-
-def _children(pid: int) -> list[int]:
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def _wait(condition, seconds: float = 60) -> bool:
-    until = time.monotonic() + seconds
-    while not condition() and time.monotonic() < until:
-        time.sleep(0.05)
-    return bool(condition())
-
-
-def _gone(pid: int) -> bool:
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_killed_or_interrupted_it_leaves_no_process_behind(tmp_path, how):
-    (tmp_path / "slow.py").write_text(_SLOW)
-    process = subprocess.Popen(
-        [sys.executable, "slow.py"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.getcwd()},
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        assert _wait(lambda: len(_children(process.pid)) >= 3)  # two workers, a resource tracker
-        children = _children(process.pid)
-        time.sleep(1)
-        process.send_signal(how)
-        process.wait(timeout=60)
-    finally:
-        process.kill()
-    assert _wait(lambda: all(_gone(child) for child in children))

@@ -33,8 +33,8 @@ def test_theta_grows_without_rounding_error():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"theta": 0.0}, r"theta must lie in \(0, 1\), got 0.0"),
-        ({"theta": 1.0}, r"theta must lie in \(0, 1\)"),
+        ({"theta": 0.0}, r"theta must be in \(0, 1\), got 0.0"),
+        ({"theta": 1.0}, r"theta must be in \(0, 1\)"),
         ({"theta": 0.9, "epsilon": 0.02, "rounds": 6}, r"theta \+ epsilon .* got 1.0"),
         ({"theta": "abc"}, r"selftraining\.theta must be a number, got 'abc'"),
         ({"epsilon": None}, r"selftraining\.epsilon must be a number"),

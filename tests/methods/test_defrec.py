@@ -80,7 +80,7 @@ def test_no_voxel_to_deform_is_no_loss_and_no_nan() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"defrec_weight": 1.5}, r"method.defrec_weight must lie in \[0, 1\]"),
+        ({"defrec_weight": 1.5}, r"method.defrec_weight must be in \[0, 1\]"),
         ({"scale": -1.0}, "method.scale must be >= 0"),
         ({"min_points": 0}, "method.min_points"),
     ],

@@ -274,7 +274,7 @@ def test_misspelt_key():
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("selftraining.theta=1.5", r"selftraining\.theta must lie in \(0, 1\), got 1\.5"),
+        ("selftraining.theta=1.5", r"selftraining\.theta must be in \(0, 1\), got 1\.5"),
         ("seed=null", "seed must be a whole number"),
         ("protocol.epochs=0", r"protocol\.epochs"),
         ("protocol.batch_size=1", r"protocol\.batch_size"),

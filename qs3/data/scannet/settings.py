@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from qs3.config.checks import check_choice, check_float, check_int
+from qs3.config.checks import check_bool, check_choice, check_float, check_int
 from qs3.data.scannet.labels import COLUMNS
 from qs3.errors import ConfigError
 
@@ -47,6 +47,5 @@ class Extraction:
                 f"0 < depth_min_m < depth_max_m must hold, got {self.depth_min_m} and "
                 f"{self.depth_max_m}"
             )
-        if not isinstance(self.align, bool):
-            raise ConfigError(f"align must be true or false, got {self.align!r}")
+        check_bool("align", self.align)
         check_choice("column", self.column, COLUMNS)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError, DataError
 from qs3.generation.released.poses import PoseTable, read_poses
 from qs3.meshes.mesh import Mesh
@@ -30,8 +31,7 @@ class ReleasedPlacing:
     max_error: float = 0.01
 
     def __post_init__(self) -> None:
-        if not self.max_error > 0:
-            raise ConfigError(f"recipe.poses.max_error must be positive, got {self.max_error}")
+        check_ranges(self, "recipe.poses.", max_error="> 0")
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str) -> Mesh:
         """A scaled, turned and moved copy; draws nothing.
