@@ -181,8 +181,8 @@ def test_windows_change_nothing(images: torch.Tensor, size: int, worth: float) -
     for p, q in zip(net.parameters(), other.parameters(), strict=True):
         largest = q.grad.abs().max().clamp(min=1)  # a channel with no variance has huge ones
         torch.testing.assert_close(p.grad / largest, q.grad / largest, rtol=1e-10, atol=1e-10)
-    for mine, plain in zip(net.buffers(), other.buffers(), strict=True):
-        torch.testing.assert_close(mine, plain, rtol=1e-10, atol=1e-10)
+    for mine, theirs in zip(net.buffers(), other.buffers(), strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
 
 
 def test_two_stages_of_clouds_use_windows() -> None:
