@@ -35,8 +35,8 @@ test: install ## lint, types and all tests that are not slow
 	$(VENV)/bin/mypy
 	$(RUN) -m pytest
 
-test-all: install ## the slow tests too
-	$(RUN) -m pytest -m ''
+test-all: install ## the slow tests too, shapes in signatures checked
+	QS3_CHECK_SHAPES=1 $(RUN) -m pytest -m ''
 
 bench: install ## speed, as ratios against named baselines
 	$(RUN) -m pytest tests/benchmarks --benchmark-enable -s
