@@ -44,8 +44,8 @@ format: install ## tidy the files
 test: install ## all tests that are not slow, on 2 cores
 	$(RUN) -m pytest $(PARALLEL) --ignore=tests/benchmarks
 
-test-all: install ## the slow tests too, and the benchmarks once each
-	$(RUN) -m pytest $(PARALLEL) -m ''
+test-all: install ## the slow tests too, shapes in signatures checked, and the benchmarks once each
+	QS3_CHECK_SHAPES=1 $(RUN) -m pytest $(PARALLEL) -m ''
 
 bench: install ## speed, as ratios against named baselines
 	$(RUN) -m pytest tests/benchmarks --benchmark-enable -s

@@ -7,3 +7,12 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Pictures need no screen.
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+if os.environ.get(
+    "QS3_CHECK_SHAPES"
+):  # `make test-all`; costs a third more time in the nets' tests
+    from jaxtyping import install_import_hook
+
+    checked = ("geometry.neighbours", "geometry.sampling", "models", "methods")
+    checked += ("datamodules.augment", "evaluation.metrics")
+    install_import_hook([f"qs3.{name}" for name in checked], "beartype.beartype")
