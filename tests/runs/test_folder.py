@@ -169,14 +169,14 @@ def test_clear_keeps_what_hydra_wrote(tmp_path):
 @pytest.mark.parametrize(
     ("words", "name"),
     [
-        (["experiment=cad10"], "cad10/seed0-f23ad346"),
-        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-03f7f66a"),
-        (["experiment=qs3_s2d"], "qs3_s2d/seed0-64cbc123"),
-        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-5a5c6274"),
-        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-5a5c6274"),
-        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-5a5c6274"),
-        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-41a8ab39"),
-        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-64cbc123"),
+        (["experiment=cad10"], "cad10/seed0-0bde6542"),
+        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-9fe5ca43"),
+        (["experiment=qs3_s2d"], "qs3_s2d/seed0-268aa070"),
+        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-f31811f3"),
+        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-f31811f3"),
+        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-f31811f3"),
+        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-405357ab"),
+        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-268aa070"),
     ],
 )
 def test_runs_from_before_are_found(words, name):
