@@ -39,7 +39,7 @@ def test_experiment_runs(experiment, data_dir, tmp_path):
     assert metrics.experiment == experiment
     assert metrics == read_metrics(hashing.run_folder(cfg))
     assert len(metrics.rounds) == min(rounds, 2)
-    if experiment == "own_scans":  # its folders are no labels, so all clouds are the user's
+    if experiment == "own_scans":  # its folders are not labels, so all clouds are the user's
         assert (metrics.final.n, metrics.final.accuracy) == (60, None)
     else:
         assert metrics.final.n == 20  # two test clouds of each of ten classes

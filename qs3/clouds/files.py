@@ -316,7 +316,7 @@ def own_dataset(file: Any, names: tuple[str, ...], path: Path) -> Any:
         raise DataError(f"{path}: {name!r} is a link; refused")
     found = file[name]
     if not isinstance(found, h5py.Dataset):
-        raise DataError(f"{path}: {name!r} is no dataset")
+        raise DataError(f"{path}: {name!r} is not a dataset")
     if found.external or found.is_virtual:
         raise DataError(f"{path}: {name!r} takes its numbers from other files; refused")
     return found

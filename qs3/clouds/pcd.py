@@ -67,10 +67,10 @@ class PcdCloud:
         """[height, width] of one field of an organised cloud.
 
         Raises:
-            DataError: the cloud is no image, or has no such field.
+            DataError: the cloud is not an image, or has no such field.
         """
         if not self.organised:
-            raise DataError(f"a cloud of {self.width} x 1 points is no image")
+            raise DataError(f"a cloud of {self.width} x 1 points is not an image")
         if name not in self.fields:
             raise DataError(f"a cloud with the fields {', '.join(self.fields)} has no {name}")
         return self.fields[name].reshape(self.height, self.width, *self.fields[name].shape[1:])
@@ -113,7 +113,7 @@ def read_pcd(path: str | os.PathLike[str]) -> PcdCloud:
 
     Raises:
         MissingDataError: there is no such file.
-        DataError: it is no PCD file, damaged, or beyond the limits of this reader.
+        DataError: it is not a PCD file, damaged, or beyond the limits of this reader.
     """
     path = Path(path)
     try:
@@ -161,7 +161,7 @@ def _parse_header(data: bytes) -> tuple[_Header, int]:
     while True:
         end = data.find(b"\n", offset, _MAX_HEADER_BYTES)
         if end < 0:
-            raise DataError("is no PCD file, or cut within its header: it has no line DATA")
+            raise DataError("is not a PCD file, or cut within its header: it has no line DATA")
         line = data[offset:end].decode("latin-1").strip()
         offset = end + 1
         if not line or line.startswith("#"):

@@ -35,7 +35,7 @@ def _wandb_id(*, _root_: DictConfig) -> str:
 
 def _tags(*, _root_: DictConfig) -> list[str]:
     """For loggers: method, self-training, net and domains, and whether the target is simulated."""
-    names, data = called(_root_), _root_.data
+    names, data = component_names(_root_), _root_.data
     tags = [f"{data.source.name} -> {data.target.name}", *dict.fromkeys(names.values())]
     return [tag for tag in tags if tag != "none"] + ["simulated"] * bool(
         data.target.get("simulated")
@@ -60,7 +60,7 @@ def _gpu_in_turn(gpus: int | None = None) -> int:
     return int(HydraConfig.get().job.num) % gpus if in_multirun() else 0
 
 
-def called(cfg: DictConfig) -> dict[str, str]:
+def component_names(cfg: DictConfig) -> dict[str, str]:
     """How method, self-training and model were called on the command line (or their classes)."""
     choices = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
     selector = cfg.selftraining.get("selector") or {"_target_": "none"}
@@ -137,7 +137,7 @@ def build(node: Any, **more: Any) -> Any:
         raise
 
 
-def speak_plainly(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
+def cli_errors(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Run `task`; an error meant for the user becomes a message without a traceback.
 
     HYDRA_FULL_ERROR=1 shows the traceback nevertheless.

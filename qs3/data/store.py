@@ -190,7 +190,7 @@ def write_pointset(
             stored as float32.
         rows: one an object; the k-th one with status "ok" describes cloud k.
         meta: plain values (numbers, strings, lists, dicts): sensor, renderer, versions, config.
-        tables: which of the arrays are no clouds but say something of each point, with the names
+        tables: which of the arrays are not clouds but say something of each point, with the names
             of their columns: they are [N, P, columns], and no variant to train on.
 
     Returns:
@@ -382,9 +382,12 @@ def _check_arrays(
     tables: Mapping[str, Sequence[str]],
 ) -> tuple[int, int, int]:
     """The common shape of all clouds, after checking that all arrays fit the manifest."""
-    if "points" in tables or (unknown := sorted(set(tables) - set(arrays))):
-        wrong = "'points' is no table" if "points" in tables else f"tables {unknown} are no arrays"
-        raise DataError(f"dataset {name!r}: {wrong}; arrays are {sorted(arrays)}")
+    if "points" in tables:
+        raise DataError(f"dataset {name!r}: 'points' is not a table; arrays are {sorted(arrays)}")
+    if unknown := sorted(set(tables) - set(arrays)):
+        raise DataError(
+            f"dataset {name!r}: tables {unknown} are not arrays; arrays are {sorted(arrays)}"
+        )
     if "points" not in arrays:
         raise DataError(f"dataset {name!r} needs an array 'points', got {sorted(arrays)}")
     for key, array in arrays.items():

@@ -14,7 +14,7 @@ from qs3.config.checks import check_ranges
 
 @dataclass(frozen=True)
 class Augment:
-    """Random turn about gravity, anisotropic scale, shift and jitter, in this order.
+    """Random rotation about the up axis, anisotropic scale, shift and jitter, in this order.
 
     Attributes:
         rotate_z: turn each cloud about z by U(0, 2π).

@@ -25,9 +25,9 @@ from qs3.datamodules.batches import Batches, Table, generator_of
 from qs3.datamodules.splits import (
     Labelled,
     Unlabelled,
-    few_of_each_split,
-    first_of_each_class,
+    first_of_class,
     load_clouds,
+    subsample_splits,
     with_labels,
 )
 from qs3.datamodules.validation_split import RULES
@@ -123,7 +123,7 @@ class DomainData(LightningDataModule):
         dataset = self.domain.open(verify=False)
         self.classes, self.sha256 = tuple(dataset.classes), dataset.sha256
         if self.clouds_a_split is not None:
-            dataset = few_of_each_split(dataset, self.clouds_a_split)
+            dataset = subsample_splits(dataset, self.clouds_a_split)
         if stage in (None, "fit", "validate") and self.train is None:
             self._setup_training(dataset)
         if stage in (None, "test", "predict") and self.test is None and "test" in dataset.counts():
@@ -163,7 +163,7 @@ class DomainData(LightningDataModule):
             self.whole = self.train = train
             return
         if self.clouds_a_class is not None:
-            train = first_of_each_class(train, self.clouds_a_class)
+            train = first_of_class(train, self.clouds_a_class)
         self.whole = train
         chosen, held_out = RULES[self.val](train.ids, train.labels.numpy())
         self.train, self.validation = train.at(chosen), train.at(held_out)

@@ -66,7 +66,7 @@ class Scheme:
 
     Attributes:
         selector: a `qs3.selftraining.selectors.Selector`.
-        rounds: number of rounds; 0 is no self-training.
+        rounds: number of rounds; 0 is not self-training.
         epochs: of each round.
         batch_size: of each round.
         theta: confidence that a pseudo-label must exceed, in round 0; 0 is for selectors that have

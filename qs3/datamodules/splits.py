@@ -84,7 +84,7 @@ def with_labels(clouds: Unlabelled, dataset: PointSet, split: str, what: str) ->
     return Labelled(clouds.clouds, clouds.ids, labels)
 
 
-def few_of_each_split(dataset: PointSet, count: int) -> PointSet:
+def subsample_splits(dataset: PointSet, count: int) -> PointSet:
     """At most `count` clouds of each split, at even steps; for `debug=fast`.
 
     They keep their order and ids, and the hash is still that of the whole dataset.
@@ -97,7 +97,7 @@ def few_of_each_split(dataset: PointSet, count: int) -> PointSet:
     return dataset.at(np.sort(chosen))
 
 
-def first_of_each_class(labelled: Labelled, count: int) -> Labelled:
+def first_of_class(labelled: Labelled, count: int) -> Labelled:
     """The first `count` clouds of each class, in their order; for `debug=overfit`."""
     chosen = np.zeros(len(labelled.ids), dtype=bool)
     for k in labelled.labels.unique().tolist():

@@ -55,7 +55,7 @@ def build_each(group: DictConfig | None) -> list[Any]:
 
 def quieten() -> None:
     """Leave Lightning's warnings and errors to Hydra's log; drop its tips and adverts."""
-    # Lightning 2.6.6 asks torch 2.13 in an old way; not ours to mend.
+    # Lightning 2.6.6 asks torch 2.13 in an old way; not ours to fix.
     warnings.filterwarnings("ignore", message=".*LeafSpec.* is deprecated", category=FutureWarning)
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)

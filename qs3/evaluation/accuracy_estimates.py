@@ -23,11 +23,11 @@ from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.ood import enough, limits, strange_clouds
+from qs3.evaluation.ood import limits, ood_reasons_of_all, relax_min_points
 from qs3.runs.metrics import AccuracyEstimates, Estimates
 
 TURNS = 3
-"""Turns about gravity besides none: by 90, 180 and 270 degrees."""
+"""Rotations about the up axis besides none: by 90, 180 and 270 degrees."""
 
 _LEAST_T, _MOST_T, _TINY = 0.05, 20.0, 1e-300
 _LOOKED_AT = 300  # clouds of a domain, 3 ms each
@@ -117,7 +117,7 @@ def difference_of_confidences(
     return min(1.0, max(0.0, accuracy - lost))
 
 
-def turns_agree(
+def rotation_agreement(
     first: Float[np.ndarray, "n c"], turned: Sequence[Float[np.ndarray, "n c"]]
 ) -> float:
     """The share of pairs (cloud, turn) with the class of the cloud as it is.
@@ -155,7 +155,7 @@ def estimates(
     }
 
 
-def quality_of(
+def estimate_accuracy(
     net: nn.Module,
     target: Unlabelled,
     validation: Labelled,
@@ -187,7 +187,7 @@ def quality_of(
         upright: z points up in the target's clouds.
 
     Returns:
-        Plain values. None where a figure does not exist (no teacher, no gravity), or is no number
+        Plain values. None where a figure does not exist (no teacher, no gravity), or is not a number
         because the net has diverged.
     """
     points, labels = target.points, validation.labels.numpy()
@@ -201,14 +201,16 @@ def quality_of(
         "validated_on": f"{owner}_val",
         "validation_clouds": len(labels),
         "validation_accuracy": agreement(known, np.eye(len(classes))[labels]),
-        "unlike_source": unlike(target.clouds, source),
+        "unlike_source": ood_fraction(target.clouds, source),
         "never_predicted": [name for name, n in zip(classes, counts, strict=True) if not n],
     }
     if not (np.isfinite(known).all() and np.isfinite(judged).all()):
         return AccuracyEstimates(**about)
     about |= estimates(known, labels, judged)
     if upright:
-        about["turns_agree"] = turns_agree(judged, _turned(net, points, batch_size, device))
+        about["rotation_agreement"] = rotation_agreement(
+            judged, _turned(net, points, batch_size, device)
+        )
     if teacher is not None:
         assert taught is not None
         theirs = predict(teacher, points, batch_size, device)
@@ -229,19 +231,19 @@ def _turned(net: nn.Module, points: Tensor, batch_size: int, device: Any) -> lis
     return tables
 
 
-def unlike(clouds: Clouds, source: Clouds) -> float:
+def ood_fraction(clouds: Clouds, source: Clouds) -> float:
     """The share of clouds outside the usual range of the source's.
 
     At most 300 of each are looked at, evenly spaced.
     """
-    found = strange_clouds(clouds, usual_of(source, _LOOKED_AT), most=_LOOKED_AT)
+    found = ood_reasons_of_all(clouds, source_ranges(source, _LOOKED_AT), most=_LOOKED_AT)
     return sum(map(bool, found)) / len(found)
 
 
-def usual_of(source: Clouds, most: int = 1000) -> dict[str, list[float]]:
+def source_ranges(source: Clouds, most: int = 1000) -> dict[str, list[float]]:
     """Of each measure the range in at most `most` clouds; of points no more than the net sees."""
     seen = source.stored.shape[1] if source.order is None else source.order.shape[2]
-    return enough(limits(source, most=most), seen)
+    return relax_min_points(limits(source, most=most), seen)
 
 
 def _certainty(probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " n"]:

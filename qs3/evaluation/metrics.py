@@ -76,14 +76,14 @@ def adapt_norms(
         adapt_batchnorm(net, (points[index].to(device) for index in batches))
 
 
-def predict_turned(
+def predict_rotation_averaged(
     net: nn.Module,
     points: Float[Tensor, "n p 3"],
     rotations: int,
     batch_size: int,
     device: Any = "cpu",
 ) -> Float[np.ndarray, "n c"]:
-    """Mean of the probabilities over `rotations` turns about gravity: by 0, 2π/n, 4π/n, ..."""
+    """Mean of the probabilities over `rotations` turns about the up axis: by 0, 2π/n, 4π/n, ..."""
     total: Any = 0.0
     for i in range(rotations):
         angle = torch.full((len(points),), 2 * math.pi * i / rotations, dtype=points.dtype)
@@ -174,12 +174,14 @@ class Evaluation:
         """What these predictions of the test clouds are worth."""
         return scores(probabilities, self.y_target_eval, self.classes)
 
-    def turned(self, net: nn.Module, device: Any = "cpu") -> Scores | None:
+    def rotation_averaged(self, net: nn.Module, device: Any = "cpu") -> Scores | None:
         """The same for probabilities averaged over turns; None if that was not asked for."""
         if not self.rotations:
             return None
         return self.scores_of(
-            predict_turned(net, self.test.points, self.rotations, self.batch_size, device)
+            predict_rotation_averaged(
+                net, self.test.points, self.rotations, self.batch_size, device
+            )
         )
 
     def pseudo_labels(self, path: Path) -> PseudoLabelScores | None:

@@ -1,6 +1,6 @@
 """What the clouds of training were like, and whether another cloud is like them.
 
-Five measures of a cloud, none of which its position, its size or a turn about gravity changes, and
+Five measures of a cloud, none of which its position, its size or a rotation about the up axis changes, and
 for each the range in which the training clouds of source and target lie. A cloud outside one of
 them is one that the classifier was never asked about. This guarantees nothing: a cloud inside all
 ranges can still show an object of no known class, and get a confident answer.
@@ -59,8 +59,8 @@ def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
 
     From 0.1 % to 99.9 % of the clouds of each domain, and of these ranges the lowest and highest
     end. Of fewer than a thousand clouds this is about the range of all. At most `most` of a domain
-    are measured, evenly spaced. Having many points is no fault: `points` has no upper end
-    (infinity). Its lower end is that of the clouds on disk, see `enough`.
+    are measured, evenly spaced. Having many points is not a fault: `points` has no upper end
+    (infinity). Its lower end is that of the clouds on disk, see `relax_min_points`.
     """
     ranges = []
     for clouds in domains:
@@ -74,7 +74,7 @@ def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
     return {name: [float(low[i]), float(high[i])] for i, name in enumerate(names)}
 
 
-def enough(usual: Mapping[str, list[float]], seen: int) -> dict[str, list[float]]:
+def relax_min_points(usual: Mapping[str, list[float]], seen: int) -> dict[str, list[float]]:
     """The same ranges for a net that sees `seen` points of a cloud.
 
     A cloud that has as many points as the net sees does not lack any, however many the clouds of
@@ -86,7 +86,7 @@ def enough(usual: Mapping[str, list[float]], seen: int) -> dict[str, list[float]
     return changed
 
 
-def strange(measured: Mapping[str, float], usual: Mapping[str, list[float]]) -> list[str]:
+def ood_reasons(measured: Mapping[str, float], usual: Mapping[str, list[float]]) -> list[str]:
     """In words, which measures lie outside the usual ranges; [] if none does."""
     told = []
     for name, (low, high) in usual.items():
@@ -98,12 +98,12 @@ def strange(measured: Mapping[str, float], usual: Mapping[str, list[float]]) -> 
     return told
 
 
-def strange_clouds(
+def ood_reasons_of_all(
     clouds: Clouds, usual: Mapping[str, list[float]], most: int | None = None
 ) -> list[list[str]]:
-    """What `strange` says of each cloud, or of at most `most`, evenly spaced."""
+    """What `ood_reasons` says of each cloud, or of at most `most`, evenly spaced."""
     found = _measured(clouds, len(clouds) if most is None else most)
-    return [strange(each, usual) for each in found]
+    return [ood_reasons(each, usual) for each in found]
 
 
 def _measured(clouds: Clouds, most: int) -> list[dict[str, float]]:

@@ -30,7 +30,7 @@ def check_objective(objective: Any) -> None:
         objective: of the search; None: there is none.
 
     Raises:
-        ConfigError: it is no label-free score, or one that differs between trials for no merit.
+        ConfigError: it is not a label-free score, or one that differs between trials for no merit.
     """
     if objective is None:
         return

@@ -101,7 +101,7 @@ LABEL_FREE: Mapping[str, Validator] = {
 def is_better(rule: str, score: float, best: float | None) -> bool:
     """Whether an epoch with `score` replaces the best one before it (None: there is none).
 
-    Not on a tie. A score that is no number loses to every number.
+    Not on a tie. A score that is not a number loses to every number.
     """
     if best is None:
         return True

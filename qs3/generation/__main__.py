@@ -3,7 +3,7 @@
 import hydra
 from omegaconf import DictConfig
 
-from qs3.config.hydra import speak_plainly
+from qs3.config.hydra import cli_errors
 from qs3.config.location import CONF
 from qs3.utils.cli import hydra_command
 
@@ -14,7 +14,7 @@ def main(cfg: DictConfig) -> None:
     """Make the dataset that the config describes, or continue it."""
     from qs3.generation.command import generate
 
-    speak_plainly(generate, cfg)
+    cli_errors(generate, cfg)
 
 
 if __name__ == "__main__":

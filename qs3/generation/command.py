@@ -163,7 +163,7 @@ def _collect(
             raise DataError(f"the part of {item.id} is gone: run the same command again")
         outcomes.append(outcome)
     if all(outcome.cloud is None for outcome in outcomes):
-        delete_dataset(folder)  # nothing is lost, and mended settings are not refused
+        delete_dataset(folder)  # nothing is lost, and corrected settings are not refused
         raise DataError(
             f"all {len(items)} objects failed; the first: {items[0].id}: {outcomes[0].reason}"
         )

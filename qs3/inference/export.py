@@ -52,7 +52,7 @@ class Comparison:
         typical: the median over the clouds of the largest difference of a cloud's logits.
         largest: the largest of all.
         odd: clouds that differ by more than `ALLOWED`.
-        other_class: clouds whose likeliest class differs.
+        other_class: clouds whose most probable class differs.
     """
 
     clouds: int

@@ -124,7 +124,7 @@ def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
     except (TypeError, ValueError, ConfigError) as error:
         raise DataError(f"{target} cannot be built as the file says: {error}") from error
     if not isinstance(net, nn.Module):
-        raise DataError(f"the file's model {target} is no net; refused")
+        raise DataError(f"the file's model {target} is not a net; refused")
     try:
         net.load_state_dict(dict(result.weights))
     except RuntimeError as error:

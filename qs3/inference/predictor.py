@@ -28,7 +28,7 @@ from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.ood import enough, measure, strange
+from qs3.evaluation.ood import measure, ood_reasons, relax_min_points
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 
 BATCH = 32  # clouds: more are no faster on a CPU
@@ -94,8 +94,8 @@ class Predictor:
         whole = stored[None]  # [1, P, 3]
         some = self.points < rules.points
         ready = Clouds.of(whole, sample(whole, self.points, 1) if some else None).all()[0]
-        usual = enough(self.result.usual, self.points)
-        found = strange(measure(stored, ready.numpy()), usual)
+        usual = relax_min_points(self.result.usual, self.points)
+        found = ood_reasons(measure(stored, ready.numpy()), usual)
         return Prepared(ready, len(cloud), tuple(found))
 
     def probabilities(

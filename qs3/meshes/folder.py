@@ -9,7 +9,7 @@ Class folders may carry any name of `qs3.classes`, in any case: `night_stand` is
 `val`, `valid` and `validation` count as train: validation sets are cut from train later, so
 that a model is selected in one way for every dataset.
 
-Hidden files, `__MACOSX` and files that are no meshes are ignored. Nothing is ignored that
+Hidden files, `__MACOSX` and files that are not meshes are ignored. Nothing is ignored that
 looks like a mesh and lies where it cannot be understood: that is an error.
 """
 
@@ -219,7 +219,7 @@ class MeshFolder:
         try:
             target = entry.resolve(strict=True)
         except (OSError, RuntimeError) as error:
-            raise DataError(f"{entry} is a broken link: remove or mend it") from error
+            raise DataError(f"{entry} is a broken link: remove or repair it") from error
         if not target.is_relative_to(self.path.resolve()):
             raise DataError(
                 f"{entry} is a link that leads out of {self.path}, to {target}: links outside "

@@ -88,7 +88,7 @@ def feature_dims(net: Any) -> tuple[int, int | None]:
     Asked of the net itself, with two clouds in eval mode: nothing in it changes.
 
     Raises:
-        ConfigError: the model is no backbone with a head.
+        ConfigError: the model is not a backbone with a head.
     """
     if not hasattr(net, "features"):
         raise ConfigError(

@@ -253,7 +253,7 @@ PAGE = Command(
     ("qs3 report page run=logs/qs3_s2d/seed0-5f0c2a71 data_dir=data",),
     about="""
 Curves, confusion, pseudo-labels, classes, calibration; if its data are there, features and clouds
-of both domains, their class balance and the surest mistakes; if they kept their views, the
+of both domains, their class balance and the most confident errors; if they kept their views, the
 pipeline; and a page of all, index.html.
 """,
 )

@@ -86,7 +86,7 @@ class Evaluated:
     Attributes:
         split: "test"; "train" where there is no other.
         labels: whether anybody knows the clouds' classes.
-        rotations: turns about gravity over which the further scores average; 0: none.
+        rotations: rotations about the up axis over which the further scores average; 0: none.
         norms: "trained" or "adabn".
         final_over_rotations, warmup_over_rotations: those scores.
     """
@@ -176,7 +176,7 @@ class AccuracyEstimates(Estimates):
         clouds: that were judged.
         validated_on: whose held-out labelled clouds calibrate, such as "source_val".
         validation_clouds: how many.
-        turns_agree: share of clouds with the same class after turns about gravity.
+        rotation_agreement: share of clouds with the same class after rotations about the up axis.
         teacher_agrees: share on which the net before self-training says the same.
         teacher: the same estimates for that net.
         unlike_source: share of clouds outside the usual range of the labelled ones.
@@ -186,7 +186,7 @@ class AccuracyEstimates(Estimates):
     clouds: int
     validated_on: str
     validation_clouds: int
-    turns_agree: float | None = None
+    rotation_agreement: float | None = None
     teacher_agrees: float | None = None
     teacher: Estimates | None = None
     unlike_source: float

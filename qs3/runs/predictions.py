@@ -1,6 +1,6 @@
 """`predictions.csv`: what a run's result says of each evaluated cloud of the target, one row each.
 
-Columns: id; mesh (hash of the object's mesh: scans of one mesh are no independent samples; the id
+Columns: id; mesh (hash of the object's mesh: scans of one mesh are not independent samples; the id
 where no mesh is known); label (empty if nobody knows it); predicted; and a probability per class.
 """
 
@@ -43,7 +43,7 @@ class Predictions:
 
     @property
     def predicted(self) -> Int[np.ndarray, " n"]:
-        """The likeliest class of each, the first one on ties."""
+        """The most probable class of each, the first one on ties."""
         return self.probabilities.argmax(axis=1)
 
 

@@ -141,7 +141,7 @@ class SelfTraining(Callback):
         )
         said = TeacherPredictions.of(probabilities, data.target.ids)
         selection = self.scheme.selector.select(said, self.scheme.theta_of(round_), round_)
-        if selection.labels is not None:  # a selector may name another class than the likeliest
+        if selection.labels is not None:  # a selector may name another class than the most probable
             said = said.relabelled(selection.labels)
         if self.scheme.rehearsal:
             selection = keep_all(selection, said.predicted)

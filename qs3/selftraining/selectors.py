@@ -38,7 +38,7 @@ class TeacherPredictions:
 
     @classmethod
     def of(cls, probabilities: Float[np.ndarray, "n k"], ids: Sequence[str]) -> TeacherPredictions:
-        """Those of the likeliest classes; the lowest on ties."""
+        """Those of the most probable classes; the lowest on ties."""
         predicted = probabilities.argmax(axis=1)
         confidence = probabilities.max(axis=1).astype(np.float64)
         return cls(ids, confidence, predicted, probabilities.shape[1], probabilities)

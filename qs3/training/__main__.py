@@ -3,7 +3,7 @@
 import hydra
 from omegaconf import DictConfig
 
-from qs3.config.hydra import speak_plainly
+from qs3.config.hydra import cli_errors
 from qs3.config.location import CONF
 from qs3.utils.cli import hydra_command
 
@@ -14,7 +14,7 @@ def main(cfg: DictConfig) -> float | None:
     """Run, continue or skip the run that the config describes; returns what a search asks for."""
     from qs3.training.command import objective_of, train
 
-    return speak_plainly(lambda cfg: objective_of(cfg, train(cfg)), cfg)
+    return cli_errors(lambda cfg: objective_of(cfg, train(cfg)), cfg)
 
 
 if __name__ == "__main__":

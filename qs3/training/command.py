@@ -214,7 +214,7 @@ def _warn_of_one_domain(run: Run) -> None:
     if run.source.folder == run.target.folder and not _is_upper_bound(run.cfg):
         log.warning(
             "data.source (%s) and data.target (%s) are the same dataset: the target's training "
-            "labels are used, so this is no adaptation",
+            "labels are used, so this is not adaptation",
             run.source.name,
             run.target.name,
         )

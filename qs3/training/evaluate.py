@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import nn
 
-from qs3.evaluation.accuracy_estimates import quality_of
+from qs3.evaluation.accuracy_estimates import estimate_accuracy
 from qs3.evaluation.metrics import adapt_norms
 from qs3.evaluation.selection_rules import LAST
 from qs3.runs.checkpoints import load
@@ -95,10 +95,10 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         name: final if path == file else evaluation.scores(nets(path), device)
         for name, path in files.items()
     }
-    turned = evaluation.turned(net, device)
+    turned = evaluation.rotation_averaged(net, device)
     before = turned if file == files["selected"] else None
     if before is None:
-        before = evaluation.turned(nets(files["selected"]), device)
+        before = evaluation.rotation_averaged(nets(files["selected"]), device)
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
     return Outcome(
         net=net,
@@ -126,7 +126,7 @@ def _quality(
         unadapted = nets.as_trained(file), nets.as_trained(taught) if taught else None
     data = loaded.data
     more: dict[str, Any] = {"batch_size": data.eval_batch_size, "device": nets.device}
-    return quality_of(
+    return estimate_accuracy(
         net,
         loaded.evaluation.test,
         data.validation,

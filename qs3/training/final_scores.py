@@ -31,7 +31,7 @@ def without_labels(
         device: of the net.
 
     Returns:
-        By name; None for a score that is no number, of a net that has diverged.
+        By name; None for a score that is not a number, of a net that has diverged.
     """
     table = predict(net, target.points, batch_size, device)
     scores = {

@@ -11,7 +11,7 @@ from qs3.data.domain import Domain
 from qs3.data.manifest import read_manifest
 from qs3.data.store import PointSet
 from qs3.datamodules.adaptation import AdaptationData
-from qs3.datamodules.splits import few_of_each_split, labels_of, load_clouds
+from qs3.datamodules.splits import labels_of, load_clouds, subsample_splits
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
 from qs3.methods.base import Method
@@ -64,7 +64,7 @@ def load_data(run: Run, method: Method) -> Loaded:
     started = note_start(run, source, target)
     data.setup("fit")
     if (few := cfg.data.clouds_a_split) is not None:
-        target = few_of_each_split(target, few)
+        target = subsample_splits(target, few)
     split = _evaluated_split(target)
     evaluation = Evaluation(
         load_clouds(target, split, cfg.data.points, cache_dir=data.target_domain.cache_dir),

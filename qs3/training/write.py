@@ -7,10 +7,10 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from qs3.config import hashing
-from qs3.config.hydra import called
+from qs3.config.hydra import component_names
 from qs3.data.manifest import read_manifest
-from qs3.evaluation.accuracy_estimates import usual_of
-from qs3.evaluation.ood import limits, strange_clouds
+from qs3.evaluation.accuracy_estimates import source_ranges
+from qs3.evaluation.ood import limits, ood_reasons_of_all
 from qs3.evaluation.selection_rules import LAST
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result
@@ -52,7 +52,7 @@ def write_outcome(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> R
 def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMetrics:
     cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
     over, before = outcome.turned
-    names = called(cfg)
+    names = component_names(cfg)
     return RunMetrics(
         experiment=cfg.experiment_name,
         hash=hashing.config_hash(cfg),
@@ -141,7 +141,7 @@ def _write_of_files(run: Run, loaded: Loaded, outcome: Outcome) -> None:
     rows = read_manifest(run.target.folder, loaded.evaluation.classes)
     origins = {row.id: row.origin for row in rows if row.origin}
     test = loaded.evaluation.test
-    strange = strange_clouds(test.clouds, usual_of(loaded.data.all_labelled.clouds))
+    strange = ood_reasons_of_all(test.clouds, source_ranges(loaded.data.all_labelled.clouds))
     write_predictions_of_files(
         run.folder / OF_FILES,
         [origins.get(id_, id_) for id_ in test.ids],

@@ -95,7 +95,7 @@ def test_command_line(tmp_path, capsys):
     assert main(["report", "pictures", "domains=[scannet10]", f"data_dir={tmp_path}"]) == 1
     assert "MissingDataError: domain scannet10" in capsys.readouterr().err
     assert main(["report", "pictures", "domains=[specklenet1]", f"data_dir={tmp_path}"]) == 1
-    assert "domains: specklenet1 is no domain (did you mean specklenet10?)" in (
+    assert "domains: specklenet1 is not a domain (did you mean specklenet10?)" in (
         capsys.readouterr().err
     )
     assert main(["report", "pictures"]) == 1

@@ -25,7 +25,7 @@ from tests.training.search import Truth, search
 from tests.training.test_target_labels import TEST, TRAIN, truth_of, write_shuffled_target
 from tests.training.toy import CLASSES, TinyNet, write_domain
 
-# Lightning 2.6.6 asks torch 2.13 in an old way; not ours to mend.
+# Lightning 2.6.6 asks torch 2.13 in an old way; not ours to fix.
 pytestmark = pytest.mark.filterwarnings("ignore:.*LeafSpec.* is deprecated:FutureWarning")
 
 

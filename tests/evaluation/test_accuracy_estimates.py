@@ -152,7 +152,7 @@ def test_where_sure_clouds_are_wrong_all_three_are_too_high():
 def test_agreements_by_hand():
     a, b = two(0.9, 0.8, 0.4, 0.3), two(0.6, 0.4, 0.1, 0.9)
     assert quality.agreement(a, b) == 0.5
-    assert quality.turns_agree(a, [a, b]) == 0.75
+    assert quality.rotation_agreement(a, [a, b]) == 0.75
 
 
 def test_words_have_a_range_or_one_figure_and_nothing_without_estimates():

@@ -14,7 +14,7 @@ from qs3.evaluation.calibration import calibration_error
 from qs3.evaluation.metrics import (
     Evaluation,
     predict,
-    predict_turned,
+    predict_rotation_averaged,
     scores,
 )
 from qs3.runs.metrics import Scores
@@ -93,15 +93,17 @@ class Net(nn.Module):
 def test_mean_over_turns():
     points = torch.nn.functional.normalize(torch.rand(6, 4, 3), dim=2)
     net = Net()
-    assert np.array_equal(predict_turned(net, points, 1, 4), predict(net, points, 4))
+    assert np.array_equal(predict_rotation_averaged(net, points, 1, 4), predict(net, points, 4))
     by_hand = [
         predict(net, rotate_z(points, torch.full((6,), angle)), 4)
         for angle in (0.0, torch.pi / 2, torch.pi, 3 * torch.pi / 2)
     ]
-    assert np.allclose(predict_turned(net, points, 4, 4), np.mean(by_hand, axis=0), atol=1e-6)
+    assert np.allclose(
+        predict_rotation_averaged(net, points, 4, 4), np.mean(by_hand, axis=0), atol=1e-6
+    )
     turned = rotate_z(points, torch.full((6,), 2 * torch.pi / 12))
-    twelve = predict_turned(net, points, 12, 4)
-    assert np.allclose(twelve, predict_turned(net, turned, 12, 4), atol=1e-6)
+    twelve = predict_rotation_averaged(net, points, 12, 4)
+    assert np.allclose(twelve, predict_rotation_averaged(net, turned, 12, 4), atol=1e-6)
     assert not np.allclose(predict(net, points, 4), predict(net, turned, 4), atol=1e-2)
 
 
@@ -114,12 +116,12 @@ def test_turned_scores_stand_beside_the_plain_ones(rotations, labelled):
         Unlabelled(clouds, tuple("abcde")), labels, None, ("x", "y"), 2, rotations
     )
     net = Net()
-    plain, turned = evaluation.scores(net), evaluation.turned(net)
+    plain, turned = evaluation.scores(net), evaluation.rotation_averaged(net)
     assert (turned is None) == (rotations == 0)
     assert (plain.accuracy is None) == (not labelled)
     predicted = predict(net, clouds.all(), 5).argmax(axis=1)
     assert list(plain.predicted.values()) == np.bincount(predicted, minlength=2).tolist()
     if turned is not None:
         assert (turned.n, turned.accuracy is None) == (plain.n, plain.accuracy is None)
-        predicted = predict_turned(net, clouds.all(), rotations, 5).argmax(axis=1)
+        predicted = predict_rotation_averaged(net, clouds.all(), rotations, 5).argmax(axis=1)
         assert list(turned.predicted.values()) == np.bincount(predicted, minlength=2).tolist()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
-from qs3.evaluation.ood import MEASURES, enough, limits, measure, strange
+from qs3.evaluation.ood import MEASURES, limits, measure, ood_reasons, relax_min_points
 from qs3.geometry.sampling import unit_ball
 
 
@@ -79,10 +79,10 @@ def test_limits_take_the_wider_end_of_each_domain():
 
 def test_a_cloud_with_as_many_points_as_the_net_sees_lacks_none():
     usual = {"points": [2048.0, np.inf], "height": [0.5, 1.5]}
-    assert enough(usual, 1024) == {"points": [1024, np.inf], "height": [0.5, 1.5]}
-    assert enough(usual, 4096) == usual  # training had fewer than that
+    assert relax_min_points(usual, 1024) == {"points": [1024, np.inf], "height": [0.5, 1.5]}
+    assert relax_min_points(usual, 4096) == usual  # training had fewer than that
     assert usual["points"] == [2048, np.inf]  # not changed in place
-    assert enough({"height": [0.5, 1.5]}, 64) == {"height": [0.5, 1.5]}
+    assert relax_min_points({"height": [0.5, 1.5]}, 64) == {"height": [0.5, 1.5]}
 
 
 def test_the_tails_are_a_thousandth():
@@ -90,7 +90,9 @@ def test_the_tails_are_a_thousandth():
     clouds = domain(rng, 400, (1, 1, 1))
     ends = limits(clouds)
     stored = np.asarray(clouds.stored)
-    out = [strange(measure(c, s.numpy()), ends) for c, s in zip(stored, clouds.all(), strict=True)]
+    out = [
+        ood_reasons(measure(c, s.numpy()), ends) for c, s in zip(stored, clouds.all(), strict=True)
+    ]
     # the extremes alone lie beyond 0.1 % and 99.9 % of 400: two a measure, `points` has no spread
     assert 1 <= sum(bool(each) for each in out) <= 8
 
@@ -102,7 +104,7 @@ def test_what_is_strange_is_named():
 
     def reasons(cloud: np.ndarray) -> str:
         ready = prepare(cloud[None].astype(np.float32), 64).all()[0].numpy()
-        return "; ".join(strange(measure(cloud, ready), ends))
+        return "; ".join(ood_reasons(measure(cloud, ready), ends))
 
     assert reasons(normal) == ""
     assert reasons(normal[np.arange(128) % 40]).startswith("points 40 is under 128")
@@ -114,6 +116,6 @@ def test_what_is_strange_is_named():
     clumped = normal.copy()
     clumped[1:100] *= 1e-3
     assert "spacing" in reasons(clumped) or "middle" in reasons(clumped)
-    assert strange({"height": 2.0}, {"height": [0.5, 1.5]}) == ["height 2 is over 1.5"]
-    assert strange({"height": 0.1}, {"height": [0.5, 1.5]}) == ["height 0.1 is under 0.5"]
-    assert strange({"height": 0.5}, {"height": [0.5, 1.5]}) == []
+    assert ood_reasons({"height": 2.0}, {"height": [0.5, 1.5]}) == ["height 2 is over 1.5"]
+    assert ood_reasons({"height": 0.1}, {"height": [0.5, 1.5]}) == ["height 0.1 is under 0.5"]
+    assert ood_reasons({"height": 0.5}, {"height": [0.5, 1.5]}) == []

@@ -265,7 +265,7 @@ def test_tables_are_checked_like_clouds(tmp_path):
                 tmp_path, arrays={"points": points, "t": table}, tables={"t": "ab"}, **arguments
             )
     for name in ("points", "nothing"):
-        with pytest.raises(DataError, match=r"is no table|are no arrays"):
+        with pytest.raises(DataError, match=r"is not a table|are not arrays"):
             write_pointset(tmp_path, arrays={"points": points}, tables={name: "abc"}, **arguments)
     table = np.arange(8.0).reshape(1, 4, 2)
     write_pointset(tmp_path, arrays={"points": points, "t": table}, tables={"t": "ab"}, **arguments)

@@ -206,7 +206,7 @@ def test_damaged_clouds_to_compare_on_are_left_out(run, tmp_path, capsys, caplog
     check.mkdir()
     (check / "a.xyz").write_text("one two three\n")
     holes = np.stack([cloud * np.nan, cloud, cloud])
-    holes[1, 7] = np.nan  # a point without coordinates is no damage
+    holes[1, 7] = np.nan  # a point without coordinates is not damage
     np.save(check / "b.npy", holes)
     words = ["export", f"ckpt={run}", f"out={tmp_path / 'model.pt2'}", f"check={check}"]
     assert main([*words, "threads=1"]) == 0

@@ -138,7 +138,7 @@ def test_mu_falls_as_its_class_grows(p, theta, k, more) -> None:
 
 
 def test_spst_worked_by_hand() -> None:
-    # theta = .6: a and d exceed it, b is just at it; c's two likeliest classes tie at .5
+    # theta = .6: a and d exceed it, b is just at it; c's two most probable classes tie at .5
     table = [[0.7, 0.2, 0.1], [0.6, 0.3, 0.1], [0.5, 0.5, 0.0], [0.1, 0.28, 0.62]]
     selection, kept = select(Spst(), table, 0.6)
     assert kept == "a0 d2"

@@ -58,7 +58,7 @@ def test_cbst_at_ties() -> None:
     assert kept == "a0 f0 g0 h0"  # four for a rank of three
 
 
-def test_cbst_overrules_the_likeliest_class() -> None:
+def test_cbst_overrules_the_most_probable_class() -> None:
     # predicted 0: a b c: rank 1, theta_0 = .99; predicted 1: d e: rank 1, theta_1 = .42
     table = [[0.99, 0.01, 0.0], [0.98, 0.02, 0.0], [0.55, 0.45, 0.0],
              [0.30, 0.42, 0.28], [0.30, 0.41, 0.29]]  # fmt: skip

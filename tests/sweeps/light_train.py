@@ -14,7 +14,7 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config import hashing
-from qs3.config.hydra import speak_plainly
+from qs3.config.hydra import cli_errors
 from qs3.errors import SelectionError
 
 
@@ -43,7 +43,7 @@ def work(cfg: DictConfig) -> float:
 
 @hydra.main(version_base="1.3", config_path="../../conf", config_name="train")
 def main(cfg: DictConfig) -> float:
-    return speak_plainly(work, cfg)
+    return cli_errors(work, cfg)
 
 
 if __name__ == "__main__":

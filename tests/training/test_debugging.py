@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_dir
 
 from qs3.config import hashing
 from qs3.data.store import open_pointset
-from qs3.datamodules.splits import few_of_each_split
+from qs3.datamodules.splits import subsample_splits
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.runs.metrics import TrainingAccuracy
@@ -71,7 +71,7 @@ def test_profiler_writes_into_the_run(profiler, toy):
 def test_few_of_each_split(tmp_path):
     write_domain(tmp_path, "x", noise=0.1, train=24, test=2)  # of each of three classes
     whole = open_pointset(tmp_path / "x")
-    few = few_of_each_split(whole, 9)
+    few = subsample_splits(whole, 9)
     assert (few.splits == "train").sum() == 9
     assert (few.splits == "test").sum() == 6  # there are no more
     assert few.sha256 == whole.sha256

@@ -65,7 +65,7 @@ def test_a_damaged_mark_is_as_good_as_none(toy, tmp_path, caplog):
     (folder / "started.json").write_text("{")
     train(toy("selftraining=none", "experiment_name=other"))
     assert not taken(caplog)
-    train(toy("selftraining=none", "experiment_name=third"))  # it was mended
+    train(toy("selftraining=none", "experiment_name=third"))  # it was repaired
     assert taken(caplog)
 
 

@@ -252,7 +252,7 @@ def test_all_before_the_last_round_is_as_without_holding_out(by_rule, finished):
     assert not same_weights(by_rule("pseudo_val") / "student.pt", finished / "student.pt")
 
 
-def test_soft_pseudo_labels_are_held_out_by_their_likeliest_class(toy):
+def test_soft_pseudo_labels_are_held_out_by_their_most_probable_class(toy):
     metrics = train(
         toy(
             "selftraining=crst_lrent",

@@ -1,4 +1,4 @@
-"""Archives of strangers: unpacked into one new folder, and the wanted folder found in them.
+"""Untrusted archives: unpacked into one new folder, and the wanted folder found in them.
 
 Refused as a whole: names that lead out of the folder, links, devices, encryption, and archives that
 unpack to far more than they are (a "bomb"). Nothing is taken over but names and contents: no

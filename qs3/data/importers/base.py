@@ -88,7 +88,7 @@ class Importer(abc.ABC):
     def object_of(self, id_: str) -> str:
         """Which object a cloud shows, where its id tells; else "".
 
-        Clouds of one object are no independent samples: `qs3.report.tables.paired` takes them
+        Clouds of one object are not independent samples: `qs3.report.tables.paired` takes them
         together.
         """
         return ""

@@ -57,7 +57,7 @@ class GraspNetPC(Importer):
         """See `Importer`. By split, class, sensor and name.
 
         Raises:
-            DataError: a folder that is no class, or a link that leads out of the folder.
+            DataError: a folder that is not a class, or a link that leads out of the folder.
         """
         found = []
         for split in ("train", "test"):

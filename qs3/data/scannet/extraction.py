@@ -243,7 +243,7 @@ def _report(pointset: PointSet, results: Sequence[SceneResult], found: Found, ou
         log.warning("failed: %s: %s", result.files.scene, result.reason)
     if failed:
         log.warning(
-            "%d of %d scenes failed (%s); mend or download them and run the same command again",
+            "%d of %d scenes failed (%s); repair or download them and run the same command again",
             len(failed),
             len(results),
             SCENES,

@@ -111,7 +111,7 @@ def read_objects(path: str | Path, label_map: LabelMap) -> tuple[list[Labelled],
         an object is left out), or another `id` than `objectId`.
 
     Raises:
-        DataError: it is no aggregation.
+        DataError: it is not an aggregation.
     """
     try:
         document = json.loads(_text(path, "the aggregation"))
@@ -119,7 +119,7 @@ def read_objects(path: str | Path, label_map: LabelMap) -> tuple[list[Labelled],
         others = sum(group.get("id", group["objectId"]) != group["objectId"]
                      for group in document["segGroups"])  # fmt: skip
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise DataError(f"{path} is no aggregation of objects ({error!r})") from error
+        raise DataError(f"{path} is not an aggregation of objects ({error!r})") from error
     found: dict[int, tuple[str, str | None]] = {}
     torn = set()
     for number, label in groups:
@@ -147,12 +147,12 @@ def read_scene_list(path: str | Path) -> list[str]:
 
     Raises:
         MissingDataError: there is no such file.
-        DataError: a line is no scene's name, or there are none.
+        DataError: a line is not a scene's name, or there are none.
     """
     scenes = [line.strip() for line in _text(path, "a scene list").splitlines() if line.strip()]
     for scene in scenes:
         if not is_scene(scene):
-            raise DataError(f"{path}: {scene!r} is no scene; a line is like scene0000_00")
+            raise DataError(f"{path}: {scene!r} is not a scene; a line is like scene0000_00")
     if not scenes:
         raise DataError(f"{path} names no scenes")
     return scenes

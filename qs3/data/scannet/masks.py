@@ -79,7 +79,7 @@ class MaskArchive:
         """[h, w] uint8 or uint16, the mask of a frame.
 
         Raises:
-            DataError: there is none, or it is no grey PNG of a sensible size.
+            DataError: there is none, or it is not a grey PNG of a sensible size.
         """
         where = f"{self.path}, frame {frame}"
         member = self._members.get(frame)
@@ -95,7 +95,7 @@ class MaskArchive:
     def _look_through(self, folder: str) -> dict[int, zipfile.ZipInfo]:
         infos = self._zip.infolist()
         if len(infos) > _MAX_MEMBERS:
-            raise DataError(f"{self.path} claims {len(infos)} files; it is no zip of masks")
+            raise DataError(f"{self.path} claims {len(infos)} files; it is not a zip of masks")
         pattern = re.compile(rf"(?:[\w-]+/)?{re.escape(folder)}/(\d{{1,7}})\.png")
         found: dict[int, zipfile.ZipInfo] = {}
         for info in infos:
@@ -124,7 +124,7 @@ def read_png(data: bytes, where: str) -> np.ndarray:
     if len(data) > _MAX_PNG_BYTES:
         raise DataError(f"{where}: the PNG has more than {_MAX_PNG_BYTES} bytes; refused")
     if len(data) < _HEADER.size:
-        raise DataError(f"{where}: {len(data)} bytes are no PNG")
+        raise DataError(f"{where}: {len(data)} bytes are not PNG")
     signature, length, kind, width, height, bits, colour, *_ = _HEADER.unpack_from(data)
     if signature != _SIGNATURE or kind != b"IHDR" or length != 13:
         raise DataError(f"{where}: no PNG")

@@ -92,7 +92,7 @@ class SensFile:
         """Open and check the file.
 
         Raises:
-            DataError: it cannot be read, is no recording, or is broken off; names the frame.
+            DataError: it cannot be read, is not a recording, or is broken off; names the frame.
         """
         self.path = Path(path)
         try:
@@ -240,7 +240,7 @@ def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
 
 def _extrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     if not is_rigid(matrix):
-        raise DataError(f"{where} are no rigid motion: {matrix.tolist()}")
+        raise DataError(f"{where} are not rigid motion: {matrix.tolist()}")
     return matrix.copy()
 
 

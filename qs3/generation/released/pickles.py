@@ -1,4 +1,4 @@
-"""Pickled dicts of strangers, as numpy saves them, read without running what they ask for.
+"""Untrusted pickled dicts, as numpy saves them, read without running what they ask for.
 
 A pickle is a program. Only the instructions for plain values are let through, and of the names
 that it may call only the two that make arrays. Even these are not numpy's here: an array is made

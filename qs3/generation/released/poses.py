@@ -1,7 +1,7 @@
 """The object and camera poses that the authors published, as one small table.
 
 `pose_params.tar.gz` of the release holds one pickled dict a shape in a .npy file,
-`pose_params/5_view/<class>/<split>/<name>.npy`. It is read as a stranger's file: in one pass,
+`pose_params/5_view/<class>/<split>/<name>.npy`. It is untrusted: in one pass,
 without unpacking it to the disk, by a reader that runs nothing (qs3.generation.released.pickles).
 """
 
@@ -158,7 +158,7 @@ def _archive(path: Path) -> Iterator[tuple[str, bytes]]:
                 assert file is not None  # a regular file
                 yield member.name, file.read()
     except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
-        raise DataError(f"{path} is no archive that can be read: {error}") from error
+        raise DataError(f"{path} is not an archive that can be read: {error}") from error
 
 
 def _folder(path: Path) -> Iterator[tuple[str, bytes]]:
@@ -166,7 +166,7 @@ def _folder(path: Path) -> Iterator[tuple[str, bytes]]:
     for file in sorted(path.rglob("*.npy")):
         name = file.relative_to(path).as_posix()
         if not file.is_file() or not file.resolve().is_relative_to(root):
-            raise DataError(f"{path}: {name} is no file, or a link that leads out of the folder")
+            raise DataError(f"{path}: {name} is not a file, or a link that leads out of the folder")
         if file.stat().st_size > _MAX_MEMBER:
             raise DataError(f"{path}: {name} has more than {_MAX_MEMBER} bytes: not a pose")
         yield name, file.read_bytes()
@@ -184,7 +184,7 @@ def _id_of(name: PurePosixPath, where: str) -> str:
     folder, split = name.parts[-3].lower(), name.parts[-2].lower()
     cls = ALIASES.get(folder, folder)
     if cls not in CLASSES or split not in SPLITS:
-        raise DataError(f"{where}: {folder}/{split} is no class and split; expected chair/train")
+        raise DataError(f"{where}: {folder}/{split} is not a class and split; expected chair/train")
     return f"{cls}/{split}/{name.stem}"
 
 

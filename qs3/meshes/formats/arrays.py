@@ -39,9 +39,9 @@ def numbers(text: bytes) -> np.ndarray:
 
 
 def whole(values: np.ndarray, what: str) -> np.ndarray:
-    """Float64 `values` as int64; MeshError if one is no whole number."""
+    """Float64 `values` as int64; MeshError if one is not a whole number."""
     if not (np.abs(values) < 2**53).all() or (values != np.trunc(values)).any():
-        raise MeshError(f"holds {what} that is no whole number")
+        raise MeshError(f"holds {what} that is not a whole number")
     return values.astype(np.int64)
 
 

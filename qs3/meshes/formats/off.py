@@ -29,7 +29,7 @@ def read(data: bytes) -> Triangles:
         data = re.sub(rb"#[^\r\n]*", b"", data)
     header = _HEADER.match(data)
     if header is None:
-        raise MeshError("is no OFF file: it does not begin with OFF")
+        raise MeshError("is not an OFF file: it does not begin with OFF")
     extras, dimensions, binary = header.groups()
     if dimensions or binary:
         raise MeshError("is a binary or four-dimensional OFF, which is not read")

@@ -86,7 +86,7 @@ def _parse_header(data: bytes) -> tuple[list[_Element], bytes]:
     """Elements, and the data behind the header; text becomes binary of float64."""
     end = _END.search(data, 0, _MAX_HEADER_BYTES)
     if end is None or not data.startswith(b"ply"):
-        raise MeshError("is no PLY file, or cut within its header")
+        raise MeshError("is not a PLY file, or cut within its header")
     lines = [line.split() for line in data[: end.start()].decode("latin-1").splitlines()]
     order = None
     elements: list[_Element] = []

@@ -173,7 +173,7 @@ def kept_object(
         meshes: the folder of meshes that it was made from, if it was.
 
     Raises:
-        MissingDataError, DataError: it is no dataset, or damaged.
+        MissingDataError, DataError: it is not a dataset, or damaged.
         ConfigError: there is no such object, or its views were not kept.
     """
     folder = Path(folder)

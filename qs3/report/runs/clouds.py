@@ -1,4 +1,4 @@
-"""A run's clouds as pictures: both domains, their classes, the surest mistakes, one object."""
+"""A run's clouds as pictures: both domains, their classes, the most confident errors, one object."""
 
 from __future__ import annotations
 
@@ -91,23 +91,23 @@ class _Domains:
         class_picture({self.label(role): self.data(role) for role in ROLES}, path)
 
     def mistakes(self, path: Path) -> None:
-        """The wrongly named clouds that the result is surest of; one a mesh."""
+        """The wrongly named clouds that the result is most confident of; one a mesh."""
         said = self._said()
         wrong = (said.labels >= 0) & (said.predicted != said.labels)
         if not wrong.any():
             raise NothingToDrawError("the result makes no mistake")
         known = f"{wrong.sum()} mistakes in {(said.labels >= 0).sum()} clouds"
-        self._sheet_of(said, _surest(said, wrong)[:_SHEET], f"surest of {known}", path)
+        self._sheet_of(said, _surest(said, wrong)[:_SHEET], f"most confident of {known}", path)
 
     def named(self, path: Path) -> None:
-        """Without labels: the clouds that the result is surest of, a row a class."""
+        """Without labels: the clouds that the result is most confident of, a row a class."""
         said = self._said()
         rows = {
             name: _surest(said, said.predicted == k)[:_ROW] for k, name in enumerate(said.classes)
         }
         rows = {name: row for name, row in rows.items() if row}
         shown = [i for row in rows.values() for i in padded(row, _ROW)]
-        words = "surest of each class as named by the result"
+        words = "most confident of each class as predicted"
         self._sheet_of(said, shown, words, path, tuple(rows))
 
     def _said(self) -> Predictions:

@@ -139,7 +139,7 @@ def read_run(folder: str | Path) -> RunFiles:
     """Read a run's folder.
 
     Raises:
-        MissingDataError: it is no run's folder.
+        MissingDataError: it is not a run's folder.
         DataError: one of its files is damaged.
     """
     folder = Path(folder).expanduser()

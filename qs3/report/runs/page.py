@@ -22,8 +22,8 @@ _TITLES = {
     "source_clouds": "Clouds of the source",
     "target_clouds": "Clouds of the target",
     "class_balance": "Classes of both domains",
-    "mistakes": "Surest mistakes",
-    "named": "Surest of each class",
+    "mistakes": "Most confident errors",
+    "named": "Most confident of each class",
     "pipeline": "From mesh to cloud",
 }
 _STYLE = """

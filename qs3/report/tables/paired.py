@@ -4,7 +4,7 @@ Both rows are judged on the same clouds with the same seeds, so their difference
 pairs: d = Σ_{s,i} w_i (a_{s,i} - b_{s,i}) / S, where a and b are 1 if the row's run of seed s is
 right about cloud i, and w_i is 1/n for accuracy, 1/(C n_class) for balanced accuracy.
 
-Two things make d vary: other seeds, and other test meshes (scans of one mesh are no independent
+Two things make d vary: other seeds, and other test meshes (scans of one mesh are not independent
 samples). Their variances are those of errors clustered two ways (Cameron, Gelbach, Miller, "Robust
 Inference with Multiway Clustering", J. Business & Economic Statistics 2011, eq. 2.11), V_seeds and
 V_meshes less V_(seed, mesh), which is in both. Few seeds say little about V_seeds, so each has its

@@ -108,7 +108,7 @@ def build_table(
     except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
     if odd := [note for note in notes if not isinstance(note, str)]:
-        raise ConfigError(f"{path}: notes: {odd[0]} is no line of text; put quotes around it")
+        raise ConfigError(f"{path}: notes: {odd[0]} is not a line of text; put quotes around it")
     if unknown := sorted(set(metrics) - set(METRICS)):
         raise ConfigError(f"{path}: unknown metrics {unknown}; known are {', '.join(METRICS)}")
     if target:
@@ -173,12 +173,12 @@ def _cell(
 
 
 def check_domain(key: str, name: str) -> None:
-    """Raise ConfigError, with the names there are, if `name` after `key` is no domain's."""
+    """Raise ConfigError, with the names there are, if `name` after `key` is not a domain's."""
     known = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         meant = f" (did you mean {near[0]}?)" if near else ""
-        raise ConfigError(f"{key}{name} is no domain{meant}; there are {', '.join(known)}")
+        raise ConfigError(f"{key}{name} is not a domain{meant}; there are {', '.join(known)}")
 
 
 def _fill(

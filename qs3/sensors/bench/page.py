@@ -249,7 +249,7 @@ def _edges(results: Sequence[SensorResult]) -> str:
         "## A square before a wall\n\nShadows are measured on who sees and who lights the wall "
         "and expected as f B (1/Zf - 1/Zb), for a projector with its own distance from the "
         "camera; a pixel that is reached in part counts as reached, which makes them 1 px "
-        "narrower at most. A blurred edge is no shadow: there the window holds both surfaces. "
+        "narrower at most. A blurred edge is not a shadow: there the window holds both surfaces. "
         "The near one, which is brighter, wins at first and what is doubtful is dropped, so the "
         "square reaches out and the wall begins within half a window of the edge where nothing "
         f"is hidden (right, top, bottom). Nguyen's lateral noise is "

@@ -28,7 +28,7 @@ class TableStatistics:
     Attributes:
         levels: distinct depths beyond 0.8 m, where a step is larger than the file's 1 mm.
         step_focal_baseline: f B in px m that fits the steps of 1 / Z at 1/8 px.
-        step_residual: RMS distance of the levels from that grid, in steps; 0.29 is no grid.
+        step_residual: RMS distance of the levels from that grid, in steps; 0.29 is not a grid.
         level_use: standard deviation over the eighths of a pixel of how often a depth falls on
             them, 0 if all are used alike: the trace of pixel locking.
         table_rms_m, table_subpixel_px: of the table about a smooth surface; local, see `table`.

@@ -117,7 +117,7 @@ def read_frame(path: str | Path, unit: str | None = None) -> DepthImage:
 
     Raises:
         MissingDataError: there is no such file.
-        DataError: it is no depth image, or its unit cannot be told.
+        DataError: it is not a depth image, or its unit cannot be told.
     """
     path = Path(path)
     if not path.is_file():
@@ -138,7 +138,7 @@ def read_frame(path: str | Path, unit: str | None = None) -> DepthImage:
     else:
         raise DataError(f"{path}: depth frames are read from .png, .npy and .pcd")
     if raw.ndim != 2 or raw.dtype.kind not in "iuf":
-        raise DataError(f"{path} is no depth image: {raw.dtype} of shape {list(raw.shape)}")
+        raise DataError(f"{path} is not a depth image: {raw.dtype} of shape {list(raw.shape)}")
     return as_frame(path.name, raw, unit)
 
 
@@ -201,10 +201,10 @@ def _png(path: Path) -> np.ndarray:
     except cv2.error as error:
         raise DataError(f"{path} cannot be read: {error}") from error
     if image is None:
-        raise DataError(f"{path} is no PNG, or damaged")
+        raise DataError(f"{path} is not a PNG, or damaged")
     if image.ndim != 2 or image.dtype != np.uint16:
         raise DataError(
-            f"{path} is no depth image: {image.dtype}, shape {list(image.shape)}; 16 bit grey "
+            f"{path} is not a depth image: {image.dtype}, shape {list(image.shape)}; 16 bit grey "
             "is needed"
         )
     return np.asarray(image)

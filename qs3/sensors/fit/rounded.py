@@ -11,13 +11,13 @@ from qs3.sensors.fit.steps import Steps
 
 _MAX_PIXELS = 12_000
 _OUTLIERS = 1e-4  # share of pixels that lie anywhere, so that a single one decides nothing
-_COARSE = 0.5  # steps a standard deviation from which rounding is no small extra error
+_COARSE = 0.5  # steps a standard deviation from which rounding is not a small extra error
 
 
 def smooth_wall(wall: Wall, steps: Steps) -> np.ndarray:
     """[h, w] 1 / Z of the wall as the camera sees it without noise: a cubic in the pixels.
 
-    Lenses bend a plane over the whole image, which is no noise. Where steps are coarse the
+    Lenses bend a plane over the whole image, which is not noise. Where steps are coarse the
     surface is that of highest likelihood (every pixel gives an interval, the error is normal),
     because a mean over few steps is drawn to them.
     """

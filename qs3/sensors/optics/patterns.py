@@ -45,14 +45,14 @@ class PictureSlide:
         """[H, W] float32 in 0..1.
 
         Raises:
-            DataError: the file is not there, is no image, or is larger than 64 megapixels.
+            DataError: the file is not there, is not an image, or is larger than 64 megapixels.
         """
         path = Path(self.path).expanduser()
         if not path.is_file():
             raise DataError(f"pattern.path: there is no file {path}")
         image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise DataError(f"pattern.path: {path} is no image that OpenCV can read")
+            raise DataError(f"pattern.path: {path} is not an image that OpenCV can read")
         if image.size > _MAX_PICTURE_PX:
             raise DataError(f"pattern.path: {path} has {image.size} pixels, 64 million at most")
         white = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65_535}.get(image.dtype)

@@ -20,7 +20,7 @@ MODES = ["zip", "w", "w:gz", "w:bz2", "w:xz"]
 
 
 def make(path, mode="zip", files=FILES, extra=()):
-    """An archive with files by name, and in a tar members that are no files."""
+    """An archive with files by name, and in a tar members that are not files."""
     if mode == "zip":
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in files.items():

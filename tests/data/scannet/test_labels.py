@@ -118,7 +118,7 @@ def test_scene_lists(tmp_path):
     path.write_text("scene0191_00\r\nscene0191_01\n\n")
     assert read_scene_list(path) == ["scene0191_00", "scene0191_01"]
     path.write_text("scene0191_00\n../etc\n")
-    with pytest.raises(DataError, match=r"'\.\./etc' is no scene"):
+    with pytest.raises(DataError, match=r"'\.\./etc' is not a scene"):
         read_scene_list(path)
     path.write_text("\n")
     with pytest.raises(DataError, match="names no scenes"):

@@ -94,7 +94,7 @@ def test_a_picture_too_large_is_refused_by_its_header(size):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "are no PNG"),
+        (b"", "are not PNG"),
         (b"GIF89a" + bytes(100), "no PNG"),
         (png(np.zeros((4, 4, 3), np.uint8)), "grey with 8 or 16 bits"),
         (png(images()[0])[:-5], "broken off"),

@@ -1,4 +1,4 @@
-"""A stranger's pickle gives numbers, or an error; it never runs anything."""
+"""An untrusted pickle gives numbers, or an error; it never runs anything."""
 
 import builtins
 import io

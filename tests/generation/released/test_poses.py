@@ -228,7 +228,7 @@ def info(name, **attributes):
         ({"sofa/test/a.npy": npy(np.zeros(3))}, "not one pickled object"),
         ({"sofa/test/a.npy": npy(np.array([1, {}], dtype=object)[0])}, "not one pickled"),
         ({"sofa/a.npy": npy({})}, "class/split/name"),
-        ({"horse/test/a.npy": npy({})}, "horse/test is no class and split"),
+        ({"horse/test/a.npy": npy({})}, "horse/test is not a class and split"),
         ({"sofa/test/a.npy": npy({})}, "obj_scale is missing"),
         ({NAME: npy(released(sofa())), "x/" + NAME: npy(released(sofa()))}, "a second file"),
         ({"readme.txt": b"x"}, "holds no class/split/name.npy"),
@@ -276,10 +276,10 @@ def test_a_file_that_would_run_code_is_refused(tmp_path):
 def test_damaged_and_missing_files_are_told(tmp_path, poses):
     cut = tmp_path / "cut.tar.gz"
     cut.write_bytes(poses.read_bytes()[:-200])
-    with pytest.raises(DataError, match=r"cut\.tar\.gz is no archive that can be read"):
+    with pytest.raises(DataError, match=r"cut\.tar\.gz is not an archive that can be read"):
         read_poses(cut)
     (tmp_path / "text.tar.gz").write_text("hello")
-    with pytest.raises(DataError, match="is no archive"):
+    with pytest.raises(DataError, match="is not an archive"):
         read_poses(tmp_path / "text.tar.gz")
     with pytest.raises(MissingDataError, match=r"poses= wants pose_params\.tar\.gz"):
         read_poses(tmp_path / "nowhere")

@@ -58,12 +58,12 @@ def test_mistakes_are_those_of_the_table_surest_first(run, toy_data, tmp_path, s
     data = open_pointset(toy_data / "kinectsim10")
     for points, row in zip(sheet["points"], rows, strict=True):
         np.testing.assert_array_equal(points, data.points[data.ids.index(row["id"])])
-    assert f"surest of {len(rows)} mistakes in 24 clouds" in sheet["heading"]
+    assert f"most confident of {len(rows)} mistakes in 24 clouds" in sheet["heading"]
     assert "(K, simulated)" in sheet["heading"]
 
 
 def test_one_mistake_of_each_mesh():
-    """Scans of one mesh are one mistake: the surest of them is shown."""
+    """Scans of one mesh are one mistake: the most confident of them is shown."""
     sure = np.array([0.6, 0.9, 0.8, 0.7])
     said = Predictions(("a", "b"), tuple("wxyz"), ("m", "m", "n", "o"), np.full(4, 1),
                        np.stack([sure, 1 - sure], axis=1))  # fmt: skip

@@ -68,7 +68,7 @@ def test_a_picture_becomes_a_slide(tmp_path, dtype):
 
 def test_a_slide_that_is_no_picture_is_refused(tmp_path):
     (tmp_path / "text.png").write_text("not a picture")
-    with pytest.raises(DataError, match="is no image"):
+    with pytest.raises(DataError, match="is not an image"):
         _ = PictureSlide(str(tmp_path / "text.png")).slide
     with pytest.raises(DataError, match="there is no file"):
         _ = PictureSlide(str(tmp_path / "missing.png")).slide
