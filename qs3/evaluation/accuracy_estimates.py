@@ -187,7 +187,7 @@ def estimate_accuracy(
         upright: z points up in the target's clouds.
 
     Returns:
-        Plain values. None where a figure does not exist (no teacher, no gravity), or is not a number
+        Plain values. None where a figure does not exist (no teacher, no gravity), or is not finite
         because the net has diverged.
     """
     points, labels = target.points, validation.labels.numpy()
@@ -209,7 +209,7 @@ def estimate_accuracy(
     about |= estimates(known, labels, judged)
     if upright:
         about["rotation_agreement"] = rotation_agreement(
-            judged, _turned(net, points, batch_size, device)
+            judged, _rotated(net, points, batch_size, device)
         )
     if teacher is not None:
         assert taught is not None
@@ -223,7 +223,7 @@ def estimate_accuracy(
     return AccuracyEstimates(**about)
 
 
-def _turned(net: nn.Module, points: Tensor, batch_size: int, device: Any) -> list[np.ndarray]:
+def _rotated(net: nn.Module, points: Tensor, batch_size: int, device: Any) -> list[np.ndarray]:
     tables = []
     for i in range(1, TURNS + 1):
         angle = torch.full((len(points),), 2 * math.pi * i / (TURNS + 1), dtype=points.dtype)

@@ -16,8 +16,8 @@ MEANINGS: Mapping[str, str] = {
     "clouds miss as are wrong (ATC). Too high as a rule; can be off either way",
     "difference": "accuracy on held-out labelled clouds, less what is lost in confidence (DoC). "
     "Too high as a rule",
-    "rotation_agreement": "share of clouds with the same class after rotations about the up axis, which change "
-    "no class. What changes is unreliable; what stays can be wrong all the same",
+    "rotation_agreement": "share of clouds with the same class after rotations about the up axis, "
+    "which change no class. What changes is unreliable; what stays can be wrong all the same",
     "teacher_agrees": "share of clouds on which the net before self-training says the same. "
     "The student learnt from it, so both can be wrong together",
     "unlike_source": "share of clouds outside the range of the labelled ones in spacing, flatness "

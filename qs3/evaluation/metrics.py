@@ -131,7 +131,7 @@ class Evaluation:
         train_labels: of its training clouds by id, which only judge pseudo-labels; None likewise.
         classes: names in label order.
         batch_size: of the predictions.
-        rotations: over how many turns `turned` averages; 0 leaves it out.
+        rotations: over how many rotations `rotation_averaged` averages; 0 leaves it out.
         meshes: of the test clouds by id; None or missing where not known.
     """
 

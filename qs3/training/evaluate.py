@@ -34,7 +34,7 @@ class Outcome:
         choice: how its epoch was chosen; None: the last one's, or the warm-up's.
         final: its scores.
         scores: of "selected" and "last", the warm-up's epochs, and "student", the last round's.
-        turned: scores of the reported net and of "selected", averaged over rotations.
+        rotated: scores of the reported net and of "selected", averaged over rotations.
         validators: its label-free scores.
         quality: estimates of its accuracy.
         training: its accuracy on training clouds, with `data.clouds_a_class` alone.
@@ -45,7 +45,7 @@ class Outcome:
     choice: Choice | None
     final: Scores
     scores: Mapping[str, Scores]
-    turned: tuple[Scores | None, Scores | None]
+    rotated: tuple[Scores | None, Scores | None]
     validators: dict[str, float | None]
     quality: AccuracyEstimates
     training: TrainingAccuracy | None
@@ -95,8 +95,8 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         name: final if path == file else evaluation.scores(nets(path), device)
         for name, path in files.items()
     }
-    turned = evaluation.rotation_averaged(net, device)
-    before = turned if file == files["selected"] else None
+    rotated = evaluation.rotation_averaged(net, device)
+    before = rotated if file == files["selected"] else None
     if before is None:
         before = evaluation.rotation_averaged(nets(files["selected"]), device)
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
@@ -106,7 +106,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         choice=choice,
         final=final,
         scores=scores,
-        turned=(turned, before),
+        rotated=(rotated, before),
         validators=without_labels(net, data.target, choice, batch_size, device),
         quality=_quality(run, loaded, nets, file, net),
         training=(

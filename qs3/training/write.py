@@ -51,7 +51,7 @@ def write_outcome(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> R
 
 def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMetrics:
     cfg, data, evaluation = run.cfg, loaded.data, loaded.evaluation
-    over, before = outcome.turned
+    over, before = outcome.rotated
     names = component_names(cfg)
     return RunMetrics(
         experiment=cfg.experiment_name,

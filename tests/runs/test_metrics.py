@@ -72,7 +72,8 @@ def whole() -> RunMetrics:
         ),
         quality=AccuracyEstimates(
             validation_accuracy=0.9, temperature=1.5, **shares, clouds=200,
-            validated_on="source_val", validation_clouds=40, rotation_agreement=0.5, teacher_agrees=0.5,
+            validated_on="source_val", validation_clouds=40,
+            rotation_agreement=0.5, teacher_agrees=0.5,
             teacher=teacher, unlike_source=0.1, never_predicted=["c"],
         ),
         training=TrainingAccuracy(n=12, accuracy=1.0),

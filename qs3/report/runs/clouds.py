@@ -1,4 +1,4 @@
-"""A run's clouds as pictures: both domains, their classes, the most confident errors, one object."""
+"""A run's clouds as pictures: both domains, their classes, confident errors, one object."""
 
 from __future__ import annotations
 
