@@ -1,9 +1,9 @@
 """What the clouds of training were like, and whether another cloud is like them.
 
-Five measures of a cloud, which its position, its size and a rotation about the up axis leave as they
-are, and for each the range in which the training clouds of source and target lie. A cloud outside one of
-them is one that the classifier was never asked about. This guarantees nothing: a cloud inside all
-ranges can still show an object of no known class, and get a confident answer.
+Five measures of a cloud, which its position, its size and a rotation about the up axis leave as
+they are, and for each the range in which the training clouds of source and target lie. A cloud
+outside one of them is one that the classifier was never asked about. This guarantees nothing: a
+cloud inside all ranges can still show an object of no known class, and get a confident answer.
 """
 
 from __future__ import annotations
