@@ -44,7 +44,7 @@ def commands() -> dict[str, set[str]]:
         lines += re.findall(r"`((?:qs3|python) [^`\n]+)`", text)
         for line in lines:
             line = line.strip().split("  ")[0].split(" #")[0]
-            if not line.startswith(OURS):
+            if not line.startswith(OURS) or "COMMAND" in line:
                 continue
             words = shlex.split(line.replace("...", ""), posix=True)
             head = [word for word in words if "=" not in word and not word.startswith("-")]

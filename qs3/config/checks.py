@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
-
-import numpy as np
 
 from qs3.errors import ConfigError
 
@@ -83,7 +82,7 @@ def _check_range(key: str, value: Any, allowed: str) -> None:
 
 
 def _inside(value: Any, allowed: str) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+    if isinstance(value, bool) or not isinstance(value, Real):
         return False
     value = float(value)
     if allowed.startswith("odd "):

@@ -246,7 +246,7 @@ def test_every_reader_names_a_damaged_file(how, toy, tmp_path, capsys):  # noqa:
         read_metrics(file.parent)
     with pytest.raises(DataError, match=said):
         read_run(file.parent)
-    assert main(["pictures", f"run={file.parent}"]) == 1
+    assert main(["report", "page", f"run={file.parent}"]) == 1
     assert re.search(said, capsys.readouterr().err)
     found = load_run(file.parent)
     assert (found.status, found.metrics) == ("damaged", None)
