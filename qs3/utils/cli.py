@@ -125,7 +125,7 @@ class Option:
         shown = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
         notes = ["required"] * self.required
         notes += [f"default {'true' if value is True else shown}"] * (
-            value not in (None, "", False)
+            value not in (None, "", False, ())
         )
         choices = f"; one of {', '.join(self.choices())}" if self.choices is not tuple else ""
         return self.help + choices + (f" ({', '.join(notes)})" if notes else "")
