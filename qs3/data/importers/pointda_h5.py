@@ -86,8 +86,9 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
     try:
         with h5py.File(path, "r") as file:
             data, label = (own_dataset(file, (key,), path) for key in ("data", "label"))
-            if data is None or label is None:
-                raise DataError(f"{path}: there are no datasets 'data' and 'label'")
+            for key, found in (("data", data), ("label", label)):
+                if found is None:
+                    raise DataError(f"{path}: there is no dataset {key!r}")
             if data.ndim != 3 or data.shape[2] not in (3, 6) or data.dtype.kind != "f":
                 raise DataError(
                     f"{path}: data is {data.dtype} {data.shape}, expected floats [n, P, 3 or 6]"
