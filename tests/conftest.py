@@ -10,7 +10,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 if os.environ.get(
     "QS3_CHECK_SHAPES"
-):  # `make test-all`; costs a third more time in the nets' tests
+):  # `make test-all`
     from jaxtyping import install_import_hook
 
     checked = ("geometry.neighbours", "geometry.sampling", "models", "methods")

@@ -84,13 +84,17 @@ def test_whole_net_equals_the_straight_one(variant: str, training: bool) -> None
 @pytest.mark.usefixtures("few_centres")
 @pytest.mark.parametrize("variant", ["ssg", "msg"])
 def test_float32_errs_no_more_than_twice_the_straight_one(variant: str) -> None:
+    """As a sum over clouds: of a few, one maximum that goes elsewhere can outweigh all rounding."""
     torch.manual_seed(0)
     exact = pointnet2(10, variant, dropout=0.0).double()
-    points = _clouds(6, 200, torch.float32)
-    truth = exact(points.double())
     straight = StraightPointNet2(copy.deepcopy(exact).float())
     ours = copy.deepcopy(exact).float()
-    assert _error(ours(points), truth) <= 2 * _error(straight(points), truth)
+    errors = torch.zeros(2)
+    for seed in range(4):
+        points = _clouds(6, 200, torch.float32, seed)
+        truth = exact(points.double())
+        errors += torch.tensor([_error(ours(points), truth), _error(straight(points), truth)])
+    assert errors[0] <= 2 * errors[1], errors
 
 
 def test_float32_gradients_err_no_more_than_twice_the_straight_ones() -> None:
