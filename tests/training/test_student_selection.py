@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from omegaconf import open_dict
 
 import qs3.selftraining.oracle
 import qs3.selftraining.student_selection
@@ -105,14 +104,9 @@ def test_last_is_the_default_and_leaves_nothing_behind(finished):
     )
 
 
-def test_runs_from_before_there_was_a_choice_are_found(toy):
-    cfg = toy()
-    old = cfg.copy()
-    with open_dict(old):
-        del old.selection["student"]
-    assert hashing.config_sha256(old) == hashing.config_sha256(cfg)
-    hashes = {hashing.config_sha256(toy(f"selection.student={rule}")) for rule in RULES}
-    assert len(hashes | {hashing.config_sha256(cfg)}) == 6
+def test_each_rule_is_another_run(toy):
+    hashes = {hashing.config_sha256(toy(f"selection.student={rule}")) for rule in STUDENT_RULES}
+    assert len(hashes | {hashing.config_sha256(toy())}) == len(STUDENT_RULES) == 6
 
 
 @pytest.mark.parametrize("rule", [*LABEL_FREE, "oracle"])
