@@ -16,6 +16,7 @@ from qs3.data.domain import Domain
 from qs3.data.ensure_source import check_or_make
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
+from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, Scheme
 from qs3.datamodules.splits import Labelled, Unlabelled
@@ -107,10 +108,10 @@ class AdaptationData(LightningDataModule):
         return self.labelled_domain.train
 
     @property
-    def all_labelled(self) -> Labelled:
+    def all_labelled(self) -> Clouds:
         """The clouds of the warm-up and the held-out ones, after `setup`."""
-        assert isinstance(self.labelled_domain.whole, Labelled)
-        return self.labelled_domain.whole
+        assert self.labelled_domain.whole is not None
+        return self.labelled_domain.whole.clouds
 
     @property
     def validation(self) -> Labelled:

@@ -58,7 +58,7 @@ class DomainData(LightningDataModule):
 
     Attributes:
         train, validation, test: clouds of each part, after `setup`.
-        whole: the training split before it was divided.
+        whole: clouds of the training split before it was divided, without their labels.
         classes: names in label order, after `setup`.
         sha256: of the dataset, after `setup`.
 
@@ -100,7 +100,7 @@ class DomainData(LightningDataModule):
         self.asks = asks or f"domain {domain.name}"
         # Indices that are cached are those of whole splits.
         self.cache_dir = Path(cache_dir) if cache_dir and clouds_a_split is None else None
-        self.whole: Labelled | Unlabelled | None = None
+        self.whole: Unlabelled | None = None
         self.train: Labelled | Unlabelled | None = None
         self.validation: Labelled | None = None
         self.test: Labelled | Unlabelled | None = None
@@ -164,7 +164,7 @@ class DomainData(LightningDataModule):
             return
         if self.clouds_a_class is not None:
             train = first_of_class(train, self.clouds_a_class)
-        self.whole = train
+        self.whole = Unlabelled(train.clouds, train.ids)
         chosen, held_out = RULES[self.val](train.ids, train.labels.numpy())
         self.train, self.validation = train.at(chosen), train.at(held_out)
 

@@ -130,7 +130,7 @@ def _quality(
         net,
         loaded.evaluation.test,
         data.validation,
-        data.all_labelled.clouds,
+        data.all_labelled,
         owner=data.owner,
         classes=loaded.evaluation.classes,
         teacher=nets(taught) if taught else None,

@@ -131,7 +131,7 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         stored_points=loaded.stored_points,
         target=run.target.name,
         gravity=run.target.gravity,
-        usual=limits(loaded.data.all_labelled.clouds, loaded.data.target.clouds),
+        usual=limits(loaded.data.all_labelled, loaded.data.target.clouds),
         weights=copy_weights(outcome.net),
     )
 
@@ -141,7 +141,7 @@ def _write_of_files(run: Run, loaded: Loaded, outcome: Outcome) -> None:
     rows = read_manifest(run.target.folder, loaded.evaluation.classes)
     origins = {row.id: row.origin for row in rows if row.origin}
     test = loaded.evaluation.test
-    strange = ood_reasons_of_all(test.clouds, source_ranges(loaded.data.all_labelled.clouds))
+    strange = ood_reasons_of_all(test.clouds, source_ranges(loaded.data.all_labelled))
     write_predictions_of_files(
         run.folder / OF_FILES,
         [origins.get(id_, id_) for id_ in test.ids],

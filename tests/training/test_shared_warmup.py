@@ -78,5 +78,5 @@ def test_force_trains_anew(toy, caplog):
 def test_what_cannot_be_written_is_a_warning(toy, tmp_path, caplog):
     (tmp_path / "file").write_text("")
     metrics = train(toy("selftraining=none", f"paths.warmup_dir={tmp_path / 'file'}"))
-    assert metrics["status"] == "finished"
+    assert metrics.status == "finished"
     assert "the warm-up cannot be shared" in caplog.text
