@@ -151,7 +151,7 @@ class AfterTraining:
             log.info("pictures: %s", drawn.page)
         except Exception as error:
             log.warning(
-                "the run is finished, but its pictures failed (%s: %s); qs3 report "
+                "the run is finished, but its pictures failed (%s: %s); qs3 report page "
                 "run=%s draws them again",
                 type(error).__name__,
                 error,

@@ -320,7 +320,7 @@ def test_the_command(written, finished, tmp_path, capsys):
         (["scans=a", "out=b"], "labels=PATH, train=PATH, val=PATH is missing"),
         (["sccans=a"], "unknown key 'sccans'; did you mean scans="),
         (["--workers", "2"], "'--workers' is not key=value"),
-        (["workers=two"], "workers must be a whole number, got 'two'"),
+        (["workers=two"], "workers must be a whole number of at least 0, got 'two'"),
         (["align=yes"], "align must be true or false, got 'yes'"),
         (["depth_max_m=far"], "depth_max_m must be a number, got 'far'"),
     ],
