@@ -197,7 +197,7 @@ def benchmark(cfg: DictConfig, recipe: dict[str, Any]) -> str:
     """Whether this is the benchmark that a domain's version names, or something like it.
 
     Returns:
-        "kinectsim10 v1", or "like kinectsim10 v1, but not it" where settings or objects
+        "kinectsim10 v2", or "like kinectsim10 v2, but not it" where settings or objects
         differ; empty for domains without a version.
     """
     stated = cfg.get("benchmark")

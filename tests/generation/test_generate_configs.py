@@ -86,10 +86,10 @@ def plan(*overrides):
 
 def test_the_benchmark_knows_itself():
     """A change of any setting is another version: give it a new number and a new hash."""
-    assert plan() == "kinectsim10 v1"
+    assert plan() == "kinectsim10 v2"
     assert plan("renderer.threads=2", "renderer.variant=scalar_rgb", "workers=1") == plan()
     for other in ("fraction=0.5", "views=3", "renderer.samples=4", "recipe.min_points=100"):
-        assert plan(other).startswith("like kinectsim10 v1, but not it")
+        assert plan(other).startswith("like kinectsim10 v2, but not it")
 
 
 def test_smaller_keeps_the_frequencies():

@@ -6,20 +6,13 @@ import subprocess
 import sys
 from collections import Counter
 
-import numpy as np
 import pytest
-import trimesh
 
 from qs3.classes import CLASSES
 from qs3.errors import ConfigError
-from qs3.meshes.catalogue import Catalogue, families, make, make_parts
+from qs3.meshes.catalogue import Catalogue, families, make
 
-SIZES = {"lamp": (0.2, 2.4), "monitor": (0.25, 1.8), "plant": (0.2, 2.4)}
-"""Smallest and largest length of an object's longest side, in metres."""
-
-
-def family_names(classes):
-    return [(cls, family.name) for cls in classes for family in families(cls)]
+SOME = ("lamp", "monitor", "plant")
 
 
 def python(script):
@@ -80,7 +73,7 @@ def test_unknown_names_are_refused():
 
 
 def test_more_objects_never_change_the_earlier_ones():
-    small = Catalogue(train=3, test=2, classes=tuple(SIZES)).items()
+    small = Catalogue(train=3, test=2, classes=SOME).items()
     large = {item.id: item for item in Catalogue(train=9, test=5, classes=CLASSES[5:]).items()}
     for item in small:
         assert large[item.id].origin == item.origin
@@ -105,12 +98,13 @@ def test_all_families_in_both_splits_on_demand():
     assert len({item.load().sha256 for item in items}) == 80
 
 
-@pytest.mark.parametrize("cls", CLASSES)
-def test_every_class_has_families_for_both_splits(cls):
-    split = Counter(family.split for family in families(cls))
-    assert set(split) == {"train", "test"}
-    assert min(split.values()) >= 2
-    assert len({family.name for family in families(cls)}) == len(families(cls))
+def test_every_class_has_families_for_both_splits():
+    for cls in CLASSES:
+        split = Counter(family.split for family in families(cls))
+        assert set(split) == {"train", "test"}, cls
+        assert split["train"] >= 3, cls  # accuracy on real CAD models suffers with fewer
+        assert split["test"] >= 2, cls
+        assert len({family.name for family in families(cls)}) == len(families(cls)), cls
 
 
 def test_two_seeds_share_no_mesh():
@@ -142,10 +136,7 @@ print(hashlib.sha256(text.encode()).hexdigest())
 def test_the_same_meshes_in_another_process():
     items = Catalogue(seed=3, train=2, test=2).items()
     text = " ".join(f"{i.id} {i.origin} {i.load().sha256}" for i in items)
-    made = subprocess.run(
-        [sys.executable, "-c", DIGEST], capture_output=True, text=True, check=True
-    )
-    assert made.stdout.strip() == hashlib.sha256(text.encode()).hexdigest()
+    assert python(DIGEST) == hashlib.sha256(text.encode()).hexdigest()
 
 
 def test_importing_and_listing_needs_no_heavy_library():
@@ -153,30 +144,9 @@ def test_importing_and_listing_needs_no_heavy_library():
         "import sys; from qs3.meshes.catalogue import Catalogue; Catalogue().items();"
         "print(sorted({'torch', 'bpy', 'mitsuba', 'lightning', 'scipy'} & set(sys.modules)))"
     )
-    made = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    assert made.stdout.strip() == "[]"
+    assert python(script) == "[]"
 
 
 def test_items_travel_to_workers():
-    for item in Catalogue(train=1, test=1, classes=tuple(SIZES)).items():
+    for item in Catalogue(train=1, test=1, classes=SOME).items():
         assert pickle.loads(pickle.dumps(item)).load().sha256 == item.load().sha256
-
-
-@pytest.mark.parametrize(("cls", "family"), family_names(tuple(SIZES)))
-def test_parts_are_solid_and_objects_have_real_sizes(cls, family):
-    low, high = SIZES[cls]
-    for k in range(4):
-        parts = make_parts(cls, family, f"test/{k}")
-        for part in parts:
-            solid = trimesh.Trimesh(part.vertices, part.faces, process=False)
-            assert solid.is_watertight
-            assert solid.is_winding_consistent
-            assert solid.volume > 0
-        mesh = make(cls, family, f"test/{k}")
-        size = np.ptp(mesh.bounds, axis=0)
-        assert mesh.bounds[0, 2] == 0
-        assert low < size.max() < high
-        assert size.min() > 0.1
-        assert len(mesh.faces) < 20_000

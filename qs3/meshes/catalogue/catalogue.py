@@ -12,8 +12,7 @@ import numpy as np
 
 from qs3.classes import CLASSES
 from qs3.errors import ConfigError
-from qs3.meshes.catalogue.draw import Draw
-from qs3.meshes.catalogue.family import Family
+from qs3.meshes.catalogue.family import Draw, Family
 from qs3.meshes.mesh import Mesh, merge
 from qs3.meshes.source import MeshItem
 

@@ -1,264 +1,199 @@
-"""Chairs: dining, office, kitchen, bar, folding and upholstered ones."""
+"""Chairs: dining, easy and office chairs, visitors' chairs of bent tube, upholstered ones."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from qs3.meshes.catalogue import furniture as f
 from qs3.meshes.catalogue import parts as p
-from qs3.meshes.catalogue.chair_metal import (
-    bar_stool,
-    cantilever,
-    shell_chair,
-    sled,
-    swivel,
-    wing_chair,
-)
-from qs3.meshes.catalogue.draw import Draw
-from qs3.meshes.catalogue.family import Family, test, train
-from qs3.meshes.catalogue.furniture import (
-    ChairSize,
-    back_cushion,
-    both_sides,
-    curved_panel,
-    dining_size,
-    four_legs,
-    leg_section,
-    post,
-    rail_at,
-)
+from qs3.meshes.catalogue.family import Draw, families_of
 from qs3.meshes.mesh import Mesh
 
 
-def frame(size: ChairSize, section: np.ndarray, foot: float) -> list[Mesh]:
-    """Two front legs and two rear ones that continue as the posts of the back."""
-    x, y = size.width / 2 - 0.025, size.depth / 2 - 0.025
-    front = post([(x, -y, 0), (x, -y, size.seat - 0.02)], section, [foot, 1.0])
-    path = [
-        (x, y + 0.05, 0),
-        (x, size.back(size.seat), size.seat),
-        (x, size.back(size.top), size.top),
-    ]
-    return [*both_sides(front), *both_sides(post(path, section, [foot, 1.0, 0.8]))]
+@dataclass(frozen=True)
+class ChairSize:
+    """The measures of a dining chair, in metres; `seat` and `top` are heights above the floor."""
+
+    width: float
+    depth: float
+    seat: float
+    top: float
+    rake: float
+
+    def back(self, z: float) -> float:
+        """The y of the back's middle plane at height z (above the seat)."""
+        return self.depth / 2 - 0.02 + (z - self.seat) * float(np.tan(np.radians(self.rake)))
+
+    def rail(self, z: float, height: float, bow: float, thickness: float = 0.02) -> Mesh:
+        """A horizontal board between the posts of the back, its lower edge at height z."""
+        shape = (self.width - 0.05, thickness, height)
+        return f.curved_panel(shape, (0, self.back(z), z), bow=bow, rake=self.rake)
 
 
-def wooden_seat(draw: Draw, size: ChairSize) -> list[Mesh]:
-    """A board or an upholstered pad at seat height, over four rails."""
-    width, depth = size.width + 0.01, size.depth + 0.01
-    if draw.chance(0.5):
-        thick = draw.between(0.04, 0.07)
-        at = (0, -0.005, size.seat - 0.02)
-        top = p.rounded_box((width, depth, thick), at, 0.02, draw.between(0.0, 0.025))
+def dining_size(draw: Draw) -> ChairSize:
+    """Measures of an ordinary dining or kitchen chair."""
+    width, depth, seat = draw.between(0.4, 0.5), draw.between(0.4, 0.48), draw.between(0.42, 0.48)
+    return ChairSize(width, depth, seat, seat + draw.between(0.36, 0.56), draw.between(4, 13))
+
+
+def dining(draw: Draw) -> list[Mesh]:
+    """Four legs, the rear ones up to the top; a back of slats, of rungs, of a board or padded."""
+    size = dining_size(draw)
+    section = f.leg_section(draw.chance(0.3), draw.between(0.03, 0.045))
+    x, y, foot = size.width / 2 - 0.025, size.depth / 2 - 0.025, draw.between(0.65, 1.0)
+    out = f.both_sides(f.post([(x, -y, 0), (x, -y, size.seat - 0.02)], section, [foot, 1.0]))
+    rear = [(x, y + 0.05, 0), *((x, size.back(z), z) for z in (size.seat, size.top))]
+    out += f.both_sides(f.post(rear, section, [foot, 1.0, 0.8]))
+    apron, soft = draw.between(0.04, 0.08), draw.pick(0.025, draw.between(0.04, 0.07))
+    at, low = (0, -0.005, size.seat - 0.02), size.seat - 0.02 - apron
+    out.append(p.rounded_box((size.width + 0.01, size.depth + 0.01, soft), at, 0.02, soft - 0.025))
+    out.append(p.box((size.width - 0.06, size.depth - 0.06, apron), (0, 0, low)))
+    if draw.chance(0.65):
+        z = draw.between(0.10, 0.24)
+        out += f.both_sides(p.rod((x, -y, z), (x, y + 0.02, z), 0.011))
+        if draw.chance(0.6):
+            out.append(p.rod((-x, 0, z), (x, 0, z), 0.011))
+    back = draw.pick("slats", "rungs", "board", "padded")
+    gap = draw.between(0.06, 0.14) if back != "padded" else draw.pick(0.0, 0.12)
+    low, tall = size.seat + gap, size.top - size.seat - gap
+    if back == "slats":
+        high = draw.between(0.07, 0.10)
+        out += [size.rail(low, 0.045, 0.0), size.rail(size.top - high, high, 0.0)]
+        slats, inner = draw.count(3, 7), size.width - 0.06
+        flat = p.rectangle(draw.between(0.25, 0.6) * inner / slats, 0.012)
+        for sx in (np.arange(slats) - (slats - 1) / 2) * inner / slats:
+            ends = [(sx, size.back(z), z) for z in (low + 0.02, size.top - high + 0.02)]
+            out.append(f.post(ends, flat))
+    elif back == "rungs":
+        rungs, bow = draw.count(2, 4), draw.between(0.01, 0.04)
+        high = draw.between(0.4, 0.65) * tall / rungs
+        for k in range(rungs):
+            out.append(size.rail(low + (k + 1) * tall / rungs - high, high, bow, 0.014))
+    elif back == "board":
+        out.append(size.rail(low, tall, draw.between(0.0, 0.03), 0.022))
     else:
-        curve = p.rounded_rectangle(width, depth, draw.between(0.01, 0.06))
-        top = p.slab(curve, 0.025, (0, -0.005, size.seat - 0.02))
-    apron = draw.between(0.04, 0.08)
-    rail = p.box((size.width - 0.06, size.depth - 0.06, apron), (0, 0, size.seat - 0.02 - apron))
-    return [top, rail]
-
-
-def stretchers(draw: Draw, size: ChairSize, radius: float) -> list[Mesh]:
-    """Bars between the legs, or none."""
-    if draw.chance(0.35):
-        return []
-    x, y, z = size.width / 2 - 0.025, size.depth / 2 - 0.025, draw.between(0.10, 0.24)
-    bars = both_sides(p.rod((x, -y, z), (x, y + 0.02, z), radius))
-    style = draw.pick("h", "box", "sides")
-    if style == "h":
-        bars.append(p.rod((-x, 0, z), (x, 0, z), radius))
-    elif style == "box":
-        bars += [p.rod((-x, s * y, z + 0.03), (x, s * y, z + 0.03), radius) for s in (-1, 1)]
-    return bars
-
-
-def four_legs_slats(draw: Draw) -> list[Mesh]:
-    """A dining chair whose back has upright slats between two rails."""
-    size = dining_size(draw)
-    section = leg_section(draw.chance(0.3), draw.between(0.032, 0.045))
-    out = frame(size, section, draw.between(0.65, 1.0)) + wooden_seat(draw, size)
-    out += stretchers(draw, size, 0.011)
-    low = size.seat + draw.between(0.06, 0.14)
-    high = size.top - draw.between(0.07, 0.10)
-    out += [rail_at(size, low, 0.045, 0.0), rail_at(size, high, size.top - high, 0.0)]
-    slats = draw.count(3, 7)
-    wide = draw.between(0.25, 0.6) * (size.width - 0.06) / slats
-    for x in (np.arange(slats) - (slats - 1) / 2) * (size.width - 0.06) / slats:
-        ends = [(x, size.back(z), z) for z in (low + 0.02, high + 0.02)]
-        out.append(post(ends, p.rectangle(wide, 0.012)))
-    return out
-
-
-def four_legs_panel(draw: Draw) -> list[Mesh]:
-    """A dining chair with a solid or padded back, sometimes covered down to the floor rail."""
-    size = dining_size(draw)
-    section = leg_section(draw.chance(0.3), draw.between(0.030, 0.045))
-    tall = draw.chance(0.5)
-    gap = 0.0 if tall else draw.between(0.08, 0.2)
-    height = size.top - size.seat - gap
-    out = wooden_seat(draw, size) + stretchers(draw, size, 0.011)
-    if draw.chance(0.5):
-        thick = draw.between(0.05, 0.08)
-        at = (0, size.back(size.seat + gap) + 0.03, size.seat + gap)
-        shape = (size.width + 0.01, thick, height)
-        out.append(back_cushion(shape, at, rake=size.rake, crown=0.015, radius=0.025))
-    else:
-        out.append(rail_at(size, size.seat + gap, height, draw.between(0.0, 0.03), 0.022))
-    return out + frame(size, section, draw.between(0.65, 1.0))
-
-
-def ladder_back(draw: Draw) -> list[Mesh]:
-    """A country chair: turned posts with finials, bowed rungs, a rush seat."""
-    size = dining_size(draw)
-    tall = ChairSize(
-        size.width, size.depth, size.seat, size.top + draw.between(0.05, 0.15), size.rake
-    )
-    radius = draw.between(0.016, 0.021)
-    out = frame(tall, p.ellipse(2 * radius, 2 * radius, 12), 0.9)
-    rungs, bow = draw.count(3, 5), draw.between(0.01, 0.04)
-    step = (tall.top - tall.seat - 0.06) / rungs
-    high = draw.between(0.4, 0.65) * step
-    out += [
-        rail_at(tall, tall.seat + (k + 1) * step - high, high, bow, 0.014) for k in range(rungs)
-    ]
-    x = tall.width / 2 - 0.025
-    if draw.chance(0.6):
-        centre = (x, tall.back(tall.top) + 0.001, tall.top + 0.02)
-        out += both_sides(p.ellipsoid((0.04, 0.04, 0.07), centre, sides=10, rings=5))
-    seat = (tall.width + 0.02, tall.depth + 0.02, 0.045)
-    out.append(p.rounded_box(seat, (0, 0, tall.seat - 0.04), 0.02))
-    y = tall.depth / 2 - 0.025
-    for z in (0.12, 0.24):
-        out += both_sides(p.rod((x, -y, z), (x, y + 0.02, z), 0.010))
-        out.append(p.rod((-x, -y, z + 0.04), (x, -y, z + 0.04), 0.010))
+        shape, at = (size.width + 0.01, 0.065, tall), (0, size.back(low) + 0.03, low)
+        out.append(f.back_cushion(shape, at, rake=size.rake, crown=0.015, radius=0.025))
     return out
 
 
 def armchair(draw: Draw) -> list[Mesh]:
     """A wooden easy chair: open arms, a seat cushion and a back cushion."""
-    seat, rake = draw.between(0.36, 0.43), draw.between(12, 22)
-    size = ChairSize(
-        draw.between(0.54, 0.66),
-        draw.between(0.52, 0.62),
-        seat,
-        seat + draw.between(0.38, 0.5),
-        rake,
-    )
-    x, y = size.width / 2, size.depth / 2
+    seat, rake, thick = draw.between(0.36, 0.43), draw.between(12, 22), draw.between(0.09, 0.15)
+    width, depth, rise = draw.between(0.54, 0.66), draw.between(0.52, 0.62), draw.between(0.38, 0.5)
+    x, y, deck, rest = width / 2, depth / 2, seat - thick, seat + draw.between(0.14, 0.2)
     section = p.rectangle(draw.between(0.03, 0.05), draw.between(0.04, 0.06))
-    rest = seat + draw.between(0.14, 0.2)
-    thick = draw.between(0.09, 0.15)
-    deck = seat - thick
-    lean = draw.between(0.0, 0.06)
     foot = draw.between(0.6, 1.0)
-    front = post([(x, -y - lean, 0), (x, -y, rest)], section, [foot, 1])
-    rear = post([(x, y + 0.08, 0), (x, y, rest)], section, [foot, 1])
+    front = [(x, -y - draw.between(0.0, 0.06), 0), (x, -y, rest)]
+    out = f.both_sides(f.post(front, section, [foot, 1]))
+    out += f.both_sides(f.post([(x, y + 0.08, 0), (x, y, rest)], section, [foot, 1]))
     arm = np.array([(x, -y - 0.04, rest + 0.012), (x, y + 0.06, rest - draw.between(0.0, 0.03))])
-    out = [*both_sides(front), *both_sides(rear)]
-    out += both_sides(p.sweep(p.rounded_rectangle(draw.between(0.045, 0.09), 0.026, 0.01, 2), arm))
-    out.append(p.box((2 * x, size.depth, 0.05), (0, 0, deck - 0.05)))
-    inside = 2 * x - 0.05
-    out.append(p.rounded_box((inside, size.depth, thick), (0, -0.02, deck), 0.04, 0.02))
-    height = size.top - deck - 0.02
-    out.append(
-        back_cushion(
-            (inside, draw.between(0.09, 0.14), height), (0, y + 0.04, deck + 0.02), rake=rake
-        )
-    )
-    out += [
-        curved_panel(
-            (inside, 0.025, 0.05),
-            (0, y + 0.055 + (z - deck) * np.tan(np.radians(rake)), z),
-            rake=rake,
-        )
-        for z in (deck + 0.1, deck + 0.28)
-    ]
+    flat = p.rounded_rectangle(draw.between(0.045, 0.09), 0.026, 0.01, 2)
+    out += f.both_sides(p.sweep(flat, arm))
+    out.append(p.box((width, depth, 0.05), (0, 0, deck - 0.05)))
+    inside, high = width - 0.05, thick + rise - 0.02
+    out.append(p.rounded_box((inside, depth, thick), (0, -0.02, deck), 0.04, 0.02))
+    shape = (inside, draw.between(0.09, 0.14), high)
+    out.append(f.back_cushion(shape, (0, y + 0.04, deck + 0.02), rake=rake))
+    for z in (0.1, 0.28):
+        at = (0, y + 0.055 + z * np.tan(np.radians(rake)), deck + z)
+        out.append(f.curved_panel((inside, 0.025, 0.05), at, rake=rake))
     return out
 
 
-def spindle_back(draw: Draw) -> list[Mesh]:
-    """A Windsor chair: a hoop filled with spindles on a thick seat, splayed turned legs."""
-    width, depth = draw.between(0.42, 0.50), draw.between(0.40, 0.45)
-    seat, rise, rake = draw.between(0.42, 0.46), draw.between(0.42, 0.58), draw.between(8, 14)
-    outline = p.rounded_rectangle(width, depth, draw.between(0.12, 0.2), 6)
-    out = [
-        p.shell(outline, [(0.9, seat - 0.045), (1, seat - 0.025), (1, seat - 0.008), (0.96, seat)])
-    ]
-    for leg in four_legs(
-        width * 0.6,
-        depth * 0.6,
-        seat - 0.03,
-        p.ellipse(0.035, 0.035, 12),
-        splay=draw.between(0.05, 0.09),
-        foot=0.65,
-    ):
-        out.append(leg)
-    z, reach = 0.2, 0.5 * 0.6 * width + 0.04
-    out += both_sides(p.rod((reach, -reach, z), (reach, reach, z), 0.010))
-    out.append(p.rod((-reach, 0, z), (reach, 0, z), 0.010))
-    half = width / 2 - 0.035
-    hoop = draw.chance(0.6)
-    squareness = draw.between(0.45, 0.75)
-    spindles = draw.count(5, 9)
-    back: list[Mesh] = []
-    if hoop:
-        angle = np.linspace(0, np.pi, 25)
-        path = np.column_stack(
-            [half * np.cos(angle), 0 * angle, rise * np.sin(angle) ** squareness]
-        )
-        back.append(p.tube(path, 0.012))
-    else:
-        back += both_sides(p.rod((half, 0, -0.02), (half + 0.02, 0, rise - 0.05), 0.014))
-        back.append(curved_panel((2 * half + 0.1, 0.022, 0.085), (0, 0, rise - 0.085), bow=0.0))
-    for x in np.linspace(-0.78, 0.78, spindles) * half:
-        top = rise * (1 - (x / half) ** 2) ** (squareness / 2) if hoop else rise - 0.04
-        back.append(p.rod((0.85 * x, 0, -0.02), (x, 0, top), 0.007))
-    return out + [p.move(p.turn(part, -rake, "x"), (0, depth / 2 - 0.045, seat)) for part in back]
-
-
-def folding(draw: Draw) -> list[Mesh]:
-    """Two crossing pairs of legs, a thin seat between them."""
-    width, depth, seat = (
-        draw.between(0.38, 0.46),
-        draw.between(0.36, 0.42),
-        draw.between(0.42, 0.46),
-    )
-    top = seat + draw.between(0.34, 0.44)
-    wooden = draw.chance(0.5)
-    section = p.rectangle(0.02, 0.035) if wooden else p.ellipse(0.024, 0.024, 8)
-    x, y = width / 2, depth / 2
-    out = both_sides(post([(x, -y - 0.05, 0), (x, y - 0.02, seat), (x, y + 0.07, top)], section))
-    inner = x - 0.028
-    out += both_sides(post([(inner, y + 0.1, 0), (inner, -y + 0.05, seat - 0.01)], section))
+def swivel(draw: Draw) -> list[Mesh]:
+    """An office chair on a five-spoked base with castors, mostly with arms."""
+    width, depth = draw.between(0.44, 0.52), draw.between(0.42, 0.50)
+    seat, reach, start = draw.between(0.42, 0.54), draw.between(0.27, 0.34), draw.between(0, 72)
+    out: list[Mesh] = []
+    for spoke in range(5):
+        bar = p.beam((0.02, 0, 0.11), (reach, 0, 0.075), (0.05, 0.035), 0.6)
+        wheels = [
+            p.rod((reach, y, 0.028), (reach, y + 0.02, 0.028), 0.028) for y in (-0.024, 0.004)
+        ]
+        out += [p.turn(part, start + 72 * spoke) for part in (bar, *wheels)]
     out += [
-        p.rod((-inner, y + 0.06, 0.08), (inner, y + 0.06, 0.08), 0.009),
-        p.rod((-x, -y, 0.09), (x, -y, 0.09), 0.009),
+        p.lathe([(0.04, 0.08), (0.035, 0.16), (0.022, 0.17), (0.022, seat - 0.08)], sides=14),
+        p.box((0.20, 0.24, 0.035), (0, 0.02, seat - 0.11)),
+        p.rounded_box((width, depth, 0.09), (0, 0, seat - 0.08), 0.035, draw.between(0.0, 0.02)),
     ]
-    if wooden:
-        boards = draw.count(4, 7)
-        for k in range(boards):
-            at = (0, -y + (k + 0.5) * depth / boards, seat - 0.01)
-            out.append(p.box((width - 0.03, 0.8 * depth / boards, 0.016), at))
+    gap, rake, rear = draw.between(0.02, 0.16), draw.between(6, 14), depth / 2 + 0.03
+    wide, height = width * draw.between(0.78, 1.0), draw.between(0.34, 0.68)
+    if draw.chance(0.5):
+        shape = (wide, draw.between(0.05, 0.09), height)
+        out.append(f.back_cushion(shape, (0, rear, seat + gap), rake=rake))
     else:
-        out.append(p.rounded_box((width - 0.03, depth, 0.03), (0, 0, seat - 0.015), 0.012))
-    rails = draw.count(1, 3)
-    high = draw.between(0.05, 0.09) if rails > 1 else draw.between(0.14, 0.2)
-    for k in range(rails):
-        z = top - high - k * (high + 0.04)
-        at = (0, y - 0.02 + 0.09 * (z - seat) / (top - seat), z)
-        out.append(curved_panel((2 * x, 0.016, high), at, bow=0.015, rake=12))
+        at = (0, rear - 0.03, seat + gap)
+        out.append(f.curved_panel((wide, 0.03, height), at, bow=0.04, rake=rake, radius=0.014))
+    path = [(0, 0.05, -0.095), (0, rear + 0.015, -0.095), (0, rear + 0.06, gap + 0.2)]
+    bracket = f.bent(list(np.add(path, (0, 0, seat))), 0.08)
+    out.append(p.sweep(p.rectangle(0.06, 0.016), bracket))
+    if draw.chance(0.65):
+        x, rise, front = width / 2 + 0.03, seat + draw.between(0.18, 0.25), -draw.between(0.1, 0.16)
+        loop = [(x, 0.1, seat - 0.08), (x, 0.14, rise), (x, front, rise)]
+        if draw.chance(0.5):
+            loop.append((x, front, seat - 0.08))
+        section = p.rounded_rectangle(0.03, 0.045, 0.01, 2)
+        out += f.both_sides(p.sweep(section, f.bent(loop, 0.05), up=(1, 0, 0)))
+        out += f.both_sides(p.box((0.12, 0.3, 0.02), (width / 2 - 0.02, 0, seat - 0.09)))
     return out
 
 
-FAMILIES: tuple[Family, ...] = (
-    train(four_legs_slats),
-    train(four_legs_panel),
-    train(swivel),
-    train(cantilever),
-    train(armchair),
-    train(shell_chair),
-    train(spindle_back),
-    train(bar_stool),
-    test(ladder_back),
-    test(sled),
-    test(folding),
-    test(wing_chair),
-)
+def tube_chair(draw: Draw) -> list[Mesh]:
+    """A visitor's chair of bent tube: on two runners, or springing from the front."""
+    size = dining_size(draw)
+    radius, x, y = draw.between(0.009, 0.013), size.width / 2 - 0.015, size.depth / 2
+    low = size.seat - 0.03
+    back = [(x, size.back(size.seat), low), (x, size.back(size.top), size.top - 0.03)]
+    runners = draw.chance(0.5)
+    side = [(x, y, radius), (x, -y - 0.01, radius), (x, -y - 0.01, low), *back]
+    if runners:
+        side = [(x, -y + 0.02, low), (x, -y - 0.02, radius), (x, y + 0.03, radius), *back]
+    out = f.both_sides(p.tube(f.bent(side, 0.05), radius))
+    if not runners:
+        out.append(p.rod((-x, y, radius), (x, y, radius), radius))
+    out += [p.rod((-x, s * y * 0.8, low), (x, s * y * 0.8, low), radius) for s in (-1, 1)]
+    seat = (size.width, size.depth, draw.between(0.02, 0.06))
+    out.append(p.rounded_box(seat, (0, -0.01, low), 0.015))
+    height, bow = draw.between(0.18, 0.34), draw.between(0.0, 0.03)
+    out.append(size.rail(size.top - height, height, bow, draw.between(0.015, 0.05)))
+    if draw.chance(0.35):
+        rest = size.seat + 0.2
+        arm = [(x, size.back(rest), rest), (x, -y, rest), (x, -y, low)]
+        out += f.both_sides(p.tube(f.bent(arm, 0.05), radius))
+    return out
+
+
+def wing_chair(draw: Draw) -> list[Mesh]:
+    """A fully upholstered easy chair with a high back and, mostly, wings."""
+    width, depth, foot = (
+        draw.between(0.68, 0.82),
+        draw.between(0.66, 0.78),
+        draw.between(0.08, 0.17),
+    )
+    seat, top = draw.between(0.42, 0.48), draw.between(0.92, 1.12)
+    arm, rest, rake = draw.between(0.09, 0.14), draw.between(0.58, 0.66), draw.between(6, 12)
+    x, y, leg = width / 2 - arm / 2, depth / 2, f.leg_section(draw.chance(0.5), 0.045)
+    out = f.four_legs(width - 0.12, depth - 0.12, foot + 0.01, leg, foot=0.6)
+    out.append(p.rounded_box((width - 0.01, depth, seat - 0.12 - foot), (0, 0, foot), 0.02))
+    cushion = (width - 2 * arm, depth - 0.12, 0.14)
+    out.append(p.rounded_box(cushion, (0, -0.07, seat - 0.13), 0.04, 0.02))
+    back, low = (width - arm, 0.14, top - foot - 0.06), (0, y, foot + 0.06)
+    out.append(f.back_cushion(back, low, rake=rake, crown=0.03, radius=0.05))
+    out += f.both_sides(p.rounded_box((arm, depth - 0.04, rest - foot), (x, -0.02, foot), 0.04))
+    if draw.chance(0.75):
+        lean, reach = (top - foot) * float(np.tan(np.radians(rake))), draw.between(0.14, 0.26)
+        wing = [
+            (y - 0.05, rest - 0.08),
+            (y + lean - 0.06, top - 0.03),
+            (y - 0.1 - reach * 0.6, top - 0.07),
+            (y - 0.1 - reach, rest + 0.12),
+            (y - 0.2 - reach, rest - 0.08),
+        ]
+        out += f.both_sides(p.move(p.extrude(wing, 0.06, "x"), (x - 0.03, 0, 0)))
+    return out
+
+
+FAMILIES = families_of(train=(dining, armchair, swivel), test=(tube_chair, wing_chair))

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from qs3.errors import MeshError
 from qs3.meshes.mesh import Mesh
 
 Vector = Sequence[float] | np.ndarray
@@ -159,7 +158,7 @@ def pillow(size: Vector, at: Vector = ORIGIN) -> Mesh:
 
 
 def slab(curve: np.ndarray, height: float, at: Vector = ORIGIN) -> Mesh:
-    """A plate whose outline is a star-shaped plane curve (see `extrude` for any other)."""
+    """A level plate whose outline is a star-shaped plane curve (see `extrude` for upright ones)."""
     rings = np.stack([ring_at(curve, 0.0), ring_at(curve, height)])
     return loft(rings + np.asarray(at, dtype=np.float64))
 
@@ -306,65 +305,15 @@ def leaf(
 
 
 def extrude(
-    outline: np.ndarray | Sequence[tuple[float, float]], thickness: float, axis: str = "z"
+    outline: np.ndarray | Sequence[tuple[float, float]], thickness: float, axis: str
 ) -> Mesh:
-    """A plate with any simple outline [N, 2], from 0 to `thickness` along `axis`.
+    """A plate with a star-shaped outline [N, 2], from 0 to `thickness` along `axis`.
 
-    The outline's plane is (x, y) for axis z, (y, z) for axis x and (x, z) for axis y.
+    The outline's plane is (y, z) for axis x and (x, z) for axis y.
     """
-    flat = np.asarray(outline, dtype=np.float64)
-    if _area(flat) < 0:
-        flat = flat[::-1]
-    n = len(flat)
-    caps = triangulate(flat)
-    following = (np.arange(n) + 1) % n
-    here = np.arange(n)
-    faces = np.concatenate(
-        [
-            caps[:, ::-1],
-            caps + n,
-            np.stack([here, following, following + n], axis=1),
-            np.stack([here, following + n, here + n], axis=1),
-        ]
-    )
-    order = {"z": (0, 1, 2), "x": (2, 0, 1), "y": (0, 2, 1)}[axis]
-    stacked = np.concatenate([ring_at(flat, 0.0), ring_at(flat, thickness)])
-    return outward(Mesh(stacked[:, order], faces))
-
-
-def triangulate(polygon: np.ndarray) -> np.ndarray:
-    """[N - 2, 3] triangles of a simple counterclockwise polygon [N, 2], by cutting ears."""
-    left = list(range(len(polygon)))
-    triangles = []
-    while len(left) > 3:
-        for k in range(len(left)):
-            i, j, m = left[k - 1], left[k], left[(k + 1) % len(left)]
-            corner = polygon[[i, j, m]]
-            if _area(corner) <= 0:
-                continue
-            others = [p for p in left if p not in (i, j, m)]
-            if not _inside(polygon[others], corner).any():
-                triangles.append((i, j, m))
-                del left[k]
-                break
-        else:
-            raise MeshError("the polygon crosses itself and has no triangulation")
-    return np.array([*triangles, tuple(left)], dtype=np.int32)
-
-
-def _area(polygon: np.ndarray) -> float:
-    """Signed area; positive for a counterclockwise polygon."""
-    x, y = polygon.T
-    return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-
-
-def _inside(points: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """[P] which points lie in a counterclockwise triangle or on its border."""
-    inside = np.ones(len(points), dtype=bool)
-    for a, b in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
-        edge, offset = b - a, points - a
-        inside &= edge[0] * offset[:, 1] - edge[1] * offset[:, 0] >= 0
-    return inside
+    order = {"x": (2, 0, 1), "y": (0, 2, 1)}[axis]
+    rings = [ring_at(np.asarray(outline, dtype=np.float64), t)[:, order] for t in (0.0, thickness)]
+    return loft(np.stack(rings))
 
 
 # Placement ------------------------------------------------------------------------------

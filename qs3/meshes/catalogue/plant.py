@@ -1,307 +1,176 @@
-"""Plants: in pots, vases and troughs, from a snake plant to a small tree."""
+"""Plants in pots and vases, from grass to a small tree."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from qs3.meshes.catalogue.draw import Draw
-from qs3.meshes.catalogue.family import Family, test, train
-from qs3.meshes.catalogue.parts import (
-    Vector,
-    arc,
-    box,
-    ellipse,
-    ellipsoid,
-    lathe,
-    leaf,
-    rectangle,
-    rod,
-    shell,
-    tube,
-)
-from qs3.meshes.catalogue.plant_parts import blade, draw_pot, leaves_along, toward
+from qs3.meshes.catalogue import parts as p
+from qs3.meshes.catalogue.family import Draw, families_of
 from qs3.meshes.mesh import Mesh
+
+
+def pot(draw: Draw, width: float) -> tuple[list[Mesh], float, float]:
+    """A pot with soil, the height of the soil and the radius of its opening."""
+    foot, height = draw.between(0.6, 0.95), width * draw.between(0.7, 1.2)
+    soil = draw.between(0.82, 0.93) * height
+    shapes: list[list[tuple[float, float]]] = [
+        [(foot, 0), (0.97, 0.82), (1.06, 0.82), (1.06, 1)],  # clay with a rim
+        [(foot, 0), (1, 1)],
+        [(0.6, 0), (0.95, 0.25), (1.12, 0.55), (1.05, 0.85), (1, 1)],  # belly
+        [(1, 0), (1, 1)],
+    ]
+    shape = draw.pick(*shapes)
+    profile = [(scale, z * height) for scale, z in shape] + [(0.94, height), (0.94, soil)]
+    square = len(shape) == 2 and draw.chance(0.35)
+    curve = p.rounded_rectangle(width, width, 0.1 * width) if square else p.ellipse(width, width)
+    return [p.shell(curve, profile)], soil, 0.45 * width
+
+
+def toward(heading: float, pitch: float = 0.0) -> np.ndarray:
+    """Unit vector by compass and elevation in degrees."""
+    a, e = np.radians(heading), np.radians(pitch)
+    return np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+
+
+def blade(
+    base: p.Vector,
+    heading: float,
+    pitch: float,
+    length: float,
+    width: float,
+    droop: float = 0.3,
+    belly: float = 0.4,
+    steps: int = 4,
+) -> Mesh:
+    """A leaf that starts at `base` in a direction and sinks by droop * length at its tip."""
+    start, way = np.asarray(base, dtype=np.float64), toward(heading, pitch)
+    tip = start + length * (way - np.array([0, 0, droop]))
+    tip[2] = max(tip[2], 0.01)  # a long leaf may reach the floor, not pass it
+    path = p.arc(start, start + 0.55 * length * way, tip, steps)
+    return p.leaf(path, width, across=toward(heading + 90), belly=belly)
+
+
+def leaves_along(
+    draw: Draw, path: np.ndarray, count: int, length: float, width: float, first: float = 0.2
+) -> list[Mesh]:
+    """Leaves in a spiral around a branch, smaller towards its tip."""
+    parts, heading = [], draw.between(0, 360)
+    for t in np.linspace(first, 1, count):
+        heading += 137.5 + draw.between(-25, 25)
+        i = min(int(t * (len(path) - 1)), len(path) - 2)
+        base = path[i] + (t * (len(path) - 1) - i) * (path[i + 1] - path[i])
+        size = length * draw.between(0.75, 1.1) * (1.1 - 0.35 * t)
+        pitch, droop = draw.between(5, 55), draw.between(0.15, 0.6)
+        parts.append(blade(base, heading, pitch, size, width * size / length, droop))
+    return parts
 
 
 def potted_leaves(draw: Draw) -> list[Mesh]:
     """Broad leaves on arching stems from the middle of a pot."""
     width = draw.between(0.16, 0.34)
-    parts, soil, r = draw_pot(draw, width)
+    parts, soil, r = pot(draw, width)
     count, reach = draw.count(16, 30), width * draw.between(0.7, 1.2)
     large = reach * draw.between(0.6, 0.95)
     for k in range(count):
         heading, rise = 137.5 * k + draw.between(-20, 20), draw.between(0.3, 1.6)
-        out = reach * draw.between(0.2, 0.9)
         base = np.array([0, 0, soil - 0.01]) + 0.4 * r * toward(heading)
-        tip = base + out * toward(heading) + np.array([0, 0, reach * rise])
-        stem = arc(base, 0.5 * (base + tip) + np.array([0, 0, 0.25 * reach]), tip, 5)
-        parts.append(tube(stem, 0.005, sides=6))
-        size = large * draw.between(0.75, 1.2)
-        drop = draw.between(0.3, 0.9)
+        tip = base + reach * (draw.between(0.2, 0.9) * toward(heading) + (0, 0, rise))
+        stem = p.arc(base, 0.5 * (base + tip) + (0, 0, 0.25 * reach), tip, 5)
+        parts.append(p.tube(stem, 0.005, sides=6))
+        size, drop = large * draw.between(0.75, 1.2), draw.between(0.3, 0.9)
         parts.append(blade(tip, heading, 15, size, 0.6 * size, drop, 0.35, 6))
-    return parts
-
-
-def snake(draw: Draw) -> list[Mesh]:
-    """Stiff upright blades."""
-    width = draw.between(0.15, 0.3)
-    parts, soil, r = draw_pot(draw, width)
-    length, broad = draw.between(0.35, 0.9), draw.between(0.045, 0.08)
-    for k in range(draw.count(8, 18)):
-        heading = 137.5 * k + draw.between(-30, 30)
-        base = np.array([0, 0, soil - 0.01]) + r * draw.between(0.1, 0.65) * toward(heading)
-        size = length * draw.between(0.55, 1.0)
-        tip = base + size * toward(heading, draw.between(70, 88))
-        middle = 0.5 * (base + tip) + 0.04 * size * toward(draw.between(0, 360))
-        across = toward(heading + 90 + draw.between(-50, 50))
-        path = arc(base, middle, tip, 6)
-        parts.append(leaf(path, broad, across=across, thickness=0.012, belly=0.5))
-    return parts
-
-
-def palm(draw: Draw) -> list[Mesh]:
-    """Feathered fronds on a trunk or straight from the soil."""
-    width = draw.between(0.24, 0.4)
-    parts, soil, _ = draw_pot(draw, width)
-    trunk = draw.pick(0.05, draw.between(0.2, 0.7), draw.between(0.3, 0.7))
-    rings = [(0.03 + 0.008 * (k % 2), 0.05 * k) for k in range(max(int(trunk / 0.05), 2))]
-    parts.append(lathe(rings, (0, 0, soil - 0.02), sides=12))
-    top = soil - 0.03 + rings[-1][1]
-    length = draw.between(0.55, 0.95)
-    for k in range(draw.count(8, 12)):
-        heading, pitch = 137.5 * k, draw.between(35, 80)
-        size = length * draw.between(0.75, 1.1)
-        base = np.array([0, 0, top])
-        tip = base + size * toward(heading, pitch) - np.array([0, 0, 0.45 * size])
-        path = arc(base, base + 0.6 * size * toward(heading, pitch + 6), tip, 12)
-        parts.append(tube(path, 0.006, scale=np.linspace(1.2, 0.4, 13), sides=6))
-        for i in range(3, 13):
-            for side in (-1, 1):
-                leaflet = size * 0.34 * (1.1 - 0.05 * i)
-                turned = heading + side * draw.between(45, 60)
-                parts.append(blade(path[i], turned, 5, leaflet, 0.035, 0.4, 0.3, 3))
     return parts
 
 
 def bush(draw: Draw) -> list[Mesh]:
     """A dense ball of small leaves on short branches."""
     width = draw.between(0.18, 0.4)
-    parts, soil, _ = draw_pot(draw, width)
-    radius = width * draw.between(0.7, 1.2)
-    flat = draw.between(0.75, 1.2)
-    size = radius * draw.between(0.3, 0.5)
-    root = np.array([0, 0, soil - 0.01])
+    parts, soil, _ = pot(draw, width)
+    radius, flat = width * draw.between(0.7, 1.2), draw.between(0.75, 1.2)
+    size, root = radius * draw.between(0.3, 0.5), np.array([0, 0, soil - 0.01])
     centre = np.array([0, 0, soil + 0.75 * radius * flat])
     for k in range(draw.count(20, 28)):
         way = toward(137.5 * k, draw.between(-35, 80)) * (1, 1, flat)
         tip = centre + 0.85 * radius * draw.between(0.8, 1.1) * way
-        path = arc(root, 0.5 * (root + tip) + np.array([0, 0, 0.1 * radius]), tip, 5)
-        parts.append(tube(path, 0.004, sides=5))
+        path = p.arc(root, 0.5 * (root + tip) + (0, 0, 0.1 * radius), tip, 5)
+        parts.append(p.tube(path, 0.004, sides=5))
         parts += leaves_along(draw, path, 8, size, 0.65 * size, 0.4)
     return parts
 
 
-def cactus(draw: Draw) -> list[Mesh]:
-    """Ribbed columns, some with raised arms, or a ribbed ball."""
-    width = draw.between(0.12, 0.3)
-    parts, soil, r = draw_pot(draw, width)
-    ribs = draw.count(7, 12)
-    thick = r * draw.between(0.4, 0.65)
-    height = draw.pick(1.6 * thick, draw.between(0.25, 0.8), draw.between(0.25, 0.8))
-    parts.append(_column(ribs, thick, height, (0, 0, soil - 0.02)))
-    if height > 2 * thick:
-        for k in range(draw.count(0, 3)):
-            level = soil + height * draw.between(0.3, 0.55)
-            heading, arm = 140 * k + draw.between(-30, 30), 0.6 * thick
-            up = np.array([0, 0, arm])
-            out = np.array([0, 0, level]) + 2.3 * thick * toward(heading)
-            bend = arc((0, 0, level - 0.2 * thick), out - up, out + up, 6)
-            parts.append(tube(bend, 0.9 * arm, sides=12))
-            rise = height * draw.between(0.2, 0.4)
-            parts.append(_column(ribs, arm, rise, (out[0], out[1], level + 0.2 * arm)))
-    for k in range(draw.count(0, 3)):
-        at = 0.75 * r * toward(120 * k + 40)
-        ball = thick * draw.between(0.35, 0.6)
-        parts.append(_column(ribs, ball, 1.7 * ball, (at[0], at[1], soil - 0.01)))
-    return parts
-
-
-def _column(ribs: int, radius: float, height: float, at: Vector) -> Mesh:
-    """A ribbed column with a round top."""
-    angle = np.linspace(0, 2 * np.pi, 4 * ribs, endpoint=False)
-    wave = radius * (0.9 + 0.13 * np.cos(ribs * angle))
-    curve = np.column_stack([wave * np.cos(angle), wave * np.sin(angle)])
-    cap = min(radius, 0.6 * height)
-    profile = [(0.85, 0.0), (1.0, min(0.5 * radius, 0.3 * height))]
-    for a in np.linspace(0, 0.47 * np.pi, 6):
-        profile.append((float(np.cos(a)), height - cap + cap * float(np.sin(a))))
-    return shell(curve, profile, at)
-
-
 def small_tree(draw: Draw) -> list[Mesh]:
     """A thin trunk, or two, with a leafy crown, as tall as a person."""
-    width = draw.between(0.28, 0.42)
-    parts, soil, _ = draw_pot(draw, width)
+    parts, soil, _ = pot(draw, draw.between(0.28, 0.42))
     height, crown = draw.between(0.9, 1.6), draw.between(0.28, 0.45)
     trunks, long = draw.count(1, 2), draw.between(0.12, 0.2)
     for k in range(trunks):
         base = np.array([0.04 * k * trunks, 0.02 * k, soil - 0.02])
         lean = 0.08 * toward(draw.between(0, 360))
-        top = base + np.array([0, 0, height * (1 - 0.25 * k) - crown]) + lean
-        path = arc(base, 0.5 * (base + top) + lean, top, 8)
-        parts.append(tube(path, 0.018, scale=np.linspace(1.1, 0.7, 9)))
+        top = base + lean + np.array([0, 0, height * (1 - 0.25 * k) - crown])
+        path = p.arc(base, 0.5 * (base + top) + lean, top, 8)
+        parts.append(p.tube(path, 0.018, scale=np.linspace(1.1, 0.7, 9)))
         for i in range(draw.count(11, 16)):
             start = path[draw.count(5, 8)]
             end = top + crown * draw.between(0.5, 1.0) * toward(137.5 * i, draw.between(-25, 85))
-            branch = arc(start, 0.5 * (start + end) + np.array([0, 0, 0.08]), end, 5)
-            parts.append(tube(branch, 0.006, sides=5))
+            branch = p.arc(start, 0.5 * (start + end) + (0, 0, 0.08), end, 5)
+            parts.append(p.tube(branch, 0.006, sides=5))
             parts += leaves_along(draw, branch, 12, long, 0.5 * long, 0.3)
     return parts
 
 
 def grass(draw: Draw) -> list[Mesh]:
-    """Many narrow blades that arch over the rim, as of a spider plant."""
-    width = draw.between(0.12, 0.28)
-    parts, soil, r = draw_pot(draw, width)
-    length, broad = width * draw.between(1.4, 2.8), draw.between(0.014, 0.03)
-    droop = draw.between(0.3, 1.0)
-    for k in range(draw.count(50, 90)):
-        heading = 137.5 * k
-        base = np.array([0, 0, soil - 0.01]) + 0.3 * r * draw.between(0, 1) * toward(heading)
-        size, pitch = length * draw.between(0.55, 1.05), draw.between(40, 88)
-        sink = droop * draw.between(0.6, 1.3) * np.cos(np.radians(0.8 * pitch)) * 1.4
-        parts.append(blade(base, heading, pitch, size, broad, float(sink), 0.3, 6))
+    """Many blades: narrow ones that arch over the rim, or broad ones that stand."""
+    width, stiff = draw.between(0.12, 0.3), draw.chance(0.3)
+    parts, soil, r = pot(draw, width)
+    length, broad = width * draw.between(1.4, 2.8), draw.between(0.014, 0.03) * (3 if stiff else 1)
+    droop = draw.between(0.3, 1.0) * (0.2 if stiff else 1)
+    for k in range(draw.count(15, 25) if stiff else draw.count(50, 90)):
+        heading, pitch = 137.5 * k, draw.between(65, 88) if stiff else draw.between(40, 88)
+        base = np.array([0, 0, soil - 0.01]) + 0.4 * r * draw.between(0, 1) * toward(heading)
+        sink = droop * draw.between(0.6, 1.3) * float(np.cos(np.radians(0.8 * pitch))) * 1.4
+        size = length * draw.between(0.55, 1.05)
+        parts.append(blade(base, heading, pitch, size, broad, sink, 0.3, 6))
     return parts
 
 
 def vase_flowers(draw: Draw) -> list[Mesh]:
     """Flowers in a vase: stems, heads with petals, a few leaves."""
-    height, r = draw.between(0.18, 0.34), draw.between(0.045, 0.08)
-    neck = draw.between(0.5, 1.0)
-    outline = [(0.7, 0), (1.0, 0.2), (1.05, 0.45), (neck, 0.8), (1.1 * neck, 1.0)]
-    outer = [(r * s, height * z) for s, z in outline]
-    inner = [(0.9 * outer[-1][0], height), (0.85 * r * neck, 0.75 * height)]
-    parts = [lathe([*outer, *inner, (0, 0.7 * height)], sides=24)]
+    height, r, neck = draw.between(0.18, 0.34), draw.between(0.045, 0.08), draw.between(0.5, 1.0)
+    outside = [(0.7, 0), (1.0, 0.2), (1.05, 0.45), (neck, 0.8), (1.1 * neck, 1.0)]
+    inside = [(0.98 * neck, 1.0), (0.85 * neck, 0.75), (0, 0.7)]
+    parts = [p.lathe([(r * s, height * z) for s, z in [*outside, *inside]], sides=24)]
     spread, tall = draw.between(15, 35), height * draw.between(1.0, 1.7)
     petal, count = draw.between(0.025, 0.05), draw.count(5, 9)
     for k in range(draw.count(7, 14)):
         heading, pitch = 137.5 * k, 90 - spread * draw.between(0.1, 1.1)
         base = np.array([0, 0, 0.65 * height])
         tip = base + tall * draw.between(0.85, 1.15) * toward(heading, pitch)
-        path = arc(base, base + 0.5 * tall * np.array([0, 0, 1]), tip, 6)
-        parts.append(tube(path, 0.003, sides=5))
-        parts.append(ellipsoid((0.6 * petal, 0.6 * petal, 0.5 * petal), tip, sides=8, rings=5))
-        for i in range(count):
-            around = 360 * i / count
+        path = p.arc(base, base + np.array([0, 0, 0.5 * tall]), tip, 6)
+        parts.append(p.tube(path, 0.003, sides=5))
+        parts.append(p.ellipsoid((0.6 * petal, 0.6 * petal, 0.5 * petal), tip, sides=8, rings=5))
+        for around in np.arange(count) * 360 / count:
             parts.append(blade(tip, around, draw.between(10, 40), petal, 0.6 * petal, 0.1, 0.6, 3))
         if draw.chance(0.7):
             parts += leaves_along(draw, path[2:], 3, 0.09, 0.035, 0.1)
     return parts
 
 
-def dracaena(draw: Draw) -> list[Mesh]:
-    """Bare canes of different heights, each with a rosette of sword-like leaves."""
-    width = draw.between(0.24, 0.36)
-    parts, soil, r = draw_pot(draw, width)
-    tallest, sword = draw.between(0.5, 1.2), draw.between(0.3, 0.5)
-    for k in range(draw.count(1, 4)):
-        base = np.array([0, 0, soil - 0.02]) + 0.4 * r * toward(120 * k + 30)
-        top = base + np.array([0, 0, tallest * (1 - 0.27 * k)]) + 0.08 * toward(120 * k)
-        parts.append(tube(arc(base, 0.5 * (base + top), top, 5), draw.between(0.014, 0.024)))
-        for i in range(draw.count(18, 30)):
-            start = top - np.array([0, 0, draw.between(0, 0.1)])
-            size, pitch = sword * draw.between(0.7, 1.1), draw.between(0, 85)
-            sink = draw.between(0.2, 0.6) * np.cos(np.radians(pitch))
-            parts.append(blade(start, 137.5 * i, pitch, size, 0.045, float(sink), 0.3))
-    return parts
-
-
-def trailing(draw: Draw) -> list[Mesh]:
-    """Vines that hang over the rim of a tall planter or of a bowl on legs."""
-    height, r = draw.between(0.45, 0.85), draw.between(0.1, 0.17)
-    bowl = min(height, draw.pick(height, 0.2))
-    profile = [(0.75, height - bowl), (1, height - 0.1), (1, height), (0.92, height)]
-    parts = [shell(ellipse(2 * r, 2 * r), [*profile, (0.92, height - 0.03)])]
-    if bowl < height:
-        for k in range(3):
-            way = toward(120 * k + 90)
-            top = 0.85 * r * way + np.array([0, 0, height - 0.12])
-            parts.append(rod(top, 1.35 * r * way, 0.011))
-    for k in range(draw.count(10, 16)):
-        heading = 137.5 * k
-        out, fall = r * draw.between(1.1, 1.5), draw.between(0.1, 0.85) * (height - 0.05)
-        start = np.array([0, 0, height - 0.04]) + 0.4 * r * toward(heading)
-        over = out * toward(heading) + np.array([0, 0, height + 0.02])
-        end = 1.05 * out * toward(heading + 10) + np.array([0, 0, height - fall])
-        rise = arc(start, 0.5 * (start + over) + np.array([0, 0, 0.1]), over, 4)
-        path = np.concatenate([rise, arc(over, over - np.array([0, 0, 0.02]), end, 5)[1:]])
-        parts.append(tube(path, 0.003, sides=5))
-        parts += leaves_along(draw, path, 6 + int(14 * fall), 0.07, 0.05, 0.1)
-    return parts
-
-
 def conifer(draw: Draw) -> list[Mesh]:
     """A little fir or a clipped cone: whorls of branches that shorten upwards."""
-    width = draw.between(0.18, 0.34)
-    parts, soil, _ = draw_pot(draw, width)
-    height, spread = draw.between(0.5, 1.3), draw.between(0.2, 0.34)
-    parts.append(rod((0, 0, soil - 0.02), (0, 0, soil + height), 0.018, 0.005))
-    whorls = draw.count(8, 13)
+    parts, soil, _ = pot(draw, draw.between(0.18, 0.34))
+    height, spread, whorls = draw.between(0.5, 1.3), draw.between(0.2, 0.34), draw.count(8, 13)
+    parts.append(p.rod((0, 0, soil - 0.02), (0, 0, soil + height), 0.018, 0.005))
     for k in range(whorls):
         t = k / whorls
         level, reach = soil + height * (0.1 + 0.9 * t), height * spread * (1.08 - t)
         for i in range(10):
-            heading = 36 * i + 17 * k + draw.between(-8, 8)
+            heading, pitch = 36 * i + 17 * k + draw.between(-8, 8), draw.between(-5, 20)
             size = reach * draw.between(0.85, 1.1)
-            pitch = draw.between(-5, 20)
-            needle = blade((0, 0, level), heading, pitch, size, 0.3 * size + 0.02, 0.25, 0.55)
-            parts.append(needle)
+            parts.append(blade((0, 0, level), heading, pitch, size, 0.3 * size + 0.02, 0.25, 0.55))
     return [*parts, blade((0, 0, soil + 0.95 * height), 0, 89, 0.12 * height, 0.03, 0.0)]
 
 
-def trough(draw: Draw) -> list[Mesh]:
-    """A long box with a row of upright plants."""
-    length, depth, height = (
-        draw.between(0.5, 1.0),
-        draw.between(0.16, 0.26),
-        draw.between(0.18, 0.4),
-    )
-    curve = rectangle(length, depth)
-    profile = [(0.96, 0.0), (1.0, height), (0.95, height), (0.95, 0.88 * height)]
-    parts = [shell(curve, profile)]
-    count = int(length / draw.between(0.12, 0.2))
-    tall, slender = draw.between(0.25, 0.6), draw.chance(0.4)
-    for k in range(count):
-        x = length * ((k + 0.5) / count - 0.5) * 0.9
-        root = np.array([x, draw.between(-0.1, 0.1) * depth, 0.86 * height])
-        if slender:
-            for i in range(14):
-                size, pitch = tall * draw.between(0.6, 1.1), draw.between(55, 88)
-                parts.append(blade(root, 137.5 * i, pitch, size, 0.02, 0.25, 0.3, 5))
-            continue
-        for i in range(6):
-            way = toward(137.5 * i + 30 * k, draw.between(60, 85))
-            tip = root + tall * draw.between(0.7, 1.1) * way
-            path = arc(root, 0.5 * (root + tip), tip, 5)
-            parts.append(tube(path, 0.004, sides=5))
-            parts += leaves_along(draw, path, 9, 0.15, 0.09, 0.1)
-    if draw.chance(0.4):
-        for x in (-0.42 * length, 0.42 * length):
-            parts.append(box((0.04, depth, 0.05), (x, 0, -0.045)))
-    return parts
-
-
-FAMILIES: tuple[Family, ...] = (
-    train(potted_leaves),
-    train(snake),
-    train(palm),
-    train(bush),
-    train(cactus),
-    train(small_tree),
-    train(grass),
-    test(vase_flowers),
-    test(dracaena),
-    test(trailing),
-    test(conifer),
-    train(trough),
+FAMILIES = families_of(
+    train=(potted_leaves, bush, small_tree, grass),
+    test=(vase_flowers, conifer),
 )

@@ -1,0 +1,127 @@
+"""Objects of the catalogue: solid parts, on the floor, of real size, in balance, in one piece."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from qs3.classes import CLASSES
+from qs3.meshes.catalogue import families, make, make_parts
+from qs3.meshes.mesh import merge
+
+SEEDS = range(4)
+# metres: least and greatest (longer side, shorter side, height), doors and drawers open
+SIZES = {
+    "bathtub": ((0.75, 0.64, 0.4), (2.3, 1.9, 1.4)),
+    "bed": ((1.15, 0.6, 0.1), (2.9, 2.7, 2.4)),
+    "bookshelf": ((0.3, 0.16, 0.25), (3.2, 1.6, 2.6)),
+    "cabinet": ((0.36, 0.3, 0.3), (3.0, 2.0, 2.5)),
+    "chair": ((0.4, 0.38, 0.7), (1.05, 1.0, 1.4)),
+    "lamp": ((0.1, 0.1, 0.25), (1.0, 0.8, 2.2)),
+    "monitor": ((0.2, 0.12, 0.25), (1.5, 0.6, 1.0)),
+    "plant": ((0.15, 0.12, 0.2), (2.0, 2.0, 2.4)),
+    "sofa": ((0.65, 0.5, 0.6), (3.4, 2.3, 1.2)),
+    "table": ((0.38, 0.3, 0.3), (2.8, 1.5, 0.95)),
+}
+# where people sit, or what things stand on, as seen from above; metres above the floor
+SURFACE = {"chair": (0.36, 0.6), "sofa": (0.34, 0.7), "table": (0.3, 0.95)}
+STANDS_FREE = set(CLASSES) - {"plant", "lamp"}  # a long leaf or an arm may reach over the foot
+
+
+def solids_of(parts):
+    return [trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts]
+
+
+def objects(cls):
+    """Name, seed and parts of some objects of every family of a class."""
+    for family in families(cls):
+        for seed in SEEDS:
+            yield f"{family.name}, seed {seed}", make_parts(cls, family.name, f"test/{seed}")
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_parts_are_solids_and_objects_stand_on_the_floor(cls):
+    low, high = SIZES[cls]
+    for where, parts in objects(cls):
+        for solid in solids_of(parts):
+            assert np.isfinite(solid.vertices).all(), where
+            assert solid.is_watertight, where
+            assert solid.is_winding_consistent, where
+            assert solid.volume > 0, where
+            assert (solid.area_faces > 1e-12).all(), where
+        whole = merge(parts)
+        width, depth, height = np.ptp(whole.bounds, axis=0)
+        size = np.array([max(width, depth), min(width, depth), height])
+        assert whole.bounds[0, 2] == 0, where
+        assert (size >= low).all(), (where, size)
+        assert (size <= high).all(), (where, size)
+        assert len(whole.faces) < 20_000, where
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_no_part_floats_and_objects_would_not_tip_over(cls):
+    """Bounding boxes, grown by 1 cm, lead to the floor; the contact encloses the centre of mass."""
+    for where, parts in objects(cls):
+        low = np.array([part.bounds[0] for part in parts]) - 0.005
+        high = np.array([part.bounds[1] for part in parts]) + 0.005
+        touching = (low[:, None] <= high[None]).all(-1) & (low[None] <= high[:, None]).all(-1)
+        reached = low[:, 2] < 0
+        for _ in parts:
+            reached |= touching[reached].any(axis=0)
+        assert reached.all(), (where, np.flatnonzero(~reached))
+        if cls in STANDS_FREE:
+            solids = solids_of(parts)
+            mesh, weight = merge(parts), np.array([solid.volume for solid in solids])
+            contact = mesh.vertices[mesh.vertices[:, 2] < 0.03, :2]
+            middle = np.array([solid.center_mass for solid in solids])
+            centre = (weight @ middle / weight.sum())[:2]
+            assert (contact.min(axis=0) < centre).all(), (where, centre)
+            assert (centre < contact.max(axis=0)).all(), (where, centre)
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_equal_keys_give_equal_bytes_and_others_do_not(cls):
+    hashes = [make(cls, f.name, str(seed)).sha256 for f in families(cls) for seed in SEEDS]
+    again = [make(cls, f.name, str(seed)).sha256 for f in families(cls) for seed in SEEDS]
+    assert hashes == again
+    assert len(set(hashes)) == len(hashes)
+
+
+@pytest.mark.parametrize("cls", SURFACE)
+def test_level_surface_at_a_usable_height(cls):
+    """Much of the area that faces up is where one sits or puts things down."""
+    low, high = SURFACE[cls]
+    for where, parts in objects(cls):
+        mesh = merge(parts)
+        a, b, c = mesh.vertices[mesh.faces.T]
+        normal, height = np.cross(b - a, c - a) / 2, (a + b + c)[:, 2] / 3
+        level = (normal[:, 2] > 0.9 * np.linalg.norm(normal, axis=1)) & (height > low)
+        area = normal[level & (height < high), 2].sum()
+        assert area > 0.06, (where, area)
+
+
+def wall_m(tub, z, directions=32):
+    """Least thickness of the wall at a height; negative where the inside has come outside."""
+    solid = trimesh.Trimesh(tub.vertices, tub.faces, process=False)
+    cut, face = trimesh.intersections.mesh_plane(solid, (0, 0, 1), (0, 0, z), return_faces=True)
+    normals = solid.face_normals[face][:, :2]
+    p, q = cut[:, 0, :2], cut[:, 1, :2]
+    centre = (p.min(axis=0) + p.max(axis=0)) / 2
+    least = np.inf
+    for angle in 0.01 + np.arange(directions) * (2 * np.pi / directions):
+        ray, across = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        u, v = (p - centre) @ across, (q - centre) @ across
+        hit = (u <= 0) != (v <= 0)
+        t = (u / np.where(hit, u - v, 1.0))[:, None]
+        radius = (p + t * (q - p) - centre) @ ray
+        outside, hit = normals @ ray > 0, hit & (radius > 0)
+        least = min(least, radius[hit & outside].max() - radius[hit & ~outside].min())
+    return least
+
+
+def test_tubs_are_hollow_and_their_walls_have_a_thickness():
+    for where, (tub, *_) in objects("bathtub"):
+        solid = trimesh.Trimesh(tub.vertices, tub.faces, process=False)
+        assert solid.volume < 0.75 * solid.convex_hull.volume, where
+        low, high = tub.bounds[:, 2]
+        for share in (0.36, 0.43, 0.5):
+            assert wall_m(tub, low + share * (high - low)) > 0.008, where
