@@ -36,7 +36,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore:.*LeafSpec:FutureWarning", "ignore::DeprecationWarning:onnxscript"
 )
 
-DOCS = Path(__file__).parents[2] / "docs" / "predictions.md"
+DOCS = Path(__file__).parents[2] / "docs" / "how-to" / "predict.md"
 
 
 def predictor_of(net: nn.Module, points: int = 64) -> Predictor:

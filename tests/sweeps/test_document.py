@@ -1,4 +1,4 @@
-"""Every training command in docs/sweeps.md is one that Hydra understands."""
+"""Every training command in docs/how-to/sweep.md is one that Hydra understands."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.training.toy import CONF
 
 COMMANDS = [
     re.split(r"   +|; ", line.strip())[0]
-    for line in (ROOT / "docs" / "sweeps.md").read_text().splitlines()
+    for line in (ROOT / "docs" / "how-to" / "sweep.md").read_text().splitlines()
     if line.startswith("    python train.py")
 ]
 
