@@ -146,7 +146,7 @@ def test_padding_and_missing_optional_lines():
     assert not read.organised
     with pytest.raises(DataError, match="without y"):
         read.xyz()
-    with pytest.raises(DataError, match="no image"):
+    with pytest.raises(DataError, match="not an image"):
         read.image("z")
 
 

@@ -66,7 +66,7 @@ def test_provenance_of_a_scan():
         (7, [], MeshError, "^object: expected a trimesh.Trimesh or Scene, got int"),
         (BOX, ["meshes=x"], ConfigError, "meshes= is for files"),
         (BOX, ["keep_views=true"], ConfigError, "keep_views= is for files"),
-        (BOX, ["colliders=hide"], ConfigError, "colliders must be skip or keep"),
+        (BOX, ["colliders=hide"], ConfigError, "colliders must be one of"),
         (BOX, ["recipe.min_points=9999999"], DataError, "^object: the sensor gave"),
         (BOX, ["domain=scannet10"], ConfigError, "published, not generated"),
     ],

@@ -56,7 +56,7 @@ def test_off_polygons_and_colours(tmp_path, content):
         (SQUARE_OFF.replace("3 0 2 3", "3 0 2 7"), "vertex 7, but there are 4"),
         (SQUARE_OFF.replace("3 0 2 3", "3 0 2 -1"), "vertex -1"),
         (SQUARE_OFF.replace("3 0 2 3", "3 0 2 4294967297"), "vertex 4294967297"),
-        (SQUARE_OFF.replace("3 0 2 3", "3 0 2 1.5"), "no whole number"),
+        (SQUARE_OFF.replace("3 0 2 3", "3 0 2 1.5"), "not a whole number"),
         (SQUARE_OFF.replace("3 0 2 3", "9 0 2 1"), "broken face"),
         (SQUARE_OFF.replace("1 1 0", "1 nan 0"), "not finite"),
         (SQUARE_OFF.replace("1 1 0", "1 inf 0"), "not finite"),

@@ -32,7 +32,7 @@ def test_text_ply_with_polygons_of_mixed_sizes(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
-        (b"ply\n", b"plx\n", "no PLY"),
+        (b"ply\n", b"plx\n", "not a PLY"),
         (b"property double x", b"property double u", "without x"),
         (b"vertex_indices", b"other_indices", "without vertex_indices"),
         (b"element face 3", b"element fact 3", "no faces"),

@@ -199,8 +199,8 @@ def test_random_draws_each_sample_equally_often() -> None:
     [
         ({"portion": 0.0}, "portion=0.0"),
         ({"portion": 0.6}, "0 < portion <= most"),
-        ({"step": -0.1}, "step >= 0"),
-        ({"alpha": 0.0}, "alpha > 0"),
+        ({"step": -0.1}, "step must be >= 0"),
+        ({"alpha": 0.0}, "alpha must be > 0"),
         ({"labels": "soft"}, "selftraining.selector.labels"),
     ],
 )

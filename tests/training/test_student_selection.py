@@ -291,7 +291,7 @@ def test_other_target_labels_change_no_weights(by_rule, toy, toy_data, tmp_path,
     folder, theirs = hashing.run_folder(cfg), metrics_of(by_rule(rule))
     for name in WEIGHTS:
         assert same_weights(folder / name, by_rule(rule) / name)
-    assert metrics["selection"] == theirs["selection"]
+    assert metrics.selection == theirs.selection
     assert same_weights(folder / "student_selected.pt", by_rule(rule) / "student_selected.pt")
 
 

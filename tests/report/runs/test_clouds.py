@@ -14,6 +14,7 @@ from qs3.report.runs import clouds as run_clouds
 from qs3.report.runs.clouds import cloud_pictures
 from qs3.report.runs.data import read_run
 from qs3.report.runs.pictures import draw as draw_run
+from qs3.runs.metrics import DataHashes
 from qs3.runs.predictions import Predictions, read_predictions
 from tests.generation.generating import config
 from tests.report.made_runs import change, not_blank, table
@@ -105,6 +106,15 @@ def test_a_sheet_has_a_row_a_class_and_spreads_over_it(tmp_path, sheets):
     assert [p is None for p in sheet["points"]] == [False] * 8 + [True] * 4
 
 
+def saw(run, data_dir, source="specklenet10", target="kinectsim10"):
+    """Note in the run that it was trained on these datasets."""
+    hashes = {
+        role: open_pointset(data_dir / name).sha256
+        for role, name in (("source", source), ("target", target))
+    }
+    change(run, data=DataHashes(**hashes))
+
+
 def test_unlabelled_domain(run, tmp_path, sheets):
     data_dir = tmp_path / "data"
     write_domain(data_dir, "specklenet10", noise=0.05)
@@ -113,7 +123,7 @@ def test_unlabelled_domain(run, tmp_path, sheets):
         data_dir / "kinectsim10", name="kinectsim10", classes=CLASSES, rows=rows, meta={},
         arrays={"points": np.random.default_rng(0).normal(size=(100, 16, 3)).astype(np.float32)},
     )  # fmt: skip
-    change(run, data={})
+    saw(run, data_dir)
     assert not_blank(draw(run, "target_clouds", tmp_path / "t.png", data_dir))
     titles = sheets[0]["titles"]
     assert (len(titles), titles[0], titles[1]) == (60, "000", "001")
@@ -130,7 +140,7 @@ def test_other_data_damaged_data_no_data(run, toy_data, tmp_path):
     (data_dir / "kinectsim10" / "points.npy").write_bytes(b"no array")
     assert "points.npy" in why_not(run, "target_clouds", out, data_dir)
     assert not_blank(draw(run, "source_clouds", tmp_path / "s.png", data_dir))
-    change(run, data={"source": "0" * 64, "target": "0" * 64})
+    change(run, data=DataHashes(source="0" * 64, target="0" * 64))
     assert "another version" in why_not(run, "mistakes", out)
 
 
@@ -160,7 +170,7 @@ def test_a_config_without_domains_costs_no_other_picture(run, text, tmp_path):
     assert drawn.page.is_file()
 
 
-def test_domains_stand_side_by_side_under_their_names(run, tmp_path, monkeypatch):
+def test_domains_stand_side_by_side_under_their_names(run, toy_data, tmp_path, monkeypatch):
     seen = {}
     monkeypatch.setattr(run_clouds, "scan_picture", lambda sets, path: seen.update(sets))
     draw(run, "domains", tmp_path / "d.png")
@@ -171,7 +181,7 @@ def test_domains_stand_side_by_side_under_their_names(run, tmp_path, monkeypatch
     config = OmegaConf.load(run / ".hydra" / "config.yaml")
     config.data.target = config.data.source
     OmegaConf.save(config, run / ".hydra" / "config.yaml")
-    change(run, data={})
+    saw(run, toy_data, target="specklenet10")
     seen.clear()
     draw(run, "domains", tmp_path / "d.png")
     assert list(seen) == ["S: SpeckleNet10, source", "S: SpeckleNet10, target"]
@@ -184,7 +194,7 @@ def test_pipeline_of_a_dataset_that_kept_its_views(run, toy_data, tmp_path):
     generate(config(tmp_path / "made", None, "workers=0", *chosen))
     data_dir = tmp_path / "made"
     shutil.copytree(toy_data / "kinectsim10", data_dir / "kinectsim10")
-    change(run, data={})
+    saw(run, data_dir)
     assert not_blank(draw(run, "pipeline", out, data_dir))
     shutil.rmtree(data_dir / "specklenet10" / "views")
     assert read_meta(data_dir / "specklenet10")["settings"]["recipe"]["sensor"]

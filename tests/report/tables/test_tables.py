@@ -127,7 +127,7 @@ def test_another_target(tmp_path):
     assert upper
     for cell in table.cells:  # the upper bound is trained on the other target, too
         assert ("domain@data.source=kinectsim10" in cell.overrides) == (cell in upper)
-    with pytest.raises(ConfigError, match=r"no domain \(did you mean kinectsim10\?\)"):
+    with pytest.raises(ConfigError, match=r"not a domain \(did you mean kinectsim10\?\)"):
         build_table("uda", tmp_path, target="kinectsim1")
 
 

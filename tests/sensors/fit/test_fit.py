@@ -270,7 +270,7 @@ def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
         (np.full((200, 300), 60.0), [], "unit="),
         (np.full((200, 300), 2.0), ["distances=1,2"], "distances= has 2"),
         (np.full((200, 300), 2.0), ["intrinsics=1,2,3"], "fx,fy,cx,cy"),
-        (np.zeros((5, 5, 3)), [], "no depth image"),
+        (np.zeros((5, 5, 3)), [], "not a depth image"),
     ],
 )
 def test_errors_say_what_to_do(image, arguments, message, tmp_path, capsys):
