@@ -2,6 +2,10 @@
 
 import os
 
+import pytest
+
+from tests.slow import is_slow
+
 # One thread a process: tests start many short ones, and two OpenMP teams on two cores spend
 # their time waiting for each other. Set before anything imports torch.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -14,3 +18,11 @@ if os.environ.get("QS3_CHECK_SHAPES"):  # `make test-all`
     checked = ("geometry.neighbours", "geometry.sampling", "models", "methods")
     checked += ("datamodules.augment", "evaluation.metrics")
     install_import_hook([f"qs3.{name}" for name in checked], "beartype.beartype")
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest leaves out what is marked
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `tests/slow.py` lists."""
+    for item in items:
+        if is_slow(item.nodeid):
+            item.add_marker(pytest.mark.slow)

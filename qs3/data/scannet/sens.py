@@ -167,7 +167,7 @@ class SensFile:
             raise DataError(f"{where}: depth in Occipital's compression, which cannot be read")
         if depth_compression not in (_RAW, _ZLIB):
             raise DataError(f"{where}: unknown depth compression {depth_compression}")
-        if not (np.isfinite(depth_shift) and depth_shift > 0):
+        if not 1 <= depth_shift < np.inf:  # 1000: a depth in millimetres
             raise DataError(f"{where}: a depth shift of {depth_shift} units a metre")
         left = self._size - self._file.tell()
         if frames > MAX_FRAMES or frames * _FRAME.size > left:

@@ -143,6 +143,7 @@ FIRST = MATRICES + 292
         (WIDTH, 0, "<I", "depth image has a side of 0 px"),
         (WIDTH, 9, "<I", "frame 0: the depth does not unpack to|frame 0: 96 bytes of depth"),
         (WIDTH + 8, 0.0, "<f", "depth shift of 0.0"),
+        (WIDTH + 8, 1e-40, "<f", "depth shift of"),
         (WIDTH + 12, 2**62, "<Q", "4611686018427387904 frames cannot lie"),
         (FIRST + 80, 2**64 - 1, "<Q", r"frame 0 of 3: 18446744073709551615 bytes of colour"),
         (FIRST + 88, 2**40, "<Q", r"frame 0 of 3: \d+ bytes of colour and 1099511627776 of depth"),

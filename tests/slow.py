@@ -1,0 +1,51 @@
+"""What `make test` leaves to `make test-all`, beside the tests that are marked where they stand.
+
+Patterns of test ids with the seconds of processor time that they took together when the list was
+made. Of each family a quick member stays: one net, one experiment, one table.
+"""
+
+from __future__ import annotations
+
+import re
+
+PATTERNS = (
+    # Every table in every format: composing all cells of all tables.
+    r"report/tables/test_formats\.py::test_every_table_in_every_format\[(?!quickstart)",
+    r"report/tables/test_formats\.py::test_how_published_numbers_were_selected",
+    r"report/tables/test_running\.py::test_(effects_by_hand|what_a_table_does_not_average|objects_that)",
+    r"report/tables/test_running\.py::test_(only_what_is_missing|one_cell|a_failure_is)",
+    r"engine/test_rows\.py::test_every_row_is_what_its_name_says\[(?!quickstart)",
+    # Real sweeps and searches of several processes.
+    r"sweeps/test_search\.py::test_(it_finds|a_run_that_diverged|a_grid_lists|the_grid_is)",
+    r"sweeps/test_launchers\.py::",
+    r"training/test_command\.py::test_(multirun_then|ddp_is_refused|missing_data_in_a_multirun)",
+    r"training/test_ddp\.py::",
+    # The large nets; the small ones take the same code.
+    r"models/test_all_nets\.py::.*\[(simpleview|pointnet2|pointnet2_ssg|rscnn)",
+    r"models/test_all_norms\.py::.*\[(simpleview|pointnet2)",
+    r"models/test_(simpleview|pointnet2|rscnn)\.py::test_numbers_of_",
+    # Exports: one net in each format stays.
+    r"inference/test_export\.py::test_onnxruntime_gives_the_net_s_logits\[(?!pointnet\])",
+    r"inference/test_export\.py::test_torch_export_gives_the_net_s_logits\[(?!pointnet\])",
+    r"inference/test_export\.py::test_(damaged_clouds|the_command_and|the_example|one_cloud_to)",
+    r"test_notebooks\.py::test_0",
+    r"test_experiments\.py::test_experiment_runs\[(?!qs3_s2d|supervised_d|pointdan_s2d|own_scans)",
+    r"data/inspection/test_measures\.py::test_inspect_says_and_saves",
+    r"data/scannet/test_extraction\.py::test_(plain_nearest|each_cloud_lies)",
+    r"data/test_gravity_axis\.py::test_the_embedded_catalogue",
+    r"sensors/bench/test_bench\.py::test_simulated_tables",
+    r"sensors/bench/test_presets\.py::test_a_preset_holds_its_bands\[(?!kinect_v1)",
+    r"sensors/renderers/test_renderers\.py::test_memory_does_not_grow\[blender",
+    r"sensors/renderers/test_agreement_paper\.py::.*\[(?!chair|table)",
+    r"sensors/fit/test_fit\.py::test_(hidden_parameters|noise_far_below)",
+    r"report/runs/test_pictures\.py::test_(offline_wandb|command_line|files_and_page|missing_round)",
+    r"training/test_fit\.py::test_(wandb_offline|seed_1_alone)",
+    r"generation/test_disk\.py::",
+)
+
+_SLOW = re.compile("|".join(PATTERNS))
+
+
+def is_slow(nodeid: str) -> bool:
+    """Whether the test of this id is one of them."""
+    return _SLOW.search(nodeid) is not None
