@@ -16,7 +16,7 @@ help: ## this list
 
 install: $(VENV)/installed ## the environment in .venv, pinned
 
-$(VENV)/installed: pyproject.toml setup.py constraints.txt
+$(VENV)/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' \
 	  || { echo "qs3 needs Python 3.11 (bpy has wheels for no other). Call: make PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) \
