@@ -8,9 +8,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Pictures need no screen.
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-if os.environ.get(
-    "QS3_CHECK_SHAPES"
-):  # `make test-all`
+if os.environ.get("QS3_CHECK_SHAPES"):  # `make test-all`
     from jaxtyping import install_import_hook
 
     checked = ("geometry.neighbours", "geometry.sampling", "models", "methods")
