@@ -46,7 +46,9 @@ def edge_conv(draw: Draw, norm: str) -> Case:
 def pooled_conv5(draw: Draw, norm: str) -> Case:
     variant = ("uda", "simpleview", "defrec")[draw(0, 2)]
     net = DGCNN(k=3, variant=variant, norm=norm, widths=(4, 5), embedding=draw(1, 8))
-    return net, [_cloud(draw)], lambda net, inputs: net(inputs[0]).global_
+    # Two clouds for the T-Net's norms; no copies, of which any could become a neighbour.
+    points = torch.randn(draw(2, 3), draw(3, 24), 3, dtype=torch.float64)
+    return net, [points], lambda net, inputs: net(inputs[0]).global_
 
 
 def point_mlp(draw: Draw, norm: str) -> Case:
@@ -117,6 +119,9 @@ def test_kernel_equals_formula(layer: Callable[[Draw, str], Case], data: st.Data
     torch.manual_seed(draw(0, 10**6))
     module, inputs, run = layer(draw, norm)
     module.double()
+    for part in module.modules():
+        if hasattr(part, "eps"):  # channels without variance would magnify rounding 300 times
+            part.eps = 0.1
     for name, values in [*module.named_parameters(), *module.named_buffers()]:
         if name.endswith("running_var"):
             nn.init.uniform_(values, 0.5, 2)
