@@ -5,16 +5,21 @@ import shutil
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.report.tables.table import build_table, table_names
+from qs3.report.tables.table import build_table
 from tests.training.conftest import finished, toy, toy_data  # noqa: F401
 from tests.training.toy import toy_config
 
 
 @pytest.fixture(scope="session")
 def empty(tmp_path_factory):
-    """All tables without any runs, by name."""
+    """Each table without any runs, by name, built when it is asked for."""
     log_dir = tmp_path_factory.mktemp("logs")
-    return {name: build_table(name, log_dir) for name in table_names()}
+
+    class Tables(dict):
+        def __missing__(self, name):
+            return self.setdefault(name, build_table(name, log_dir))
+
+    return Tables()
 
 
 @pytest.fixture
