@@ -22,6 +22,7 @@ PATTERNS = (
     r"training/test_ddp\.py::",
     # The large nets; the small ones take the same code.
     r"models/test_all_nets\.py::.*\[(simpleview|pointnet2|pointnet2_ssg|rscnn)",
+    r"models/test_rscnn\.py::test_(equals_straight_network\[True|float32_error)",
     r"models/test_all_norms\.py::.*\[(simpleview|pointnet2)",
     r"models/test_(simpleview|pointnet2|rscnn)\.py::test_numbers_of_",
     # Exports: one net in each format stays.
@@ -38,10 +39,14 @@ PATTERNS = (
     r"sensors/bench/test_presets\.py::test_a_preset_holds_its_bands\[(?!kinect_v1)",
     r"sensors/renderers/test_renderers\.py::test_memory_does_not_grow\[blender",
     r"sensors/renderers/test_agreement_paper\.py::.*\[(?!chair|table)",
-    r"sensors/fit/test_fit\.py::test_(hidden_parameters|noise_far_below)",
+    r"sensors/fit/test_fit\.py::test_(hidden_parameters|noise_far_below|holes_of_any_size|a_lens_that)",
+    r"sensors/fit/test_fit\.py::test_(walls_that_face|other_things_before|whole_millimetres)",
     r"report/runs/test_pictures\.py::test_(offline_wandb|command_line|files_and_page|missing_round)",
     r"training/test_fit\.py::test_(wandb_offline|seed_1_alone)",
-    r"generation/test_disk\.py::",
+    r"generation/test_(disk|blensor|forty_classes)\.py::",
+    r"data/test_contact_sheets\.py::test_command_line",
+    r"selftraining/test_learning\.py::test_crst",
+    r"inference/test_export\.py::test_a_net_of_one_s_own_is_exported_as_it_is\[onnx",
 )
 
 _SLOW = re.compile("|".join(PATTERNS))
