@@ -9,7 +9,7 @@ PIP_ARGS ?=
 PARALLEL ?= -n 2 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor quickstart lint format test test-all bench docs clean
+.PHONY: help install doctor quickstart lint format test test-all bench mutants docs clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -49,6 +49,9 @@ test-all: install ## the slow tests too, shapes in signatures checked, and the b
 
 bench: install ## speed, as ratios against named baselines
 	$(RUN) -m pytest tests/benchmarks --benchmark-enable -s
+
+mutants: install ## how many faults put into the core the tests notice; hours, goes on where it stopped
+	$(RUN) .ci/mutants.py .ci/mutants.toml out/mutants.csv
 
 docs: install ## the docs as a site, in out/site
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build -q -f .ci/mkdocs.yml

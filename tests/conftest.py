@@ -3,6 +3,7 @@
 import os
 
 import pytest
+from hypothesis import settings
 
 from tests.slow import is_slow
 
@@ -11,6 +12,10 @@ from tests.slow import is_slow
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Pictures need no screen.
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+# How long an example takes says how busy the machine is, not whether the code is right.
+settings.register_profile("qs3", deadline=None)
+settings.load_profile("qs3")
 
 if os.environ.get("QS3_CHECK_SHAPES"):  # `make test-all`
     from jaxtyping import install_import_hook

@@ -1,0 +1,267 @@
+"""How strong the tests are: faults put into the code one at a time, and whether a test fails.
+
+    python .ci/mutants.py .ci/mutants.toml out/mutants.csv          # all that the file names
+    python .ci/mutants.py .ci/mutants.toml out/mutants.csv store    # only targets named so
+
+The faults ("mutants") are those of cosmic-ray's operators: other comparisons, arithmetic, numbers
+and booleans, `and` for `or`, a removed `not`, decorator or loop, other exceptions. Those in type
+annotations change nothing and are left out. Each is judged by the tests named for its module
+alone, so a mutant that only a distant test would notice counts as alive.
+
+cosmic-ray's own runner starts Python and imports torch anew for every mutant. Here a worker has
+the large libraries loaded, works on a copy of the tracked files, and forks a child for each
+mutant. Results are appended as they come: a second call goes on where the first one stopped.
+"""
+
+from __future__ import annotations
+
+import ast
+import csv
+import importlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+import traceback
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator, operator_names
+
+WORKERS = int(os.environ.get("WORKERS", "2"))
+LIBRARIES = [
+    *("numpy", "scipy.spatial", "torch", "torch.utils.data", "torch._dynamo", "lightning", "hydra"),
+    *("omegaconf", "pydantic", "rich.progress", "h5py", "cv2", "pytest", "trimesh", "filelock"),
+    *("matplotlib.pyplot", "torchmetrics", "fpsample"),
+]
+OPTIONS = [
+    *("-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"),
+    *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # of plugins that are loaded already
+]
+FIELDS = ["target", "module", "operator", "occurrence", "line", "outcome", "seconds", "change"]
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One fault: the `occurrence`-th place of a module where an operator applies."""
+
+    target: str
+    module: str
+    operator: str
+    occurrence: int
+    line: int
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """What tells it from the others."""
+        return self.module, self.operator, self.occurrence
+
+
+def annotated_spans(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Where annotations stand: (line, column) of their beginnings and ends."""
+    spans = []
+    for node in ast.walk(ast.parse(source)):
+        for note in (getattr(node, "annotation", None), getattr(node, "returns", None)):
+            if isinstance(note, ast.expr):
+                start = note.lineno, note.col_offset
+                spans.append((start, (note.end_lineno or 0, note.end_col_offset or 0)))
+    return spans
+
+
+def mutants(root: Path, target: str, module: str) -> Iterator[Mutant]:
+    """All mutants of a module, those in annotations left out."""
+    source = (root / module).read_text()
+    spans = annotated_spans(source)
+    tree = get_ast(source)
+    for name in sorted(operator_names()):
+        kind = get_operator(name)
+        if kind.arguments():
+            continue
+        operator = kind()
+        places = [place for node in ast_nodes(tree) for place in operator.mutation_positions(node)]
+        for occurrence, (start, _) in enumerate(places):
+            if not any(first <= tuple(start) < last for first, last in spans):
+                yield Mutant(target, module, name, occurrence, start[0])
+
+
+def chosen(root: Path, targets: dict[str, Any], names: list[str]) -> list[tuple[Mutant, list[str]]]:
+    """The mutants to try, with the tests that judge each; a sample is drawn by its seed."""
+    jobs: list[tuple[Mutant, list[str]]] = []
+    for target, spec in targets.items():
+        if names and target not in names:
+            continue
+        found: list[tuple[Mutant, list[str]]] = []
+        for pattern, tests in spec["modules"].items():
+            for path in sorted(root.glob(pattern)):
+                module = str(path.relative_to(root))
+                if module in spec.get("except", []) or path.name == "__init__.py":
+                    continue
+                first = f"tests/{path.parent.relative_to(root / 'qs3')}/test_{path.stem}.py"
+                order = [first] if (root / first).exists() else []
+                for test in tests:
+                    order += [str(p.relative_to(root)) for p in sorted(root.glob(test))]
+                found += [(m, list(dict.fromkeys(order))) for m in mutants(root, target, module)]
+        if "sample" in spec:
+            found = random.Random(spec["seed"]).sample(found, min(spec["sample"], len(found)))
+        jobs += found
+    return jobs
+
+
+def run_tests(copy: Path, tests: list[str], limit: float, log: Path) -> tuple[str, float]:
+    """Fork, run the tests there, and say how it ended: killed, survived or timeout."""
+    start = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setsid()
+            stream = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(stream, 1)
+            os.dup2(stream, 2)
+            os.chdir(copy)
+            import pytest
+
+            rc = pytest.main([*OPTIONS, *tests])
+        except BaseException:
+            traceback.print_exc()
+            rc = 3
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(int(rc))
+    while time.monotonic() - start < limit:
+        pid, status = os.waitpid(child, os.WNOHANG)
+        if pid:
+            code = os.waitstatus_to_exitcode(status)
+            kill_group(child)
+            return "survived" if code == 0 else "killed", time.monotonic() - start
+        time.sleep(0.02)
+    kill_group(child)
+    os.waitpid(child, 0)
+    return "timeout", time.monotonic() - start
+
+
+def kill_group(leader: int) -> None:
+    """End what a child may have started."""
+    with suppress(ProcessLookupError):
+        os.killpg(leader, signal.SIGKILL)
+
+
+def work(root: Path, number: int, jobs: Any, results: Any) -> None:
+    """A worker: its own copy of the files, the libraries loaded, a child for each mutant."""
+    copy = Path(tempfile.mkdtemp(prefix=f"mutants{number}-")) / "repo"
+    files = subprocess.check_output(["git", "-C", str(root), "ls-files", "-z"], text=True)
+    for name in filter(None, files.split("\0")):
+        if (root / name).is_file():
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, copy / name)
+    os.environ.update(
+        PYTHONPATH=str(copy), OMP_NUM_THREADS="1", MPLBACKEND="Agg", TMPDIR=str(copy.parent)
+    )
+    tempfile.tempdir = str(copy.parent)
+    sys.path.insert(0, str(copy))
+    for name in LIBRARIES:
+        importlib.import_module(name)
+    limits: dict[tuple[str, ...], float] = {}
+    log = copy.parent / "log.txt"
+    while (job := jobs.get()) is not None:
+        mutant, tests = job
+        path = copy / mutant.module
+        source = path.read_text()
+        if tuple(tests) not in limits:
+            sys.dont_write_bytecode = False
+            outcome, seconds = run_tests(copy, tests, 3600, log)
+            if outcome != "survived":
+                raise SystemExit(
+                    f"The tests fail without a mutant: {tests}\n{log.read_text()[-3000:]}"
+                )
+            limits[tuple(tests)] = 3 * seconds + 15
+        sys.dont_write_bytecode = True
+        changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
+        for cached in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
+            cached.unlink()
+        if changed is None or changed == source:
+            results.put((mutant, "none", 0.0, ""))
+            continue
+        path.write_text(changed)
+        try:
+            outcome, seconds = run_tests(copy, tests, limits[tuple(tests)], log)
+        finally:
+            path.write_text(source)
+        before, after = source.splitlines(), changed.splitlines()
+        same = next((i for i, (a, b) in enumerate(zip(before, after, strict=False)) if a != b), 0)
+        line = f"{before[same].strip()}  ->  {after[same].strip() if same < len(after) else ''}"
+        results.put((mutant, outcome, seconds, line))
+        for left in copy.parent.glob("pytest-of-*"):
+            shutil.rmtree(left, ignore_errors=True)
+    shutil.rmtree(copy.parent, ignore_errors=True)
+
+
+def summary(rows: list[dict[str, str]]) -> str:
+    """A table: of each module how many mutants there were and what share died."""
+    counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+    for row in rows:
+        if row["outcome"] != "none":
+            for key in ((row["target"], row["module"]), (row["target"], "together")):
+                counts[key][row["outcome"]] += 1
+    lines = ["| target | module | mutants | killed |", "|---|---|---|---|"]
+    for (target, module), count in sorted(counts.items()):
+        dead = count["killed"] + count["timeout"]
+        share = f"{100 * dead / count.total():.1f} %"
+        lines.append(f"| {target} | {module} | {count.total()} | {share} |")
+    return "\n".join(lines)
+
+
+def main(targets_file: str, out: str, *names: str) -> None:
+    """Try what has not been tried yet, and print the table."""
+    root = Path(os.environ.get("MUTANTS_ROOT", Path(__file__).parents[1])).resolve()
+    targets = tomllib.loads(Path(targets_file).read_text())
+    table = Path(out)
+    table.parent.mkdir(parents=True, exist_ok=True)
+    begun = table.exists()
+    rows = list(csv.DictReader(table.open())) if begun else []
+    done = {(row["module"], row["operator"], int(row["occurrence"])) for row in rows}
+    wanted = [job for job in chosen(root, targets, list(names)) if job[0].key not in done]
+    context = get_context("fork")
+    jobs, results = context.Queue(), context.Queue()
+    for job in [*wanted, *[None] * WORKERS]:
+        jobs.put(job)
+    workers = [
+        context.Process(target=work, args=(root, number, jobs, results))
+        for number in range(WORKERS)
+    ]
+    for worker in workers:
+        worker.start()
+    with table.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
+        if not begun:
+            writer.writeheader()
+        for number in range(1, len(wanted) + 1):
+            while results.empty():
+                if any(worker.exitcode for worker in workers):
+                    raise SystemExit("A worker failed; what it printed stands above.")
+                time.sleep(0.05)
+            mutant, outcome, seconds, change = results.get()
+            row = {**asdict(mutant), "outcome": outcome, "seconds": f"{seconds:.1f}"}
+            writer.writerow(row | {"change": change})
+            stream.flush()
+            rows.append({k: str(v) for k, v in row.items()})
+            if number % 25 == 0:
+                print(f"{number} of {len(wanted)}", file=sys.stderr, flush=True)
+    print(summary(rows))
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        raise SystemExit(__doc__)
+    main(*sys.argv[1:])
