@@ -16,6 +16,11 @@ _WHITE = np.ones((2, 2), dtype=np.float32)
 _WIDE = 10.0  # tangent of half the lamp's angle: all that lies before it
 
 
+def white_lamp(world_from_lamp: np.ndarray) -> Projector:
+    """A point lamp at a pose [4, 4]; it lights all before it, white at 1 m to radiance 1."""
+    return Projector(world_from_lamp, _WHITE, _WIDE)
+
+
 def reached_from(
     bodies: tuple[Body, ...], camera: Camera, world_from_source: np.ndarray, renderer: Renderer
 ) -> np.ndarray:
@@ -30,8 +35,8 @@ def reached_from(
     Returns:
         [h, w] bool, False where no surface is. A pixel counts if any part of it is reached.
     """
-    lamp = Projector(world_from_source, _WHITE, _WIDE)
-    (image,) = renderer.render(Scene(bodies, lamp), [camera], seed=0, geometry=[False])
+    scene = Scene(bodies, white_lamp(world_from_source))
+    (image,) = renderer.render(scene, [camera], seed=0, geometry=[False])
     return image.radiance > 0
 
 

@@ -114,6 +114,28 @@ class Image:
         )
 
 
+def tangents(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Tangents x / z [w] and y / z [h, 1] of the rays through the centres of rendered pixels."""
+    window, k = camera.rendered, camera.intrinsics
+    x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
+    y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
+    return x, y
+
+
+def incidence(normal: np.ndarray, hit: np.ndarray, camera: Camera) -> np.ndarray:
+    """Cosine of the angle of incidence, for `Image.cosine`.
+
+    Args:
+        normal: [h, w, 3] unit normals of what is seen, in the camera's axes.
+        hit: [h, w] bool; where it does not hold the cosine is 0.
+        camera: with its window.
+    """
+    x, y = tangents(camera)
+    nx, ny, nz = np.moveaxis(normal, -1, 0)
+    cosine = np.abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1)
+    return np.where(hit, np.minimum(cosine, 1), 0).astype(np.float32)
+
+
 class Renderer(Protocol):
     """Turns a scene into images. Not thread safe; one instance a process."""
 

@@ -20,7 +20,14 @@ import numpy as np
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera
 from qs3.sensors.renderers import blender_devices, memory
-from qs3.sensors.renderers.base import Body, Image, Projector, RendererSettings, Scene
+from qs3.sensors.renderers.base import (
+    Body,
+    Image,
+    Projector,
+    RendererSettings,
+    Scene,
+    incidence,
+)
 from qs3.sensors.renderers.exr import read_exr
 
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
@@ -373,17 +380,9 @@ def _image(channels: dict[str, np.ndarray], camera: Camera) -> Image:
         return Image.without_geometry(radiance)
     depth = np.where(depth < _BACKGROUND_M, depth, np.float32(np.inf))
     normal = np.stack([named[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
-    return Image(radiance, depth, label.astype(np.uint8), _cosine(normal, depth, camera))
-
-
-def _cosine(normal: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """[h, w] float32, cosine of incidence from world normals [h, w, 3] at the pixels' centres."""
-    window, k = camera.rendered, camera.intrinsics
-    x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
-    y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
-    nx, ny, nz = np.moveaxis(normal @ camera.world_from_camera[:3, :3], -1, 0)
-    cosine = np.abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1)
-    return np.where(np.isfinite(depth), np.minimum(cosine, 1), 0).astype(np.float32)
+    local = normal @ camera.world_from_camera[:3, :3]
+    cosine = incidence(local, np.isfinite(depth), camera)
+    return Image(radiance, depth, label.astype(np.uint8), cosine)
 
 
 def _remove_everything(bpy: Any) -> None:
