@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from qs3.errors import DataError
 from qs3.sensors.devices.fitted import FittedDepth, neighbour_correlation
 from qs3.sensors.fit.planes import Wall
-from qs3.sensors.fit.rounded import TRIMMED_NORMAL, smooth_wall, spread_between
+from qs3.sensors.fit.rounded import inner_spread, smooth_wall, spread_between
 from qs3.sensors.fit.steps import Steps
 from qs3.sensors.fit.texture import noise_size_px
 
@@ -96,9 +96,7 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
             inside = bins == number
             if inside.sum() < _LEAST_IN_BIN:
                 continue
-            part = measured[inside] - 1 / mean[inside]
-            near, far = np.quantile(part, [0.005, 0.995])
-            sigma.append(float(part[(part >= near) & (part <= far)].std()) / TRIMMED_NORMAL)
+            sigma.append(inner_spread(measured[inside] - 1 / mean[inside]))
             # One level or none besides says nothing of what lies below a step.
             levels = len(np.unique(measured[inside].astype(np.float32)))
             found = spread_between(low[inside], high[inside], mean[inside]) if levels > 1 else 0.0

@@ -158,17 +158,23 @@ def _error_around(error_m: np.ndarray, camera: Intrinsics) -> float:
     return float(part.mean()) if part.size else 0.0
 
 
+def between(mask: np.ndarray) -> np.ndarray:
+    """[h, w] bool: between the first and the last True of [h, w], in its row and its column."""
+    out = np.ones_like(mask)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(mask, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(mask, axis), axis=axis), axis)
+        out &= before & after
+    return out
+
+
 def _region(on_wall: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """[h, w] bool: the wall with its holes, of whatever size these are.
 
     What lies between pixels of the wall, in its row and in its column, but for a rim, where
     holes would be open to one side and left out. Holes beside another thing are its shadow.
     """
-    inside = np.ones_like(on_wall)
-    for axis in (0, 1):
-        before = np.logical_or.accumulate(on_wall, axis=axis)
-        after = np.flip(np.logical_or.accumulate(np.flip(on_wall, axis), axis=axis), axis)
-        inside &= before & after
+    inside = between(on_wall)
     side = 2 * (on_wall.shape[1] // _RIM) + 1
     kernel = np.ones((side, side), np.uint8)
     inside = cv2.erode(
