@@ -3,10 +3,8 @@
 The whole bench is qs3.sensors.bench; here are a few of its conditions, the same measurement.
 """
 
-import numpy as np
 import pytest
 
-from qs3.errors import ConfigError
 from qs3.sensors.bench import bands, edges, planar, runner
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 
@@ -18,7 +16,6 @@ GEOMETRY = {
     "realsense_d435": (848, 480, 424.0, 0.050, 32, 15),
 }
 KINECTS = ("kinect_v1", "structure_sensor")
-D400 = ("realsense_d415", "realsense_d435")
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +74,10 @@ def test_a_preset_holds_its_bands(name, measured):
     assert failures(result, skip) == []
     judged = [v.band for v in bands.judge(result)]
     assert len(judged) >= 6
+    if name in KINECTS:
+        # Steps of 1/8 px alone give 0.036 px; the rest is matching, below Nguyen's total.
+        sigma = [m["sigma_px"] for m in result.facing()]
+        assert 0.036 < min(sigma) <= max(sigma) < 0.11
 
 
 def test_a_sensor_that_is_too_noisy_fails_its_bands(renderer):
@@ -92,18 +93,3 @@ def test_a_sensor_that_is_too_noisy_fails_its_bands(renderer):
     said = " ".join(failures(result))
     assert "of Nguyen's" in said
     assert "projector shadow" in said
-
-
-@pytest.mark.parametrize("name", KINECTS)
-def test_noise_of_a_kinect_is_the_device_s_and_not_the_frame_s(name, measured):
-    """Depth steps of 1/8 px alone give 0.036 px; the rest is matching, below Nguyen's total."""
-    sigma = np.array([m["sigma_px"] for m in measured(name).facing()])
-    assert (sigma > 0.036).all()
-    assert (sigma < 0.11).all()
-
-
-def test_an_unknown_sensor_and_a_wrong_key_are_refused():
-    with pytest.raises(ConfigError, match=r"there are .*kinect_v1"):
-        runner.load("kinect_v9")
-    with pytest.raises(ConfigError):
-        runner.load("kinect_v1", ["sensor.no_such_key=1"])
