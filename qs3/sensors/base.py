@@ -22,8 +22,8 @@ from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
 class DepthFrame:
     """One depth image of a part of a scene, on a regular grid of pixels.
 
-    Sample (r, c) belongs to the pixel (u, v) = (left + c * step_px, top + r * step_px) of
-    `camera`: samples are pixels that were really measured, so no shift enters.
+    Sample (r, c) is the pixel (u, v) = (left + c * step_px, top + r * step_px) of `camera`, really
+    measured, so no shift enters.
 
     Attributes:
         camera: where it was taken from.
@@ -32,12 +32,11 @@ class DepthFrame:
         depth_m: [h, w] float32 as measured, NaN where nothing was.
         clean_m: [h, w] float32 true depth at the same pixels, inf where nothing is hit.
         label: [h, w] uint8, Body.label of what is seen, 0 where nothing is.
-        cosine: [h, w] float32, cosine of the angle of incidence on what is seen, 0 where
-            nothing is.
-        reason: [h, w] uint8 `Reason`, why a sample has a depth or none. Shadow and occlusion
-            are told apart from other causes only if the scan was asked to `explain`.
-        images: intermediate pictures by name ("left", "right", "disparity", ...), for
-            looking at; their size is that of the matched canvas, not of `depth_m`.
+        cosine: [h, w] float32 of the angle of incidence, 0 where nothing is.
+        reason: [h, w] uint8 `Reason`. Shadow and occlusion are told apart from other causes only
+            if the scan was asked to `explain`.
+        images: intermediate pictures by name ("left", "right", "disparity", ...), for looking at,
+            of the size of the rendered window.
     """
 
     camera: Camera
@@ -52,14 +51,12 @@ class DepthFrame:
     images: dict[str, np.ndarray] = field(default_factory=dict)
 
     def points(self, depth_m: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-        """Back-project `depth_m` (self.depth_m or self.clean_m, possibly masked).
+        """Back-project `depth_m` [h, w] (self.depth_m or self.clean_m, possibly masked).
 
-        Args:
-            depth_m: [h, w]; pixels that are not finite are left out.
-            world_from_camera: [4, 4], the pose that is believed: a drifting one or the true.
+        `world_from_camera` [4, 4] is the pose that is believed: a drifting one or the true.
 
         Returns:
-            [M, 3] float64 points in the world, row-major.
+            [M, 3] float64 points in the world, row-major, of the pixels that are finite.
         """
         rows, cols = np.nonzero(np.isfinite(depth_m))
         k = self.camera.intrinsics
@@ -160,14 +157,10 @@ class Shot:
         at: Samples | None = None,
         intrinsics: Intrinsics | None = None,
     ) -> DepthFrame:
-        """The finished frame.
+        """The finished frame of `depth_m` and `reason` at samples, by default of every pixel.
 
-        Args:
-            depth_m, reason: of the samples.
-            image: of the whole window; what is true is read off it.
-            pictures: see `DepthFrame.images`.
-            at: where the samples are; by default every pixel.
-            intrinsics: what the device believes of its camera, where that is not the truth.
+        What is true is read off `image`, which covers the whole window. `intrinsics` are what the
+        device believes of its camera, where that is not the truth.
         """
         at = at or self.samples()
         return DepthFrame(
@@ -291,11 +284,7 @@ class TriangulatingSensor(DepthSensor):
 
 
 def check_depths(sensor: Any) -> None:
-    """Check the nearest and the farthest depth that a sensor gives.
-
-    Raises:
-        ConfigError: not 0 < min_depth_m < max_depth_m.
-    """
+    """Raise ConfigError unless 0 < min_depth_m < max_depth_m."""
     if not 0 < sensor.min_depth_m < sensor.max_depth_m:
         raise ConfigError(
             "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
@@ -304,14 +293,7 @@ def check_depths(sensor: Any) -> None:
 
 
 def window_of(box_m: np.ndarray, camera: Camera, *, margin_px: int = 0) -> Window | None:
-    """The pixels that an axis-aligned box covers, clipped to the image.
-
-    Args:
-        box_m: [2, 3] lowest and highest corner in the world.
-
-    Returns:
-        None if no part of the box is in front of the camera and inside the image.
-    """
+    """The pixels of the image that a box [2, 3] of the world covers; None if there are none."""
     corners = np.stack(np.meshgrid(*box_m.T, indexing="ij"), axis=-1).reshape(8, 3)
     pixels, depth = project(corners, camera)
     k = camera.intrinsics
@@ -333,8 +315,8 @@ def on_grid(start: int, count: int, step: int, offset: int | None = None) -> tup
     """Every step-th of `count` pixels from `start`, on a grid that does not depend on them.
 
     Returns:
-        The first pixel x >= start with x % step == offset (by default step // 2), and the slice
-        of the pixels.
+        The first pixel x >= start with x % step == offset (default: step // 2), and the pixels'
+        slice.
     """
     first = start + ((step // 2 if offset is None else offset) - start) % step
     return first, slice(first - start, count, step)

@@ -46,11 +46,7 @@ class Comparison:
 
 
 def real_clouds(folder: Path) -> list[Path]:
-    """The files, by name.
-
-    Raises:
-        MissingDataError: they are not here.
-    """
+    """The .pcd files in a folder, by name; MissingDataError if there are none."""
     found = sorted(folder.glob("*.pcd"))
     if not found:
         raise MissingDataError(

@@ -136,11 +136,7 @@ def _intel_laws(axes: Any, results: Results) -> None:
         axes.plot(z, count_on, color=_LAW, ls=style, label=f"Intel's formula, {name}, 0.08 px")
     near = z[z < 3.25]
     axes.plot(
-        near,
-        1e3 * laws.kotsonis_d435_m(near),
-        color=_LAW,
-        ls=":",
-        label="Kotsonis (real D435)",
+        near, 1e3 * laws.kotsonis_d435_m(near), color=_LAW, ls=":", label="Kotsonis (real D435)"
     )
 
 
@@ -252,10 +248,7 @@ def _histogram(results: Results, styles: dict) -> Any:
 
 
 def draw_real(
-    real: np.ndarray,
-    simulated: np.ndarray,
-    runs: tuple[np.ndarray, np.ndarray],
-    path: Path,
+    real: np.ndarray, simulated: np.ndarray, runs: tuple[np.ndarray, np.ndarray], path: Path
 ) -> None:
     """Real clouds and simulated ones: depth images, depth steps, lengths of holes.
 

@@ -67,13 +67,10 @@ def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
 
 
 def fit_steps(depths_m: np.ndarray, steps_per_px: int = 8) -> tuple[float, float]:
-    """The f B for which the levels 1 / Z lie best on a grid of 1 / (steps f B).
-
-    Args:
-        depths_m: [N] distinct depths, rounded to whole millimetres by the file.
+    """The f B in px m for which [N] distinct levels lie best on a grid of 1 / (steps f B) in 1 / Z.
 
     Returns:
-        f B in px m; RMS distance of the levels from the grid in steps (0.29 if there is none).
+        f B, and the RMS distance of the levels from the grid in steps (0.29 if there is none).
     """
     if len(depths_m) < 20:
         return float("nan"), float("nan")
@@ -140,11 +137,10 @@ def shadow_side(depth_m: np.ndarray, gaps: np.ndarray) -> float:
 def table_noise(depth_m: np.ndarray, block: int = 24) -> tuple[float, float]:
     """Noise of the table, free of its bow and of the device's distortion.
 
-    Planes are fitted to blocks of `block` px that lie on the table as a whole; the rest is what
-    depth noise does at short range.
+    Planes are fitted to blocks of `block` px that lie on the table as a whole.
 
     Returns:
-        RMS distance to the planes in metres, and sub-pixel RMS with the infrared camera's f B.
+        RMS distance to them in metres, and sub-pixel RMS with the infrared camera's f B.
     """
     height, width = depth_m.shape
     normal, distance = table_plane(depth_m)

@@ -101,14 +101,10 @@ class SensorResult:
 
 
 def load(name: str, overrides: Sequence[str] = ()) -> tuple[Subject, dict[str, Any]]:
-    """A sensor by the name of its file in conf/sensor, and its resolved settings.
-
-    Args:
-        name: e.g. "kinect_v1".
-        overrides: e.g. ["sensor.infrared.read_noise_e=20"].
+    """A sensor by the name of its file in conf/sensor ("kinect_v1"), and its resolved settings.
 
     Raises:
-        ConfigError: there is no such sensor, or it cannot be put on the bench.
+        ConfigError: there is no such sensor, or `overrides` ("sensor.key=value") do not fit.
     """
     known = [choice for choice in choices("sensor") if choice != "none"]
     if name not in known:

@@ -144,14 +144,9 @@ class DotMask(TriangulatingSensor):
 
 
 def spread(values: np.ndarray, radius_px: float) -> np.ndarray:
-    """Give each pixel the value of the nearest one that has any, up to a distance.
+    """Give each pixel of [h, w] the value of the nearest one that is not NaN, up to a distance.
 
-    Args:
-        values: [h, w] float32, NaN where there is none.
-        radius_px: how far.
-
-    Returns:
-        [h, w] float32; of several at the same distance the first in reading order counts.
+    Of several at the same distance the first in reading order counts.
     """
     reach = int(radius_px)
     height, width = values.shape

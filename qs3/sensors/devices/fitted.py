@@ -92,12 +92,9 @@ class FittedDepth(DepthSensor):
     def measure(
         self, clean_m: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the camera says of true depths.
+        """What the camera says of true depths `clean_m` [h, w] float32, inf where nothing is.
 
-        Args:
-            clean_m: [h, w] float32, inf where nothing is.
-            cosine: [h, w] float32 of the angle of incidence.
-            rng: of this frame.
+        `cosine` [h, w] float32 is that of the angle of incidence.
 
         Returns:
             [h, w] float32 depth with NaN; [h, w] uint8 `Reason`.

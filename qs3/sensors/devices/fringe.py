@@ -88,12 +88,10 @@ class FringeProjection(TriangulatingSensor):
     def depth_sigma_m(
         self, depth_m: float, noise: float | np.ndarray, modulation: float | np.ndarray
     ) -> float | np.ndarray:
-        """The law of the module's docstring.
+        """The law of the module's docstring, at depth Z.
 
-        Args:
-            depth_m: Z.
-            noise: standard deviation of one exposure in grey values, rounding included.
-            modulation: of the finest fringes in grey values.
+        `noise` is the standard deviation of one exposure in grey values, rounding included, and
+        `modulation` that of the finest fringes in grey values.
         """
         place = self.code.place_sigma(noise, modulation)
         return depth_m**2 / self.baseline_m * 2 * self._tan_half * place

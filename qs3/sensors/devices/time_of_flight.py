@@ -118,14 +118,9 @@ class TimeOfFlight(DepthSensor):
     def distance_sigma_m(
         self, amplitude_e: float | np.ndarray, mean_e: float | np.ndarray
     ) -> float | np.ndarray:
-        """The law of the module's docstring, all frequencies taken together.
+        """Standard deviation in metres along the ray, of all frequencies together: the law above.
 
-        Args:
-            amplitude_e: A, electrons.
-            mean_e: K (R + B), electrons a bucket on average.
-
-        Returns:
-            Standard deviation of the distance along the ray, metres.
+        `amplitude_e` is A and `mean_e` K (R + B), in electrons a bucket.
         """
         together = sum(f**2 for f in self.frequencies_hz) ** 0.5
         noise = np.sqrt(mean_e + self.read_noise_e**2) / (math.sqrt(2) * amplitude_e)
@@ -239,8 +234,7 @@ def unwrapped(
     weighed with 1 / sigma^2, which is proportional to (f A)^2 as the buckets' mean is common.
 
     Args:
-        phase: [F, h, w] in 0..2 pi.
-        amplitude: [F, h, w] electrons, for the weights.
+        phase, amplitude: [F, h, w] in 0..2 pi, and in electrons, for the weights.
         frequencies_hz: F of them.
 
     Returns:

@@ -92,9 +92,7 @@ def _four(found: object) -> list[float] | None:
 def read_frame(path: str | Path, unit: str | None = None) -> DepthImage:
     """One depth frame: 16 bit PNG, .npy, or an organised .pcd cloud.
 
-    Args:
-        path: of the file.
-        unit: "m", "mm", units a metre as a number, or None: as the numbers look.
+    `unit` is "m", "mm", units a metre as a number, or None: as the numbers look.
 
     Raises:
         MissingDataError: there is no such file.

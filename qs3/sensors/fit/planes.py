@@ -49,20 +49,14 @@ class Wall:
 
 
 def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0) -> Wall:
-    """Fit the plane that most pixels lie on.
+    """Fit the plane that most pixels of `depth_m` [h, w] with NaN lie on.
 
-    A plane is linear in 1 / Z over the pixels, so the fit is linear and its errors are those of
-    a disparity. Random triples first (the one with the lowest 30 % quantile of errors), then
-    least squares on what lies within 4.5 standard deviations, eight times.
-
-    Args:
-        name: for messages.
-        depth_m: [h, w] with NaN.
-        camera: intrinsics.
-        seed: of the triples.
+    A plane is linear in 1 / Z over the pixels, so the fit is linear and its errors are those of a
+    disparity. Random triples first (the one with the lowest 30 % quantile of errors), then least
+    squares on what lies within 4.5 standard deviations, eight times.
 
     Raises:
-        DataError: there is no plane, or it covers too little.
+        DataError: there is no plane, or it covers too little; the message begins with `name`.
     """
     height, width = depth_m.shape
     rows, cols = np.nonzero(np.isfinite(depth_m))

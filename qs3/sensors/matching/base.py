@@ -17,8 +17,7 @@ class Match:
 
     Attributes:
         disparity: [h, w] float32 in px, NaN where there is no match.
-        reason: [h, w] uint8, `Reason.OK` where there is one, else why not, as far as the
-            matcher knows.
+        reason: [h, w] uint8, `Reason.OK` where there is one, else why not, as far as is known.
     """
 
     disparity: np.ndarray
@@ -61,11 +60,8 @@ class Matcher(Protocol):
         Args:
             image: [h, w] uint8.
             other: [h, W] uint8 or float32 (0..255), the same rows.
-            first: column of `other` that column 0 of `image` has at zero disparity; what
-                lies outside `other` matches nothing.
-
-        Returns:
-            [h, w] disparities.
+            first: column of `other` that column 0 of `image` has at zero disparity; what lies
+                outside `other` matches nothing.
         """
         ...
 

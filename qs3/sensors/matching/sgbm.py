@@ -70,10 +70,7 @@ class SemiGlobalMatcher:
     def penalties(self) -> tuple[int, int]:
         """P1 and P2 as used."""
         area = self.block_size**2
-        return (
-            8 * area if self.p1 is None else self.p1,
-            32 * area if self.p2 is None else self.p2,
-        )
+        return (8 * area if self.p1 is None else self.p1, 32 * area if self.p2 is None else self.p2)
 
     @property
     def reach_px(self) -> int:

@@ -24,16 +24,11 @@ def white_lamp(world_from_lamp: np.ndarray) -> Projector:
 def reached_from(
     bodies: tuple[Body, ...], camera: Camera, world_from_source: np.ndarray, renderer: Renderer
 ) -> np.ndarray:
-    """Whether the surface in each pixel can be seen from another place.
+    """[h, w] bool: whether the surface in each pixel can be seen from another place, too.
 
-    Args:
-        bodies: the scene.
-        camera: with its window.
-        world_from_source: [4, 4] pose of the other camera or the projector, which looks along
-            its +z; what lies behind it is not reached.
-
-    Returns:
-        [h, w] bool, False where no surface is. A pixel counts if any part of it is reached.
+    `world_from_source` [4, 4] is the pose of the other camera or the projector, which looks along
+    its +z; what lies behind it is not reached. A pixel counts if any part of its surface is
+    reached.
     """
     scene = Scene(bodies, white_lamp(world_from_source))
     (image,) = renderer.render(scene, [camera], seed=0, geometry=[False])
@@ -41,21 +36,14 @@ def reached_from(
 
 
 def explained(
-    reason: np.ndarray,
-    clean_m: np.ndarray,
-    lit: np.ndarray,
-    seen: np.ndarray | None,
+    reason: np.ndarray, clean_m: np.ndarray, lit: np.ndarray, seen: np.ndarray | None
 ) -> np.ndarray:
-    """Reasons that geometry gives, put before the matcher's.
+    """Reasons that geometry gives, put before the [h, w] uint8 `reason` of matcher and filters.
 
     Args:
-        reason: [h, w] uint8 of matcher and filters.
         clean_m: [h, w] true depth, inf where nothing is.
         lit: [h, w] bool, reached by the projector.
         seen: [h, w] bool, reached by the other camera; None if there is none.
-
-    Returns:
-        [h, w] uint8.
     """
     out = reason.copy()
     invalid = reason != Reason.OK

@@ -123,12 +123,9 @@ def tangents(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def incidence(normal: np.ndarray, hit: np.ndarray, camera: Camera) -> np.ndarray:
-    """Cosine of the angle of incidence, for `Image.cosine`.
+    """Cosine of the angle of incidence, for `Image.cosine`; 0 where `hit` [h, w] does not hold.
 
-    Args:
-        normal: [h, w, 3] unit normals of what is seen, in the camera's axes.
-        hit: [h, w] bool; where it does not hold the cosine is 0.
-        camera: with its window.
+    `normal` [h, w, 3] are unit normals of what is seen, in the camera's axes.
     """
     x, y = tangents(camera)
     nx, ny, nz = np.moveaxis(normal, -1, 0)
@@ -142,17 +139,13 @@ class Renderer(Protocol):
     def render(
         self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
     ) -> list[Image]:
-        """Render every camera.
+        """Render one image a camera.
 
         Args:
             scene: what is there.
             cameras: where it is seen from.
             seed: of the sampling pattern; the same call gives the same bytes.
-            geometry: for each camera, whether depth_m, label and cosine are wanted; where
-                not, they are filled with inf and 0.
-
-        Returns:
-            One image a camera.
+            geometry: for each camera, whether depth_m, label and cosine are wanted, else inf and 0.
 
         Raises:
             RenderError: the renderer failed; the message holds its own.

@@ -20,14 +20,7 @@ import numpy as np
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera
 from qs3.sensors.renderers import blender_devices, memory
-from qs3.sensors.renderers.base import (
-    Body,
-    Image,
-    Projector,
-    RendererSettings,
-    Scene,
-    incidence,
-)
+from qs3.sensors.renderers.base import Body, Image, Projector, RendererSettings, Scene, incidence
 from qs3.sensors.renderers.exr import read_exr
 
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
@@ -244,17 +237,16 @@ def _add_body(bpy: Any, target: Any, body: Body, ambient: float) -> Any:
     material.cycles.emission_sampling = "NONE"  # the ambient term lights nothing else
     tree = material.node_tree
     tree.nodes.clear()
-    diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    node, link = tree.nodes.new, tree.links.new
+    diffuse, glow = node("ShaderNodeBsdfDiffuse"), node("ShaderNodeEmission")
     diffuse.inputs["Color"].default_value = (body.albedo, body.albedo, body.albedo, 1.0)
     diffuse.inputs["Roughness"].default_value = 0.0
-    glow = tree.nodes.new("ShaderNodeEmission")
     glow.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     glow.inputs["Strength"].default_value = body.albedo * ambient
-    total = tree.nodes.new("ShaderNodeAddShader")
-    output = tree.nodes.new("ShaderNodeOutputMaterial")
-    tree.links.new(diffuse.outputs[0], total.inputs[0])
-    tree.links.new(glow.outputs[0], total.inputs[1])
-    tree.links.new(total.outputs[0], output.inputs["Surface"])
+    total, output = node("ShaderNodeAddShader"), node("ShaderNodeOutputMaterial")
+    link(diffuse.outputs[0], total.inputs[0])
+    link(glow.outputs[0], total.inputs[1])
+    link(total.outputs[0], output.inputs["Surface"])
     mesh.materials.append(material)
 
     thing = bpy.data.objects.new("body", mesh)

@@ -110,11 +110,7 @@ def find_variant(variant: str = "auto") -> Probe:
 
 
 def try_variant(variant: str, llvm_path: str | None) -> str | None:
-    """Render a small scene in a child process.
-
-    Returns:
-        None if that worked, else the reason why not.
-    """
+    """Render a small scene in a child process: None if that worked, else the reason why not."""
     environment = dict(os.environ)
     environment.pop(PROBE_VARIABLE, None)
     if llvm_path is not None:

@@ -33,11 +33,7 @@ class MitsubaRenderer:
     """
 
     def __init__(
-        self,
-        samples: int = 16,
-        threads: int = 1,
-        variant: str = "auto",
-        name: str = "mitsuba",
+        self, samples: int = 16, threads: int = 1, variant: str = "auto", name: str = "mitsuba"
     ) -> None:
         """Find a variant that works here and load it.
 

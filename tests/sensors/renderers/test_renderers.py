@@ -268,8 +268,9 @@ def test_threads_do_not_change_a_byte(renderer):
 def test_fresh_process_makes_the_same_bytes(renderer, request):
     name = request.node.callspec.params["shared"]
     code = (
-        "import tests.sensors.renderers.test_renderers as t\n"
-        f"print(t.busy_digest(t.RENDERERS[{name!r}]()))"
+        "from tests.sensors.renderers.scenes import RENDERERS\n"
+        "from tests.sensors.renderers.test_renderers import busy_digest\n"
+        f"print(busy_digest(RENDERERS[{name!r}]()))"
     )
     child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert child.stdout.strip() == busy_digest(renderer)  # and nothing else was printed
