@@ -148,9 +148,8 @@ def _around(
     """What is measured across one side of the square, for each row or column of it.
 
     Returns:
-        [N] px by which near depths reach beyond the true edge, positive outwards; [N] px
-        from the edge to the first five pixels in a row that have the wall's depth. NaN where
-        there is no such thing.
+        [N] px by which near depths reach beyond the true edge, positive outwards; [N] px from the
+        edge to the first five pixels in a row that have the wall's depth. NaN where there is none.
     """
     true, found = (a.T if side in ("top", "bottom") else a for a in (clean, depth))
     if side in ("left", "top"):

@@ -43,11 +43,6 @@ def khoshelham_m(depth_m: np.ndarray | float) -> np.ndarray:
     return 1.425e-3 * np.asarray(depth_m, dtype=np.float64) ** 2
 
 
-def kinect_step_m(depth_m: np.ndarray | float) -> np.ndarray:
-    """Depth step of Kinect v1, twice the random error (same paper): 2.85e-6 Z^2 in mm."""
-    return 2 * khoshelham_m(depth_m)
-
-
 def kotsonis_d435_m(depth_m: np.ndarray | float) -> np.ndarray:
     """Axial noise of a D435 as measured by L. Kotsonis (elevation_mapping, 0.2 to 3.25 m)."""
     z = np.asarray(depth_m, dtype=np.float64)

@@ -68,11 +68,9 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
 
     Pixels are binned by the plane's depth, frame by frame. Errors are those from a smooth surface
     (`smooth_wall`), so that neither distortion nor bias counts as noise. sigma as measured is the
-    standard deviation of the inner 99 %; that before the quantiser, to which the law is fitted,
-    is the one of highest likelihood (`spread_between`).
-
-    Args:
-        power: 1 or 2 to fix the law; None lets the data choose, if distances differ by 30 %.
+    standard deviation of the inner 99 %; that before the quantiser, to which the law is fitted, is
+    the one of highest likelihood (`spread_between`). `power` 1 or 2 fixes the law; None lets the
+    data choose, if distances differ by 30 %.
 
     Raises:
         DataError: too few pixels.
@@ -215,14 +213,11 @@ def _hole_size(walls: Sequence[Wall]) -> float:
 
 
 def find_bias(walls: Sequence[Wall], distances_m: Sequence[float] | None) -> tuple[float, ...]:
-    """Polynomial of the error of the wall's distance at the principal point.
+    """Polynomial of the error of the wall's distance at the principal point, the constant first.
 
-    A constant, a line or a parabola: a higher power must lower the corrected RMS error by a
-    fifth, and there must be more distances than coefficients. A slanted wall counts less: an
-    error of its tilt is one of its distance.
-
-    Returns:
-        Coefficients, the constant first; (0,) without references.
+    A constant, a line or a parabola: a higher power must lower the corrected RMS error by a fifth,
+    and there must be more distances than coefficients. A slanted wall counts less: an error of its
+    tilt is one of its distance. (0,) without references.
     """
     if distances_m is None:
         return (0.0,)

@@ -37,11 +37,7 @@ def smooth_wall(wall: Wall, steps: Steps) -> np.ndarray:
 
 
 def spread_between(low: np.ndarray, high: np.ndarray, mean: np.ndarray) -> float:
-    """Standard deviation of normal errors about `mean` of values known to lie in [low, high].
-
-    Args:
-        low, high, mean: [N], of one unit.
-    """
+    """Standard deviation of normal errors about `mean` of values known to lie in [low, high]."""
     step = float(np.median(high - low))
     total = inner_spread((low + high) / 2 - mean)
     if step < _COARSE * total:

@@ -23,11 +23,9 @@ _SIZES = (0.0, *np.geomspace(0.3, 12.0, 14))
 
 
 def noise_size_px(walls: Sequence[Wall], simulated: Callable[[float], FittedDepth]) -> float:
-    """Size of the Gaussian that smooths the noise.
+    """Size of the Gaussian that smooths the noise of a camera's walls.
 
-    Args:
-        walls: of the camera.
-        simulated: the fitted sensor with noise of a size, without holes.
+    `simulated` gives the fitted sensor with noise of a size, without holes.
     """
     cuts = [_cut(wall) for wall in _facing(walls)]
 

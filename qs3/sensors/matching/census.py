@@ -203,8 +203,7 @@ class CensusMatcher:
 def _best_of_other(total: np.ndarray) -> np.ndarray:
     """Best place of each pixel of the other image, from the same costs.
 
-    Args:
-        total: [h, w, D]; place [v, u, j] is column u + j of the other image.
+    `total` is [h, w, D]; place [v, u, j] is column u + j of the other image.
 
     Returns:
         [h, w + D - 1] place j of the lowest total[v, x - j, j] for each column x.

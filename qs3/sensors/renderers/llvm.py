@@ -25,14 +25,9 @@ LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 _PREFERRED = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 _FOLDERS = (
-    "/usr/lib/*-linux-gnu",
-    "/usr/lib/llvm-*/lib",
-    "/usr/lib64",
-    "/usr/lib64/llvm*/lib",
-    "/usr/lib",
-    "/usr/local/lib",
-    "/opt/homebrew/opt/llvm*/lib",
-)
+    "/usr/lib/*-linux-gnu", "/usr/lib/llvm-*/lib", "/usr/lib64", "/usr/lib64/llvm*/lib",
+    "/usr/lib", "/usr/local/lib", "/opt/homebrew/opt/llvm*/lib",
+)  # fmt: skip
 _CHILD_TIMEOUT_S = 120.0
 _CHILD_OK = "qs3-probe-ok"
 _CHILD = f"""

@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 
@@ -10,27 +9,12 @@ from qs3.sensors.matching import (
     StereoBlockMatcher,
 )
 from qs3.sensors.pixel_status import Reason
-
-
-def dots(height, width, seed, scale=8):
-    """A smooth random texture that can be shifted by fractions of a pixel: [h, w * scale]."""
-    rng = np.random.default_rng(seed)
-    fine = rng.random((height, width)).astype(np.float32)
-    fine = cv2.resize(fine, (width * scale, height), interpolation=cv2.INTER_CUBIC)
-    fine = cv2.GaussianBlur(fine, (0, 0), sigmaX=scale, sigmaY=1)  # the lens: one pixel
-    fine = (fine - fine.min()) / (fine.max() - fine.min())
-    return fine * 255
-
-
-def shifted(texture, shift_px, scale=8):
-    """The texture sampled at whole pixels after moving it to the right by shift_px."""
-    offset = round(shift_px * scale)
-    return np.roll(texture, offset, axis=1)[:, scale // 2 :: scale]
+from tests.sensors.matching.textures import dots, seen
 
 
 def test_removing_the_bias_of_stereobm_is_a_switch():
     texture = dots(60, 300, seed=2)
-    left, right = (shifted(texture, d).astype(np.uint8) for d in (12.0, 0.0))
+    left, right = (seen(texture, d) for d in (12.0, 0.0))
     with_bias = StereoBlockMatcher(32, 11, remove_bias=False).match(left, right).disparity
     without = StereoBlockMatcher(32, 11).match(left, right).disparity
     both = np.isfinite(with_bias)
@@ -70,7 +54,7 @@ def test_the_way_back_is_the_best_column_of_the_other_image():
 
 def test_correlation_says_what_did_not_find_back():
     texture = dots(60, 300, seed=7)
-    image, other = (shifted(texture, d).astype(np.uint8) for d in (20.0, 0.0))
+    image, other = (seen(texture, d) for d in (20.0, 0.0))
     # A poor copy of what is seen 15 px farther right: it finds the other image's pixel of that.
     image[:, 150:170] = image[:, 165:185] + np.random.default_rng(0).integers(0, 4, (60, 20))
     settings = {"num_disparities": 40, "min_score": 0.0, "uniqueness": 0.0}
@@ -92,7 +76,7 @@ def test_the_a_factor_removes_the_locking_of_the_parabola():
         matcher = NormalisedCorrelation(9, 10, 20, a_factor=a_factor)
         errors = []
         for true in 20 + np.arange(8) / 8:
-            image, other = shifted(texture, true), shifted(texture, 0.0)
+            image, other = seen(texture, true), seen(texture, 0.0)
             found = matcher.match(image.astype(np.uint8), other.astype(np.float32)).disparity
             errors.append(np.nanmedian(found[8:-8, 40:-20]) - true)
         worst[a_factor] = np.abs(errors).max()
@@ -102,8 +86,8 @@ def test_the_a_factor_removes_the_locking_of_the_parabola():
 
 def test_the_reference_matcher_is_correlation_with_the_steps_of_a_kinect():
     texture = dots(60, 300, seed=10)
-    reference = shifted(texture, 0.0).astype(np.float32)
-    image = shifted(texture, 4.3).astype(np.uint8)[:, 60:200]
+    reference = seen(texture, 0.0).astype(np.float32)
+    image = seen(texture, 4.3)[:, 60:200]
     plain = NormalisedCorrelation(9, -24, 64).match(image, reference, 60)
     kinect = ReferenceMatcher().match(image, reference, 60)
     np.testing.assert_array_equal(kinect.disparity, np.rint(plain.disparity * 8) / 8)
@@ -130,7 +114,7 @@ def test_locking_of_sgbm_is_a_switch(a_factor):
     matcher = SemiGlobalMatcher(32, a_factor=a_factor)
     errors = []
     for true in 20 + np.arange(8) / 8:
-        image, other = (shifted(texture, d).astype(np.uint8) for d in (true, 0.0))
+        image, other = (seen(texture, d) for d in (true, 0.0))
         errors.append(np.nanmedian(matcher.match(image, other).disparity[8:-8, 60:-20]) - true)
     assert abs(np.mean(errors)) < 0.02
     assert (np.abs(errors).max() < 0.13) == bool(a_factor)
@@ -138,9 +122,9 @@ def test_locking_of_sgbm_is_a_switch(a_factor):
 
 def test_block_matching_tells_dark_from_not_found():
     texture = dots(60, 300, seed=12)
-    image, other = (shifted(texture, d).astype(np.uint8) for d in (20.0, 0.0))
+    image, other = (seen(texture, d) for d in (20.0, 0.0))
     image[:, 120:180] = 3
-    image[:, 200:240] = shifted(dots(60, 300, seed=13), 0.0).astype(np.uint8)[:, 200:240]
+    image[:, 200:240] = seen(dots(60, 300, seed=13), 0.0)[:, 200:240]
     found = StereoBlockMatcher(64, 9).match(image, other)
     assert (found.reason[8:-8, 130:170] == Reason.DARK).all()
     foreign = found.reason[8:-8, 208:232]

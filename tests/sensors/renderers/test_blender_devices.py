@@ -33,11 +33,6 @@ def test_unknown_device_is_refused():
         choose("cuda", {})
 
 
-def test_variants_have_names_of_their_own():
-    names = {Device(b).variant for b in ("CPU", "OPTIX", "CUDA")}
-    assert names == {"cycles_cpu", "cycles_optix", "cycles_cuda"}
-
-
 def test_what_blender_really_lists():
     """With a GPU: it is found, used, and named. Without: the CPU, and an error that says so."""
     renderer = BlenderRenderer(samples=1)

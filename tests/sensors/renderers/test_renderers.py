@@ -94,15 +94,6 @@ def test_slide_is_black_outside(renderer):
     assert abs(np.ptp(rows) + 1 - 25) <= 2
 
 
-def test_slide_may_be_read_only(renderer):
-    scene = busy_scene()
-    slide = scene.projector.slide.copy()
-    slide.flags.writeable = False
-    locked = replace(scene, projector=replace(scene.projector, slide=slide))
-    first, second = one(renderer, scene, busy_camera()), one(renderer, locked, busy_camera())
-    np.testing.assert_array_equal(second.radiance, first.radiance)
-
-
 def test_shadow_is_on_the_far_side_of_the_projector(renderer):
     blocker = quad([[-0.1, -0.1, 1], [0.1, -0.1, 1], [0.1, 0.1, 1], [-0.1, 0.1, 1]])
     slide = np.ones((8, 8), dtype=np.float32)
