@@ -151,8 +151,8 @@ def _own_laws(axes: Any, results: Results) -> None:
 def _subpixel(results: Results, styles: dict) -> Any:
     figure, axes = _axes()
     axes.axhspan(*laws.D400_BAND_PX, color=_BAND, zorder=0)
-    for told in laws.INTEL_SUBPIXEL_PX:
-        axes.axhline(told, color=_LAW, ls="--", linewidth=0.9)
+    for stated in laws.INTEL_SUBPIXEL_PX:
+        axes.axhline(stated, color=_LAW, ls="--", linewidth=0.9)
     for result in results:
         depth, value = _series(result.facing(), "depth_m", "subpixel_rms_px")
         axes.plot(depth, value, label=result.subject.name, **styles[result.subject.name])

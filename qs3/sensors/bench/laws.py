@@ -1,4 +1,4 @@
-"""Published laws of the noise of real depth cameras, to lay beside ours. Depths in metres.
+"""Published laws of the noise of real depth cameras, to compare ours with. Depths in metres.
 
 Only formulas and constants; each function names where they come from.
 """

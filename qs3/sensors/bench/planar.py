@@ -40,12 +40,6 @@ class PlanarCondition:
     half_px: int = 24
     repeats: int = 0
 
-    def __post_init__(self) -> None:
-        if not self.depth_m > 0 or not 0 <= self.tilt_deg <= 85:
-            raise ConfigError("a bench plane needs depth_m > 0 and tilt_deg in 0..85")
-        if self.phases < 4:
-            raise ConfigError(f"phases must be at least 4, got {self.phases}")
-
     @property
     def name(self) -> str:
         """For file names and messages."""

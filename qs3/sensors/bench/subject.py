@@ -30,7 +30,7 @@ class Subject:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of the camera whose depth image it is."""
+        """The camera's whose depth image it is."""
         return self.sensor.intrinsics
 
     @property

@@ -33,7 +33,7 @@ from qs3.sensors.optics.visibility import explained, white_lamp
 
 @dataclass(frozen=True)
 class DotMask(TriangulatingSensor):
-    """A camera and a projector of dots beside it, without light: geometry decides.
+    """A camera and a projector of dots next to it, without light: geometry decides.
 
     The defaults are Kinect v1's geometry.
 

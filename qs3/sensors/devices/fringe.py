@@ -1,7 +1,7 @@
 """Fringe projection: structured light with sinusoids, one camera and one projector.
 
 The camera's ray through u meets the plane of light that leaves the projector at x / z = x_p. The
-projector looks the same way from a distance b beside the camera, so x_p = x - b / Z with
+projector looks the same way at a distance b from the camera, so x_p = x - b / Z with
 x = (u - cx) / f, and Z = f b / d with the disparity d = f (x - x_p). Above the camera the same
 holds for rows. The place on the slide comes from phase shifting (`optics.fringe_code`), so
 
@@ -32,7 +32,7 @@ from qs3.sensors.renderers.base import Image, Projector, Scene, tangents
 
 @dataclass(frozen=True)
 class FringeProjection(TriangulatingSensor):
-    """A camera and a projector of fringes beside or above it. All numbers are ours.
+    """A camera and a projector of fringes to the right of it or above. All numbers are ours.
 
     Attributes:
         baseline_m: the projector is above the camera, and not to its right, if the fringes change

@@ -1,6 +1,6 @@
 """Kinect-v1-like sensor: one camera matched against a stored image of the pattern.
 
-The projector sits at a distance b beside the camera. A dot at slide position s (x / z in
+The projector sits at a distance b to the right of the camera. A dot at slide position s (x / z in
 the projector's frame) is seen at u = f (b / Z + s) + cx, and in the reference image, which
 was stored with a plane at Z_ref, at u_ref = f (b / Z_ref + s) + cx. So the disparity
 u - u_ref = f b (1 / Z - 1 / Z_ref) (Khoshelham and Elberink, Sensors 2012, eq. 1 to 5).
@@ -24,7 +24,7 @@ from qs3.sensors.renderers.base import Projector
 
 @dataclass(frozen=True)
 class ReferenceSpeckle(TriangulatingSensor):
-    """A single infrared camera and a projector beside it.
+    """A single infrared camera and a projector next to it.
 
     Kinect v1: 640 x 480 px, f about 580 px, baseline about 75 mm (Konolige and Mihelich,
     ROS kinect_calibration/technical); pattern of 3 x 3 tiles of 211 x 165 positions.

@@ -69,13 +69,18 @@ class SpeckleStereo(TriangulatingSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ranges(self, "sensor.", step_px=">= 1", projector_strength="> 0")
+        check_ranges(
+            self,
+            "sensor.",
+            step_px=">= 1",
+            projector_strength="> 0",
+            blind_left_px=f"[0, {self.width_px})",
+        )
         if self.sample_offset_px is not None and not 0 <= self.sample_offset_px < self.step_px:
             raise ConfigError(
                 f"sensor.sample_offset_px must be null or in 0..{self.step_px - 1} (step_px is "
                 f"{self.step_px}), got {self.sample_offset_px}"
             )
-        check_ranges(self, "sensor.", blind_left_px=f"[0, {self.width_px})")
         end = self.matcher.min_disparity + self.matcher.num_disparities
         if self.focal_px * self.baseline_m / self.min_depth_m > end:
             nearest = self.focal_px * self.baseline_m / end
@@ -100,9 +105,8 @@ class SpeckleStereo(TriangulatingSensor):
         window = window_of(shot.box_m, Camera(self.intrinsics, right), margin_px=self.margin_px)
         if window is None:
             return None
-        projector = Projector(
-            middle, self.pattern.slide, self.tan_half_width, self.projector_strength
-        )
+        slide, strength = self.pattern.slide, self.projector_strength
+        projector = Projector(middle, slide, self.tan_half_width, strength)
         images = shot.renderer.render(
             Scene(shot.bodies, projector, self.ambient),
             [shot.camera, Camera(self.intrinsics, right, window)],

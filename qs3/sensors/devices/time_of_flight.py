@@ -1,6 +1,6 @@
 """Time of flight: the phase of modulated light, per pixel.
 
-A lamp beside the lens shines with an intensity modulated at f. Light that went to a surface
+A lamp next to the lens shines with an intensity modulated at f. Light that went to a surface
 and back, s metres in all, is late by the phase 2 pi f s / c. A pixel collects it in four
 buckets, a quarter of a period apart; with K electrons a unit of radiance, contrast C, radiance
 R of the lamp's light and radiance B of all other light, bucket m holds on average
@@ -145,13 +145,12 @@ class TimeOfFlight(DepthSensor):
         depth = self._depth(window, half_path)
 
         middle = (slice(self.supersampling // 2, None, self.supersampling),) * 2
-        centres = Image(
-            *map(np.ascontiguousarray, (lamp_light, fine.depth_m[middle])),
-            *map(np.ascontiguousarray, (fine.label[middle], fine.cosine[middle])),
+        clean, label, cosine = (
+            np.ascontiguousarray(a[middle]) for a in (fine.depth_m, fine.label, fine.cosine)
         )
         with np.errstate(invalid="ignore"):
             causes = {
-                Reason.EMPTY: ~np.isfinite(centres.depth_m),
+                Reason.EMPTY: ~np.isfinite(clean),
                 Reason.SHADOW: lamp_light <= 0,
                 Reason.DARK: amplitude.min(axis=0) < self.min_amplitude_e,
                 Reason.SATURATED: buckets.max(axis=(0, 1)) > self.full_well_e,
@@ -161,11 +160,11 @@ class TimeOfFlight(DepthSensor):
         # A pixel on an edge is a measurement even where its centre sees nothing.
         dropped = np.any(list(causes.values())[2:], axis=0)
         reason = first_reason({Reason.OK: ~dropped, **causes}, Reason.UNMATCHED)
-        pictures = {"left": _grey(amplitude[0]), "clean": centres.depth_m}
+        pictures = {"left": _grey(amplitude[0]), "clean": clean}
         if shot.explain:
             pictures["lit"] = lamp_light > 0
         depth = np.where(dropped, np.nan, depth).astype(np.float32)
-        return shot.frame(depth, reason, centres, pictures)
+        return shot.frame(depth, reason, Image(lamp_light, clean, label, cosine), pictures)
 
     def _render(self, shot: Shot) -> tuple[Image, np.ndarray]:
         """The lamp's light in a camera with finer pixels, and radiance of other light [h, w]."""
@@ -174,9 +173,8 @@ class TimeOfFlight(DepthSensor):
         part = Window(window.left * n, window.top * n, window.width * n, window.height * n)
         lamp = white_lamp(shot.pose_at(self.lamp_offset_m))
         camera = Camera(small, shot.camera.world_from_camera, part)
-        (fine,) = shot.renderer.render(
-            Scene(shot.bodies, lamp), [camera], seed=seed, geometry=[True]
-        )
+        lit = Scene(shot.bodies, lamp)
+        (fine,) = shot.renderer.render(lit, [camera], seed=seed, geometry=[True])
         if not self.ambient:
             return fine, np.zeros((window.height, window.width), dtype=np.float32)
         dim = Scene(shot.bodies, None, self.ambient)

@@ -95,7 +95,7 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
             if inside.sum() < _LEAST_IN_BIN:
                 continue
             sigma.append(inner_spread(measured[inside] - 1 / mean[inside]))
-            # One level or none besides says nothing of what lies below a step.
+            # A single level says nothing of what lies below a step.
             levels = len(np.unique(measured[inside].astype(np.float32)))
             found = spread_between(low[inside], high[inside], mean[inside]) if levels > 1 else 0.0
             depth.append(float(z[inside].mean()))

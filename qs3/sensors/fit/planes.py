@@ -166,7 +166,7 @@ def _region(on_wall: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """[h, w] bool: the wall with its holes, of whatever size these are.
 
     What lies between pixels of the wall, in its row and in its column, but for a rim, where
-    holes would be open to one side and left out. Holes beside another thing are its shadow.
+    holes would be open to one side and left out. Holes next to another thing are its shadow.
     """
     inside = between(on_wall)
     side = 2 * (on_wall.shape[1] // _RIM) + 1

@@ -126,9 +126,10 @@ def try_variant(variant: str, llvm_path: str | None) -> str | None:
     if child.returncode == 0 and _CHILD_OK in child.stdout:
         return None
     said = [line.strip() for line in child.stderr.splitlines() if line.strip()]
-    told = next((line for line in said if "LLVM ERROR" in line), said[-1] if said else "no message")
+    last = said[-1] if said else "no message"
+    reason = next((line for line in said if "LLVM ERROR" in line), last)
     how = f"killed by signal {-child.returncode}" if child.returncode < 0 else "failed"
-    return f"{how}: {told[:300]}"
+    return f"{how}: {reason[:300]}"
 
 
 def _first_that_works() -> Probe:

@@ -150,7 +150,7 @@ def test_without_the_real_clouds_the_comparison_says_so(tmp_path):
 
 
 def test_simulated_tables_have_the_steps_and_the_noise_of_real_ones(renderer, tmp_path):
-    """kinect_v1 beside 8 real clouds; ranges, because the scenes are not the same."""
+    """kinect_v1 and 8 real clouds; ranges, because the scenes are not the same."""
     pytest.importorskip("qs3.clouds.pcd")
     if not CLOUDS.is_dir():
         pytest.skip(f"{CLOUDS} is absent")

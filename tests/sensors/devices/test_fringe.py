@@ -152,7 +152,7 @@ def test_reasons(renderer):
     assert (middle(reasons(loud, square(1.5)).reason) == Reason.SATURATED).mean() > 0.5
     assert (middle(reasons(SIDE, square(7.0)).reason) == Reason.RANGE).mean() > 0.99
     narrow = replace(SIDE, tan_half_width=0.1)
-    beside = reasons(narrow, square(1.0, 0.4))
-    assert (beside.reason == Reason.OUTSIDE).mean() > 0.4
+    aside = reasons(narrow, square(1.0, 0.4))
+    assert (aside.reason == Reason.OUTSIDE).mean() > 0.4
     bright = replace(SIDE, ambient=20.0)  # the pattern drowns
     assert (middle(reasons(bright, square(1.5)).reason) == Reason.DARK).all()

@@ -224,7 +224,7 @@ def test_the_shadow_of_a_thing_is_no_hole_of_the_wall(tmp_path):
     assert min(found.fill_rates) == 1
 
 
-@pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds beside the checkout")
+@pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds next to the checkout")
 def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
     files = sorted(KINECT.glob("*.pcd"))[:4]
     found, _ = fitted(tmp_path, files, "focal=575")
