@@ -42,17 +42,14 @@ class Matcher(Protocol):
     @property
     def min_disparity(self) -> int:
         """Smallest disparity searched."""
-        ...
 
     @property
     def num_disparities(self) -> int:
         """How many whole disparities are searched."""
-        ...
 
     @property
     def reach_px(self) -> int:
         """How far from a pixel the images have an influence on it: half a block, or more."""
-        ...
 
     def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
         """Match every pixel of `image`.
@@ -63,7 +60,6 @@ class Matcher(Protocol):
             first: column of `other` that column 0 of `image` has at zero disparity; what lies
                 outside `other` matches nothing.
         """
-        ...
 
 
 def side_by_side(

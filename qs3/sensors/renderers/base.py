@@ -150,11 +150,9 @@ class Renderer(Protocol):
         Raises:
             RenderError: the renderer failed; the message holds its own.
         """
-        ...
 
     def provenance(self) -> dict[str, str]:
         """Renderer, variant and library versions: what decides the bytes it makes."""
-        ...
 
 
 @dataclass(frozen=True)
