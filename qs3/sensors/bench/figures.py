@@ -258,23 +258,24 @@ def draw_real(
     """
     figure = blank(8.6, 6.4, _DPI, constrained=True)
     panels = figure.subplots(2, 2)
-    names = ("REAL Kinect v1", "SIMULATED, kinect_v1")
-    for axes, depth, name in zip(panels[0], (real, simulated), names, strict=True):
+    steps, holes = panels[1]
+    bins = np.arange(0.5, 31.5, 1)
+    both = (("REAL Kinect v1", real, "o"), ("SIMULATED, kinect_v1", simulated, "x"))
+    for axes, (name, depth, marker), found, colour in zip(
+        panels[0], both, runs, _COLOURS[:2], strict=True
+    ):
         axes.imshow(depth, vmin=0.55, vmax=1.35, cmap="viridis")
         axes.set_title(name + " (white: no depth)", fontsize=10)
         axes.set_xlabel("column (px)", fontsize=8)
         axes.set_ylabel("row (px)", fontsize=8)
         axes.tick_params(labelsize=7)
-    figure.colorbar(panels[0][0].images[0], ax=list(panels[0]), label="depth (m)", shrink=0.85)
-    steps, holes = panels[1]
-    for depth, name, colour, marker in zip(
-        (real, simulated), names, (_COLOURS[0], _COLOURS[1]), "ox", strict=True
-    ):
         values = depth[np.isfinite(depth) & (depth > 0.8) & (depth < 1.3)].astype(np.float64)
-        unique = np.unique(np.rint(values * 1000)) / 1000
-        steps.plot(
-            unique[:-1], 1e3 * np.diff(unique), ls="", marker=marker, ms=3, color=colour, label=name
-        )
+        levels = np.unique(np.rint(values * 1000)) / 1000
+        style = {"ls": "", "marker": marker, "ms": 3, "color": colour, "label": name}
+        steps.plot(levels[:-1], 1e3 * np.diff(levels), **style)
+        share = np.histogram(found, bins=bins)[0] / max(len(found), 1)
+        holes.step(bins[:-1] + 0.5, 100 * share, where="mid", color=colour, label=name)
+    figure.colorbar(panels[0][0].images[0], ax=list(panels[0]), label="depth (m)", shrink=0.85)
     z = np.linspace(0.8, 1.3, 50)
     steps.plot(z, 1e3 * z**2 / (8 * 43.5), color=_LAW, label="1/8 px: Z^2 / (8 f B)")
     steps.set(
@@ -283,10 +284,6 @@ def draw_real(
         ylabel="step to the next depth (mm)",
     )
     steps.legend(fontsize=8)
-    bins = np.arange(0.5, 31.5, 1)
-    for found, name, colour in zip(runs, names, (_COLOURS[0], _COLOURS[1]), strict=True):
-        share = np.histogram(found, bins=bins)[0] / max(len(found), 1)
-        holes.step(bins[:-1] + 0.5, 100 * share, where="mid", color=colour, label=name)
     holes.set(xlabel="length of a hole along a row (px)", ylabel="share of all holes (%)")
     holes.legend(fontsize=8)
     save_png(figure, path)

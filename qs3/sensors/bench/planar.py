@@ -11,9 +11,8 @@ from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.bench import metrics
 from qs3.sensors.bench.cached_renderer import StillRenderer
-from qs3.sensors.bench.preset_laws import stated_sigma_m
 from qs3.sensors.bench.subject import Subject
-from qs3.sensors.bench.targets import POSE, TiltedPlane
+from qs3.sensors.bench.targets import ALBEDO, POSE, TiltedPlane
 from qs3.sensors.renderers.base import Renderer
 
 _GOLDEN = (5**0.5 - 1) / 2
@@ -152,6 +151,32 @@ def _part(
         reasons=np.bincount(frame.reason[part][wanted], minlength=32),
         law_m=stated_sigma_m(subject.sensor, plane.depth_m, frame) if facing else None,
     )
+
+
+def stated_sigma_m(sensor: Any, depth_m: float, frame: DepthFrame) -> float | None:
+    """Standard deviation of the depth of a plane that faces the sensor, by the sensor's own law.
+
+    Args:
+        sensor: any; those that state no law give None.
+        depth_m: of the plane, whose albedo is ALBEDO.
+        frame: of that plane, for exposures that no one knows beforehand.
+    """
+    if hasattr(sensor, "noise_law_m"):
+        return float(np.asarray(sensor.noise_law_m(depth_m)))
+    if hasattr(sensor, "distance_sigma_m"):  # time of flight: light falls with the square
+        lamp = sensor.electrons_at_1m * ALBEDO / depth_m**2
+        mean = lamp + sensor.electrons_at_1m * ALBEDO * sensor.ambient
+        return float(sensor.distance_sigma_m(sensor.contrast * lamp, mean))
+    if hasattr(sensor, "depth_sigma_m") and "modulation" in frame.images:  # fringes
+        modulation = float(np.median(frame.images["modulation"]))
+        per_grey = sensor.infrared.electrons_at_white / 255
+        mean_e = float(frame.images["exposures"].mean()) * per_grey
+        shot_and_read = np.sqrt(mean_e + sensor.infrared.read_noise_e**2) / per_grey
+        noise = float(np.hypot(shot_and_read, np.sqrt(1 / 12)))  # and whole grey values
+        return float(sensor.depth_sigma_m(depth_m, noise, modulation))
+    if hasattr(sensor, "noise_sigma_m"):
+        return float(sensor.noise_sigma_m)
+    return None
 
 
 def _summary(

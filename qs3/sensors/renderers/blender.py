@@ -19,8 +19,16 @@ import numpy as np
 
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera
-from qs3.sensors.renderers import blender_devices, memory
-from qs3.sensors.renderers.base import Body, Image, Projector, RendererSettings, Scene, incidence
+from qs3.sensors.renderers import blender_devices
+from qs3.sensors.renderers.base import (
+    Body,
+    Image,
+    Projector,
+    RendererSettings,
+    Scene,
+    give_memory_back,
+    incidence,
+)
 from qs3.sensors.renderers.exr import read_exr
 
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
@@ -123,7 +131,7 @@ class BlenderRenderer:
         finally:
             target.render.use_persistent_data = False
             _remove_everything(bpy)
-            memory.give_back()
+            give_memory_back()
         return images
 
 
