@@ -1,23 +1,29 @@
-"""What every depth sensor is asked for and gives back."""
+"""Depth sensors: what one is asked for, what it gives back, and what all of them share."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
-from qs3.geometry.cameras import Camera, Window, project
-from qs3.sensors.renderers.base import Body, Renderer
+from qs3.geometry.cameras import Camera, Intrinsics, Window, project
+from qs3.sensors.matching import Match
+from qs3.sensors.matching.filters import PostFilter, Quantiser
+from qs3.sensors.matching.triangulation import Triangulation
+from qs3.sensors.optics.visibility import explained, reached_from
+from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
 
 
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
     """One depth image of a part of a scene, on a regular grid of pixels.
 
-    Sample (r, c) belongs to the pixel (u, v) = (left + c * step_px, top + r * step_px) of
-    `camera`: samples are pixels that were really measured, so no shift enters.
+    Sample (r, c) is the pixel (u, v) = (left + c * step_px, top + r * step_px) of `camera`, really
+    measured, so no shift enters.
 
     Attributes:
         camera: where it was taken from.
@@ -26,12 +32,11 @@ class DepthFrame:
         depth_m: [h, w] float32 as measured, NaN where nothing was.
         clean_m: [h, w] float32 true depth at the same pixels, inf where nothing is hit.
         label: [h, w] uint8, Body.label of what is seen, 0 where nothing is.
-        cosine: [h, w] float32, cosine of the angle of incidence on what is seen, 0 where
-            nothing is.
-        reason: [h, w] uint8 `Reason`, why a sample has a depth or none. Shadow and occlusion
-            are told apart from other causes only if the scan was asked to `explain`.
-        images: intermediate pictures by name ("left", "right", "disparity", ...), for
-            looking at; their size is that of the matched canvas, not of `depth_m`.
+        cosine: [h, w] float32 of the angle of incidence, 0 where nothing is.
+        reason: [h, w] uint8 `Reason`. Shadow and occlusion are told apart from other causes only
+            if the scan was asked to `explain`.
+        images: intermediate pictures by name ("left", "right", "disparity", ...), for looking at,
+            of the size of the rendered window.
     """
 
     camera: Camera
@@ -46,14 +51,12 @@ class DepthFrame:
     images: dict[str, np.ndarray] = field(default_factory=dict)
 
     def points(self, depth_m: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
-        """Back-project `depth_m` (self.depth_m or self.clean_m, possibly masked).
+        """Back-project `depth_m` [h, w] (self.depth_m or self.clean_m, possibly masked).
 
-        Args:
-            depth_m: [h, w]; pixels that are not finite are left out.
-            world_from_camera: [4, 4], the pose that is believed: a drifting one or the true.
+        `world_from_camera` [4, 4] is the pose that is believed: a drifting one or the true.
 
         Returns:
-            [M, 3] float64 points in the world, row-major.
+            [M, 3] float64 points in the world, row-major, of the pixels that are finite.
         """
         rows, cols = np.nonzero(np.isfinite(depth_m))
         k = self.camera.intrinsics
@@ -64,8 +67,137 @@ class DepthFrame:
         return local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
 
 
-class DepthSensor(Protocol):
-    """A depth camera that looks at bodies through a renderer."""
+@dataclass(frozen=True)
+class Samples:
+    """Every step-th pixel of every step-th row of a window; `left`, `top` are the first one's."""
+
+    left: int
+    top: int
+    step_px: int
+    grid: tuple[slice, slice]
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        """The samples of an image [h, w] of the window."""
+        return np.ascontiguousarray(image[self.grid])
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A frame in the making: what `DepthSensor.take` works with.
+
+    Attributes:
+        camera: at its true pose, with the window that the box covers.
+        bodies, box_m, renderer, rng, explain: as in `DepthSensor.scan`.
+    """
+
+    camera: Camera
+    bodies: tuple[Body, ...]
+    box_m: np.ndarray
+    renderer: Renderer
+    rng: np.random.Generator
+    explain: bool
+
+    @property
+    def window(self) -> Window:
+        """The pixels that are rendered."""
+        return self.camera.rendered
+
+    def seed(self) -> int:
+        """A seed for the renderer, drawn from `rng`."""
+        return int(self.rng.integers(2**31))
+
+    def image(self, projector: Projector | None = None, ambient: float = 0.0) -> Image:
+        """What the camera sees, with the geometry; draws a seed."""
+        scene = Scene(self.bodies, projector, ambient)
+        (image,) = self.renderer.render(scene, [self.camera], seed=self.seed(), geometry=[True])
+        return image
+
+    def pose_at(self, right_m: float, down_m: float = 0.0) -> np.ndarray:
+        """[4, 4] pose of a device so far from the camera, looking the same way."""
+        return self.camera.moved((right_m, down_m, 0.0)).world_from_camera
+
+    def reached_from(self, world_from_source: np.ndarray) -> np.ndarray:
+        """[h, w] bool: whether a surface is seen, and can be seen from another pose, too."""
+        return reached_from(self.bodies, self.camera, world_from_source, self.renderer)
+
+    def explained(
+        self,
+        reason: np.ndarray,
+        pictures: dict[str, np.ndarray],
+        projector: np.ndarray,
+        other: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Put shadow and occlusion before `reason` where `explain` asks for it.
+
+        Args:
+            reason: [h, w] uint8 of matcher and filters.
+            pictures: with "clean"; gets "lit" and, with another camera, "seen".
+            projector, other: [4, 4] poses of the projector and of the other camera.
+        """
+        if not self.explain:
+            return reason
+        pictures["lit"] = self.reached_from(projector)
+        if other is not None:
+            pictures["seen"] = self.reached_from(other)
+        return explained(reason, pictures["clean"], pictures["lit"], pictures.get("seen"))
+
+    def samples(self, step_px: int = 1, offset_px: int | None = None) -> Samples:
+        """Samples of the window, on one grid over the whole image; see `on_grid`."""
+        window = self.window
+        left, columns = on_grid(window.left, window.width, step_px, offset_px)
+        top, rows = on_grid(window.top, window.height, step_px, offset_px)
+        return Samples(left, top, step_px, (rows, columns))
+
+    def frame(
+        self,
+        depth_m: np.ndarray,
+        reason: np.ndarray,
+        image: Image,
+        pictures: dict[str, np.ndarray],
+        at: Samples | None = None,
+        intrinsics: Intrinsics | None = None,
+    ) -> DepthFrame:
+        """The finished frame of `depth_m` and `reason` at samples, by default of every pixel.
+
+        What is true is read off `image`, which covers the whole window. `intrinsics` are what the
+        device believes of its camera, where that is not the truth.
+        """
+        at = at or self.samples()
+        return DepthFrame(
+            Camera(intrinsics or self.camera.intrinsics, self.camera.world_from_camera),
+            at.left,
+            at.top,
+            at.step_px,
+            depth_m,
+            at.of(image.depth_m),
+            at.of(image.label),
+            at.of(image.cosine),
+            reason,
+            pictures,
+        )
+
+
+@dataclass(frozen=True)
+class DepthSensor(ABC):
+    """A depth camera that looks at bodies through a renderer. A kind of sensor writes `take`.
+
+    Attributes:
+        width_px, height_px, focal_px: of its camera, or of both.
+    """
+
+    width_px: int = 640
+    height_px: int = 480
+    focal_px: float = 580.0
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera's; its principal point is in the middle."""
+        return Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
+
+    @property
+    def margin_px(self) -> int:
+        """Pixels around a box that have an influence on what is measured in it."""
+        return 0
 
     def scan(
         self,
@@ -91,15 +223,68 @@ class DepthSensor(Protocol):
         Returns:
             The frame, or None if the box is outside the view.
         """
-        ...
+        whole = Camera(self.intrinsics, world_from_camera)
+        window = window_of(box_m, whole, margin_px=self.margin_px)
+        if window is None:
+            return None
+        camera = Camera(self.intrinsics, world_from_camera, window)
+        return self.take(Shot(camera, bodies, box_m, renderer, rng, explain))
+
+    @abstractmethod
+    def take(self, shot: Shot) -> DepthFrame | None:
+        """Render, expose and measure; None if the box is outside another camera's view."""
+
+
+@dataclass(frozen=True)
+class TriangulatingSensor(DepthSensor):
+    """A sensor whose depth is f b / disparity.
+
+    Attributes:
+        baseline_m: b, to the right of the camera unless the sensor says otherwise.
+        min_depth_m, max_depth_m: depths outside are dropped.
+        quantiser: step of the disparity.
+        filters: applied to the disparity in this order, before the quantiser.
+    """
+
+    baseline_m: float = 0.075
+    min_depth_m: float = 0.7
+    max_depth_m: float = 6.0
+    quantiser: Quantiser = field(default_factory=Quantiser)
+    filters: tuple[PostFilter, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "sensor.", baseline_m="> 0")
+        check_depths(self)
+
+    @property
+    def zero_disparity_px(self) -> float:
+        """Disparity f b / Z of a point that the matcher gives 0: 0 for two parallel cameras."""
+        return 0.0
+
+    @property
+    def steps_per_px(self) -> int:
+        """Steps of the disparity; 0 where it is not quantised."""
+        return self.quantiser.steps_per_px
+
+    def depth_step_m(self, depth_m: float) -> float:
+        """Depth that one step of the disparity makes: Z^2 / (steps f b); 0 without steps."""
+        steps = self.steps_per_px
+        return depth_m**2 / (steps * self.focal_px * self.baseline_m) if steps else 0.0
+
+    def depth_of(self, match: Match) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Depth, disparity and reason [h, w]; see `Triangulation.depth`."""
+        lens = Triangulation(
+            self.focal_px,
+            self.baseline_m,
+            self.zero_disparity_px,
+            self.min_depth_m,
+            self.max_depth_m,
+        )
+        return lens.depth(match, self.quantiser, self.filters)
 
 
 def check_depths(sensor: Any) -> None:
-    """Check the nearest and the farthest depth that a sensor gives.
-
-    Raises:
-        ConfigError: not 0 < min_depth_m < max_depth_m.
-    """
+    """Raise ConfigError unless 0 < min_depth_m < max_depth_m."""
     if not 0 < sensor.min_depth_m < sensor.max_depth_m:
         raise ConfigError(
             "sensor.min_depth_m and max_depth_m must satisfy 0 < min < max, got "
@@ -108,14 +293,7 @@ def check_depths(sensor: Any) -> None:
 
 
 def window_of(box_m: np.ndarray, camera: Camera, *, margin_px: int = 0) -> Window | None:
-    """The pixels that an axis-aligned box covers, clipped to the image.
-
-    Args:
-        box_m: [2, 3] lowest and highest corner in the world.
-
-    Returns:
-        None if no part of the box is in front of the camera and inside the image.
-    """
+    """The pixels of the image that a box [2, 3] of the world covers; None if there are none."""
     corners = np.stack(np.meshgrid(*box_m.T, indexing="ij"), axis=-1).reshape(8, 3)
     pixels, depth = project(corners, camera)
     k = camera.intrinsics
@@ -133,11 +311,12 @@ def window_of(box_m: np.ndarray, camera: Camera, *, margin_px: int = 0) -> Windo
     return Window(left, top, right - left + 1, bottom - top + 1)
 
 
-def on_grid(start: int, count: int, step: int) -> tuple[int, slice]:
+def on_grid(start: int, count: int, step: int, offset: int | None = None) -> tuple[int, slice]:
     """Every step-th of `count` pixels from `start`, on a grid that does not depend on them.
 
     Returns:
-        The first pixel x >= start with x % step == step // 2, and the slice of the pixels.
+        The first pixel x >= start with x % step == offset (default: step // 2), and the pixels'
+        slice.
     """
-    first = start + (step // 2 - start) % step
+    first = start + ((step // 2 if offset is None else offset) - start) % step
     return first, slice(first - start, count, step)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
+
+import numpy as np
 
 
 class Reason(IntEnum):
@@ -34,3 +37,9 @@ class Reason(IntEnum):
     RANGE = 9
     FILTERED = 10
     UNMATCHED = 11
+
+
+def first_reason(causes: Mapping[Reason, np.ndarray], otherwise: Reason) -> np.ndarray:
+    """[h, w] uint8: of each pixel the first reason whose mask [h, w] holds, else `otherwise`."""
+    reasons = [np.uint8(reason) for reason in causes]
+    return np.select(list(causes.values()), reasons, np.uint8(otherwise)).astype(np.uint8)

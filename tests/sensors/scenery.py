@@ -21,6 +21,16 @@ def square(depth_m, half_m=0.3, albedo=0.8):
     return rectangle(depth_m, -half_m, half_m, -half_m, half_m, albedo)
 
 
+def plane(depth_m, half_m=0.5, tilt_deg=0.0):
+    """A square in front of the camera, turned about the vertical axis."""
+    angle = np.deg2rad(tilt_deg)
+    side = np.array([np.sin(angle), np.cos(angle), 0.0]) * half_m
+    up = np.array([0.0, 0.0, half_m])
+    centre = np.array([depth_m, 0.0, 0.0])
+    vertices = [centre - side - up, centre + side - up, centre + side + up, centre - side + up]
+    return Body(Mesh(np.array(vertices), np.array([[0, 1, 2], [0, 2, 3]])))
+
+
 def box_of(*bodies):
     vertices = np.concatenate([body.mesh.vertices for body in bodies])
     return np.stack([vertices.min(axis=0), vertices.max(axis=0)])

@@ -42,28 +42,27 @@ class Verdict:
         return self.value is not None and self.low <= self.value <= self.high
 
 
+_Band = tuple[str, str, float, float, float | None]
+"""A `Verdict` but for the sensor."""
+
+
 def judge(result: SensorResult) -> list[Verdict]:
     """All bands that apply to a sensor."""
-    name, subject = result.subject.name, result.subject
-    out: list[Verdict] = []
-    if subject.focal_baseline is not None:
+    name = result.subject.name
+    out: list[_Band] = []
+    if result.subject.focal_baseline is not None:
         p, _ = exponent(result)
-        out.append(
-            Verdict(name, "sigma_Z grows as Z^p, p in 1.8 to 2.2", f"p = {p:.2f}", 1.8, 2.2, p)
-        )
-        out += _bias(result)
-        out += _levels(result)
+        out.append(("sigma_Z grows as Z^p, p in 1.8 to 2.2", f"p = {p:.2f}", 1.8, 2.2, p))
+        out += _bias(result) + _levels(result)
     if name.startswith("kinect_v1"):
         out += _nguyen(result)
     if "d4" in name:
         out += _d400(result)
-    out += _own_law(result)
-    out += _fill(result)
-    out += _edge(result)
-    return out
+    out += _own_law(result) + _fill(result) + _edge(result)
+    return [Verdict(name, *band) for band in out]
 
 
-def _own_law(result: SensorResult) -> list[Verdict]:
+def _own_law(result: SensorResult) -> list[_Band]:
     """Within 10 % of what the sensor states, at the distance where it is farthest from it."""
     worst: tuple[float, float, float, float] | None = None
     for m in result.facing():
@@ -78,7 +77,7 @@ def _own_law(result: SensorResult) -> list[Verdict]:
     ratio, depth, sigma, law = worst
     text = f"{1e3 * sigma:.2f} mm against {1e3 * law:.2f} mm at {depth:g} m, the worst"
     band = "sigma_Z within 10 % of the sensor's own law at every distance"
-    return [Verdict(result.subject.name, band, text, 0.9, 1.1, ratio)]
+    return [(band, text, 0.9, 1.1, ratio)]
 
 
 def exponent(result: SensorResult) -> tuple[float, float]:
@@ -88,24 +87,23 @@ def exponent(result: SensorResult) -> tuple[float, float]:
     return metrics.power_law(depth, np.array([m["sigma_m"] for m in facing]))
 
 
-def _bias(result: SensorResult) -> list[Verdict]:
+def _bias(result: SensorResult) -> list[_Band]:
     """Pooled over phases: 0.02 px for a D400, else a quarter of a step of the disparity."""
-    name, subject = result.subject.name, result.subject
     facing = [m for m in result.facing() if m["bias_px"] is not None]
     worst = max(facing, key=lambda m: abs(m["bias_px"]), default=None)
     if worst is None:
-        return [Verdict(name, "median bias", "nothing measured", 0, 0, None)]
-    if "d4" in name:
+        return [("median bias", "nothing measured", 0, 0, None)]
+    if "d4" in result.subject.name:
         limit = 0.02
         band = "median bias under 0.02 px at every distance"
     else:
-        limit = 0.25 / (subject.steps_per_px or 16)
+        limit = 0.25 / (result.subject.steps_per_px or 16)
         band = f"median bias under a quarter of a step ({limit:.4f} px) at every distance"
     text = f"{worst['bias_px']:+.4f} px at {worst['condition']['depth_m']:g} m"
-    return [Verdict(name, band, text, -limit, limit, worst["bias_px"])]
+    return [(band, text, -limit, limit, worst["bias_px"])]
 
 
-def _levels(result: SensorResult) -> list[Verdict]:
+def _levels(result: SensorResult) -> list[_Band]:
     """As many distinct depths as the quantiser has steps; coarse ones only, where all occur."""
     subject = result.subject
     if not subject.steps_per_px:
@@ -114,11 +112,11 @@ def _levels(result: SensorResult) -> list[Verdict]:
     wanted = sum(m.get("levels_expected", 0) for m in result.facing())
     band = f"distinct depth levels as 1/{subject.steps_per_px} px predicts"
     text = f"{found} of {wanted} over {len(result.facing())} distances"
-    return [Verdict(subject.name, band, text, wanted, wanted, found)]
+    return [(band, text, wanted, wanted, found)]
 
 
-def _nguyen(result: SensorResult) -> list[Verdict]:
-    out = []
+def _nguyen(result: SensorResult) -> list[_Band]:
+    out: list[_Band] = []
     by_depth = {m["condition"]["depth_m"]: m for m in result.facing()}
     for depth in NGUYEN_DEPTHS_M:
         m = by_depth.get(depth)
@@ -127,11 +125,11 @@ def _nguyen(result: SensorResult) -> list[Verdict]:
         ratio = None if sigma is None else sigma / law
         text = "-" if ratio is None else f"{1e3 * law * ratio:.2f} mm, {ratio - 1:+.0%}"
         band = f"sigma_Z at {depth:g} m within 30 % of Nguyen's {1e3 * law:.2f} mm"
-        out.append(Verdict(result.subject.name, band, text, 0.7, 1.3, ratio))
+        out.append((band, text, 0.7, 1.3, ratio))
     return out
 
 
-def _d400(result: SensorResult) -> list[Verdict]:
+def _d400(result: SensorResult) -> list[_Band]:
     low, high = laws.D400_BAND_PX
     values = [m["subpixel_rms_px"] for m in result.facing()]
     good = [v for v in values if v is not None]
@@ -140,22 +138,21 @@ def _d400(result: SensorResult) -> list[Verdict]:
     # The value farthest from the middle of the band decides.
     middle = (low + high) / 2
     worst = max(good, key=lambda v: abs(v - middle)) if len(good) == len(values) else None
-    return [Verdict(result.subject.name, band, text, low, high, worst)]
+    return [(band, text, low, high, worst)]
 
 
-def _fill(result: SensorResult) -> list[Verdict]:
-    name = result.subject.name
+def _fill(result: SensorResult) -> list[_Band]:
     both = result.tilted(True) + result.tilted(False)
     gentle = result.facing() + [m for m in both if m["condition"]["tilt_deg"] <= 45]
     worst = min(gentle, key=lambda m: m["fill"])
     where = f"{worst['condition']['depth_m']:g} m, {worst['condition']['tilt_deg']:g} deg"
     text = f"at least {worst['fill']:.1%} ({where})"
-    return [Verdict(name, "fill above 95 % up to 45 degrees", text, 0.95, 1.0, worst["fill"])]
+    return [("fill above 95 % up to 45 degrees", text, 0.95, 1.0, worst["fill"])]
 
 
-def _edge(result: SensorResult) -> list[Verdict]:
-    name, m = result.subject.name, result.edge
-    out = []
+def _edge(result: SensorResult) -> list[_Band]:
+    m = result.edge
+    out: list[_Band] = []
     for who, what in (("camera", "camera shadow"), ("projector", "projector shadow")):
         if f"{who}_left_px" not in m or m.get(f"{who}_expected_px") is None:
             continue
@@ -168,7 +165,7 @@ def _edge(result: SensorResult) -> list[Verdict]:
         text = f"{on:.1f} px {side}, {off:.1f} px on the other side"
         band = f"{what} {wide:.1f} px {side} of the square, within 2 px"
         worst = max(abs(on - wide), off)
-        out.append(Verdict(name, band, text, 0.0, 2.0, worst))
+        out.append((band, text, 0.0, 2.0, worst))
     half = m.get("half_window_px")
     if half and m.get("fattening_right_px") is not None:
         right, wall = m["fattening_right_px"], m["wall_right_px"]
@@ -176,7 +173,7 @@ def _edge(result: SensorResult) -> list[Verdict]:
         text = f"square ends {right:+.0f} px, wall begins {begins}"
         band = f"open edge blurred by no more than half a window ({half:.1f} px) and 1 px"
         worst_px = max(abs(right), abs(wall if wall is not None else np.inf))
-        out.append(Verdict(name, band, text, 0.0, half + 1, worst_px))
+        out.append((band, text, 0.0, half + 1, worst_px))
     return out
 
 

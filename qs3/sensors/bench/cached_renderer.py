@@ -9,11 +9,11 @@ from qs3.sensors.renderers.base import Image, Renderer, Scene
 
 
 class StillRenderer:
-    """Renders what it has not rendered yet, always with one seed.
+    """Renders what it has not rendered yet, always with one seed; use one for each scene.
 
-    Anti-aliasing draws its samples from the seed of a frame. Over a still scene a device has
-    noise of its sensor only, so the frames of one scene must share their samples. Use one for
-    each scene: frames are told apart by the number of the call since `rewind`.
+    Anti-aliasing draws its samples from the seed of a frame. Over a still scene a device has noise
+    of its sensor only, so the frames of one scene must share their samples: they are told apart by
+    the number of the call since `rewind`.
     """
 
     def __init__(self, renderer: Renderer, seed: int = 0) -> None:

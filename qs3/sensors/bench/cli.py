@@ -34,14 +34,14 @@ def _bench(
     with progress_bar("conditions", total=total) as advance:
         results = [runner.run(*subject, renderer, cache, plan, advance) for subject in subjects]
     captions = figures.draw_all(results, folder)
-    beside = None
+    compared = None
     for subject, config in subjects:
         if real is not None and subject.name == "kinect_v1":
             figure = folder / comparison.FIGURE
-            beside = comparison.compare(subject, config, renderer, cache, figure, Path(real))
+            compared = comparison.compare(subject, config, renderer, cache, figure, Path(real))
     shown = [word for word in line.split() if not word.startswith(("out=", "real="))]
     detail = ", ".join(f"{k} {v}" for k, v in renderer.provenance().items())
-    said = page.page(results, captions, beside, plan, " ".join(shown), detail)
+    said = page.page(results, captions, compared, plan, " ".join(shown), detail)
     write_text(folder / "index.md", said)
     write_text(folder / "planes.csv", page.csv_text(results))
     write_json(folder / "settings.json", {subject.name: config for subject, config in subjects})
@@ -61,7 +61,7 @@ BENCH = Command(
         Option("quick", FLAG, "few conditions: seconds a sensor", False),
         Option("samples", whole(), "a pixel", 16),
         Option("out", text("FOLDER"), "of the page, its figures and all numbers", "out/bench"),
-        Option("real", text("FOLDER"), "of a real Kinect's clouds (.pcd), set beside kinect_v1"),
+        Option("real", text("FOLDER"), "of a real Kinect's clouds (.pcd), for kinect_v1"),
     ),
     (
         "qs3 bench",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +16,6 @@ from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.tabletop import Tabletop
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.files import write_json
-
-log = logging.getLogger(__name__)
 
 FIGURE = "real.png"
 
@@ -50,11 +46,7 @@ class Comparison:
 
 
 def real_clouds(folder: Path) -> list[Path]:
-    """The files, by name.
-
-    Raises:
-        MissingDataError: they are not here.
-    """
+    """The .pcd files in a folder, by name; MissingDataError if there are none."""
     found = sorted(folder.glob("*.pcd"))
     if not found:
         raise MissingDataError(
@@ -71,7 +63,6 @@ def compare(
     figure: Path | None,
     folder: Path,
     scenes: int = 8,
-    advance: Callable[[], None] = lambda: None,
 ) -> Comparison:
     """Measure all real clouds and as many simulated ones.
 
@@ -82,27 +73,25 @@ def compare(
         figure: where the picture goes; None draws none.
         folder: of the real clouds.
         scenes: how many are simulated.
-        advance: called after each simulated scene.
     """
     real_images = [real.read_cloud(path) for path in real_clouds(folder)]
     table = Tabletop()
     key = fingerprint(config, renderer.provenance(), repr(table), scenes)
     path = cache / subject.name / f"tabletop-{key[:12]}.json"
-    images = path.with_suffix(".npz")
-    found = read_cached(path)
-    if found is None or not images.is_file():
+    kept = path.with_suffix(".npz")
+    if read_cached(path) is None or not kept.is_file():
         depths = []
         for seed in range(scenes):
             depths.append(table.scan(subject, renderer, seed))
-            advance()
-        images.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(images, depth_m=np.stack(depths))
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(kept, depth_m=np.stack(depths))
         write_json(path, {"scenes": scenes})
-    with np.load(images) as file:
+    with np.load(kept) as file:
         simulated = list(file["depth_m"])
-    statistics = [[real.statistics(d) for d in group] for group in (real_images, simulated)]
+    images = (real_images, simulated)
+    numbers = [[real.statistics(depth) for depth in group] for group in images]
     if figure is not None:
-        runs = [np.concatenate([s.runs_px for s in group]) for group in statistics]
+        runs = [np.concatenate([found[1] for found in group]) for group in numbers]
         draw_real(real_images[0], simulated[0], (runs[0], runs[1]), figure)
-    as_dicts = [[s.as_dict() for s in group] for group in statistics]
-    return Comparison(subject.name, as_dicts[0], as_dicts[1])
+    found_real, found_simulated = ([found[0] for found in group] for group in numbers)
+    return Comparison(subject.name, found_real, found_simulated)

@@ -6,6 +6,7 @@ and lateral noise on the disparity map (the depth image of a sensor without one)
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -57,7 +58,7 @@ def measure(
     """Render and measure; see the module.
 
     Returns:
-        Widths in px, `*_expected_px` beside them. Of each side of the square: `fattening`, by
+        Widths in px, next to them `*_expected_px`. Of each side of the square: `fattening`, by
         how much near depths reach beyond it; `wall`, where the wall's depth begins (both are
         about half a window at most where nothing is hidden); `lateral`, the noise of the edge.
     """
@@ -66,9 +67,7 @@ def measure(
     depth_ratio = 1 / condition.near_m - 1 / condition.far_m
     shadow = 0.0 if fb is None else fb * depth_ratio
     around = int(np.ceil(shadow)) + subject.margin_px + 20
-    widths: dict[str, list[np.ndarray]] = {"camera": [], "projector": [], "hole": []}
-    sides: dict[str, list[np.ndarray]] = {s: [] for s in SIDES}
-    wall: dict[str, list[np.ndarray]] = {s: [] for s in SIDES}
+    widths, sides, wall = (defaultdict(list) for _ in range(3))
     for i in range(condition.frames):
         place = ((i + 0.5) / condition.frames + 0.13, (0.37 * i) % 1)
         target = SquareBeforeWall(condition.near_m, condition.far_m, condition.half_px, place)
@@ -89,9 +88,8 @@ def measure(
             wall[side].append(far)
     out: dict[str, Any] = {"condition": asdict(condition), "baseline_shadow_px": shadow}
     for key, found in widths.items():
-        if found:
-            left, right = np.concatenate(found).mean(axis=0)
-            out[f"{key}_left_px"], out[f"{key}_right_px"] = float(left), float(right)
+        left, right = np.concatenate(found).mean(axis=0)
+        out[f"{key}_left_px"], out[f"{key}_right_px"] = float(left), float(right)
     if fb is not None:
         out["camera_expected_px"] = shadow
     source_m = subject.source_m(cameras=2 if "camera_left_px" in out else 1)
@@ -116,7 +114,7 @@ def _full(frame: DepthFrame, fb: float | None, subject: Subject) -> tuple[np.nda
 
 
 def _shadow(clean: np.ndarray, dark: np.ndarray, middle_m: float) -> np.ndarray:
-    """[rows, 2] dark pixels of the wall beside the square, left and right of it.
+    """[rows, 2] dark pixels of the wall, left and right of the square.
 
     Counted in the rows of the square's inner half, up to the next 5 pixels that are not dark.
     """
@@ -150,9 +148,8 @@ def _around(
     """What is measured across one side of the square, for each row or column of it.
 
     Returns:
-        [N] px by which near depths reach beyond the true edge, positive outwards; [N] px
-        from the edge to the first five pixels in a row that have the wall's depth. NaN where
-        there is no such thing.
+        [N] px by which near depths reach beyond the true edge, positive outwards; [N] px from the
+        edge to the first five pixels in a row that have the wall's depth. NaN where there is none.
     """
     true, found = (a.T if side in ("top", "bottom") else a for a in (clean, depth))
     if side in ("left", "top"):

@@ -1,4 +1,4 @@
-"""Published laws of the noise of real depth cameras, to lay beside ours. Depths in metres.
+"""Published laws of the noise of real depth cameras, to compare ours with. Depths in metres.
 
 Only formulas and constants; each function names where they come from.
 """
@@ -41,11 +41,6 @@ def nguyen_lateral_px(angle_deg: float) -> float:
 def khoshelham_m(depth_m: np.ndarray | float) -> np.ndarray:
     """Random error of Kinect v1: 1.425e-6 Z^2 with Z in mm (Khoshelham and Elberink 2012)."""
     return 1.425e-3 * np.asarray(depth_m, dtype=np.float64) ** 2
-
-
-def kinect_step_m(depth_m: np.ndarray | float) -> np.ndarray:
-    """Depth step of Kinect v1, twice the random error (same paper): 2.85e-6 Z^2 in mm."""
-    return 2 * khoshelham_m(depth_m)
 
 
 def kotsonis_d435_m(depth_m: np.ndarray | float) -> np.ndarray:

@@ -56,11 +56,11 @@ class PlaneFit:
 def fit_plane(
     depth_m: np.ndarray, x: np.ndarray, y: np.ndarray, focal_baseline: float | None
 ) -> PlaneFit:
-    """Total least squares through the points of a depth image.
+    """Total least squares through [N] points of a depth image.
 
     Args:
-        depth_m: [N] metres along the optical axis, finite.
-        x, y: [N] tangents of the rays, (u - cx) / f and (v - cy) / f.
+        depth_m: metres along the optical axis, finite.
+        x, y: tangents of the rays, (u - cx) / f and (v - cy) / f.
         focal_baseline: f B in px m; None for sensors that do not triangulate.
     """
     if len(depth_m) < 10:
@@ -105,11 +105,10 @@ def expected_levels(low_px: float, high_px: float, steps_per_px: int, offset_px:
 
 
 def locking_px(phase: np.ndarray, error_px: np.ndarray) -> float:
-    """Amplitude of the first harmonic of the disparity's error over the sub-pixel phase.
+    """Amplitude of the first harmonic of the error of the disparity over its sub-pixel phase.
 
-    Args:
-        phase: [N] fraction of the true disparity, 0..1, spread evenly.
-        error_px: [N] error there.
+    `phase` [N] is the fraction of the true disparity, 0..1, spread evenly; `error_px` [N] may be
+    NaN.
     """
     good = np.isfinite(error_px)
     if good.sum() < 4:

@@ -7,6 +7,7 @@ from typing import Any
 
 from qs3.sensors.bench import bands, laws
 from qs3.sensors.bench.comparison import Comparison
+from qs3.sensors.bench.edges import SIDES
 from qs3.sensors.bench.runner import Plan, SensorResult
 from qs3.utils import text_table
 
@@ -93,158 +94,123 @@ def _verdicts(verdicts: Sequence[bands.Verdict]) -> str:
     return text + _table(("sensor", "band", "measured", ""), rows)
 
 
+# Header, key of a result, format, factor.
+_Column = tuple[str, str, str, float]
+_FILL: _Column = ("fill %", "fill", ".1f", 100)
+_NOISE: tuple[_Column, ...] = (
+    ("sigma_Z mm", "sigma_m", ".2f", 1e3),
+    ("bias mm", "bias_m", "+.2f", 1e3),
+)
+_PLANE: tuple[_Column, ...] = (
+    ("plane fit mm", "plane_rms_m", ".2f", 1e3),
+    ("sub-pixel RMS px", "subpixel_rms_px", ".3f", 1),
+)
+_FACING: tuple[_Column, ...] = (
+    _FILL,
+    *_NOISE,
+    ("bias px", "bias_px", "+.4f", 1),
+    *_PLANE,
+    ("over time 1/1000", "temporal", ".2f", 1e3),
+    ("locking px", "locking_px", ".3f", 1),
+)
+_LAW: tuple[_Column, ...] = (("own law mm", "law_m", ".2f", 1e3),)
+_TILTED: tuple[_Column, ...] = (
+    _FILL,
+    *_NOISE,
+    *_PLANE,
+    ("off by > 1 px, %", "outliers", ".2f", 100),
+)
+
+
+def _cells(m: dict[str, Any], columns: Sequence[_Column]) -> list[str]:
+    return [_number(m.get(key), form, factor) for _, key, form, factor in columns]
+
+
+def _heads(columns: Sequence[_Column]) -> list[str]:
+    return [column[0] for column in columns]
+
+
 def _distances(results: Sequence[SensorResult]) -> str:
     rows = []
     for result in results:
         for m in result.facing():
             expected = m.get("levels_expected")
-            rows.append(
-                (
-                    result.subject.name,
-                    f"{m['condition']['depth_m']:g}",
-                    _number(m["fill"], ".1f", 100),
-                    _number(m["sigma_m"], ".2f", 1e3),
-                    _number(m["bias_m"], "+.2f", 1e3),
-                    _number(m.get("bias_px"), "+.4f"),
-                    _number(m["plane_rms_m"], ".2f", 1e3),
-                    _number(m.get("subpixel_rms_px")),
-                    _number(m.get("temporal"), ".2f", 1e3),
-                    _number(m.get("locking_px")),
-                    f"{m['levels']} / {expected}" if expected else "-",
-                    _number(m.get("law_m"), ".2f", 1e3),
-                )
-            )
-    header = (
-        "sensor",
-        "Z m",
-        "fill %",
-        "sigma_Z mm",
-        "bias mm",
-        "bias px",
-        "plane fit mm",
-        "sub-pixel RMS px",
-        "over time 1/1000",
-        "locking px",
-        "levels",
-        "own law mm",
-    )
+            levels = f"{m['levels']} / {expected}" if expected else "-"
+            place = [result.subject.name, f"{m['condition']['depth_m']:g}"]
+            rows.append([*place, *_cells(m, _FACING), levels, *_cells(m, _LAW)])
+    header = ["sensor", "Z m", *_heads(_FACING), "levels", *_heads(_LAW)]
     return "## Planes that face the camera\n\n" + _table(header, rows)
 
 
 def _tilts(results: Sequence[SensorResult]) -> str:
-    drops, rows = [], []
-    for result in results:
-        subject = result.subject
-        across = result.tilted(True)
-        if not across:
-            continue
-        depth = across[0]["condition"]["depth_m"]
-        predicted = ["-", "-"]
-        if subject.window_px and subject.baseline_m:
-            predicted = [
-                f"{laws.ramp_angle_deg(subject.window_px, subject.baseline_m, depth, n):.0f}"
-                for n in (1, 2)
-            ]
-        measured = []
-        for direction in (True, False):
-            angle = bands.drop(result, direction)
-            last = max(m["condition"]["tilt_deg"] for m in across)
-            if angle is None:
-                measured.append(f"not up to {last:g}")
-            elif subject.window_px and subject.baseline_m:
-                ramp = laws.ramp_px(subject.window_px, subject.baseline_m, depth, angle)
-                measured.append(f"{angle:.0f} ({ramp:.1f} px)")
-            else:
-                measured.append(f"{angle:.0f}")
-        window = "-" if subject.window_px is None else str(subject.window_px)
-        drops.append((subject.name, f"{depth:g}", window, *predicted, *measured))
-        for direction, word in ((True, "along"), (False, "across")):
-            for m in result.tilted(direction)[1:]:
-                rows.append(
-                    (
-                        subject.name,
-                        word,
-                        f"{m['condition']['tilt_deg']:g}",
-                        _number(m["fill"], ".1f", 100),
-                        _number(m["sigma_m"], ".2f", 1e3),
-                        _number(m["bias_m"], "+.2f", 1e3),
-                        _number(m["plane_rms_m"], ".2f", 1e3),
-                        _number(m.get("subpixel_rms_px")),
-                        _number(m.get("outliers"), ".2f", 100),
-                    )
-                )
+    results = [result for result in results if result.tilted(True)]
+    rows = [
+        [result.subject.name, word, f"{m['condition']['tilt_deg']:g}", *_cells(m, _TILTED)]
+        for result in results
+        for across, word in ((True, "along"), (False, "across"))
+        for m in result.tilted(across)[1:]
+    ]
     text = (
         "## Tilted planes\n\nA window of w px on a plane tilted by theta sees a ramp of "
         "w B tan(theta) / Z px of disparity, whichever way the plane recedes; where it reaches "
         "one to two pixels no single shift fits it. At the same time a dot's radiance falls "
-        "with cos(theta) and it is foreshortened, so contrast goes too. In degrees, beside "
+        "with cos(theta) and it is foreshortened, so contrast goes too. In degrees, next to "
         "where fill falls below 95 % and the ramp there:\n\n"
     )
-    header = (
-        "sensor",
-        "Z m",
-        "window px",
-        "1 px ramp",
-        "2 px ramp",
-        "fill < 95 %: along",
-        "across",
-    )
-    text += _table(header, drops)
-    text += "\n" + _table(
-        (
-            "sensor",
-            "recedes",
-            "tilt",
-            "fill %",
-            "sigma_Z mm",
-            "bias mm",
-            "plane fit mm",
-            "sub-pixel RMS px",
-            "off by > 1 px, %",
-        ),
-        rows,
-    )
-    return text
+    text += _table(_DROP_HEADER, [_drop_row(result) for result in results])
+    return text + "\n" + _table(["sensor", "recedes", "tilt", *_heads(_TILTED)], rows)
+
+
+_DROP_HEADER = (
+    "sensor", "Z m", "window px", "1 px ramp", "2 px ramp", "fill < 95 %: along", "across"
+)  # fmt: skip
+
+
+def _drop_row(result: SensorResult) -> list[str]:
+    """Where a window should fail on tilted planes, and where fill falls below 95 %."""
+    subject, across = result.subject, result.tilted(True)
+    window, baseline = subject.window_px, subject.baseline_m
+    depth = across[0]["condition"]["depth_m"]
+    predicted = ["-", "-"]
+    if window and baseline:
+        angles = [laws.ramp_angle_deg(window, baseline, depth, ramp) for ramp in (1, 2)]
+        predicted = [f"{angle:.0f}" for angle in angles]
+    measured = []
+    for direction in (True, False):
+        angle = bands.drop(result, direction)
+        if angle is None:
+            measured.append(f"not up to {max(m['condition']['tilt_deg'] for m in across):g}")
+        elif window and baseline:
+            ramp = laws.ramp_px(window, baseline, depth, angle)
+            measured.append(f"{angle:.0f} ({ramp:.1f} px)")
+        else:
+            measured.append(f"{angle:.0f}")
+    wide = "-" if window is None else str(window)
+    return [subject.name, f"{depth:g}", wide, *predicted, *measured]
+
+
+_EDGE_HEADER = (
+    "sensor",
+    "Z m",
+    "camera shadow px: left / right (expected)",
+    "projector shadow px",
+    "half window px",
+    "square reaches beyond px (l / r / t / b)",
+    "wall begins px",
+    "lateral noise px",
+)
 
 
 def _edges(results: Sequence[SensorResult]) -> str:
     rows = []
     for result in results:
-        m = result.edge
-        c = m["condition"]
-        shadow = []
-        for who in ("camera", "projector"):
-            if f"{who}_left_px" not in m:
-                shadow.append("-")
-                continue
-            expected = m.get(f"{who}_expected_px")
-            wanted = "?" if expected is None else f"{expected:.1f} / 0"
-            shadow.append(f"{m[f'{who}_left_px']:.1f} / {m[f'{who}_right_px']:.1f} ({wanted})")
-        rows.append(
-            (
-                result.subject.name,
-                f"{c['near_m']:g}, {c['far_m']:g}",
-                *shadow,
-                _number(m.get("half_window_px"), ".1f"),
-                *(
-                    " / ".join(
-                        _number(m[f"{key}_{side}_px"], form)
-                        for side in ("left", "right", "top", "bottom")
-                    )
-                    for key, form in (("fattening", "+.0f"), ("wall", ".0f"), ("lateral", ".2f"))
-                ),
-            )
-        )
-    header = (
-        "sensor",
-        "Z m",
-        "camera shadow px: left / right (expected)",
-        "projector shadow px",
-        "half window px",
-        "square reaches beyond px (l / r / t / b)",
-        "wall begins px",
-        "lateral noise px",
-    )
+        m, c = result.edge, result.edge["condition"]
+        row = [result.subject.name, f"{c['near_m']:g}, {c['far_m']:g}"]
+        row += [_shadow(m, who) for who in ("camera", "projector")]
+        row.append(_number(m.get("half_window_px"), ".1f"))
+        for key, form in (("fattening", "+.0f"), ("wall", ".0f"), ("lateral", ".2f")):
+            row.append(" / ".join(_number(m[f"{key}_{side}_px"], form) for side in SIDES))
+        rows.append(row)
     text = (
         "## A square before a wall\n\nShadows are measured on who sees and who lights the wall "
         "and expected as f B (1/Zf - 1/Zb), for a projector with its own distance from the "
@@ -255,7 +221,15 @@ def _edges(results: Sequence[SensorResult]) -> str:
         f"is hidden (right, top, bottom). Nguyen's lateral noise is "
         f"{laws.nguyen_lateral_px(0):.1f} px.\n\n"
     )
-    return text + _table(header, rows)
+    return text + _table(_EDGE_HEADER, rows)
+
+
+def _shadow(m: dict[str, Any], who: str) -> str:
+    if f"{who}_left_px" not in m:
+        return "-"
+    expected = m.get(f"{who}_expected_px")
+    wanted = "?" if expected is None else f"{expected:.1f} / 0"
+    return f"{m[f'{who}_left_px']:.1f} / {m[f'{who}_right_px']:.1f} ({wanted})"
 
 
 _REAL_ROWS: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
@@ -281,7 +255,7 @@ def _real(comparison: Comparison) -> str:
             cells.append(f"{form(mid)} ({form(low)} to {form(high)})")
         rows.append(cells)
     text = (
-        "## Beside real clouds\n\n"
+        "## Next to real clouds\n\n"
         f"{len(comparison.real)} **real** clouds of a Kinect v1 (boxes and cups on a table, BSD-3; "
         "moved to the colour camera and cut to the table by those who made them) and "
         f"{len(comparison.simulated)} **simulated** ones by `{comparison.sensor}`: a table, boxes "
@@ -289,41 +263,23 @@ def _real(comparison: Comparison) -> str:
         "the same way. Median, and range over the clouds.\n\n"
     )
     text += _table(("", "REAL Kinect v1", f"SIMULATED {comparison.sensor}"), rows)
-    return text + f"\n![real beside simulated]({comparison.figure})\n"
+    return text + f"\n![real and simulated]({comparison.figure})\n"
+
+
+_CSV_KEYS = (
+    "pixels", "fill", "sigma_m", "bias_m", "accuracy", "plane_rms_m", "subpixel_rms_px", "sigma_px",
+    "bias_px", "outliers", "temporal", "locking_px", "levels", "levels_expected", "law_m",
+)  # fmt: skip
 
 
 def csv_text(results: Sequence[SensorResult]) -> str:
     """All numbers of the plane bench, one row a condition."""
-    keys = (
-        "pixels",
-        "fill",
-        "sigma_m",
-        "bias_m",
-        "accuracy",
-        "plane_rms_m",
-        "subpixel_rms_px",
-        "sigma_px",
-        "bias_px",
-        "outliers",
-        "temporal",
-        "locking_px",
-        "levels",
-        "levels_expected",
-        "law_m",
-    )
-    rows: list[list[Any]] = [["sensor", "depth_m", "tilt_deg", "recedes", *keys]]
+    rows: list[list[Any]] = [["sensor", "depth_m", "tilt_deg", "recedes", *_CSV_KEYS]]
     for result in results:
         for m in result.planes:
             c = m["condition"]
             word = "" if c["tilt_deg"] == 0 else ("along" if c["across"] else "across")
-            values = [m.get(key) for key in keys]
-            rows.append(
-                [
-                    result.subject.name,
-                    c["depth_m"],
-                    c["tilt_deg"],
-                    word,
-                    *(f"{v:.6g}" if isinstance(v, float) else v for v in values),
-                ]
-            )
+            values = [m.get(key) for key in _CSV_KEYS]
+            numbers = [f"{v:.6g}" if isinstance(v, float) else v for v in values]
+            rows.append([result.subject.name, c["depth_m"], c["tilt_deg"], word, *numbers])
     return text_table.csv_text(rows)

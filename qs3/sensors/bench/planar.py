@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from qs3.errors import ConfigError
-from qs3.sensors.base import DepthFrame, DepthSensor
+from qs3.sensors.base import DepthFrame
 from qs3.sensors.bench import metrics
 from qs3.sensors.bench.cached_renderer import StillRenderer
-from qs3.sensors.bench.preset_laws import stated_sigma_m
 from qs3.sensors.bench.subject import Subject
-from qs3.sensors.bench.targets import POSE, TiltedPlane
+from qs3.sensors.bench.targets import ALBEDO, POSE, TiltedPlane
 from qs3.sensors.renderers.base import Renderer
 
 _GOLDEN = (5**0.5 - 1) / 2
@@ -40,12 +39,6 @@ class PlanarCondition:
     half_px: int = 24
     repeats: int = 0
 
-    def __post_init__(self) -> None:
-        if not self.depth_m > 0 or not 0 <= self.tilt_deg <= 85:
-            raise ConfigError("a bench plane needs depth_m > 0 and tilt_deg in 0..85")
-        if self.phases < 4:
-            raise ConfigError(f"phases must be at least 4, got {self.phases}")
-
     @property
     def name(self) -> str:
         """For file names and messages."""
@@ -65,19 +58,17 @@ class PlanarCondition:
         return focal_baseline / (focal_baseline / self.depth_m + place)
 
 
-@dataclass
-class _Pool:
-    """What the frames of one condition add to."""
+@dataclass(frozen=True)
+class _Part:
+    """What one frame says: [N] errors, disparities, the fitted plane, the noise that is stated."""
 
-    error_m: list[np.ndarray] = field(default_factory=list)
-    error_px: list[np.ndarray] = field(default_factory=list)
-    disparity: list[np.ndarray] = field(default_factory=list)
-    planes: list[metrics.PlaneFit] = field(default_factory=list)
-    bias_px: list[float] = field(default_factory=list)
-    law_m: list[float] = field(default_factory=list)
-    wanted: int = 0
-    valid: int = 0
-    reasons: np.ndarray = field(default_factory=lambda: np.zeros(32, dtype=np.int64))
+    error_m: np.ndarray
+    error_px: np.ndarray
+    disparity: np.ndarray
+    plane: metrics.PlaneFit
+    wanted: int
+    reasons: np.ndarray
+    law_m: float | None
 
 
 def measure(
@@ -94,27 +85,22 @@ def measure(
     Returns:
         The metrics by name, plain numbers and lists (None where there is no such thing).
     """
-    fb = subject.focal_baseline
-    pool, stills = _Pool(), []
-    depths = condition.depths_m(fb)
+    parts, stills = [], []
+    depths = condition.depths_m(subject.focal_baseline)
     for k, depth in enumerate(depths):
         # Elsewhere in the image for each plane: other dots of the pattern.
         angle, away = 2 * np.pi * _GOLDEN * k, 12.0 + 24.0 * (k % 4) / 4
         centre = (away * np.cos(angle) * subject.step_px, away * np.sin(angle) * subject.step_px)
         sign = 1 if k % 2 else -1
         plane = TiltedPlane(float(depth), sign * condition.tilt_deg, condition.across, centre)
-        rng = np.random.default_rng([seed, k])
         if k < 3 and condition.repeats:
             still = StillRenderer(renderer, seed=k)
             noise = [np.random.default_rng([seed, k, i]) for i in range(condition.repeats)]
-            frames = [_take(subject, plane, condition, still, r) for r in noise]
+            frames = [_take(subject, plane, condition, still, rng) for rng in noise]
             stills.append(np.stack([frame.depth_m[part] for frame, part in frames]))
-        frame, part = _take(subject, plane, condition, renderer, rng)
-        _add(pool, frame, part, subject)
-        law = stated_sigma_m(subject.sensor, float(depth), frame)
-        if law is not None and condition.tilt_deg == 0:
-            pool.law_m.append(law)
-    return _summary(subject, condition, pool, depths, stills)
+        rng = np.random.default_rng([seed, k])
+        parts.append(_part(*_take(subject, plane, condition, renderer, rng), subject, plane))
+    return _summary(subject, condition, parts, depths, stills)
 
 
 def _take(
@@ -128,10 +114,9 @@ def _take(
     k, step = subject.intrinsics, subject.step_px
     region = plane.region(k, condition.half_px * step, step)
     bodies, box = plane.scene(k, region, subject.margin_px)
-    sensor: DepthSensor = subject.sensor
     if isinstance(renderer, StillRenderer):
         renderer.rewind()
-    frame = sensor.scan(bodies, box, POSE, renderer, rng)
+    frame = subject.sensor.scan(bodies, box, POSE, renderer, rng)
     if frame is None:
         raise ConfigError(f"{condition.name}: the plane is outside the sensor's view")
     rows = _samples(region.top, region.height, frame.top, frame.step_px)
@@ -145,69 +130,99 @@ def _samples(start: int, length: int, first: int, step: int) -> slice:
     return slice(low, (start + length - 1 - first) // step + 1)
 
 
-def _add(pool: _Pool, frame: DepthFrame, part: tuple[slice, slice], subject: Subject) -> None:
+def _part(
+    frame: DepthFrame, part: tuple[slice, slice], subject: Subject, plane: TiltedPlane
+) -> _Part:
     depth, clean = (a[part].astype(np.float64) for a in (frame.depth_m, frame.clean_m))
     wanted = np.isfinite(clean)
     valid = wanted & np.isfinite(depth)
-    pool.wanted += int(wanted.sum())
-    pool.valid += int(valid.sum())
-    pool.reasons += np.bincount(frame.reason[part][wanted], minlength=32)
     rows, cols = np.nonzero(valid)
-    k = frame.camera.intrinsics
+    k, fb = frame.camera.intrinsics, subject.focal_baseline
     x = (frame.left + (cols + part[1].start) * frame.step_px - k.cx_px) / k.focal_px
     y = (frame.top + (rows + part[0].start) * frame.step_px - k.cy_px) / k.focal_px
     z, truth = depth[valid], clean[valid]
-    pool.error_m.append(z - truth)
-    fb = subject.focal_baseline
-    pool.planes.append(metrics.fit_plane(z, x, y, fb))
-    if fb is not None:
-        pool.error_px.append(fb / z - fb / truth)
-        pool.disparity.append(fb / z)
-        pool.bias_px.append(metrics.median(pool.error_px[-1]))
+    facing = plane.tilt_deg == 0
+    return _Part(
+        error_m=z - truth,
+        error_px=np.zeros(0) if fb is None else fb / z - fb / truth,
+        disparity=np.zeros(0) if fb is None else fb / z,
+        plane=metrics.fit_plane(z, x, y, fb),
+        wanted=int(wanted.sum()),
+        reasons=np.bincount(frame.reason[part][wanted], minlength=32),
+        law_m=stated_sigma_m(subject.sensor, plane.depth_m, frame) if facing else None,
+    )
+
+
+def stated_sigma_m(sensor: Any, depth_m: float, frame: DepthFrame) -> float | None:
+    """Standard deviation of the depth of a plane that faces the sensor, by the sensor's own law.
+
+    Args:
+        sensor: any; those that state no law give None.
+        depth_m: of the plane, whose albedo is ALBEDO.
+        frame: of that plane, for exposures that no one knows beforehand.
+    """
+    if hasattr(sensor, "noise_law_m"):
+        return float(np.asarray(sensor.noise_law_m(depth_m)))
+    if hasattr(sensor, "distance_sigma_m"):  # time of flight: light falls with the square
+        lamp = sensor.electrons_at_1m * ALBEDO / depth_m**2
+        mean = lamp + sensor.electrons_at_1m * ALBEDO * sensor.ambient
+        return float(sensor.distance_sigma_m(sensor.contrast * lamp, mean))
+    if hasattr(sensor, "depth_sigma_m") and "modulation" in frame.images:  # fringes
+        modulation = float(np.median(frame.images["modulation"]))
+        per_grey = sensor.infrared.electrons_at_white / 255
+        mean_e = float(frame.images["exposures"].mean()) * per_grey
+        shot_and_read = np.sqrt(mean_e + sensor.infrared.read_noise_e**2) / per_grey
+        noise = float(np.hypot(shot_and_read, np.sqrt(1 / 12)))  # and whole grey values
+        return float(sensor.depth_sigma_m(depth_m, noise, modulation))
+    if hasattr(sensor, "noise_sigma_m"):
+        return float(sensor.noise_sigma_m)
+    return None
 
 
 def _summary(
     subject: Subject,
     condition: PlanarCondition,
-    pool: _Pool,
+    parts: list[_Part],
     depths: np.ndarray,
     stills: list[np.ndarray],
 ) -> dict[str, Any]:
     fb = subject.focal_baseline
-    error = np.concatenate(pool.error_m)
-    kept = metrics.trimmed(error)
+    error = np.concatenate([part.error_m for part in parts])
+    kept, wanted = metrics.trimmed(error), sum(part.wanted for part in parts)
+    reasons = np.sum([part.reasons for part in parts], axis=0)
     out: dict[str, Any] = {
         "condition": asdict(condition),
         "frames": len(depths),
-        "pixels": pool.wanted,
-        "fill": pool.valid / pool.wanted if pool.wanted else 0.0,
+        "pixels": wanted,
+        "fill": len(error) / wanted if wanted else 0.0,
         "sigma_m": float(np.std(kept)) if kept.size else None,
         "bias_m": metrics.median(error),
         "accuracy": metrics.median(error) / condition.depth_m,
-        "plane_rms_m": _pooled([plane.rms_m for plane in pool.planes]),
-        "reasons": {str(i): int(n) for i, n in enumerate(pool.reasons) if n},
-        "law_m": _pooled(pool.law_m),
+        "plane_rms_m": _pooled([part.plane.rms_m for part in parts]),
+        "reasons": {str(i): int(n) for i, n in enumerate(reasons) if n},
+        "law_m": _pooled([part.law_m for part in parts if part.law_m is not None]),
     }
     if stills:
         spread = [_temporal(stack) for stack in stills]
         out["temporal"] = metrics.median(np.concatenate(spread))
         out["temporal_std_m"] = [float(np.nanmean(_over_time(stack))) for stack in stills]
     if fb is not None:
-        error_px = np.concatenate(pool.error_px)
+        errors = [part.error_px for part in parts]
+        error_px = np.concatenate(errors)
+        disparity = np.concatenate([part.disparity for part in parts])
         phase = (fb / depths - subject.whole_px) % 1
-        bias = np.array(pool.bias_px)
-        mean = np.array([float(np.mean(e)) if e.size else np.nan for e in pool.error_px])
+        mean = np.array([float(np.mean(e)) if e.size else np.nan for e in errors])
         out |= {
-            "subpixel_rms_px": _pooled([plane.subpixel_rms_px for plane in pool.planes]),
+            "subpixel_rms_px": _pooled([part.plane.subpixel_rms_px for part in parts]),
             "sigma_px": float(np.std(metrics.trimmed(error_px))),
             "bias_px": metrics.median(error_px),
             "outliers": float(np.mean(np.abs(error_px) > 1)) if error_px.size else None,
             "phase": phase.tolist(),
-            "phase_bias_px": bias.tolist(),
+            "phase_bias_px": [metrics.median(e) for e in errors],
             "locking_px": metrics.locking_px(phase, mean) if condition.tilt_deg == 0 else None,
-            "phase_histogram": _histogram(np.concatenate(pool.disparity) - subject.whole_px),
+            "phase_histogram": _histogram(disparity - subject.whole_px),
         }
-        out |= _levels(subject, np.concatenate(pool.disparity), fb / depths)
+        out |= _levels(subject, disparity, fb / depths)
     return without_nan(out)
 
 
@@ -254,6 +269,4 @@ def without_nan(value: Any) -> Any:
         return {key: without_nan(v) for key, v in value.items()}
     if isinstance(value, list):
         return [without_nan(v) for v in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -6,63 +6,20 @@ measured on a depth image alone, so that real and simulated ones are treated ali
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from qs3.sensors.bench import metrics
+from qs3.sensors.fit.planes import between
 
 FOCAL_PX = 525.0
 """Focal length of the published clouds: u - 319.5 = 525 x / z holds to 1e-5 px in all eight."""
 
 FOCAL_BASELINE = 580.0 * 0.075
 """f B of the device's infrared camera (Konolige and Mihelich), px m."""
-
-
-@dataclass(frozen=True, eq=False)
-class TableStatistics:
-    """Measured on one depth image of a table.
-
-    Attributes:
-        levels: distinct depths beyond 0.8 m, where a step is larger than the file's 1 mm.
-        step_focal_baseline: f B in px m that fits the steps of 1 / Z at 1/8 px.
-        step_residual: RMS distance of the levels from that grid, in steps; 0.29 is not a grid.
-        level_use: standard deviation over the eighths of a pixel of how often a depth falls on
-            them, 0 if all are used alike: the trace of pixel locking.
-        table_rms_m, table_subpixel_px: of the table about a smooth surface; local, see `table`.
-        holes: share of pixels without depth within the outline of what has depth.
-        runs_px: [N] lengths of the holes along rows.
-        left_share: share of the holes' pixels beside an edge that lie left of the nearer
-            surface.
-    """
-
-    levels: int
-    step_focal_baseline: float
-    step_residual: float
-    level_use: float
-    table_rms_m: float
-    table_subpixel_px: float
-    holes: float
-    runs_px: np.ndarray
-    left_share: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers; of the runs the median and the 90 % quantile."""
-        runs = self.runs_px
-        return {
-            "levels": self.levels,
-            "step_focal_baseline": self.step_focal_baseline,
-            "step_residual": self.step_residual,
-            "level_use": self.level_use,
-            "table_rms_m": self.table_rms_m,
-            "table_subpixel_px": self.table_subpixel_px,
-            "holes": self.holes,
-            "run_median_px": metrics.median(runs),
-            "run_90_px": float(np.quantile(runs, 0.9)) if runs.size else float("nan"),
-            "left_share": self.left_share,
-        }
 
 
 def read_cloud(path: Path) -> np.ndarray:
@@ -72,11 +29,21 @@ def read_cloud(path: Path) -> np.ndarray:
     return np.asarray(read_pcd(path).image("z"), dtype=np.float32)
 
 
-def statistics(depth_m: np.ndarray) -> TableStatistics:
-    """All of one depth image.
+def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
+    """All that is measured on one depth image of a table.
 
     Args:
         depth_m: [h, w] metres with NaN, camera with FOCAL_PX and the principal point centred.
+
+    Returns:
+        Plain numbers by name, and [N] lengths in px of the holes along rows. The numbers:
+        levels: distinct depths beyond 0.8 m, where a step is larger than the file's 1 mm.
+        step_focal_baseline, step_residual: see `fit_steps`.
+        level_use: see `uneven_levels`; 0 if all levels are used alike: the trace of pixel locking.
+        table_rms_m, table_subpixel_px: see `table_noise`.
+        holes: share of pixels without depth within the outline of what has depth.
+        run_median_px, run_90_px: median and 90 % quantile of the holes' lengths.
+        left_share: see `shadow_side`.
     """
     flat = depth_m[np.isfinite(depth_m)].astype(np.float64)
     values = np.unique(np.rint(flat[flat > 0.8] * 1000)) / 1000
@@ -84,27 +51,26 @@ def statistics(depth_m: np.ndarray) -> TableStatistics:
     rms_m, subpixel = table_noise(depth_m)
     inside = outline(depth_m)
     gaps = inside & ~np.isfinite(depth_m)
-    return TableStatistics(
-        levels=len(values),
-        step_focal_baseline=fb,
-        step_residual=residual,
-        level_use=uneven_levels(flat[(flat > 0.8) & (flat < 1.3)], fb),
-        table_rms_m=rms_m,
-        table_subpixel_px=subpixel,
-        holes=float(gaps.sum() / max(inside.sum(), 1)),
-        runs_px=metrics.runs(gaps),
-        left_share=shadow_side(depth_m, gaps),
-    )
+    runs = metrics.runs(gaps)
+    return {
+        "levels": len(values),
+        "step_focal_baseline": fb,
+        "step_residual": residual,
+        "level_use": uneven_levels(flat[(flat > 0.8) & (flat < 1.3)], fb),
+        "table_rms_m": rms_m,
+        "table_subpixel_px": subpixel,
+        "holes": float(gaps.sum() / max(inside.sum(), 1)),
+        "run_median_px": metrics.median(runs),
+        "run_90_px": float(np.quantile(runs, 0.9)) if runs.size else float("nan"),
+        "left_share": shadow_side(depth_m, gaps),
+    }, runs
 
 
 def fit_steps(depths_m: np.ndarray, steps_per_px: int = 8) -> tuple[float, float]:
-    """The f B for which the levels 1 / Z lie best on a grid of 1 / (steps f B).
-
-    Args:
-        depths_m: [N] distinct depths, rounded to whole millimetres by the file.
+    """The f B in px m for which [N] distinct levels lie best on a grid of 1 / (steps f B) in 1 / Z.
 
     Returns:
-        f B in px m; RMS distance of the levels from the grid in steps (0.29 if there is none).
+        f B, and the RMS distance of the levels from the grid in steps (0.29 if there is none).
     """
     if len(depths_m) < 20:
         return float("nan"), float("nan")
@@ -112,12 +78,15 @@ def fit_steps(depths_m: np.ndarray, steps_per_px: int = 8) -> tuple[float, float
     best = (np.inf, np.nan)
     for fb in np.arange(35.0, 55.0, 0.01):
         phase = inverse * fb * steps_per_px
-        # The offset of the grid is free: the circular mean of the phases.
-        angle = 2 * np.pi * phase
-        offset = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()) / (2 * np.pi)
-        off = (phase - offset + 0.5) % 1 - 0.5
+        off = (phase - _offset(phase) + 0.5) % 1 - 0.5
         best = min(best, (metrics.rms(off), float(fb)))
     return best[1], best[0]
+
+
+def _offset(phase: np.ndarray) -> float:
+    """The free offset of a grid of whole numbers: the circular mean of the phases."""
+    angle = 2 * np.pi * phase
+    return float(np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()) / (2 * np.pi))
 
 
 def uneven_levels(depths_m: np.ndarray, focal_baseline: float, steps_per_px: int = 8) -> float:
@@ -129,9 +98,7 @@ def uneven_levels(depths_m: np.ndarray, focal_baseline: float, steps_per_px: int
     if not np.isfinite(focal_baseline) or not depths_m.size:
         return float("nan")
     phase = steps_per_px * focal_baseline / depths_m
-    angle = 2 * np.pi * phase
-    offset = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean()) / (2 * np.pi)
-    level = np.rint(phase - offset).astype(int)
+    level = np.rint(phase - _offset(phase)).astype(int)
     counts = np.bincount(level - level.min()).astype(np.float64)
     around = np.convolve(counts, np.ones(steps_per_px) / steps_per_px, mode="same")
     inner = np.arange(steps_per_px, len(counts) - steps_per_px)
@@ -146,14 +113,7 @@ def outline(depth_m: np.ndarray) -> np.ndarray:
 
     The outer 4 pixels are left out: there the cut of the table is ragged.
     """
-    valid = np.isfinite(depth_m)
-    out = np.ones_like(valid)
-    for axis in (0, 1):
-        before = np.logical_or.accumulate(valid, axis=axis)
-        after = np.flip(np.logical_or.accumulate(np.flip(valid, axis), axis=axis), axis)
-        out &= before & after
-    import cv2
-
+    out = between(np.isfinite(depth_m))
     return cv2.erode(out.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
 
 
@@ -177,11 +137,10 @@ def shadow_side(depth_m: np.ndarray, gaps: np.ndarray) -> float:
 def table_noise(depth_m: np.ndarray, block: int = 24) -> tuple[float, float]:
     """Noise of the table, free of its bow and of the device's distortion.
 
-    Planes are fitted to blocks of `block` px that lie on the table as a whole; the rest is what
-    depth noise does at short range.
+    Planes are fitted to blocks of `block` px that lie on the table as a whole.
 
     Returns:
-        RMS distance to the planes in metres, and sub-pixel RMS with the infrared camera's f B.
+        RMS distance to them in metres, and sub-pixel RMS with the infrared camera's f B.
     """
     height, width = depth_m.shape
     normal, distance = table_plane(depth_m)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,20 +19,10 @@ from qs3.sensors.bench.subject import Subject
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.files import write_json
 
-log = logging.getLogger(__name__)
-
 DEFAULT_SENSORS = (
-    "kinect_v1",
-    "structure_sensor",
-    "realsense_d415",
-    "realsense_d435",
-    "speckle_stereo",
-    "time_of_flight",
-    "fringe",
-    "kinect_like",
-    "blensor_kinect",
-    "blensor_tof",
-)
+    "kinect_v1", "structure_sensor", "realsense_d415", "realsense_d435", "speckle_stereo",
+    "time_of_flight", "fringe", "kinect_like", "blensor_kinect", "blensor_tof",
+)  # fmt: skip
 """On the page. Not on it: copies of others, and those that repeat a defect on purpose."""
 
 
@@ -101,27 +90,21 @@ class SensorResult:
 
     def tilted(self, across: bool) -> list[dict[str, Any]]:
         """Conditions at one depth, by tilt, the untilted one first."""
-        found = [
-            m
-            for m in self.planes
-            if m["condition"]["tilt_deg"] > 0 and m["condition"]["across"] == across
-        ]
-        if not found:
-            return []
-        depth = found[0]["condition"]["depth_m"]
-        first = [m for m in self.facing() if m["condition"]["depth_m"] == depth]
+
+        def wanted(c: dict[str, Any]) -> bool:
+            return c["tilt_deg"] > 0 and c["across"] == across
+
+        found = [m for m in self.planes if wanted(m["condition"])]
+        depths = {m["condition"]["depth_m"] for m in found}
+        first = [m for m in self.facing() if m["condition"]["depth_m"] in depths]
         return first + sorted(found, key=lambda m: m["condition"]["tilt_deg"])
 
 
 def load(name: str, overrides: Sequence[str] = ()) -> tuple[Subject, dict[str, Any]]:
-    """A sensor by the name of its file in conf/sensor, and its resolved settings.
-
-    Args:
-        name: e.g. "kinect_v1".
-        overrides: e.g. ["sensor.infrared.read_noise_e=20"].
+    """A sensor by the name of its file in conf/sensor ("kinect_v1"), and its resolved settings.
 
     Raises:
-        ConfigError: there is no such sensor, or it cannot be put on the bench.
+        ConfigError: there is no such sensor, or `overrides` ("sensor.key=value") do not fit.
     """
     known = [choice for choice in choices("sensor") if choice != "none"]
     if name not in known:
@@ -140,15 +123,12 @@ def run(
     plan: Plan,
     advance: Callable[[], None] = lambda: None,
 ) -> SensorResult:
-    """Measure all conditions of one sensor, or read what an earlier call measured.
+    """Measure all conditions of one sensor from `load`, or read what an earlier call measured.
 
     Args:
-        subject, config: from `load`.
-        renderer: makes the images.
         cache: folder for one JSON file a condition. Its name holds a hash of the settings, the
             renderer and the code that measures, so a changed sensor is measured anew.
-        plan: which conditions.
-        advance: called after each.
+        advance: called after each condition.
     """
     result = SensorResult(subject, config)
     for condition in plan.conditions(subject):
@@ -168,30 +148,12 @@ def run(
 
 
 def fingerprint(*parts: Any) -> str:
-    """SHA-256 of settings and of the source code of sensors and measurements."""
+    """SHA-256 of settings and of the code that decides the numbers: sensors and measurements."""
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
-    digest.update(_code().encode())
-    return digest.hexdigest()
-
-
-def _code() -> str:
-    """Hash of what decides the numbers: the sensors, and how they are measured."""
-    sensors = Path(__file__).resolve().parents[1]
-    measuring = (
-        "metrics",
-        "targets",
-        "planar",
-        "edges",
-        "subject",
-        "cached_renderer",
-        "preset_laws",
-        "tabletop",
-    )
-    files = [path for path in sensors.rglob("*.py") if path.parent.name != "bench"]
-    files += [sensors / "bench" / f"{name}.py" for name in measuring]
-    digest = hashlib.sha256()
-    for path in sorted(files):
-        digest.update(path.read_bytes())
+    showing = ("bands", "cli", "comparison", "figures", "laws", "page", "real")
+    for path in sorted(Path(__file__).resolve().parents[1].rglob("*.py")):
+        if path.parent.name != "bench" or path.stem not in showing:
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

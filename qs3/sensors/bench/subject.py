@@ -8,6 +8,7 @@ from typing import Any
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics
 from qs3.sensors.base import DepthSensor
+from qs3.sensors.matching import STEREOBM_BIAS_PX
 
 DEPTHS_M = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 
@@ -24,22 +25,13 @@ class Subject:
     name: str
     sensor: DepthSensor
 
-    def __post_init__(self) -> None:
-        for key in ("width_px", "height_px", "focal_px"):
-            if not hasattr(self.sensor, key):
-                raise ConfigError(
-                    f"sensor={self.name} has no {key}, so the bench cannot place targets before it"
-                )
-
     def _get(self, key: str, default: Any = None) -> Any:
         return getattr(self.sensor, key, default)
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of the camera whose depth image it is."""
-        return Intrinsics.centred(
-            self._get("width_px"), self._get("height_px"), self._get("focal_px")
-        )
+        """The camera's whose depth image it is."""
+        return self.sensor.intrinsics
 
     @property
     def step_px(self) -> int:
@@ -55,7 +47,7 @@ class Subject:
     @property
     def focal_baseline(self) -> float | None:
         """Product f B in px m; None for a sensor that does not triangulate."""
-        return None if self.baseline_m is None else self._get("focal_px") * self.baseline_m
+        return None if self.baseline_m is None else self.sensor.focal_px * self.baseline_m
 
     @property
     def matcher(self) -> Any:
@@ -65,22 +57,15 @@ class Subject:
     @property
     def window_px(self) -> int | None:
         """Side of what one match looks at; None where nothing is matched."""
-        for key in ("window_px", "block_size"):
-            if hasattr(self.matcher, key):
-                # Costs of census windows are averaged over a block.
-                return (
-                    int(getattr(self.matcher, key)) + int(getattr(self.matcher, "block_px", 1)) - 1
-                )
-        return None
+        window = getattr(self.matcher, "window_px", getattr(self.matcher, "block_size", None))
+        # Costs of census windows are averaged over a block.
+        return None if window is None else window + getattr(self.matcher, "block_px", 1) - 1
 
     @property
     def steps_per_px(self) -> int:
         """Steps of the disparity a pixel; 0 where it is not quantised (or nothing is known)."""
-        quantiser = self._get("quantiser")
-        steps = getattr(quantiser, "steps_per_px", 0) or getattr(self.matcher, "steps_per_px", 0)
-        if not steps and type(self.matcher).__name__ == "StereoBlockMatcher":
-            return 16  # OpenCV's own
-        return int(steps)
+        own = getattr(self.matcher, "steps_per_px", 0)
+        return getattr(self._get("quantiser"), "steps_per_px", 0) or own
 
     @property
     def whole_px(self) -> float:
@@ -91,8 +76,6 @@ class Subject:
     @property
     def level_offset_px(self) -> float:
         """Disparity (f B / Z) of one of the levels of the quantiser."""
-        from qs3.sensors.matching import STEREOBM_BIAS_PX
-
         quantised = getattr(self._get("quantiser"), "steps_per_px", 0)
         if getattr(self.matcher, "remove_bias", False) and not quantised:
             return -STEREOBM_BIAS_PX

@@ -98,10 +98,9 @@ class Tabletop:
         return self.cropped(self.registered(depth, k.focal_px))
 
     def registered(self, depth_m: np.ndarray, focal_px: float) -> np.ndarray:
-        """A depth image moved to the colour camera, nearest surface first, whole millimetres.
+        """A depth image [h, w] with NaN moved to the colour camera, in whole millimetres.
 
-        Args:
-            depth_m: [h, w] with NaN, of the infrared camera, whose focal length is `focal_px`.
+        `focal_px` is that of the infrared camera, which took it; the nearest surface hides others.
         """
         height, width = depth_m.shape
         rows, cols = np.nonzero(np.isfinite(depth_m))

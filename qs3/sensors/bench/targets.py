@@ -72,11 +72,7 @@ class TiltedPlane:
     def scene(
         self, k: Intrinsics, region: Window, margin_px: int
     ) -> tuple[tuple[Body, ...], np.ndarray]:
-        """The plane as a body that reaches beyond `region` by three margins, and a box.
-
-        Returns:
-            Bodies, and the [2, 3] box of the part within one margin.
-        """
+        """The plane, three margins wider than `region`, and the [2, 3] box of one margin."""
         body = Body(Mesh(to_world(self._corners(k, region, 3 * margin_px)), _QUAD), ALBEDO)
         part = to_world(self._corners(k, region, margin_px))
         return (body,), np.stack([part.min(axis=0) - 1e-4, part.max(axis=0) + 1e-4])

@@ -22,30 +22,24 @@ from itertools import product
 import numpy as np
 
 from qs3.config.checks import check_ranges
-from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, check_depths, on_grid, window_of
+from qs3.geometry.cameras import Window
+from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import Quantiser
-from qs3.sensors.matching.triangulation import Triangulation
 from qs3.sensors.optics.patterns import Speckle
-from qs3.sensors.optics.point_light import white_lamp
 from qs3.sensors.optics.smooth_field import smooth_field
-from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.base import Body, Renderer, Scene
+from qs3.sensors.optics.visibility import explained, white_lamp
 
 
 @dataclass(frozen=True)
-class DotMask:
-    """A camera and a projector of dots beside it, without light: geometry decides.
+class DotMask(TriangulatingSensor):
+    """A camera and a projector of dots next to it, without light: geometry decides.
 
     The defaults are Kinect v1's geometry.
 
     Attributes:
-        width_px, height_px, focal_px: of the camera. A dot is one of the camera's pixels wide.
-        baseline_m: projector minus camera along the camera's x.
         step_px: every step-th pixel of every step-th row gives a depth, the middle of each step.
-        min_depth_m, max_depth_m: depths outside are dropped.
-        pattern: the dots, one position a pixel, repeated over the whole field.
+        pattern: the dots, one position a pixel of the camera, repeated over the whole field.
         window_px: side of the window around a dot, odd.
         min_share: more than this share of the window's dots must be seen ...
         inlier_m: ... with a depth that differs by less from the dot's own.
@@ -53,16 +47,9 @@ class DotMask:
         column_sigma_px: standard deviation of independent noise on the column of each dot.
         field_sigma_px: rms of the smooth noise field.
         field_cell_px: its shortest wave.
-        quantiser: step of the disparity.
     """
 
-    width_px: int = 640
-    height_px: int = 480
-    focal_px: float = 580.0
-    baseline_m: float = 0.075
     step_px: int = 1
-    min_depth_m: float = 0.7
-    max_depth_m: float = 6.0
     pattern: Speckle = field(
         default_factory=lambda: Speckle(columns=633, rows=495, tiles=1, dot_px=1, seed=2)
     )
@@ -76,97 +63,46 @@ class DotMask:
     quantiser: Quantiser = field(default_factory=lambda: Quantiser(8))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_ranges(
             self,
             "sensor.",
-            **dict.fromkeys(("baseline_m", "inlier_m", "field_cell_px"), "> 0"),
+            **dict.fromkeys(("inlier_m", "field_cell_px"), "> 0"),
             **dict.fromkeys(("fill_px", "column_sigma_px", "field_sigma_px"), ">= 0"),
             step_px=">= 1",
             window_px="odd >= 1",
             min_share="[0, 1)",
         )
-        check_depths(self)
 
     @property
-    def intrinsics(self) -> Intrinsics:
-        """Of the camera."""
-        return Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
+    def margin_px(self) -> int:
+        """Half a window, and how far values are spread."""
+        return self.window_px // 2 + int(self.fill_px) + 1
 
-    @property
-    def triangulation(self) -> Triangulation:
-        """From disparity to depth."""
-        return Triangulation(
-            self.focal_px, self.baseline_m, 0.0, self.min_depth_m, self.max_depth_m
-        )
-
-    def depth_step_m(self, depth_m: float) -> float:
-        """Depth that one step of the quantiser makes: Z^2 / (steps f b)."""
-        steps = self.quantiser.steps_per_px
-        return depth_m**2 / (steps * self.focal_px * self.baseline_m) if steps else 0.0
-
-    def scan(
-        self,
-        bodies: tuple[Body, ...],
-        box_m: np.ndarray,
-        world_from_camera: np.ndarray,
-        renderer: Renderer,
-        rng: np.random.Generator,
-        explain: bool = False,
-    ) -> DepthFrame | None:
-        """Take one frame; see qs3.sensors.base.DepthSensor.
-
-        Shadow is told apart whether asked for or not: the mask needs it anyway.
-        """
-        camera = Camera(self.intrinsics, world_from_camera)
-        margin = self.window_px // 2 + int(self.fill_px) + 1
-        window = window_of(box_m, camera, margin_px=margin)
-        if window is None:
-            return None
+    def take(self, shot: Shot) -> DepthFrame:
+        """See `DepthSensor.take`. Shadow is always explained: the mask needs it anyway."""
+        window = shot.window
         # One render for both: what the projector reaches is what a white lamp there lights.
-        lamp = white_lamp(camera.moved((self.baseline_m, 0.0, 0.0)).world_from_camera)
-        (image,) = renderer.render(
-            Scene(bodies, lamp),
-            [Camera(self.intrinsics, world_from_camera, window)],
-            seed=int(rng.integers(2**31)),
-            geometry=[True],
-        )
-        clean = image.depth_m
-        lit = image.radiance > 0
+        image = shot.image(white_lamp(shot.pose_at(self.baseline_m)))
+        clean, lit = image.depth_m, image.radiance > 0
         exact = self.focal_px * self.baseline_m / clean.astype(np.float64)  # 0 where nothing is
         dots = self._dots(window, exact) & lit & np.isfinite(clean)
         good = dots & self._backed(window, exact, clean, lit, dots)
-        noise = self.field_sigma_px * smooth_field(window, self.field_cell_px, rng)
-        noise += self.column_sigma_px * rng.standard_normal(clean.shape)
+        noise = self.field_sigma_px * smooth_field(window, self.field_cell_px, shot.rng)
+        noise += self.column_sigma_px * shot.rng.standard_normal(clean.shape)
         measured = np.where(good, exact + noise, np.nan).astype(np.float32)
         # A dot's value is rounded before it is handed to its neighbours or after: the same.
-        match = Match.of(spread(measured, self.fill_px))
-        depth, disparity, reason = self.triangulation.depth(match, self.quantiser, ())
-        invalid = reason != Reason.OK
-        reason[invalid & ~lit] = Reason.SHADOW
-        reason[invalid & ~np.isfinite(clean)] = Reason.EMPTY
-
-        first_col, cols = on_grid(window.left, window.width, self.step_px)
-        first_row, rows = on_grid(window.top, window.height, self.step_px)
-        grid = (rows, cols)
+        depth, disparity, reason = self.depth_of(Match.of(spread(measured, self.fill_px)))
+        reason = explained(reason, clean, lit, None)
         pictures = {
             "left": np.where(dots, np.uint8(255), np.where(lit, np.uint8(40), np.uint8(0))),
             "disparity": disparity,
             "clean": clean,
         }
-        if explain:
+        if shot.explain:
             pictures["lit"] = lit
-        return DepthFrame(
-            camera=camera,
-            left=first_col,
-            top=first_row,
-            step_px=self.step_px,
-            depth_m=np.ascontiguousarray(depth[grid]),
-            clean_m=np.ascontiguousarray(clean[grid]),
-            label=np.ascontiguousarray(image.label[grid]),
-            cosine=np.ascontiguousarray(image.cosine[grid]),
-            reason=np.ascontiguousarray(reason[grid]),
-            images=pictures,
-        )
+        at = shot.samples(self.step_px)
+        return shot.frame(at.of(depth), at.of(reason), image, pictures, at)
 
     def _mask(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
         """Whether there is a dot at a row and column of the projector, repeated for ever."""
@@ -208,14 +144,9 @@ class DotMask:
 
 
 def spread(values: np.ndarray, radius_px: float) -> np.ndarray:
-    """Give each pixel the value of the nearest one that has any, up to a distance.
+    """Give each pixel of [h, w] the value of the nearest one that is not NaN, up to a distance.
 
-    Args:
-        values: [h, w] float32, NaN where there is none.
-        radius_px: how far.
-
-    Returns:
-        [h, w] float32; of several at the same distance the first in reading order counts.
+    Of several at the same distance the first in reading order counts.
     """
     reach = int(radius_px)
     height, width = values.shape

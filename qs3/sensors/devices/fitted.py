@@ -7,29 +7,26 @@ presets of this sensor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
-from qs3.geometry.cameras import Camera, Intrinsics
-from qs3.sensors.base import DepthFrame, check_depths, on_grid, window_of
-from qs3.sensors.optics.visibility import reached_from
-from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.base import Body, Renderer, Scene
+from qs3.geometry.cameras import Intrinsics
+from qs3.sensors.base import DepthFrame, DepthSensor, Shot, check_depths
+from qs3.sensors.pixel_status import Reason, first_reason
 
 
 @dataclass(frozen=True)
-class FittedDepth:
+class FittedDepth(DepthSensor):
     """An empirical depth camera.
 
     depth = quantise(Z + bias(Z) + sigma(Z) n), where n is normal noise of variance 1 that is
     smooth over `correlation_px`, and sigma(Z) = noise_floor_m + noise_factor * Z ** noise_power.
 
     Attributes:
-        width_px, height_px, focal_px: of the camera.
         cx_px, cy_px: principal point; null is the middle.
         step_px: every step-th pixel of every step-th row gives a depth, the middle of each step.
         min_depth_m, max_depth_m: depths outside are dropped.
@@ -46,9 +43,6 @@ class FittedDepth:
             measured. null: no shadows.
     """
 
-    width_px: int = 640
-    height_px: int = 480
-    focal_px: float = 580.0
     cx_px: float | None = None
     cy_px: float | None = None
     step_px: int = 1
@@ -83,14 +77,12 @@ class FittedDepth:
 
     @property
     def intrinsics(self) -> Intrinsics:
-        """Of the camera."""
-        centred = Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
-        return Intrinsics(
-            self.width_px,
-            self.height_px,
-            self.focal_px,
-            centred.cx_px if self.cx_px is None else self.cx_px,
-            centred.cy_px if self.cy_px is None else self.cy_px,
+        """The camera's."""
+        middle = super().intrinsics
+        return replace(
+            middle,
+            cx_px=middle.cx_px if self.cx_px is None else self.cx_px,
+            cy_px=middle.cy_px if self.cy_px is None else self.cy_px,
         )
 
     def noise_law_m(self, depth_m: float) -> float:
@@ -100,12 +92,9 @@ class FittedDepth:
     def measure(
         self, clean_m: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the camera says of true depths.
+        """What the camera says of true depths `clean_m` [h, w] float32, inf where nothing is.
 
-        Args:
-            clean_m: [h, w] float32, inf where nothing is.
-            cosine: [h, w] float32 of the angle of incidence.
-            rng: of this frame.
+        `cosine` [h, w] float32 is that of the angle of incidence.
 
         Returns:
             [h, w] float32 depth with NaN; [h, w] uint8 `Reason`.
@@ -127,58 +116,23 @@ class FittedDepth:
         rate = np.interp(tilt, self.tilts_deg, self.fill_rates)
         lost = _share_below(holes) >= rate
         inside = (found > self.min_depth_m) & (found < self.max_depth_m)
-        reason = np.select(
-            [~hit, lost, ~inside],
-            [np.uint8(Reason.EMPTY), np.uint8(Reason.UNMATCHED), np.uint8(Reason.RANGE)],
-            np.uint8(Reason.OK),
-        ).astype(np.uint8)
+        reason = first_reason(
+            {Reason.EMPTY: ~hit, Reason.UNMATCHED: lost, Reason.RANGE: ~inside}, Reason.OK
+        )
         depth = np.where(reason == Reason.OK, found, np.nan).astype(np.float32)
         return depth, reason
 
-    def scan(
-        self,
-        bodies: tuple[Body, ...],
-        box_m: np.ndarray,
-        world_from_camera: np.ndarray,
-        renderer: Renderer,
-        rng: np.random.Generator,
-        explain: bool = False,
-    ) -> DepthFrame | None:
-        """Take one frame; see qs3.sensors.base.DepthSensor. Shadows are always explained."""
-        whole = Camera(self.intrinsics, world_from_camera)
-        window = window_of(box_m, whole)
-        if window is None:
-            return None
-        camera = Camera(self.intrinsics, world_from_camera, window)
-        (image,) = renderer.render(
-            Scene(bodies), [camera], seed=int(rng.integers(2**31)), geometry=[True]
-        )
-        first_col, cols = on_grid(window.left, window.width, self.step_px)
-        first_row, rows = on_grid(window.top, window.height, self.step_px)
-        grid = (rows, cols)
-        clean, cosine, label = (
-            np.ascontiguousarray(a[grid]) for a in (image.depth_m, image.cosine, image.label)
-        )
-        depth, reason = self.measure(clean, cosine, rng)
+    def take(self, shot: Shot) -> DepthFrame:
+        """See `DepthSensor.take`. Shadows are always explained."""
+        image, at = shot.image(), shot.samples(self.step_px)
+        clean = at.of(image.depth_m)
+        depth, reason = self.measure(clean, at.of(image.cosine), shot.rng)
         pictures = {"clean": image.depth_m}
         if self.baseline_m is not None:
-            projector = whole.moved((self.baseline_m, 0.0, 0.0)).world_from_camera
-            lit = reached_from(bodies, camera, projector, renderer)
-            pictures["lit"] = lit
-            dark = ~lit[grid] & np.isfinite(clean)
+            pictures["lit"] = shot.reached_from(shot.pose_at(self.baseline_m))
+            dark = ~at.of(pictures["lit"]) & np.isfinite(clean)
             depth[dark], reason[dark] = np.nan, Reason.SHADOW
-        return DepthFrame(
-            camera=whole,
-            left=first_col,
-            top=first_row,
-            step_px=self.step_px,
-            depth_m=depth,
-            clean_m=clean,
-            label=label,
-            cosine=cosine,
-            reason=reason,
-            images=pictures,
-        )
+        return shot.frame(depth, reason, image, pictures, at)
 
 
 def neighbour_correlation(size_px: float) -> float:

@@ -1,7 +1,7 @@
 """Fringe projection: structured light with sinusoids, one camera and one projector.
 
 The camera's ray through u meets the plane of light that leaves the projector at x / z = x_p. The
-projector looks the same way from a distance b beside the camera, so x_p = x - b / Z with
+projector looks the same way at a distance b from the camera, so x_p = x - b / Z with
 x = (u - cx) / f, and Z = f b / d with the disparity d = f (x - x_p). Above the camera the same
 holds for rows. The place on the slide comes from phase shifting (`optics.fringe_code`), so
 
@@ -21,28 +21,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from qs3.config.checks import check_ranges
-from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, check_depths, window_of
+from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
-from qs3.sensors.matching.filters import PostFilter, Quantiser
-from qs3.sensors.matching.triangulation import Triangulation
 from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.subpixel_offsets import sample_centres
-from qs3.sensors.optics.visibility import explained, reached_from
-from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
+from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.sensors.renderers.base import Image, Projector, Scene, tangents
 
 
 @dataclass(frozen=True)
-class FringeProjection:
-    """A camera and a projector of fringes beside or above it. All numbers are ours.
+class FringeProjection(TriangulatingSensor):
+    """A camera and a projector of fringes to the right of it or above. All numbers are ours.
 
     Attributes:
-        width_px, height_px, focal_px: of the camera.
-        baseline_m: distance of the projector: along the camera's x, or above the camera if the
-            fringes change along the rows (code.along_rows).
-        min_depth_m, max_depth_m: depths outside are dropped.
+        baseline_m: the projector is above the camera, and not to its right, if the fringes change
+            along the rows (code.along_rows).
         tan_half_width: half the width of the slide at distance 1.
         projector_strength, ambient: as in SpeckleStereo.
         code: the slides.
@@ -50,15 +44,11 @@ class FringeProjection:
         min_modulation: pixels with a weaker modulation (grey values) at any fringes are dark.
         max_misfit: pixels where neighbouring fringes differ by more (in periods of the finer,
             0.5 accepts all) are ambiguous.
-        quantiser, filters: of the disparity, as in SpeckleStereo.
     """
 
-    width_px: int = 640
-    height_px: int = 480
     focal_px: float = 600.0
     baseline_m: float = 0.15
     min_depth_m: float = 0.4
-    max_depth_m: float = 6.0
     tan_half_width: float = 0.6
     projector_strength: float = 1.0
     ambient: float = 0.01
@@ -66,38 +56,27 @@ class FringeProjection:
     infrared: InfraredCamera = field(default_factory=InfraredCamera)
     min_modulation: float = 10.0
     max_misfit: float = 0.35
-    quantiser: Quantiser = field(default_factory=Quantiser)
-    filters: tuple[PostFilter, ...] = ()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_ranges(
             self,
             "sensor.",
-            **dict.fromkeys(("baseline_m", "tan_half_width", "projector_strength"), "> 0"),
+            **dict.fromkeys(("tan_half_width", "projector_strength"), "> 0"),
             ambient=">= 0",
             min_modulation=">= 0",
             max_misfit="(0, 0.5]",
         )
-        check_depths(self)
 
     @property
-    def intrinsics(self) -> Intrinsics:
-        """Of the camera."""
-        return Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
+    def margin_px(self) -> int:
+        """A pixel."""
+        return 1
 
     @property
-    def triangulation(self) -> Triangulation:
-        """From disparity to depth."""
-        return Triangulation(
-            self.focal_px, self.baseline_m, 0.0, self.min_depth_m, self.max_depth_m
-        )
-
-    @property
-    def _offset_m(self) -> tuple[float, float, float]:
-        """Projector minus camera along the camera's axes."""
-        if self.code.along_rows:
-            return 0.0, -self.baseline_m, 0.0
-        return self.baseline_m, 0.0, 0.0
+    def _offset_m(self) -> tuple[float, float]:
+        """Projector minus camera: to the right and down."""
+        return (0.0, -self.baseline_m) if self.code.along_rows else (self.baseline_m, 0.0)
 
     @property
     def _tan_half(self) -> float:
@@ -109,47 +88,31 @@ class FringeProjection:
     def depth_sigma_m(
         self, depth_m: float, noise: float | np.ndarray, modulation: float | np.ndarray
     ) -> float | np.ndarray:
-        """The law of the module's docstring.
+        """The law of the module's docstring, at depth Z.
 
-        Args:
-            depth_m: Z.
-            noise: standard deviation of one exposure in grey values, rounding included.
-            modulation: of the finest fringes in grey values.
+        `noise` is the standard deviation of one exposure in grey values, rounding included, and
+        `modulation` that of the finest fringes in grey values.
         """
         place = self.code.place_sigma(noise, modulation)
         return depth_m**2 / self.baseline_m * 2 * self._tan_half * place
 
-    def scan(
-        self,
-        bodies: tuple[Body, ...],
-        box_m: np.ndarray,
-        world_from_camera: np.ndarray,
-        renderer: Renderer,
-        rng: np.random.Generator,
-        explain: bool = False,
-    ) -> DepthFrame | None:
-        """Take one frame; see qs3.sensors.base.DepthSensor.
+    def take(self, shot: Shot) -> DepthFrame:
+        """See `DepthSensor.take`.
 
         The image "left" is the first exposure of the finest fringes, "exposures" has all.
         """
-        camera = Camera(self.intrinsics, world_from_camera)
-        window = window_of(box_m, camera, margin_px=1)
-        if window is None:
-            return None
-        here = Camera(self.intrinsics, world_from_camera, window)
-        pose = camera.moved(self._offset_m).world_from_camera
-        seed = int(rng.integers(2**31))
-        images = self._render(bodies, here, pose, renderer, seed)
-        centres = sample_centres(here, renderer, seed, along_rows=self.code.along_rows)
+        pose, seed = shot.pose_at(*self._offset_m), shot.seed()
+        images = self._render(shot, pose, seed)
+        centres = sample_centres(shot.camera, shot.renderer, seed, along_rows=self.code.along_rows)
         seen = images[0]
         hit = np.isfinite(seen.depth_m)
         radiance = np.stack([image.radiance for image in images])
         gain = self.infrared.gain(radiance.max(axis=0), hit)
-        grey = np.stack([self.infrared.expose(image, gain, rng) for image in radiance])
+        grey = np.stack([self.infrared.expose(image, gain, shot.rng) for image in radiance])
         exposures = grey.reshape(len(self.code.periods), self.code.steps, *grey.shape[1:])
 
         match, modulation = self._match(exposures, centres)
-        depth, disparity, reason = self.triangulation.depth(match, self.quantiser, self.filters)
+        depth, disparity, reason = self.depth_of(match)
         pictures = {
             "left": exposures[-1, 0],
             "disparity": disparity,
@@ -158,33 +121,11 @@ class FringeProjection:
             "exposures": grey,
         }
         invalid = reason != Reason.OK
-        reason[invalid & self._beside_slide(window, seen.depth_m)] = Reason.OUTSIDE
+        reason[invalid & self._off_slide(shot, seen.depth_m)] = Reason.OUTSIDE
         reason[invalid & ~hit] = Reason.EMPTY
-        if explain:
-            lit = reached_from(bodies, here, pose, renderer)
-            reason = explained(reason, seen.depth_m, lit, None)
-            pictures["lit"] = lit
-        return DepthFrame(
-            camera=camera,
-            left=window.left,
-            top=window.top,
-            step_px=1,
-            depth_m=depth,
-            clean_m=seen.depth_m,
-            label=seen.label,
-            cosine=seen.cosine,
-            reason=reason,
-            images=pictures,
-        )
+        return shot.frame(depth, shot.explained(reason, pictures, pose), seen, pictures)
 
-    def _render(
-        self,
-        bodies: tuple[Body, ...],
-        camera: Camera,
-        world_from_projector: np.ndarray,
-        renderer: Renderer,
-        seed: int,
-    ) -> list[Image]:
+    def _render(self, shot: Shot, world_from_projector: np.ndarray, seed: int) -> list[Image]:
         """One image a slide, coarse fringes first; the first has the geometry too."""
         images: list[Image] = []
         for slide in self.code.slides.reshape(-1, self.code.rows, self.code.columns):
@@ -194,22 +135,16 @@ class FringeProjection:
                 self.tan_half_width,
                 self.projector_strength,
             )
+            scene = Scene(shot.bodies, projector, self.ambient)
             # One seed: a pixel sees the same piece of the surface in every exposure.
-            images += renderer.render(
-                Scene(bodies, projector, self.ambient),
-                [camera],
-                seed=seed,
-                geometry=[not images],
-            )
+            images += shot.renderer.render(scene, [shot.camera], seed=seed, geometry=[not images])
         return images
 
-    def _beside_slide(self, window: Window, depth_m: np.ndarray) -> np.ndarray:
+    def _off_slide(self, shot: Shot, depth_m: np.ndarray) -> np.ndarray:
         """[h, w] bool: the projector's slide ends before the surface; False where none is."""
-        k = self.intrinsics
-        right, down, _ = self._offset_m
-        x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px - right / depth_m
-        y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
-        y = y - down / depth_m
+        right, down = self._offset_m
+        x, y = tangents(shot.camera)
+        x, y = x - right / depth_m, y - down / depth_m
         tan_half_height = self.tan_half_width * self.code.rows / self.code.columns
         return (np.abs(x) > self.tan_half_width) | (np.abs(y) > tan_half_height)
 
@@ -225,15 +160,12 @@ class FringeProjection:
             disparity = k.focal_px * on_slide - (centres - k.cy_px)
         else:
             disparity = (centres - k.cx_px) - k.focal_px * on_slide
-        why_not = np.select(
-            [
-                modulation.min(axis=0) < self.min_modulation,
-                exposures.max(axis=(0, 1)) == 255,
-                misfit > self.max_misfit,
-            ],
-            [np.uint8(Reason.DARK), np.uint8(Reason.SATURATED), np.uint8(Reason.AMBIGUOUS)],
-            np.uint8(Reason.OK),
-        )
+        causes = {
+            Reason.DARK: modulation.min(axis=0) < self.min_modulation,
+            Reason.SATURATED: exposures.max(axis=(0, 1)) == 255,
+            Reason.AMBIGUOUS: misfit > self.max_misfit,
+        }
+        why_not = first_reason(causes, Reason.OK)
         valid = why_not == Reason.OK
         found = np.where(valid, disparity, np.nan).astype(np.float32)
         return Match.of(found, why_not), modulation[-1]

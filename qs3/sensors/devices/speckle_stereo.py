@@ -18,35 +18,27 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, check_depths, window_of
-from qs3.sensors.matching import Matcher, StereoBlockMatcher
-from qs3.sensors.matching.filters import PostFilter, Quantiser
-from qs3.sensors.matching.triangulation import Triangulation
+from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
+from qs3.sensors.matching import Match, Matcher, StereoBlockMatcher
 from qs3.sensors.optics.blender_filmic import FilmicCamera
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Slide, Speckle
-from qs3.sensors.optics.visibility import explained, reached_from
 from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
+from qs3.sensors.renderers.base import Image, Projector, Scene
 
 
 @dataclass(frozen=True)
-class SpeckleStereo:
-    """An active stereo depth camera.
+class SpeckleStereo(TriangulatingSensor):
+    """An active stereo depth camera; the projector is half-way between its two cameras.
 
     Attributes:
-        width_px, height_px, focal_px: of both cameras.
-        baseline_m: right camera minus left camera along x; the projector is half-way.
         step_px: every step-th pixel of every step-th row gives a depth (1080 / 4 = 270).
-        min_depth_m, max_depth_m: depths outside are dropped.
         tan_half_width: half the width of the projected slide at distance 1.
         ambient: radiance of the fill light relative to the pattern's on a white surface
             at 4 m; it lowers the contrast.
         pattern: the slide.
         matcher: finds the left image in the right one.
         infrared: from radiance to grey values.
-        quantiser: step of the disparity; StereoBM's own is 1/16 px.
-        filters: applied to the disparity in this order, before the quantiser.
         projector_strength: radiance of a white surface under a lit dot at 1 m; at 16, white at
             4 m has radiance 1. `ambient` is in the same units.
         sample_offset_px: first column and row that are kept; null: the middle of each step.
@@ -70,22 +62,25 @@ class SpeckleStereo:
     pattern: Slide = field(default_factory=Speckle)
     matcher: Matcher = field(default_factory=StereoBlockMatcher)
     infrared: InfraredCamera | FilmicCamera = field(default_factory=InfraredCamera)
-    quantiser: Quantiser = field(default_factory=Quantiser)
-    filters: tuple[PostFilter, ...] = ()
     projector_strength: float = 16.0
     sample_offset_px: int | None = None
     centre_error_px: float = 0.0
     blind_left_px: int = 0
 
     def __post_init__(self) -> None:
-        check_ranges(self, "sensor.", baseline_m="> 0", step_px=">= 1", projector_strength="> 0")
-        check_depths(self)
+        super().__post_init__()
+        check_ranges(
+            self,
+            "sensor.",
+            step_px=">= 1",
+            projector_strength="> 0",
+            blind_left_px=f"[0, {self.width_px})",
+        )
         if self.sample_offset_px is not None and not 0 <= self.sample_offset_px < self.step_px:
             raise ConfigError(
                 f"sensor.sample_offset_px must be null or in 0..{self.step_px - 1} (step_px is "
                 f"{self.step_px}), got {self.sample_offset_px}"
             )
-        check_ranges(self, "sensor.", blind_left_px=f"[0, {self.width_px})")
         end = self.matcher.min_disparity + self.matcher.num_disparities
         if self.focal_px * self.baseline_m / self.min_depth_m > end:
             nearest = self.focal_px * self.baseline_m / end
@@ -95,71 +90,39 @@ class SpeckleStereo:
             )
 
     @property
-    def triangulation(self) -> Triangulation:
-        """From disparity to depth."""
-        return Triangulation(
-            self.focal_px, self.baseline_m, 0.0, self.min_depth_m, self.max_depth_m
-        )
+    def steps_per_px(self) -> int:
+        """Steps of the disparity; OpenCV's own are 1/16 px."""
+        return self.quantiser.steps_per_px or 16
 
-    def depth_step_m(self, depth_m: float) -> float:
-        """Depth that one step of the disparity makes: Z^2 q / (f b); OpenCV's q is 1/16 px."""
-        steps = self.quantiser.steps_per_px or 16
-        return depth_m**2 / (steps * self.focal_px * self.baseline_m)
+    @property
+    def margin_px(self) -> int:
+        """Fattening puts values up to half a block outside the silhouette."""
+        return self.matcher.reach_px
 
-    def scan(
-        self,
-        bodies: tuple[Body, ...],
-        box_m: np.ndarray,
-        world_from_camera: np.ndarray,
-        renderer: Renderer,
-        rng: np.random.Generator,
-        explain: bool = False,
-    ) -> DepthFrame | None:
-        """Take one frame; see qs3.sensors.base.DepthSensor."""
-        intrinsics = Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
-        left = Camera(intrinsics, world_from_camera)
-        right = left.moved((self.baseline_m, 0.0, 0.0))
-        # Fattening puts values up to half a block outside the silhouette.
-        reach = self.matcher.reach_px
-        left_window = window_of(box_m, left, margin_px=reach)
-        right_window = window_of(box_m, right, margin_px=reach)
-        if left_window is None or right_window is None:
+    def take(self, shot: Shot) -> DepthFrame | None:
+        """See `DepthSensor.take`."""
+        middle, right = shot.pose_at(self.baseline_m / 2), shot.pose_at(self.baseline_m)
+        window = window_of(shot.box_m, Camera(self.intrinsics, right), margin_px=self.margin_px)
+        if window is None:
             return None
-
-        middle = left.moved((self.baseline_m / 2, 0.0, 0.0)).world_from_camera
-        projector = Projector(
-            middle,
-            self.pattern.slide,
-            self.tan_half_width,
-            strength=self.projector_strength,
-        )
-        images = renderer.render(
-            Scene(bodies, projector, self.ambient),
-            [
-                Camera(intrinsics, left.world_from_camera, left_window),
-                Camera(intrinsics, right.world_from_camera, right_window),
-            ],
-            seed=int(rng.integers(2**31)),
+        slide, strength = self.pattern.slide, self.projector_strength
+        projector = Projector(middle, slide, self.tan_half_width, strength)
+        images = shot.renderer.render(
+            Scene(shot.bodies, projector, self.ambient),
+            [shot.camera, Camera(self.intrinsics, right, window)],
+            seed=shot.seed(),
             geometry=[True, False],  # only the left image gets a depth
         )
-
-        canvas = self._canvas(left_window, right_window)
+        windows = (shot.window, window)
+        canvas = self._canvas(*windows)
         gain = self.infrared.gain(images[0].radiance, images[0].label > 0)
         grey = [
-            self.infrared.expose(_place(image, window, canvas), gain, rng)
-            for image, window in zip(images, (left_window, right_window), strict=True)
+            self.infrared.expose(_place(image, at, canvas), gain, shot.rng)
+            for image, at in zip(images, windows, strict=True)
         ]
-        match = self.matcher.match(grey[0], grey[1])
-        if self.blind_left_px:
-            blind = slice(0, max(0, self.blind_left_px - canvas.left))
-            match.reason[:, blind], match.disparity[:, blind] = Reason.OUTSIDE, np.nan
-        depth, disparity, reason = self.triangulation.depth(match, self.quantiser, self.filters)
-
-        inside = Window(
-            left_window.left - canvas.left,
-            left_window.top - canvas.top,
-            left_window.width,
-            left_window.height,
+        depth, disparity, reason = self.depth_of(self._match(grey[0], grey[1], canvas.left))
+        inside = replace(
+            shot.window, left=shot.window.left - canvas.left, top=shot.window.top - canvas.top
         ).slices
         pictures = {
             "left": grey[0][inside],
@@ -167,42 +130,23 @@ class SpeckleStereo:
             "disparity": disparity[inside],
             "clean": images[0].depth_m,
         }
-        reason = reason[inside]
-        if explain:
-            camera = Camera(intrinsics, left.world_from_camera, left_window)
-            lit = reached_from(bodies, camera, middle, renderer)
-            seen = reached_from(bodies, camera, right.world_from_camera, renderer)
-            reason = explained(reason, images[0].depth_m, lit, seen)
-            pictures |= {"lit": lit, "seen": seen}
+        reason = shot.explained(reason[inside], pictures, middle, right)
+        at = shot.samples(self.step_px, self.sample_offset_px)
+        depth = at.of(depth[inside])
+        return shot.frame(depth, at.of(reason), images[0], pictures, at, self._believed)
 
-        # Samples lie on one grid over the whole image, whatever the window.
-        offset = self.sample_offset_px
-        if offset is None:
-            offset = self.step_px // 2
-        first_col = _first_on_grid(left_window.left, self.step_px, offset)
-        first_row = _first_on_grid(left_window.top, self.step_px, offset)
-        grid = (
-            slice(first_row - left_window.top, None, self.step_px),
-            slice(first_col - left_window.left, None, self.step_px),
-        )
-        return DepthFrame(
-            camera=Camera(self._believed, left.world_from_camera),
-            left=first_col,
-            top=first_row,
-            step_px=self.step_px,
-            depth_m=depth[inside][grid],
-            clean_m=images[0].depth_m[grid],
-            label=images[0].label[grid],
-            cosine=images[0].cosine[grid],
-            reason=reason[grid],
-            images=pictures,
-        )
+    def _match(self, left: np.ndarray, right: np.ndarray, first_column: int) -> Match:
+        """What the matcher finds; `first_column` is the canvas's first in the whole image."""
+        match = self.matcher.match(left, right)
+        if self.blind_left_px:
+            blind = slice(0, max(0, self.blind_left_px - first_column))
+            match.reason[:, blind], match.disparity[:, blind] = Reason.OUTSIDE, np.nan
+        return match
 
     @property
     def _believed(self) -> Intrinsics:
         """What back-projection takes for the intrinsics."""
-        true = Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
-        error = self.centre_error_px
+        true, error = self.intrinsics, self.centre_error_px
         return replace(true, cx_px=true.cx_px + error, cy_px=true.cy_px + error)
 
     def _canvas(self, left: Window, right: Window) -> Window:
@@ -224,8 +168,3 @@ def _place(image: Image, window: Window, canvas: Window) -> np.ndarray:
     row, col = window.top - canvas.top, window.left - canvas.left
     out[row : row + window.height, col : col + window.width] = image.radiance
     return out
-
-
-def _first_on_grid(start: int, step: int, offset: int) -> int:
-    """The smallest x >= start with x % step == offset."""
-    return start + (offset - start) % step

@@ -1,6 +1,6 @@
 """Time of flight: the phase of modulated light, per pixel.
 
-A lamp beside the lens shines with an intensity modulated at f. Light that went to a surface
+A lamp next to the lens shines with an intensity modulated at f. Light that went to a surface
 and back, s metres in all, is late by the phase 2 pi f s / c. A pixel collects it in four
 buckets, a quarter of a period apart; with K electrons a unit of radiance, contrast C, radiance
 R of the lamp's light and radiance B of all other light, bucket m holds on average
@@ -37,17 +37,17 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.sensors.base import DepthFrame, check_depths, window_of
-from qs3.sensors.optics.point_light import grey_picture, white_lamp
-from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.base import Body, Image, Renderer, Scene
+from qs3.sensors.base import DepthFrame, DepthSensor, Shot, check_depths
+from qs3.sensors.optics.visibility import white_lamp
+from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.sensors.renderers.base import Image, Scene
 
 SPEED_OF_LIGHT = 299_792_458.0
 """Metres a second."""
 
 
 @dataclass(frozen=True)
-class TimeOfFlight:
+class TimeOfFlight(DepthSensor):
     """An amplitude-modulated continuous-wave time-of-flight camera.
 
     The defaults put white at the noise of published cameras: on albedo 0.8 sigma is 1.1 mm at
@@ -56,7 +56,6 @@ class TimeOfFlight:
     of 16 and 80 MHz are two of Kinect v2's three; the other numbers are ours.
 
     Attributes:
-        width_px, height_px, focal_px: of the camera.
         lamp_offset_m: lamp minus camera along the camera's x. The device knows it.
         frequencies_hz: one, or more that are measured in turn; the first is unwrapped by the
             others, and each counts by its noise.
@@ -107,9 +106,9 @@ class TimeOfFlight:
         check_depths(self)
 
     @property
-    def intrinsics(self) -> Intrinsics:
-        """Of the camera."""
-        return Intrinsics.centred(self.width_px, self.height_px, self.focal_px)
+    def margin_px(self) -> int:
+        """A pixel."""
+        return 1
 
     @property
     def ambiguity_m(self) -> float:
@@ -119,44 +118,24 @@ class TimeOfFlight:
     def distance_sigma_m(
         self, amplitude_e: float | np.ndarray, mean_e: float | np.ndarray
     ) -> float | np.ndarray:
-        """The law of the module's docstring, all frequencies taken together.
+        """Standard deviation in metres along the ray, of all frequencies together: the law above.
 
-        Args:
-            amplitude_e: A, electrons.
-            mean_e: K (R + B), electrons a bucket on average.
-
-        Returns:
-            Standard deviation of the distance along the ray, metres.
+        `amplitude_e` is A and `mean_e` K (R + B), in electrons a bucket.
         """
         together = sum(f**2 for f in self.frequencies_hz) ** 0.5
         noise = np.sqrt(mean_e + self.read_noise_e**2) / (math.sqrt(2) * amplitude_e)
         return SPEED_OF_LIGHT / (4 * math.pi * together) * noise
 
-    def scan(
-        self,
-        bodies: tuple[Body, ...],
-        box_m: np.ndarray,
-        world_from_camera: np.ndarray,
-        renderer: Renderer,
-        rng: np.random.Generator,
-        explain: bool = False,
-    ) -> DepthFrame | None:
-        """Take one frame; see qs3.sensors.base.DepthSensor.
-
-        Surfaces that the lamp does not reach are told apart whether asked for or not: the
-        lamp's light is rendered anyway.
-        """
-        camera = Camera(self.intrinsics, world_from_camera)
-        window = window_of(box_m, camera, margin_px=1)
-        if window is None:
-            return None
-        fine, other = self._render(bodies, camera, window, renderer, int(rng.integers(2**31)))
+    def take(self, shot: Shot) -> DepthFrame:
+        """See `DepthSensor.take`. The lamp's light is rendered anyway, so shadow is explained."""
+        window = shot.window
+        fine, other = self._render(shot)
         lamp_light = _pixel_mean(fine.radiance, self.supersampling)
         mean_e = self.electrons_at_1m * (lamp_light + other)
         path = self._path_m(window, fine.depth_m)
 
         buckets = np.stack(
-            [self._expose(fine.radiance, path, f, mean_e, rng) for f in self.frequencies_hz]
+            [self._expose(fine.radiance, path, f, mean_e, shot.rng) for f in self.frequencies_hz]
         )  # [F, 4, h, w]
         cosine_part = buckets[:, 0] - buckets[:, 2]
         sine_part = buckets[:, 1] - buckets[:, 3]
@@ -165,8 +144,10 @@ class TimeOfFlight:
         half_path, disagreement = unwrapped(phase, amplitude, self.frequencies_hz)
         depth = self._depth(window, half_path)
 
-        middle = slice(self.supersampling // 2, None, self.supersampling)
-        clean = np.ascontiguousarray(fine.depth_m[middle, middle])
+        middle = (slice(self.supersampling // 2, None, self.supersampling),) * 2
+        clean, label, cosine = (
+            np.ascontiguousarray(a[middle]) for a in (fine.depth_m, fine.label, fine.cosine)
+        )
         with np.errstate(invalid="ignore"):
             causes = {
                 Reason.EMPTY: ~np.isfinite(clean),
@@ -178,52 +159,26 @@ class TimeOfFlight:
             }
         # A pixel on an edge is a measurement even where its centre sees nothing.
         dropped = np.any(list(causes.values())[2:], axis=0)
-        reason = np.select(
-            [~dropped, *causes.values()],
-            [np.uint8(Reason.OK), *(np.uint8(cause) for cause in causes)],
-            np.uint8(Reason.UNMATCHED),
-        ).astype(np.uint8)
-        pictures = {"left": grey_picture(amplitude[0]), "clean": clean}
-        if explain:
+        reason = first_reason({Reason.OK: ~dropped, **causes}, Reason.UNMATCHED)
+        pictures = {"left": _grey(amplitude[0]), "clean": clean}
+        if shot.explain:
             pictures["lit"] = lamp_light > 0
-        return DepthFrame(
-            camera=camera,
-            left=window.left,
-            top=window.top,
-            step_px=1,
-            depth_m=np.where(dropped, np.nan, depth).astype(np.float32),
-            clean_m=clean,
-            label=np.ascontiguousarray(fine.label[middle, middle]),
-            cosine=np.ascontiguousarray(fine.cosine[middle, middle]),
-            reason=reason,
-            images=pictures,
-        )
+        depth = np.where(dropped, np.nan, depth).astype(np.float32)
+        return shot.frame(depth, reason, Image(lamp_light, clean, label, cosine), pictures)
 
-    def _render(
-        self,
-        bodies: tuple[Body, ...],
-        camera: Camera,
-        window: Window,
-        renderer: Renderer,
-        seed: int,
-    ) -> tuple[Image, np.ndarray]:
+    def _render(self, shot: Shot) -> tuple[Image, np.ndarray]:
         """The lamp's light in a camera with finer pixels, and radiance of other light [h, w]."""
-        n = self.supersampling
-        pose = camera.world_from_camera
+        n, window, seed = self.supersampling, shot.window, shot.seed()
         small = Intrinsics.centred(self.width_px * n, self.height_px * n, self.focal_px * n)
         part = Window(window.left * n, window.top * n, window.width * n, window.height * n)
-        lamp = white_lamp(camera.moved((self.lamp_offset_m, 0.0, 0.0)).world_from_camera)
-        (fine,) = renderer.render(
-            Scene(bodies, lamp), [Camera(small, pose, part)], seed=seed, geometry=[True]
-        )
+        lamp = white_lamp(shot.pose_at(self.lamp_offset_m))
+        camera = Camera(small, shot.camera.world_from_camera, part)
+        lit = Scene(shot.bodies, lamp)
+        (fine,) = shot.renderer.render(lit, [camera], seed=seed, geometry=[True])
         if not self.ambient:
             return fine, np.zeros((window.height, window.width), dtype=np.float32)
-        (other,) = renderer.render(
-            Scene(bodies, None, self.ambient),
-            [Camera(self.intrinsics, pose, window)],
-            seed=seed,
-            geometry=[False],
-        )
+        dim = Scene(shot.bodies, None, self.ambient)
+        (other,) = shot.renderer.render(dim, [shot.camera], seed=seed, geometry=[False])
         return fine, other.radiance
 
     def _rays(self, window: Window, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -277,8 +232,7 @@ def unwrapped(
     weighed with 1 / sigma^2, which is proportional to (f A)^2 as the buckets' mean is common.
 
     Args:
-        phase: [F, h, w] in 0..2 pi.
-        amplitude: [F, h, w] electrons, for the weights.
+        phase, amplitude: [F, h, w] in 0..2 pi, and in electrons, for the weights.
         frequencies_hz: F of them.
 
     Returns:
@@ -309,3 +263,10 @@ def _pixel_mean(fine: np.ndarray, n: int) -> np.ndarray:
     """[h n, w n] -> [h, w] float64, the mean over each pixel's n by n places."""
     height, width = fine.shape[0] // n, fine.shape[1] // n
     return fine.reshape(height, n, width, n).mean(axis=(1, 3), dtype=np.float64)
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    """[h, w] of any scale -> uint8 for looking at: the 98 % quantile of what is lit at 220."""
+    lit = image[image > 0]
+    white = float(np.quantile(lit, 0.98)) if lit.size else 1.0
+    return np.clip(np.rint(image * (220 / white)), 0, 255).astype(np.uint8)

@@ -11,7 +11,6 @@ from qs3.errors import ConfigError
 from qs3.utils.cli import NUMBER, Command, Option, one_of, several, text
 
 if TYPE_CHECKING:
-    from qs3.geometry.cameras import Intrinsics
     from qs3.sensors.fit.preset import FittedPreset
 
 
@@ -48,7 +47,8 @@ def fit(
     Raises:
         ConfigError, DataError: say which argument or file is to blame.
     """
-    from qs3.sensors.fit.frames import read_frame
+    from qs3.geometry.cameras import Intrinsics
+    from qs3.sensors.fit.frames import read_camera, read_frame
     from qs3.sensors.fit.laws import find_bias, find_fill, find_noise
     from qs3.sensors.fit.planes import find_wall
     from qs3.sensors.fit.preset import FittedPreset
@@ -63,7 +63,12 @@ def fit(
     if len(shapes) > 1:
         raise ConfigError(f"frames of one camera have one size, these have {sorted(shapes)}")
     height, width = frames[0].depth_m.shape
-    camera = _camera(intrinsics, focal, width, height)
+    if intrinsics is not None:
+        camera = read_camera(intrinsics, width, height)
+    elif focal is not None:
+        camera = Intrinsics.centred(width, height, focal)
+    else:
+        raise ConfigError("give the camera: intrinsics=fx,fy,cx,cy, or focal=PIXELS")
     if distances is not None and len(distances) != len(frames):
         raise ConfigError(f"distances= has {len(distances)} values for {len(frames)} frames")
     steps = find_steps(frames)
@@ -74,29 +79,13 @@ def fit(
     )
 
 
-def _camera(intrinsics: str | None, focal: float | None, width: int, height: int) -> Intrinsics:
-    from qs3.geometry.cameras import Intrinsics
-    from qs3.sensors.fit.frames import read_pinhole
-
-    if intrinsics is None:
-        if focal is None:
-            raise ConfigError("give the camera: intrinsics=fx,fy,cx,cy, or focal=PIXELS")
-        return Intrinsics.centred(width, height, focal)
-    found = read_pinhole(intrinsics)
-    if not 0.95 < found.fx_px / found.fy_px < 1.05:
-        raise ConfigError(
-            f"intrinsics=: fx {found.fx_px} and fy {found.fy_px} differ; pixels must be square"
-        )
-    return Intrinsics(width, height, (found.fx_px + found.fy_px) / 2, found.cx_px, found.cy_px)
-
-
 FIT = Command(
     "qs3 fit",
     "a preset for your own depth camera, from a few frames of a flat wall",
     _fit,
     (
         Option("out", text("FILE"), "the preset, conf/sensor/NAME.yaml", required=True),
-        Option("plot", text("FILE"), ".png (default: beside the preset)"),
+        Option("plot", text("FILE"), ".png (default: next to the preset)"),
         Option("intrinsics", text("fx,fy,cx,cy"), "in px, or a JSON file with these keys"),
         Option("focal", NUMBER, "px, instead; the principal point is the middle"),
         Option("unit", text("UNIT"), "m, mm, or units a metre (default: judged by the values)"),

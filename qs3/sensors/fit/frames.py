@@ -9,36 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.geometry.cameras import Intrinsics
 
 _MAX_PIXELS = 1 << 26
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
 _INVALID = 65535  # of 16 bits; 0 is the usual mark
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """The depth camera: focal lengths and principal point in pixels."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-
-    def __post_init__(self) -> None:
-        if not (self.fx_px > 0 and self.fy_px > 0):
-            raise ConfigError(
-                f"intrinsics=: fx and fy must be positive, got {self.fx_px} and {self.fy_px}"
-            )
-        if not np.isfinite([self.cx_px, self.cy_px]).all():
-            raise ConfigError("intrinsics=: cx and cy must be numbers")
-
-    def tangents(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """[w] and [h]: x / Z of each column and y / Z of each row."""
-        height, width = shape
-        return (
-            (np.arange(width) - self.cx_px) / self.fx_px,
-            (np.arange(height) - self.cy_px) / self.fy_px,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +24,7 @@ class DepthImage:
         name: of its file, for messages.
         depth_m: [h, w] float64 metres, NaN where nothing was measured.
         resolution_m: all depths are whole multiples of it; 0 if there is no such step.
-        unit: what the file's numbers were taken for, in words.
+        unit: what the file's numbers were taken for, and why.
     """
 
     name: str
@@ -58,34 +33,40 @@ class DepthImage:
     unit: str
 
 
-def read_pinhole(text: str) -> Pinhole:
+def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
     """`fx,fy,cx,cy`, or a JSON file with fx, fy, cx, cy (also as K or intrinsic_matrix).
 
     Raises:
-        ConfigError: it is neither.
+        ConfigError: it is neither, or pixels are not square.
         MissingDataError: there is no such file.
+        DataError: the file does not hold them.
     """
     if text.lower().endswith(".json"):
-        path = Path(text)
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            values = _four(json.loads(Path(text).read_text(encoding="utf-8")))
         except OSError as error:
-            raise MissingDataError(f"intrinsics={path}: {error.strerror or error}") from error
+            raise MissingDataError(f"intrinsics={text}: {error.strerror or error}") from error
         except ValueError as error:
-            raise DataError(f"intrinsics={path} is not JSON: {error}") from error
-        values = _four(found)
+            raise DataError(f"intrinsics={text} is not JSON: {error}") from error
         if values is None:
             raise DataError(
-                f"intrinsics={path} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
+                f"intrinsics={text} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
             )
-        return Pinhole(*values)
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 4:
-        raise ConfigError(f"intrinsics={text!r}: write fx,fy,cx,cy in pixels, or a .json file")
-    return Pinhole(*values)
+    else:
+        try:
+            values = [float(word) for word in text.split(",")]
+        except ValueError:
+            values = []
+        if len(values) != 4:
+            raise ConfigError(f"intrinsics={text!r}: write fx,fy,cx,cy in pixels, or a .json file")
+    fx, fy, cx, cy = values
+    if not (fx > 0 and fy > 0 and np.isfinite(values).all()):
+        raise ConfigError(
+            f"intrinsics=: fx and fy must be positive, cx and cy finite, got {values}"
+        )
+    if not 0.95 < fx / fy < 1.05:
+        raise ConfigError(f"intrinsics=: fx {fx} and fy {fy} differ; pixels must be square")
+    return Intrinsics(width_px, height_px, (fx + fy) / 2, cx, cy)
 
 
 def _four(found: object) -> list[float] | None:
@@ -111,9 +92,7 @@ def _four(found: object) -> list[float] | None:
 def read_frame(path: str | Path, unit: str | None = None) -> DepthImage:
     """One depth frame: 16 bit PNG, .npy, or an organised .pcd cloud.
 
-    Args:
-        path: of the file.
-        unit: "m", "mm", units a metre as a number, or None: as the numbers look.
+    `unit` is "m", "mm", units a metre as a number, or None: as the numbers look.
 
     Raises:
         MissingDataError: there is no such file.
@@ -214,9 +193,9 @@ def _npy(path: Path) -> np.ndarray:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path} is no .npy array, or damaged: {error}") from error
+        raise DataError(f"{path} is not a .npy array, or damaged: {error}") from error
     if not isinstance(array, np.ndarray):
-        raise DataError(f"{path} is no .npy array but an archive of several")
+        raise DataError(f"{path} is not a .npy array but an archive of several")
     if array.size > _MAX_PIXELS:
         raise DataError(f"{path} has {array.size} values; at most {_MAX_PIXELS} are read")
     return np.array(array)

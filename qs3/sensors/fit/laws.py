@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from qs3.errors import DataError
 from qs3.sensors.devices.fitted import FittedDepth, neighbour_correlation
 from qs3.sensors.fit.planes import Wall
-from qs3.sensors.fit.rounded import TRIMMED_NORMAL, smooth_wall, spread_between
+from qs3.sensors.fit.rounded import inner_spread, smooth_wall, spread_between
 from qs3.sensors.fit.steps import Steps
 from qs3.sensors.fit.texture import noise_size_px
 
@@ -68,11 +68,9 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
 
     Pixels are binned by the plane's depth, frame by frame. Errors are those from a smooth surface
     (`smooth_wall`), so that neither distortion nor bias counts as noise. sigma as measured is the
-    standard deviation of the inner 99 %; that before the quantiser, to which the law is fitted,
-    is the one of highest likelihood (`spread_between`).
-
-    Args:
-        power: 1 or 2 to fix the law; None lets the data choose, if distances differ by 30 %.
+    standard deviation of the inner 99 %; that before the quantiser, to which the law is fitted, is
+    the one of highest likelihood (`spread_between`). `power` 1 or 2 fixes the law; None lets the
+    data choose, if distances differ by 30 %.
 
     Raises:
         DataError: too few pixels.
@@ -96,10 +94,8 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
             inside = bins == number
             if inside.sum() < _LEAST_IN_BIN:
                 continue
-            part = measured[inside] - 1 / mean[inside]
-            near, far = np.quantile(part, [0.005, 0.995])
-            sigma.append(float(part[(part >= near) & (part <= far)].std()) / TRIMMED_NORMAL)
-            # One level or none besides says nothing of what lies below a step.
+            sigma.append(inner_spread(measured[inside] - 1 / mean[inside]))
+            # A single level says nothing of what lies below a step.
             levels = len(np.unique(measured[inside].astype(np.float32)))
             found = spread_between(low[inside], high[inside], mean[inside]) if levels > 1 else 0.0
             depth.append(float(z[inside].mean()))
@@ -217,14 +213,11 @@ def _hole_size(walls: Sequence[Wall]) -> float:
 
 
 def find_bias(walls: Sequence[Wall], distances_m: Sequence[float] | None) -> tuple[float, ...]:
-    """Polynomial of the error of the wall's distance at the principal point.
+    """Polynomial of the error of the wall's distance at the principal point, the constant first.
 
-    A constant, a line or a parabola: a higher power must lower the corrected RMS error by a
-    fifth, and there must be more distances than coefficients. A slanted wall counts less: an
-    error of its tilt is one of its distance.
-
-    Returns:
-        Coefficients, the constant first; (0,) without references.
+    A constant, a line or a parabola: a higher power must lower the corrected RMS error by a fifth,
+    and there must be more distances than coefficients. A slanted wall counts less: an error of its
+    tilt is one of its distance. (0,) without references.
     """
     if distances_m is None:
         return (0.0,)

@@ -49,20 +49,14 @@ class Wall:
 
 
 def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0) -> Wall:
-    """Fit the plane that most pixels lie on.
+    """Fit the plane that most pixels of `depth_m` [h, w] with NaN lie on.
 
-    A plane is linear in 1 / Z over the pixels, so the fit is linear and its errors are those of
-    a disparity. Random triples first (the one with the lowest 30 % quantile of errors), then
-    least squares on what lies within 4.5 standard deviations, eight times.
-
-    Args:
-        name: for messages.
-        depth_m: [h, w] with NaN.
-        camera: intrinsics.
-        seed: of the triples.
+    A plane is linear in 1 / Z over the pixels, so the fit is linear and its errors are those of a
+    disparity. Random triples first (the one with the lowest 30 % quantile of errors), then least
+    squares on what lies within 4.5 standard deviations, eight times.
 
     Raises:
-        DataError: there is no plane, or it covers too little.
+        DataError: there is no plane, or it covers too little; the message begins with `name`.
     """
     height, width = depth_m.shape
     rows, cols = np.nonzero(np.isfinite(depth_m))
@@ -158,17 +152,23 @@ def _error_around(error_m: np.ndarray, camera: Intrinsics) -> float:
     return float(part.mean()) if part.size else 0.0
 
 
+def between(mask: np.ndarray) -> np.ndarray:
+    """[h, w] bool: between the first and the last True of [h, w], in its row and its column."""
+    out = np.ones_like(mask)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(mask, axis=axis)
+        after = np.flip(np.logical_or.accumulate(np.flip(mask, axis), axis=axis), axis)
+        out &= before & after
+    return out
+
+
 def _region(on_wall: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """[h, w] bool: the wall with its holes, of whatever size these are.
 
     What lies between pixels of the wall, in its row and in its column, but for a rim, where
-    holes would be open to one side and left out. Holes beside another thing are its shadow.
+    holes would be open to one side and left out. Holes next to another thing are its shadow.
     """
-    inside = np.ones_like(on_wall)
-    for axis in (0, 1):
-        before = np.logical_or.accumulate(on_wall, axis=axis)
-        after = np.flip(np.logical_or.accumulate(np.flip(on_wall, axis), axis=axis), axis)
-        inside &= before & after
+    inside = between(on_wall)
     side = 2 * (on_wall.shape[1] // _RIM) + 1
     kernel = np.ones((side, side), np.uint8)
     inside = cv2.erode(

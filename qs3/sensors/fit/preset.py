@@ -42,35 +42,35 @@ class FittedPreset:
 
     def save(self, path: Path, command: str) -> None:
         """Write the preset, with the command that made it."""
-        k, nearest, farthest = self.camera, *self._range()
+        k, noise, (nearest, farthest) = self.camera, self.noise, self._range()
+        assumed = "" if noise.power_known else "   # assumed: all walls are equally far"
         baseline = "null" if self.baseline_m is None else f"{self.baseline_m:.6g}"
-        lines = [
-            "# Fitted to depth frames of a flat wall; noise is added to the true depth.",
-            f"# {command}",
-            "_target_: qs3.sensors.devices.fitted.FittedDepth",
-            f"width_px: {k.width_px}",
-            f"height_px: {k.height_px}",
-            f"focal_px: {k.focal_px:.8g}",
-            f"cx_px: {k.cx_px:.8g}",
-            f"cy_px: {k.cy_px:.8g}",
-            "step_px: 1",
-            f"# The frames show walls from {nearest:.2f} to {farthest:.2f} m.",
-            "min_depth_m: 0.3",
-            "max_depth_m: 8.0",
-            f"noise_floor_m: {self.noise.floor_m:.6g}",
-            f"noise_factor: {self.noise.factor:.6g}",
-            f"noise_power: {self.noise.power:g}"
-            + ("" if self.noise.power_known else "   # assumed: all walls are equally far"),
-            f"correlation_px: {self.noise.correlation_px:.3g}",
-            f"inverse_step_per_m: {self.steps.inverse_per_m:.8g}",
-            f"depth_step_m: {self.steps.depth_m:.6g}",
-            f"bias_m: {_numbers(self.bias_m)}",
-            f"tilts_deg: {_numbers(self.fill.tilts_deg)}",
-            f"fill_rates: {_numbers(self.fill.rates)}",
-            f"hole_px: {self.fill.hole_px:.3g}",
-            f"baseline_m: {baseline}",
-        ]
-        write_text(path, "\n".join(lines) + "\n")
+        text = f"""\
+# Fitted to depth frames of a flat wall; noise is added to the true depth.
+# {command}
+_target_: qs3.sensors.devices.fitted.FittedDepth
+width_px: {k.width_px}
+height_px: {k.height_px}
+focal_px: {k.focal_px:.8g}
+cx_px: {k.cx_px:.8g}
+cy_px: {k.cy_px:.8g}
+step_px: 1
+# The frames show walls from {nearest:.2f} to {farthest:.2f} m.
+min_depth_m: 0.3
+max_depth_m: 8.0
+noise_floor_m: {noise.floor_m:.6g}
+noise_factor: {noise.factor:.6g}
+noise_power: {noise.power:g}{assumed}
+correlation_px: {noise.correlation_px:.3g}
+inverse_step_per_m: {self.steps.inverse_per_m:.8g}
+depth_step_m: {self.steps.depth_m:.6g}
+bias_m: {_numbers(self.bias_m)}
+tilts_deg: {_numbers(self.fill.tilts_deg)}
+fill_rates: {_numbers(self.fill.rates)}
+hole_px: {self.fill.hole_px:.3g}
+baseline_m: {baseline}
+"""
+        write_text(path, text)
 
     def summary(self) -> list[str]:
         """What was found, a line each."""

@@ -23,11 +23,11 @@ def smooth_wall(wall: Wall, steps: Steps) -> np.ndarray:
     """
     height, width = wall.depth_m.shape
     rows, cols = np.nonzero(wall.on_wall)
-    basis = _basis(rows / height - 0.5, cols / width - 0.5)
+    basis = cubic_basis(rows / height - 0.5, cols / width - 0.5)
     y = 1 / wall.depth_m[rows, cols]
     found = np.linalg.lstsq(basis, y, rcond=None)[0]
     v, u = np.mgrid[:height, :width]
-    everywhere = _basis(v.ravel() / height - 0.5, u.ravel() / width - 0.5)
+    everywhere = cubic_basis(v.ravel() / height - 0.5, u.ravel() / width - 0.5)
     low, high = steps.interval(wall.depth_m[rows, cols])
     step, spread = float(np.median(high - low)), float(np.std(basis @ found - y))
     if step > _COARSE * spread:
@@ -37,16 +37,9 @@ def smooth_wall(wall: Wall, steps: Steps) -> np.ndarray:
 
 
 def spread_between(low: np.ndarray, high: np.ndarray, mean: np.ndarray) -> float:
-    """Standard deviation of normal errors about `mean` of values known to lie in [low, high].
-
-    Args:
-        low, high, mean: [N], of one unit.
-    """
+    """Standard deviation of normal errors about `mean` of values known to lie in [low, high]."""
     step = float(np.median(high - low))
-    off = (low + high) / 2 - mean
-    near, far = np.quantile(off, [0.005, 0.995])
-    inner = off[(off >= near) & (off <= far)]
-    total = float(inner.std()) / TRIMMED_NORMAL
+    total = inner_spread((low + high) / 2 - mean)
     if step < _COARSE * total:
         return float(np.sqrt(max(total**2 - step**2 / 12, 0.0)))
 
@@ -63,7 +56,13 @@ TRIMMED_NORMAL = 0.9616
 """Standard deviation of a normal law without its lowest and highest 0.5 %."""
 
 
-def _basis(v: np.ndarray, u: np.ndarray) -> np.ndarray:
+def inner_spread(values: np.ndarray) -> float:
+    """Standard deviation of a normal law, from the inner 99 % of [N] values."""
+    near, far = np.quantile(values, [0.005, 0.995])
+    return float(values[(values >= near) & (values <= far)].std()) / TRIMMED_NORMAL
+
+
+def cubic_basis(v: np.ndarray, u: np.ndarray) -> np.ndarray:
     """[N, 10] monomials up to the third degree."""
     return np.stack([u**i * v**j for i in range(4) for j in range(4 - i)], axis=1)
 

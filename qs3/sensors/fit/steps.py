@@ -20,18 +20,18 @@ class Steps:
     """What was found.
 
     Attributes:
-        inverse_per_m: step of 1 / Z in 1/m; 0 if there is none.
-        offset_per_m: 1 / Z is this plus a whole number of steps.
         depth_m: step of Z, of the device or of its files; 0 if there is none.
         levels_m: [N] the distinct depths, ascending; empty where depths are continuous.
+        inverse_per_m: step of 1 / Z in 1/m; 0 if there is none.
+        offset_per_m: 1 / Z is this plus a whole number of steps.
         misfit: RMS distance of 1 / Z from the steps, in steps; 0.29 would be no steps at all.
     """
 
-    inverse_per_m: float
-    offset_per_m: float
     depth_m: float
     levels_m: np.ndarray
-    misfit: float
+    inverse_per_m: float = 0.0
+    offset_per_m: float = 0.0
+    misfit: float = 0.29
 
     def interval(self, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Between which values of 1 / Z the measured one lay before it was rounded."""
@@ -55,25 +55,22 @@ def find_steps(frames: Sequence[DepthImage]) -> Steps:
     else:
         levels, counts = np.unique(depths.astype(np.float32), return_counts=True)
         levels = levels.astype(np.float64)
-    nothing = Steps(0.0, 0.0, resolution, np.zeros(0), 0.29)
     if not resolution and len(levels) > 0.2 * len(depths):
-        return nothing
+        return Steps(0.0, np.zeros(0))
     strong = counts >= max(2, 2e-6 * len(depths))
     levels, counts = levels[strong], counts[strong]
     if len(levels) < 4:
-        return Steps(0.0, 0.0, resolution, levels, 0.29)
+        return Steps(resolution, levels)
     weight = np.sqrt(np.minimum(counts, 100))  # each level is one witness
     # A level is known to half a unit of the file: dx = r / Z^2 / 2 to either side.
     found = _lattice((1 / levels)[::-1], weight[::-1], resolution / levels[::-1] ** 2)
     if found is not None:
-        step, offset, misfit = found
-        return Steps(step, offset, resolution, levels, misfit)
+        return Steps(resolution, levels, *found)
     if resolution:
         coarser = _multiple(np.rint(levels / resolution).astype(np.int64), counts)
-        return Steps(0.0, 0.0, coarser * resolution, levels, 0.29)
+        return Steps(coarser * resolution, levels)
     found = _lattice(levels, weight, np.zeros_like(levels))
-    step = found[0] if found is not None else 0.0
-    return Steps(0.0, 0.0, step, levels, 0.29)
+    return Steps(0.0 if found is None else found[0], levels)
 
 
 def _multiple(whole: np.ndarray, counts: np.ndarray) -> int:
@@ -88,18 +85,15 @@ def _multiple(whole: np.ndarray, counts: np.ndarray) -> int:
 def _lattice(
     x: np.ndarray, weight: np.ndarray, blur: np.ndarray
 ) -> tuple[float, float, float] | None:
-    """Step and offset of the lattice on which levels lie.
+    """Step, offset in [0, step) and RMS misfit in steps of the levels' lattice, if there is one.
 
-    The levels' phases at a trial step are as one if it is right: the largest resultant wins,
-    and of those as large the coarsest step.
+    The levels' phases at a trial step are as one if it is right: the largest resultant wins, and of
+    those as large the coarsest step.
 
     Args:
         x: [N] levels, ascending.
         weight: [N] how much each counts.
         blur: [N] width of the interval in which each is uniform, from rounding in the file.
-
-    Returns:
-        Step, offset in [0, step), RMS misfit in steps; None if there is no lattice.
     """
     if len(x) > _MAX_LEVELS:
         keep = np.linspace(0, len(x) - 1, _MAX_LEVELS).astype(int)  # trims nothing of the range

@@ -8,11 +8,13 @@ the size is taken whose correlations over the first pixels are nearest to the ca
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.fit.planes import Wall
+from qs3.sensors.fit.rounded import cubic_basis
 
 _WALLS = 3  # so many of the least slanted are used
 _HEIGHT_PX, _WIDTH_PX = 180, 240  # and so much of each
@@ -21,11 +23,9 @@ _SIZES = (0.0, *np.geomspace(0.3, 12.0, 14))
 
 
 def noise_size_px(walls: Sequence[Wall], simulated: Callable[[float], FittedDepth]) -> float:
-    """Size of the Gaussian that smooths the noise.
+    """Size of the Gaussian that smooths the noise of a camera's walls.
 
-    Args:
-        walls: of the camera.
-        simulated: the fitted sensor with noise of a size, without holes.
+    `simulated` gives the fitted sensor with noise of a size, without holes.
     """
     cuts = [_cut(wall) for wall in _facing(walls)]
 
@@ -60,16 +60,8 @@ def _cut(wall: Wall) -> Wall:
     ):
         first = int(min(max(0.0, at - limit / 2), max(0, size - limit)))
         spans.append(slice(first, first + limit))
-    part = tuple(spans)
-    return Wall(
-        wall.name,
-        wall.depth_m[part],
-        wall.plane_m[part],
-        wall.tilt_deg[part],
-        wall.region[part],
-        wall.centre_m,
-        wall.gap_per_m,
-    )
+    images = ("depth_m", "plane_m", "tilt_deg", "region")
+    return replace(wall, **{name: getattr(wall, name)[tuple(spans)] for name in images})
 
 
 def _measured(sensor: FittedDepth, wall: Wall, rng: np.random.Generator) -> np.ndarray:
@@ -82,7 +74,7 @@ def _flattened(error: np.ndarray, where: np.ndarray) -> np.ndarray:
     height, width = error.shape
     x = np.broadcast_to(np.linspace(-1, 1, width), error.shape)[where]
     y = np.broadcast_to(np.linspace(-1, 1, height)[:, None], error.shape)[where]
-    design = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
+    design = cubic_basis(y, x)
     out = np.full(error.shape, np.nan)
     if len(x) < 2 * design.shape[1]:
         return out

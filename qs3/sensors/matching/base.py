@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from qs3.errors import ConfigError
 from qs3.sensors.pixel_status import Reason
 
 
@@ -16,8 +17,7 @@ class Match:
 
     Attributes:
         disparity: [h, w] float32 in px, NaN where there is no match.
-        reason: [h, w] uint8, `Reason.OK` where there is one, else why not, as far as the
-            matcher knows.
+        reason: [h, w] uint8, `Reason.OK` where there is one, else why not, as far as is known.
     """
 
     disparity: np.ndarray
@@ -42,17 +42,14 @@ class Matcher(Protocol):
     @property
     def min_disparity(self) -> int:
         """Smallest disparity searched."""
-        ...
 
     @property
     def num_disparities(self) -> int:
         """How many whole disparities are searched."""
-        ...
 
     @property
     def reach_px(self) -> int:
         """How far from a pixel the images have an influence on it: half a block, or more."""
-        ...
 
     def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
         """Match every pixel of `image`.
@@ -60,13 +57,9 @@ class Matcher(Protocol):
         Args:
             image: [h, w] uint8.
             other: [h, W] uint8 or float32 (0..255), the same rows.
-            first: column of `other` that column 0 of `image` has at zero disparity; what
-                lies outside `other` matches nothing.
-
-        Returns:
-            [h, w] disparities.
+            first: column of `other` that column 0 of `image` has at zero disparity; what lies
+                outside `other` matches nothing.
         """
-        ...
 
 
 def side_by_side(
@@ -89,13 +82,50 @@ def side_by_side(
     total = start + width + margin + max(-low, 0)
     a = np.zeros((height, total), dtype=np.uint8)
     a[:, start : start + width] = image
-    b = np.zeros_like(a)
-    # Column x of `other` goes to column x + shift.
-    shift = start - first
-    lo, hi = max(0, -shift), min(other.shape[1], total - shift)
-    if hi > lo:
-        part = other[:, lo:hi]
-        if part.dtype != np.uint8:
-            part = np.clip(np.rint(part), 0, 255).astype(np.uint8)
-        b[:, lo + shift : hi + shift] = part
-    return a, b, start
+    if other.dtype != np.uint8:
+        other = np.clip(np.rint(other), 0, 255).astype(np.uint8)
+    # Column x of `other` goes to column x + start - first.
+    return a, columns_of(other, first - start, total), start
+
+
+def columns_of(image: np.ndarray, begin: int, count: int) -> np.ndarray:
+    """Columns begin .. begin + count - 1 of an image, 0 where it has none."""
+    out = np.zeros((image.shape[0], count), dtype=image.dtype)
+    low, high = max(0, begin), min(image.shape[1], begin + count)
+    if high > low:
+        out[:, low - begin : high - begin] = image[:, low:high]
+    return out
+
+
+def opencv_disparity(
+    matcher: Any, image: np.ndarray, other: np.ndarray, first: int, margin: int, missing: float
+) -> tuple[np.ndarray, np.ndarray, tuple]:
+    """What OpenCV's StereoBM or StereoSGBM finds.
+
+    Args:
+        matcher: OpenCV's, with its range of disparities set.
+        image, other, first: as in `Matcher.match`.
+        margin: px around, dark.
+        missing: largest disparity that counts as none; at least 0 if the search begins there,
+            where it is a point at infinity.
+
+    Returns:
+        [h, w] float32 disparity in px with NaN; `image` on its dark canvas, and its place there.
+    """
+    low = matcher.getMinDisparity()
+    high = low + matcher.getNumDisparities() - 1
+    left, right, start = side_by_side(image, other, first, low, high, margin)
+    place = np.s_[:, start : start + image.shape[1]]
+    disparity = matcher.compute(left, right)[place].astype(np.float32) / 16
+    disparity[disparity <= (missing if low else max(missing, 0))] = np.nan
+    return disparity, left, place
+
+
+def check_search(num_disparities: int) -> None:
+    """Check how many disparities OpenCV's matchers search.
+
+    Raises:
+        ConfigError: not a positive multiple of 16.
+    """
+    if num_disparities < 16 or num_disparities % 16:
+        raise ConfigError(f"num_disparities must be a multiple of 16, got {num_disparities}")

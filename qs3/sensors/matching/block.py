@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError
-from qs3.sensors.matching.base import Match, side_by_side
+from qs3.sensors.matching.base import Match, check_search, opencv_disparity
 from qs3.sensors.pixel_status import Reason
 
 STEREOBM_BIAS_PX = 7.5 / 256
@@ -41,11 +40,13 @@ class StereoBlockMatcher:
     max_difference_px: int = -1
 
     def __post_init__(self) -> None:
-        if self.num_disparities % 16:
-            raise ConfigError(
-                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
-            )
-        check_ranges(self, num_disparities=">= 16", block_size="odd [5, 255]")
+        check_search(self.num_disparities)
+        check_ranges(self, block_size="odd [5, 255]")
+
+    @property
+    def steps_per_px(self) -> int:
+        """OpenCV's own steps."""
+        return 16
 
     @property
     def reach_px(self) -> int:
@@ -54,23 +55,20 @@ class StereoBlockMatcher:
 
     def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
         """Disparities; see `Matcher.match`."""
-        low, high = self.min_disparity, self.min_disparity + self.num_disparities - 1
-        left, right, start = side_by_side(image, other, first, low, high, self.block_size)
         matcher = cv2.StereoBM.create(self.num_disparities, self.block_size)
-        matcher.setMinDisparity(low)
+        matcher.setMinDisparity(self.min_disparity)
         matcher.setTextureThreshold(self.texture_threshold)
         matcher.setUniquenessRatio(self.uniqueness_ratio)
         matcher.setDisp12MaxDiff(self.max_difference_px)
-        found = matcher.compute(left, right)[:, start : start + image.shape[1]]
-        disparity = found.astype(np.float32) / 16
-        disparity[disparity <= low - 1] = np.nan  # OpenCV's mark for no match
-        if low == 0:
-            disparity[disparity <= 0] = np.nan  # a point at infinity, as in the released code
+        missing = self.min_disparity - 1  # OpenCV's mark
+        disparity, left, place = opencv_disparity(
+            matcher, image, other, first, self.block_size, missing
+        )
         if self.remove_bias:
             disparity -= np.float32(STEREOBM_BIAS_PX)
         dark = self._texture(left) < self.texture_threshold
         why_not = np.where(dark, np.uint8(Reason.DARK), np.uint8(Reason.UNMATCHED))
-        return Match.of(disparity, why_not[:, start : start + image.shape[1]])
+        return Match.of(disparity, why_not[place])
 
     def _texture(self, canvas: np.ndarray) -> np.ndarray:
         """[h, w] float32: what OpenCV compares with texture_threshold.

@@ -10,11 +10,11 @@ from numpy.lib.stride_tricks import as_strided, sliding_window_view
 
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
-from qs3.sensors.matching.base import Match
+from qs3.sensors.matching.base import Match, columns_of
 from qs3.sensors.matching.hamming import census, count_ones
 from qs3.sensors.matching.semiglobal import aggregate
 from qs3.sensors.matching.subpixel import Fit, linearised, offset
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.pixel_status import Reason, first_reason
 
 A_FACTORS = {Fit.V: 0.03, Fit.PARABOLA: 0.57}
 """What `linearised` needs for Hamming distances over blocks, without grey values: measured on
@@ -141,16 +141,13 @@ class CensusMatcher:
         unique = total.min(axis=2) > top * np.float32(1 + self.uniqueness_percent / 100)
 
         valid = within & textured & inner & unique & consistent
-        why_not = np.select(
-            [~within, ~textured, inner & ~unique, inner & ~consistent],
-            [
-                np.uint8(Reason.OUTSIDE),
-                np.uint8(Reason.DARK),
-                np.uint8(Reason.AMBIGUOUS),
-                np.uint8(Reason.INCONSISTENT),
-            ],
-            np.uint8(Reason.UNMATCHED),
-        )
+        causes = {
+            Reason.OUTSIDE: ~within,
+            Reason.DARK: ~textured,
+            Reason.AMBIGUOUS: inner & ~unique,
+            Reason.INCONSISTENT: inner & ~consistent,
+        }
+        why_not = first_reason(causes, Reason.UNMATCHED)
         return Match.of(np.where(valid, disparity, np.nan).astype(np.float32), why_not)
 
     def _cost(self, image: np.ndarray, other: np.ndarray, begin: int) -> np.ndarray:
@@ -159,8 +156,8 @@ class CensusMatcher:
         count = self.num_disparities
         length = width + count - 1
         words = census(image, self.window_px)
-        others = [_columns(word, begin, length) for word in census(other, self.window_px)]
-        grey = _columns(other, begin, length)
+        others = [columns_of(word, begin, length) for word in census(other, self.window_px)]
+        grey = columns_of(other, begin, length)
         if grey.dtype != np.uint8:
             grey = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
         capped = np.minimum(np.arange(256), self.difference_cap)
@@ -203,20 +200,10 @@ class CensusMatcher:
         )
 
 
-def _columns(image: np.ndarray, begin: int, length: int) -> np.ndarray:
-    """Columns begin .. begin + length - 1 of an image, 0 where it has none."""
-    out = np.zeros((image.shape[0], length), dtype=image.dtype)
-    low, high = max(0, begin), min(image.shape[1], begin + length)
-    if high > low:
-        out[:, low - begin : high - begin] = image[:, low:high]
-    return out
-
-
 def _best_of_other(total: np.ndarray) -> np.ndarray:
     """Best place of each pixel of the other image, from the same costs.
 
-    Args:
-        total: [h, w, D]; place [v, u, j] is column u + j of the other image.
+    `total` is [h, w, D]; place [v, u, j] is column u + j of the other image.
 
     Returns:
         [h, w + D - 1] place j of the lowest total[v, x - j, j] for each column x.

@@ -10,7 +10,7 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.sensors.matching.base import Match
 from qs3.sensors.matching.subpixel import linearised
-from qs3.sensors.pixel_status import Reason
+from qs3.sensors.pixel_status import Reason, first_reason
 
 
 @dataclass(frozen=True)
@@ -75,16 +75,13 @@ class NormalisedCorrelation:
         disparity = self.min_disparity + best + phase
         if self.steps_per_px:
             disparity = np.rint(disparity * self.steps_per_px) / self.steps_per_px
-        why_not = np.select(
-            [top <= -1, top < self.min_score, inner & ~unique, inner & ~consistent],
-            [
-                np.uint8(Reason.OUTSIDE),
-                np.uint8(Reason.UNMATCHED),
-                np.uint8(Reason.AMBIGUOUS),
-                np.uint8(Reason.INCONSISTENT),
-            ],
-            np.uint8(Reason.UNMATCHED),
-        )
+        causes = {
+            Reason.OUTSIDE: top <= -1,
+            Reason.UNMATCHED: top < self.min_score,
+            Reason.AMBIGUOUS: inner & ~unique,
+            Reason.INCONSISTENT: inner & ~consistent,
+        }
+        why_not = first_reason(causes, Reason.UNMATCHED)
         return Match.of(np.where(valid, disparity, np.nan).astype(np.float32), why_not)
 
     def _agrees(self, scores: np.ndarray, best: np.ndarray) -> np.ndarray:

@@ -36,7 +36,6 @@ class PostFilter(Protocol):
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """[h, w] float32 px with NaN -> the same, changed; dropped values are NaN."""
-        ...
 
 
 @dataclass(frozen=True)

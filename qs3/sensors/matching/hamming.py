@@ -9,8 +9,8 @@ import numpy as np
 def census(image: np.ndarray, window_px: int) -> list[np.ndarray]:
     """Which pixels of the window around a pixel are brighter than it.
 
-    Zabih and Woodfill, Non-parametric local transforms, ECCV 1994, section 3. At the border
-    the image is mirrored.
+    Zabih and Woodfill, Non-parametric local transforms, ECCV 1994, section 3. The border is
+    mirrored.
 
     Args:
         image: [h, w] uint8 or float32.

@@ -9,7 +9,7 @@ import numpy as np
 
 from qs3.config.checks import check_choice, check_ranges
 from qs3.errors import ConfigError
-from qs3.sensors.matching.base import Match, side_by_side
+from qs3.sensors.matching.base import Match, check_search, opencv_disparity
 from qs3.sensors.matching.subpixel import linearised
 
 SGBM_A_FACTOR = 1.0
@@ -59,11 +59,8 @@ class SemiGlobalMatcher:
     a_factor: float = SGBM_A_FACTOR
 
     def __post_init__(self) -> None:
-        if self.num_disparities % 16:
-            raise ConfigError(
-                f"num_disparities must be a multiple of 16, got {self.num_disparities}"
-            )
-        check_ranges(self, num_disparities=">= 16", block_size="odd [1, 31]", a_factor="[-1, 1]")
+        check_search(self.num_disparities)
+        check_ranges(self, block_size="odd [1, 31]", a_factor="[-1, 1]")
         check_choice("mode", self.mode, tuple(_MODES))
         small, large = self.penalties
         if not 0 < small < large:
@@ -73,10 +70,7 @@ class SemiGlobalMatcher:
     def penalties(self) -> tuple[int, int]:
         """P1 and P2 as used."""
         area = self.block_size**2
-        return (
-            8 * area if self.p1 is None else self.p1,
-            32 * area if self.p2 is None else self.p2,
-        )
+        return (8 * area if self.p1 is None else self.p1, 32 * area if self.p2 is None else self.p2)
 
     @property
     def reach_px(self) -> int:
@@ -85,11 +79,9 @@ class SemiGlobalMatcher:
 
     def match(self, image: np.ndarray, other: np.ndarray, first: int = 0) -> Match:
         """Disparities; see `Matcher.match`."""
-        low, high = self.min_disparity, self.min_disparity + self.num_disparities - 1
-        left, right, start = side_by_side(image, other, first, low, high, self.reach_px)
         small, large = self.penalties
         matcher = cv2.StereoSGBM.create(
-            minDisparity=low,
+            minDisparity=self.min_disparity,
             numDisparities=self.num_disparities,
             blockSize=self.block_size,
             P1=small,
@@ -99,13 +91,10 @@ class SemiGlobalMatcher:
             uniquenessRatio=self.uniqueness_ratio,
             mode=_MODES[self.mode],
         )
-        found = matcher.compute(left, right)[:, start : start + image.shape[1]]
-        disparity = found.astype(np.float32) / 16
-        # OpenCV's mark for no match is min_disparity - 1; at the very first disparity the
-        # curve through the costs has only one side.
-        disparity[disparity < low] = np.nan
-        if low == 0:
-            disparity[disparity <= 0] = np.nan
+        # OpenCV's mark for no match is min_disparity - 1; at the very first disparity the curve
+        # through the costs has only one side.
+        missing = self.min_disparity - 1 / 16
+        disparity, _, _ = opencv_disparity(matcher, image, other, first, self.reach_px, missing)
         if self.remove_bias:
             disparity = self._repaired(disparity)
         return Match.of(disparity)

@@ -32,14 +32,10 @@ class Fit(StrEnum):
 
 
 def offset(lower: np.ndarray, best: np.ndarray, upper: np.ndarray, fit: Fit) -> np.ndarray:
-    """Position of the minimum, -0.5..0.5 px from the best towards `upper`.
+    """Position of the minimum, -0.5..0.5 px from the best towards `upper`; float32.
 
-    Args:
-        lower, best, upper: float32 costs of one shape. Where `best` is not the lowest, as
-            costs before aggregation may be, the nearer end is taken.
-
-    Returns:
-        float32; 0 where all three are the same.
+    0 where all three float32 costs are the same; where `best` is not the lowest, as costs before
+    aggregation may be, the nearer end.
     """
     if fit is Fit.PARABOLA:
         width = 2 * (lower + upper - 2 * best)

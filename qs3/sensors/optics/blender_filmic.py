@@ -33,13 +33,10 @@ _CURVE = np.array([
 
 
 def filmic(radiance: np.ndarray) -> np.ndarray:
-    """Scene-linear radiance to grey values as Blender's Filmic view transform does.
-
-    Args:
-        radiance: any shape, >= 0; 16.3 and more is white.
+    """Scene-linear radiance, any shape, to grey values as Blender's Filmic transform does.
 
     Returns:
-        The same shape, float64 in 0..255, not rounded; within 0.1 of Blender's.
+        The same shape, float64 in 0..255, not rounded, within 0.1 of Blender's; 16.3 is white.
     """
     stops = np.log2(np.maximum(radiance, 2.0**_FIRST_STOP))
     place = (stops - _FIRST_STOP) / (_LAST_STOP - _FIRST_STOP) * (len(_CURVE) - 1)
@@ -71,16 +68,7 @@ class FilmicCamera:
         return 1.0
 
     def expose(self, radiance: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
-        """The picture; draws nothing from `rng`.
-
-        Args:
-            radiance: [h, w] float32.
-            gain: from `gain`.
-            rng: not used.
-
-        Returns:
-            [h, w] uint8.
-        """
+        """[h, w] uint8 picture of [h, w] float32 radiance; draws nothing from `rng`."""
         light = np.asarray(radiance, dtype=np.float64) * gain
         free = np.clip(1 - light / self.faintest, 0, 1)
         return np.rint(filmic(light + self.background * free)).astype(np.uint8)

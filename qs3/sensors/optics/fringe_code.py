@@ -80,10 +80,7 @@ class FringeCode:
         return np.broadcast_to(wave, (*wave.shape[:2], self.rows, self.columns))
 
     def decode(self, exposures: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Places on the slide.
-
-        Args:
-            exposures: [F, N, h, w], in the order of `slides`.
+        """Places on the slide, from `exposures` [F, N, h, w] in the order of `slides`.
 
         Returns:
             [h, w] float64 s; [F, h, w] modulation M in the exposures' units; [h, w] how far, in
@@ -104,11 +101,10 @@ class FringeCode:
     def place_sigma(
         self, noise: float | np.ndarray, modulation: float | np.ndarray
     ) -> float | np.ndarray:
-        """The law of the module's docstring: standard deviation of s.
+        """Standard deviation of s, by the law of the module's docstring.
 
-        Args:
-            noise: sigma_n of one exposure, root of the mean variance over the steps.
-            modulation: M of the finest fringes, same units.
+        `noise` is sigma_n of one exposure, root of the mean variance over the steps, and
+        `modulation` M of the finest fringes, in the same units.
         """
         phase = math.sqrt(2 / self.steps) * noise / modulation
         return phase / (2 * np.pi * self.periods[-1])

@@ -63,15 +63,9 @@ class InfraredCamera:
         return self.white_level / white if white > 0 else 0.0
 
     def expose(self, radiance: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
-        """One exposure.
+        """One exposure, [h, w] uint8, of `radiance` [h, w] float32.
 
-        Args:
-            radiance: [h, w] float32.
-            gain: from `gain`, shared by the cameras of one rig.
-            rng: of this exposure.
-
-        Returns:
-            [h, w] uint8.
+        `gain` is shared by the cameras of one rig.
         """
         per_grey = self.electrons_at_white / 255.0
         if self.speckle_contrast:  # before the lens: grains are as small as its blur or smaller

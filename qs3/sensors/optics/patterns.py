@@ -27,7 +27,6 @@ class Slide(Protocol):
     @property
     def slide(self) -> np.ndarray:
         """[H, W] float32 in 0..1, row 0 at the top."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from qs3.sensors.optics.patterns import Speckle
 class ReleasedSlide(Speckle):
     """A speckle pattern with the shape of the released slide's dots.
 
-    The released scene projects its 1266 x 990 px picture onto a square, so that its dots are
-    higher than wide (3.0 x 3.8 px of the camera). And the picture is 8-bit sRGB, which Cycles
-    interpolates as it is stored and decodes afterwards: the slopes of a dot are steeper than those
-    of a linear slide, and it is smaller. The matcher locks more to whole pixels on such dots: on
-    a plane at 4 m its error grows from 0.057 to 0.088 px (released scene: 0.083 px).
+    The released scene projects its 1266 x 990 px picture onto a square, so that its dots are higher
+    than wide (3.0 x 3.8 px of the camera). And the picture is 8-bit sRGB, which Cycles
+    interpolates as stored and decodes afterwards: a dot's slopes are steeper than a linear
+    slide's, and it is smaller. The matcher locks more to whole pixels on such dots: on a plane at
+    4 m its error grows from 0.057 to 0.088 px (released scene: 0.083 px).
 
     Attributes:
         detail: pixels of the slide for each of the picture, after interpolation.

@@ -10,18 +10,10 @@ _WAVES = 64
 
 
 def smooth_field(window: Window, cell_px: float, rng: np.random.Generator) -> np.ndarray:
-    """A stationary field of mean 0 and variance 1 without waves shorter than `cell_px`.
+    """A stationary field [h, w] of mean 0, variance 1 and no waves shorter than `cell_px`.
 
-    The sum of plane waves with random directions, lengths and phases. What a pixel gets does
-    not depend on the window.
-
-    Args:
-        window: the pixels wanted.
-        cell_px: shortest wave length.
-        rng: of the field; a fixed number of draws.
-
-    Returns:
-        [h, w] float64.
+    The sum of plane waves with random directions, lengths and phases: a fixed number of draws.
+    What a pixel gets does not depend on the window.
     """
     direction, offset = rng.uniform(0, 2 * np.pi, (2, _WAVES))
     # Uniform over the disc of frequencies up to 1 / cell.

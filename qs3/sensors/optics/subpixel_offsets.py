@@ -21,13 +21,12 @@ _ROOM = 1.1  # the plane and the slide are larger than the view by this factor
 def sample_centres(
     camera: Camera, renderer: Renderer, seed: int, *, along_rows: bool
 ) -> np.ndarray:
-    """The mean column (or row) of each pixel's samples.
+    """The mean column, or with `along_rows` the mean row, of each pixel's samples.
 
     Args:
         camera: with its window.
-        renderer: which is asked for one image.
+        renderer: asked for one image.
         seed: of the images that are to be corrected, rendered with one camera a call.
-        along_rows: rows are wanted, not columns.
 
     Returns:
         [h, w] float64, in px of the whole image: u (or v) plus some hundredths.

@@ -16,41 +16,34 @@ _WHITE = np.ones((2, 2), dtype=np.float32)
 _WIDE = 10.0  # tangent of half the lamp's angle: all that lies before it
 
 
+def white_lamp(world_from_lamp: np.ndarray) -> Projector:
+    """A point lamp at a pose [4, 4]; it lights all before it, white at 1 m to radiance 1."""
+    return Projector(world_from_lamp, _WHITE, _WIDE)
+
+
 def reached_from(
     bodies: tuple[Body, ...], camera: Camera, world_from_source: np.ndarray, renderer: Renderer
 ) -> np.ndarray:
-    """Whether the surface in each pixel can be seen from another place.
+    """[h, w] bool: whether the surface in each pixel can be seen from another place, too.
 
-    Args:
-        bodies: the scene.
-        camera: with its window.
-        world_from_source: [4, 4] pose of the other camera or the projector, which looks along
-            its +z; what lies behind it is not reached.
-
-    Returns:
-        [h, w] bool, False where no surface is. A pixel counts if any part of it is reached.
+    `world_from_source` [4, 4] is the pose of the other camera or the projector, which looks along
+    its +z; what lies behind it is not reached. A pixel counts if any part of its surface is
+    reached.
     """
-    lamp = Projector(world_from_source, _WHITE, _WIDE)
-    (image,) = renderer.render(Scene(bodies, lamp), [camera], seed=0, geometry=[False])
+    scene = Scene(bodies, white_lamp(world_from_source))
+    (image,) = renderer.render(scene, [camera], seed=0, geometry=[False])
     return image.radiance > 0
 
 
 def explained(
-    reason: np.ndarray,
-    clean_m: np.ndarray,
-    lit: np.ndarray,
-    seen: np.ndarray | None,
+    reason: np.ndarray, clean_m: np.ndarray, lit: np.ndarray, seen: np.ndarray | None
 ) -> np.ndarray:
-    """Reasons that geometry gives, put before the matcher's.
+    """Reasons that geometry gives, put before the [h, w] uint8 `reason` of matcher and filters.
 
     Args:
-        reason: [h, w] uint8 of matcher and filters.
         clean_m: [h, w] true depth, inf where nothing is.
         lit: [h, w] bool, reached by the projector.
         seen: [h, w] bool, reached by the other camera; None if there is none.
-
-    Returns:
-        [h, w] uint8.
     """
     out = reason.copy()
     invalid = reason != Reason.OK

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -114,32 +116,45 @@ class Image:
         )
 
 
+def tangents(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Tangents x / z [w] and y / z [h, 1] of the rays through the centres of rendered pixels."""
+    window, k = camera.rendered, camera.intrinsics
+    x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
+    y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
+    return x, y
+
+
+def incidence(normal: np.ndarray, hit: np.ndarray, camera: Camera) -> np.ndarray:
+    """Cosine of the angle of incidence, for `Image.cosine`; 0 where `hit` [h, w] does not hold.
+
+    `normal` [h, w, 3] are unit normals of what is seen, in the camera's axes.
+    """
+    x, y = tangents(camera)
+    nx, ny, nz = np.moveaxis(normal, -1, 0)
+    cosine = np.abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1)
+    return np.where(hit, np.minimum(cosine, 1), 0).astype(np.float32)
+
+
 class Renderer(Protocol):
     """Turns a scene into images. Not thread safe; one instance a process."""
 
     def render(
         self, scene: Scene, cameras: list[Camera], *, seed: int, geometry: list[bool]
     ) -> list[Image]:
-        """Render every camera.
+        """Render one image a camera.
 
         Args:
             scene: what is there.
             cameras: where it is seen from.
             seed: of the sampling pattern; the same call gives the same bytes.
-            geometry: for each camera, whether depth_m, label and cosine are wanted; where
-                not, they are filled with inf and 0.
-
-        Returns:
-            One image a camera.
+            geometry: for each camera, whether depth_m, label and cosine are wanted, else inf and 0.
 
         Raises:
             RenderError: the renderer failed; the message holds its own.
         """
-        ...
 
     def provenance(self) -> dict[str, str]:
         """Renderer, variant and library versions: what decides the bytes it makes."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -156,3 +171,15 @@ class RendererSettings:
 
     def __post_init__(self) -> None:
         check_ranges(self, "renderer.", samples=">= 1")
+
+
+def give_memory_back() -> None:
+    """Let the C library return what is free in its heap; does nothing where it cannot.
+
+    Images of every size come and go between small blocks that stay, and glibc keeps the holes:
+    tens of megabytes over 200 objects, with nothing lost. Takes about a millisecond.
+    """
+    if sys.platform.startswith("linux"):
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # musl has none
+        if trim is not None:
+            trim(0)

@@ -19,8 +19,16 @@ import numpy as np
 
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera
-from qs3.sensors.renderers import blender_devices, memory
-from qs3.sensors.renderers.base import Body, Image, Projector, RendererSettings, Scene
+from qs3.sensors.renderers import blender_devices
+from qs3.sensors.renderers.base import (
+    Body,
+    Image,
+    Projector,
+    RendererSettings,
+    Scene,
+    give_memory_back,
+    incidence,
+)
 from qs3.sensors.renderers.exr import read_exr
 
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
@@ -123,7 +131,7 @@ class BlenderRenderer:
         finally:
             target.render.use_persistent_data = False
             _remove_everything(bpy)
-            memory.give_back()
+            give_memory_back()
         return images
 
 
@@ -237,17 +245,16 @@ def _add_body(bpy: Any, target: Any, body: Body, ambient: float) -> Any:
     material.cycles.emission_sampling = "NONE"  # the ambient term lights nothing else
     tree = material.node_tree
     tree.nodes.clear()
-    diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    node, link = tree.nodes.new, tree.links.new
+    diffuse, glow = node("ShaderNodeBsdfDiffuse"), node("ShaderNodeEmission")
     diffuse.inputs["Color"].default_value = (body.albedo, body.albedo, body.albedo, 1.0)
     diffuse.inputs["Roughness"].default_value = 0.0
-    glow = tree.nodes.new("ShaderNodeEmission")
     glow.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     glow.inputs["Strength"].default_value = body.albedo * ambient
-    total = tree.nodes.new("ShaderNodeAddShader")
-    output = tree.nodes.new("ShaderNodeOutputMaterial")
-    tree.links.new(diffuse.outputs[0], total.inputs[0])
-    tree.links.new(glow.outputs[0], total.inputs[1])
-    tree.links.new(total.outputs[0], output.inputs["Surface"])
+    total, output = node("ShaderNodeAddShader"), node("ShaderNodeOutputMaterial")
+    link(diffuse.outputs[0], total.inputs[0])
+    link(glow.outputs[0], total.inputs[1])
+    link(total.outputs[0], output.inputs["Surface"])
     mesh.materials.append(material)
 
     thing = bpy.data.objects.new("body", mesh)
@@ -373,17 +380,9 @@ def _image(channels: dict[str, np.ndarray], camera: Camera) -> Image:
         return Image.without_geometry(radiance)
     depth = np.where(depth < _BACKGROUND_M, depth, np.float32(np.inf))
     normal = np.stack([named[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
-    return Image(radiance, depth, label.astype(np.uint8), _cosine(normal, depth, camera))
-
-
-def _cosine(normal: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """[h, w] float32, cosine of incidence from world normals [h, w, 3] at the pixels' centres."""
-    window, k = camera.rendered, camera.intrinsics
-    x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
-    y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
-    nx, ny, nz = np.moveaxis(normal @ camera.world_from_camera[:3, :3], -1, 0)
-    cosine = np.abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1)
-    return np.where(np.isfinite(depth), np.minimum(cosine, 1), 0).astype(np.float32)
+    local = normal @ camera.world_from_camera[:3, :3]
+    cosine = incidence(local, np.isfinite(depth), camera)
+    return Image(radiance, depth, label.astype(np.uint8), cosine)
 
 
 def _remove_everything(bpy: Any) -> None:

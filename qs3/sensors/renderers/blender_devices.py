@@ -30,11 +30,7 @@ class Device:
 
 
 def choose(wanted: str, listed: dict[str, list[str]]) -> Device:
-    """The device to use.
-
-    Args:
-        wanted: one of `CHOICES`.
-        listed: names of GPUs by backend, as `list_gpus` finds them.
+    """The device for one of `CHOICES`; `listed` are names of GPUs by backend, see `list_gpus`.
 
     Raises:
         ConfigError: `wanted` is none of them.
@@ -66,11 +62,7 @@ def list_gpus(bpy: Any) -> dict[str, list[str]]:
 
 
 def use(bpy: Any, cycles: Any, device: Device) -> None:
-    """Set Blender's preferences and a scene's Cycles settings to `device`.
-
-    Raises:
-        RenderError: it is not listed any more.
-    """
+    """Set Blender's preferences and a scene's Cycles to `device`; RenderError if it has gone."""
     if device.backend == "CPU":
         cycles.device = "CPU"
         return

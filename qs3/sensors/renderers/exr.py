@@ -10,12 +10,10 @@ from qs3.errors import RenderError
 
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Channels of an EXR file as Blender writes it here: scan lines, float32, not compressed.
+    """Channels [h, w] float32 by full name of an EXR file as Blender writes it here.
 
-    Neither bpy nor OpenCV hands out the channels of a multilayer file.
-
-    Returns:
-        Full channel name -> [h, w] float32.
+    That is scan lines, float32, not compressed. Neither bpy nor OpenCV hands out the channels of a
+    multilayer file.
     """
     data = path.read_bytes()
     if data[:4] != b"\x76\x2f\x31\x01":

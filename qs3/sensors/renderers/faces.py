@@ -9,7 +9,7 @@ import numpy as np
 
 from qs3.geometry.cameras import Camera
 from qs3.meshes.mesh import Mesh, merge
-from qs3.sensors.renderers.base import Body
+from qs3.sensors.renderers.base import Body, incidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +50,11 @@ class Faces:
 
     def seen(self, camera: Camera, face: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Label and cosine of incidence, [h, w], where a camera's pixels see `face` (-1: none)."""
-        valid, window, k = face >= 0, camera.rendered, camera.intrinsics
+        valid = face >= 0
         face = np.where(valid, face, 0)
         label = np.where(valid, self.label[face], 0).astype(np.uint8)
-        x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
-        y = (window.top + np.arange(window.height) - k.cy_px)[:, None] / k.focal_px
         normals = (self.normals() @ camera.world_from_camera[:3, :3]).astype(np.float32)
-        nx, ny, nz = np.moveaxis(normals[face], -1, 0)
-        cosine = np.abs(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1)
-        return label, np.where(valid, np.minimum(cosine, 1), 0).astype(np.float32)
+        return label, incidence(normals[face], valid, camera)
 
 
 def mitsuba_mesh(mi: Any, faces: Faces, properties: Any) -> Any:

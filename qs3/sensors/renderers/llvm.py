@@ -25,14 +25,9 @@ LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 _PREFERRED = ("cuda_ad_mono", "llvm_ad_mono", "scalar_rgb")
 _FOLDERS = (
-    "/usr/lib/*-linux-gnu",
-    "/usr/lib/llvm-*/lib",
-    "/usr/lib64",
-    "/usr/lib64/llvm*/lib",
-    "/usr/lib",
-    "/usr/local/lib",
-    "/opt/homebrew/opt/llvm*/lib",
-)
+    "/usr/lib/*-linux-gnu", "/usr/lib/llvm-*/lib", "/usr/lib64", "/usr/lib64/llvm*/lib",
+    "/usr/lib", "/usr/local/lib", "/opt/homebrew/opt/llvm*/lib",
+)  # fmt: skip
 _CHILD_TIMEOUT_S = 120.0
 _CHILD_OK = "qs3-probe-ok"
 _CHILD = f"""
@@ -110,11 +105,7 @@ def find_variant(variant: str = "auto") -> Probe:
 
 
 def try_variant(variant: str, llvm_path: str | None) -> str | None:
-    """Render a small scene in a child process.
-
-    Returns:
-        None if that worked, else the reason why not.
-    """
+    """Render a small scene in a child process: None if that worked, else the reason why not."""
     environment = dict(os.environ)
     environment.pop(PROBE_VARIABLE, None)
     if llvm_path is not None:
@@ -135,9 +126,10 @@ def try_variant(variant: str, llvm_path: str | None) -> str | None:
     if child.returncode == 0 and _CHILD_OK in child.stdout:
         return None
     said = [line.strip() for line in child.stderr.splitlines() if line.strip()]
-    told = next((line for line in said if "LLVM ERROR" in line), said[-1] if said else "no message")
+    last = said[-1] if said else "no message"
+    reason = next((line for line in said if "LLVM ERROR" in line), last)
     how = f"killed by signal {-child.returncode}" if child.returncode < 0 else "failed"
-    return f"{how}: {told[:300]}"
+    return f"{how}: {reason[:300]}"
 
 
 def _first_that_works() -> Probe:

@@ -18,8 +18,15 @@ import numpy as np
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.meshes.mesh import Mesh
-from qs3.sensors.renderers import llvm, memory
-from qs3.sensors.renderers.base import Body, Image, Projector, RendererSettings, Scene
+from qs3.sensors.renderers import llvm
+from qs3.sensors.renderers.base import (
+    Body,
+    Image,
+    Projector,
+    RendererSettings,
+    Scene,
+    give_memory_back,
+)
 from qs3.sensors.renderers.mitsuba_jit import JitScene
 from qs3.sensors.renderers.mitsuba_scalar import ScalarScene
 
@@ -33,11 +40,7 @@ class MitsubaRenderer:
     """
 
     def __init__(
-        self,
-        samples: int = 16,
-        threads: int = 1,
-        variant: str = "auto",
-        name: str = "mitsuba",
+        self, samples: int = 16, threads: int = 1, variant: str = "auto", name: str = "mitsuba"
     ) -> None:
         """Find a variant that works here and load it.
 
@@ -150,7 +153,7 @@ def _give_memory_back() -> None:
     import drjit as dr
 
     dr.flush_malloc_cache()
-    memory.give_back()
+    give_memory_back()
 
 
 def _import_mitsuba() -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from qs3.geometry.cameras import Camera
-from qs3.sensors.renderers.base import Projector, Scene
+from qs3.sensors.renderers.base import Projector, Scene, tangents
 from qs3.sensors.renderers.faces import Faces, mitsuba_mesh
 
 
@@ -62,14 +62,12 @@ class ScalarScene:
         Mitsuba's own depth carries the rounding of its crop matrix, so that a window would
         differ from the whole image in the last bit.
         """
-        window, k = camera.rendered, camera.intrinsics
-        x = (window.left + np.arange(window.width) - k.cx_px) / k.focal_px
-        y = (window.top + np.arange(window.height) - k.cy_px) / k.focal_px
+        x, y = tangents(camera)
         rotation, origin = camera.world_from_camera[:3, :3], camera.world_from_camera[:3, 3]
         normal = (self.faces.normals() @ rotation)[face]  # [h, w, 3], camera axes
         corners = np.stack([(corner - origin) @ rotation for corner in self.faces.corners()])
         depths = corners[:, :, 2]
-        along = normal[..., 0] * x + normal[..., 1] * y[:, None] + normal[..., 2]
+        along = normal[..., 0] * x + normal[..., 1] * y + normal[..., 2]
         plane = np.einsum("hwc,hwc->hw", normal, corners[0][face])
         safe = np.where(np.abs(along) > 0, along, 1)
         # A face seen edge-on has no well-defined depth; it stays within its corners'.

@@ -14,18 +14,12 @@ from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.targets import POSE, TiltedPlane
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.commands import main
 
 CLOUDS = Path(__file__).parents[4] / "shared" / "data" / "kinect_v1"
 KINECT = Subject("kinect_like", ReferenceSpeckle())
 STEREO = Subject("speckle_stereo", SpeckleStereo())
 PLAN = runner.Plan(tilts_deg=(60,), phases=4, repeats=3, half_px=8, edge_frames=1)
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return MitsubaRenderer(samples=8)
 
 
 @pytest.mark.parametrize("subject", [KINECT, STEREO], ids=lambda s: s.name)
@@ -61,7 +55,7 @@ def test_phases_are_spread_evenly_over_a_pixel_and_over_the_steps():
 def test_more_read_noise_is_more_noise_over_time(renderer):
     quiet, _ = runner.load("kinect_like", ["sensor.infrared.read_noise_e=5"])
     loud, _ = runner.load("kinect_like", ["sensor.infrared.read_noise_e=300"])
-    condition = planar.PlanarCondition(2.0, phases=4, half_px=10, repeats=5)
+    condition = planar.PlanarCondition(2.0, phases=4, half_px=10, repeats=3)
     over_time = [
         np.mean(planar.measure(s, condition, renderer)["temporal_std_m"]) for s in (quiet, loud)
     ]
@@ -78,7 +72,8 @@ def test_a_still_scene_is_rendered_once_and_its_noise_is_new(renderer):
         still.rewind()
         rng = np.random.default_rng(seed)
         frames.append(KINECT.sensor.scan(bodies, box, POSE, still, rng))
-    assert frames[0].clean_m is frames[1].clean_m  # not rendered a second time
+    first, second = (frame.images["clean"] for frame in frames)
+    assert first is second  # not rendered a second time
     assert (frames[0].images["left"] != frames[1].images["left"]).any()
 
 
@@ -136,6 +131,7 @@ def test_the_command_writes_page_numbers_and_figures(tmp_path, capsys):
         ("sensor=nothing", "unknown; there are"),
         ("kinect", "key=value"),
         ("depth=3", "keys are sensor, quick"),
+        ("sensor.no_such_key=1", "no_such_key"),
     ],
 )
 def test_wrong_arguments_are_explained(word, message, capsys):
@@ -146,8 +142,6 @@ def test_wrong_arguments_are_explained(word, message, capsys):
 def test_a_sensor_that_sees_too_little_is_refused():
     with pytest.raises(ConfigError, match="fewer than two"):
         Subject("short", SpeckleStereo(min_depth_m=1.0, max_depth_m=1.2)).depths_m()
-    with pytest.raises(ConfigError, match="no width_px"):
-        Subject("none", object())
 
 
 def test_without_the_real_clouds_the_comparison_says_so(tmp_path):
@@ -156,7 +150,7 @@ def test_without_the_real_clouds_the_comparison_says_so(tmp_path):
 
 
 def test_simulated_tables_have_the_steps_and_the_noise_of_real_ones(renderer, tmp_path):
-    """kinect_v1 beside 8 real clouds; ranges, because the scenes are not the same."""
+    """kinect_v1 and 8 real clouds; ranges, because the scenes are not the same."""
     pytest.importorskip("qs3.clouds.pcd")
     if not CLOUDS.is_dir():
         pytest.skip(f"{CLOUDS} is absent")

@@ -3,12 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import look_at
 from qs3.sensors.devices.fitted import FittedDepth, neighbour_correlation
-from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.sensors.devices.test_known_planes import plane
 
 POSE = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
 FLAT = np.full((300, 400), 2.0, np.float32)
@@ -59,36 +55,3 @@ def test_fill_rates_are_interpolated_over_the_tilt(hole):
             for seed in range(4)
         ]
         assert np.mean(shares) == pytest.approx(rate, abs=0.005 if not hole else 0.03)
-
-
-def test_a_scan_casts_the_projectors_shadow_and_says_why():
-    renderer = MitsubaRenderer(samples=1)
-    near, far, f, b = 1.2, 2.4, 290.0, 0.075
-    front, _ = plane(near, half_m=0.15)
-    back, box = plane(far, half_m=0.8)
-    sensor = FittedDepth(width_px=320, height_px=240, focal_px=f, baseline_m=b)
-    frame = sensor.scan((*front, *back), box, POSE, renderer, np.random.default_rng(0))
-    row = frame.reason[len(frame.reason) // 2]
-    assert (row == Reason.SHADOW).sum() == pytest.approx(f * b * (1 / near - 1 / far), abs=2)
-    assert np.isnan(frame.depth_m[frame.reason == Reason.SHADOW]).all()
-    ok = frame.reason == Reason.OK
-    assert np.abs(frame.depth_m - frame.clean_m)[ok].std() < 0.01
-    again = sensor.scan((*front, *back), box, POSE, renderer, np.random.default_rng(0))
-    assert again.depth_m.tobytes() == frame.depth_m.tobytes()
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"noise_factor": -1.0},
-        {"tilts_deg": (0.0, 10.0)},
-        {"fill_rates": (1.2,)},
-        {"tilts_deg": (10.0, 0.0), "fill_rates": (1.0, 1.0)},
-        {"min_depth_m": 9.0},
-        {"hole_px": -1.0},
-        {"step_px": 0},
-    ],
-)
-def test_settings_out_of_range_are_refused(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        FittedDepth(**wrong)

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import ConfigError
-from qs3.geometry.cameras import Camera, Intrinsics, Window, look_at
+from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.devices.fringe import FringeProjection
 from qs3.sensors.optics.fringe_code import FringeCode, phase_of
 from qs3.sensors.optics.subpixel_offsets import sample_centres
@@ -16,17 +15,12 @@ from qs3.sensors.pixel_status import Reason
 from qs3.sensors.renderers.base import Projector, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.sensors.scenery import POSE, box_of, middle, scan, square
+from tests.sensors.scenery import POSE, middle, scan, square
 
 SIDE = FringeProjection()
 ABOVE = FringeProjection(
     baseline_m=0.2, code=FringeCode((1.0, 6.0, 36.0), steps=5, along_rows=True)
 )
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return MitsubaRenderer(samples=4)
 
 
 def law_of(camera, frame, depth):
@@ -145,28 +139,6 @@ def test_hardly_a_pixel_is_a_period_off(renderer):
     assert (np.abs(error[found]) > period / 2).mean() < 1e-3
 
 
-@pytest.mark.parametrize("camera", [SIDE, ABOVE], ids=["side", "above"])
-def test_the_projectors_shadow_is_as_wide_as_geometry_says(renderer, camera):
-    near, far = 0.8, 1.6
-    bodies = [square(near, 0.1), square(far, 0.5)]
-    frame = scan(camera, bodies, renderer, explain=True)
-    shadow = frame.reason == Reason.SHADOW
-    width = camera.focal_px * camera.baseline_m * (1 / near - 1 / far)
-    if camera.code.along_rows:  # light comes from above, the shadow falls below
-        shadow = shadow.T
-        near_pixels = (frame.clean_m < 1).T
-    else:  # light comes from the right, the shadow falls to the left
-        shadow, near_pixels = shadow[:, ::-1], (frame.clean_m < 1)[:, ::-1]
-    line = len(shadow) // 2
-    # A pixel that is lit in part counts as lit.
-    assert shadow[line - 5 : line + 5].sum(axis=1) == pytest.approx(width, abs=2.5)
-    last = np.flatnonzero(near_pixels[line])[-1]
-    assert np.flatnonzero(shadow[line])[0] >= last
-    plain = scan(camera, bodies, renderer)
-    np.testing.assert_array_equal(plain.depth_m, frame.depth_m)
-    assert (plain.reason[frame.reason == Reason.SHADOW] == Reason.DARK).all()
-
-
 def test_reasons(renderer):
     def reasons(camera, body):
         frame = scan(camera, [body], renderer)
@@ -180,36 +152,7 @@ def test_reasons(renderer):
     assert (middle(reasons(loud, square(1.5)).reason) == Reason.SATURATED).mean() > 0.5
     assert (middle(reasons(SIDE, square(7.0)).reason) == Reason.RANGE).mean() > 0.99
     narrow = replace(SIDE, tan_half_width=0.1)
-    beside = reasons(narrow, square(1.0, 0.4))
-    assert (beside.reason == Reason.OUTSIDE).mean() > 0.4
+    aside = reasons(narrow, square(1.0, 0.4))
+    assert (aside.reason == Reason.OUTSIDE).mean() > 0.4
     bright = replace(SIDE, ambient=20.0)  # the pattern drowns
     assert (middle(reasons(bright, square(1.5)).reason) == Reason.DARK).all()
-
-
-def test_a_frame_is_complete_and_the_same_bytes_each_time(renderer):
-    frame, again = (scan(SIDE, [square(1.5)], renderer, seed=4) for _ in range(2))
-    assert frame.depth_m.tobytes() == again.depth_m.tobytes()
-    np.testing.assert_allclose(middle(frame.clean_m), 1.5, rtol=1e-5)
-    assert (middle(frame.label) == 1).all()
-    assert (middle(frame.cosine) > 0.9).all()
-    assert frame.images["left"].shape == frame.depth_m.shape
-    away = look_at(np.zeros(3), np.array([-1.0, 0.0, 0.0]))
-    body = square(1.5)
-    assert SIDE.scan((body,), box_of(body), away, renderer, np.random.default_rng(0)) is None
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: FringeCode(steps=2), "at least 3"),
-        (lambda: FringeCode((1.0, 64.0, 8.0)), "must increase"),
-        (lambda: FringeCode((2.0, 8.0)), "at most 1 period"),
-        (lambda: FringeCode((1.0, 200.0)), "at least 8 px"),
-        (lambda: FringeProjection(max_misfit=0.6), "max_misfit"),
-        (lambda: FringeProjection(baseline_m=0.0), "baseline_m"),
-        (lambda: FringeProjection(min_depth_m=7.0), "min_depth_m"),
-    ],
-)
-def test_wrong_settings_are_refused(make, message):
-    with pytest.raises(ConfigError, match=message):
-        make()

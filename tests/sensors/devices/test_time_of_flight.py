@@ -7,25 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import ConfigError
-from qs3.geometry.cameras import look_at
 from qs3.sensors.base import on_grid
 from qs3.sensors.devices.gaussian_time_of_flight import GaussianTimeOfFlight
 from qs3.sensors.devices.time_of_flight import SPEED_OF_LIGHT, TimeOfFlight, unwrapped
 from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.sensors.scenery import POSE, box_of, middle, rectangle, scan, square
+from tests.sensors.scenery import box_of, middle, rectangle, scan, square
 
 CAMERA = TimeOfFlight()
 # Next to no noise, and a lamp in the lens, so without shadows.
 QUIET = TimeOfFlight(
     lamp_offset_m=0.0, electrons_at_1m=1e12, full_well_e=1e15, read_noise_e=0.0, ambient=0.0
 )
-
-
-@pytest.fixture(scope="module")
-def renderer():
-    return MitsubaRenderer(samples=4)
 
 
 def rays(frame):
@@ -157,42 +149,6 @@ def test_reasons(renderer):
     assert (middle(reasons(bright, [square(7.0)]).reason) == Reason.RANGE).all()
 
 
-def test_the_lamps_shadow_is_as_wide_as_geometry_says(renderer):
-    camera = replace(CAMERA, lamp_offset_m=0.1)
-    near, far = 0.8, 2.0
-    bodies = [square(near, 0.1), square(far, 0.6)]
-    frame = scan(camera, bodies, renderer, explain=True)
-    row = frame.depth_m.shape[0] // 2
-    shadow = (frame.reason[row - 5 : row + 5] == Reason.SHADOW).sum(axis=1)
-    width = camera.focal_px * camera.lamp_offset_m * (1 / near - 1 / far)
-    assert shadow == pytest.approx(width, abs=1.5)
-    assert not frame.images["lit"][frame.reason == Reason.SHADOW].any()
-
-
-def test_a_frame_is_the_same_bytes_each_time_and_none_out_of_view(renderer):
-    for camera in (CAMERA, GaussianTimeOfFlight()):
-        a, b = (scan(camera, [square(1.5)], renderer, seed=3) for _ in range(2))
-        assert a.depth_m.tobytes() == b.depth_m.tobytes()
-        away = look_at(np.zeros(3), np.array([-1.0, 0.0, 0.0]))
-        rng = np.random.default_rng(0)
-        body = square(1.5)
-        assert camera.scan((body,), box_of(body), away, renderer, rng) is None
-
-
-def test_frames_are_complete_and_clean_depth_is_exact(renderer):
-    for camera in (CAMERA, GaussianTimeOfFlight(step_px=2)):
-        frame = scan(camera, [square(1.7)], renderer)
-        np.testing.assert_allclose(middle(frame.clean_m), 1.7, rtol=1e-5)
-        np.testing.assert_allclose(middle(frame.cosine) * middle(rays(frame)), 1, rtol=1e-5)
-        assert (middle(frame.label) == 1).all()
-        shapes = {a.shape for a in (frame.depth_m, frame.clean_m, frame.label, frame.reason)}
-        assert len(shapes) == 1
-        types = (frame.depth_m.dtype, frame.clean_m.dtype, frame.label.dtype, frame.reason.dtype)
-        assert types == (np.float32, np.float32, np.uint8, np.uint8)
-        points = frame.points(frame.clean_m, POSE)
-        assert np.abs(points[:, 0] - 1.7).max() < 1e-5
-
-
 def test_blensors_noise_is_one_normal_law_along_the_ray(renderer):
     camera = GaussianTimeOfFlight(noise_mean_m=0.01)
     for depth in (1.0, 4.0):
@@ -217,18 +173,3 @@ def test_samples_lie_on_one_grid_whatever_the_window(start, count, step):
     expected = [x for x in range(start, start + count) if x % step == step // 2]
     assert list(np.arange(start, start + count)[part]) == expected
     assert not expected or first == expected[0]
-
-
-@pytest.mark.parametrize(
-    ("settings_", "message"),
-    [
-        ({"frequencies_hz": ()}, "frequencies_hz"),
-        ({"supersampling": 2}, "supersampling must be odd >= 1"),
-        ({"contrast": 1.2}, "contrast"),
-        ({"min_depth_m": 7.0}, "min_depth_m"),
-        ({"read_noise_e": -1.0}, "read_noise_e"),
-    ],
-)
-def test_wrong_settings_are_refused(settings_, message):
-    with pytest.raises(ConfigError, match=message):
-        TimeOfFlight(**settings_)

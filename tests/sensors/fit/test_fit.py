@@ -1,5 +1,6 @@
 """`qs3 fit` must find what cameras hide."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -7,14 +8,14 @@ import numpy as np
 import pytest
 import yaml
 
-from qs3.geometry.cameras import look_at
 from qs3.sensors.bench.laws import nguyen_axial_m
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
-from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.commands import main
-from tests.sensors.devices.test_known_planes import plane
+from tests.sensors.scenery import plane, scan
 
+SMALL = FittedDepth(width_px=200, height_px=150, focal_px=180.0)
+STEP = 1 / (8 * 43.5)  # of 1 / Z: eighths of a pixel of a Kinect
 POSES = [(0.9, 8), (1.4, -6), (2.0, 10), (3.0, 7), (2.0, 30), (2.0, 55)]
 KINECT = Path(__file__).resolve().parents[4] / "shared" / "data" / "kinect_v1"
 
@@ -64,16 +65,19 @@ def fitted(folder, files, *arguments):
     ), text
 
 
+def recovered(folder, hidden, poses=POSES[:4], *arguments):
+    """What is found from frames of walls at (distance, tilt) that a hidden sensor made."""
+    files = [folder / f"{i}.npy" for i in range(len(poses))]
+    for i, (depth, tilt) in enumerate(poses):
+        np.save(files[i], wall(hidden, depth, tilt, seed=i))
+    return fitted(folder, files, f"intrinsics={camera_of(hidden)}", *arguments)
+
+
 @pytest.mark.parametrize("name", HIDDEN)
 def test_hidden_parameters_are_recovered(name, tmp_path):
-    hidden, files = HIDDEN[name], []
-    for i, (depth, tilt) in enumerate(POSES):
-        files.append(tmp_path / f"{i}.npy")
-        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
+    hidden = HIDDEN[name]
     distances = ",".join(str(depth) for depth, _ in POSES)
-    found, text = fitted(
-        tmp_path, files, f"intrinsics={camera_of(hidden)}", f"distances={distances}"
-    )
+    found, text = recovered(tmp_path, hidden, POSES, f"distances={distances}")
     assert found.noise_power == hidden.noise_power
     for depth in (0.9, 1.5, 2.5, 3.0):
         assert found.noise_law_m(depth) == pytest.approx(hidden.noise_law_m(depth), rel=0.1)
@@ -106,22 +110,18 @@ def test_other_things_before_the_wall_and_millimetre_pictures(tmp_path):
 
 
 def test_one_distance_cannot_tell_the_law(tmp_path):
-    hidden = FittedDepth(noise_factor=0.003)
-    np.save(tmp_path / "a.npy", wall(hidden, 1.5, 4, seed=0))
-    found, text = fitted(tmp_path, [tmp_path / "a.npy"], f"intrinsics={camera_of(hidden)}")
+    hidden = replace(SMALL, noise_factor=0.003)
+    found, text = recovered(tmp_path, hidden, [(1.5, 4)])
     assert found.noise_power == 2
     assert found.noise_factor == pytest.approx(0.003, rel=0.05)
     assert "assumed: all walls are equally far" in text
 
 
-def test_the_steps_of_a_simulated_kinect_are_found(tmp_path):
+def test_the_steps_of_a_simulated_kinect_are_found(tmp_path, renderer):
     """Frames of matched images, not of this model: 1/8 px steps of f b = 43.5 px m."""
-    sensor, renderer = ReferenceSpeckle(), MitsubaRenderer(samples=4)
-    pose = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
-    files = []
+    sensor, files = ReferenceSpeckle(), []
     for i, (depth, tilt) in enumerate([(1.2, 12), (1.9, -15), (2.6, 20)]):
-        bodies, box = plane(depth, half_m=0.45, tilt_deg=tilt)
-        frame = sensor.scan(bodies, box, pose, renderer, np.random.default_rng(i))
+        frame = scan(sensor, [plane(depth, 0.45, tilt)], renderer, seed=i)
         whole = np.full((sensor.height_px, sensor.width_px), np.nan, np.float32)
         height, width = frame.depth_m.shape
         place = (slice(frame.top, frame.top + height), slice(frame.left, frame.left + width))
@@ -136,29 +136,24 @@ def test_the_steps_of_a_simulated_kinect_are_found(tmp_path):
 @pytest.mark.parametrize("share", [0.1, 0.25])
 def test_noise_far_below_a_step_is_found(share, tmp_path):
     """Taking step^2 / 12 off the variance would leave nothing but its own error."""
-    step, files = 1 / (8 * 43.5), []
-    hidden = FittedDepth(noise_factor=share * step, inverse_step_per_m=step)
-    for i, (depth, tilt) in enumerate(POSES[:4]):
-        files.append(tmp_path / f"{i}.npy")
-        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
+    hidden = FittedDepth(noise_factor=share * STEP, inverse_step_per_m=STEP)
+    found, _ = recovered(tmp_path, hidden)
     assert found.noise_law_m(2.0) == pytest.approx(hidden.noise_law_m(2.0), rel=0.05)
     assert found.correlation_px == 0
 
 
 def test_walls_that_show_too_few_levels_are_refused(tmp_path, capsys):
-    step = 1 / (8 * 43.5)
-    hidden = FittedDepth(noise_factor=0.3 * step, inverse_step_per_m=step)
+    hidden = replace(SMALL, noise_factor=0.3 * STEP, inverse_step_per_m=STEP)
     np.save(tmp_path / "a.npy", wall(hidden, 1.5, 0.5, seed=0))
     out = [f"out={tmp_path / 'x.yaml'}"]
-    assert main(["fit", str(tmp_path / "a.npy"), "focal=580", *out]) == 1
+    assert main(["fit", str(tmp_path / "a.npy"), "focal=180", *out]) == 1
     assert "turn the camera by a few degrees" in capsys.readouterr().err
     # Three such walls show the step, but two or three levels each hide noise far below it.
-    quiet = FittedDepth(noise_factor=0.2 * step, inverse_step_per_m=step)
+    quiet = replace(SMALL, noise_factor=0.2 * STEP, inverse_step_per_m=STEP)
     files = [str(tmp_path / f"{i}.npy") for i in range(3)]
     for i, depth in enumerate((1.0, 1.7, 2.5)):
         np.save(files[i], wall(quiet, depth, 0.2, seed=i))
-    assert main(["fit", *files, "focal=580", *out]) == 1
+    assert main(["fit", *files, "focal=180", *out]) == 1
     assert "turn the camera by a few degrees" in capsys.readouterr().err
 
 
@@ -174,29 +169,21 @@ def test_a_lens_that_bends_the_wall_adds_no_noise(tmp_path):
 
 
 def test_the_true_distance_is_that_at_the_principal_point(tmp_path):
-    """Half a pixel beside it, a wall at a slant of 60 degrees is 1 % further away."""
-    hidden = FittedDepth(width_px=320, height_px=240, focal_px=90.0, noise_factor=0.0005)
-    files = []
-    for i, (depth, tilt) in enumerate([(1.0, 50), (1.5, -50), (2.0, 50)]):
-        files.append(tmp_path / f"{i}.npy")
-        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    camera = [f"intrinsics={camera_of(hidden)}", "distances=1,1.5,2"]
-    found, _ = fitted(tmp_path, files, *camera)
+    """Half a pixel off it, a wall at a slant of 60 degrees is 1 % further away."""
+    hidden = FittedDepth(width_px=200, height_px=150, focal_px=56.0, noise_factor=0.0005)
+    poses = [(1.0, 50), (1.5, -50), (2.0, 50)]
+    found, _ = recovered(tmp_path, hidden, poses, "distances=1,1.5,2")
     for depth in (1.0, 1.5, 2.0):
         assert abs(np.polynomial.polynomial.polyval(depth, found.bias_m)) < 0.0007
 
 
 def test_walls_that_face_the_camera_do_not_hide_their_steps(tmp_path):
     """Three distances with some levels each, in whole millimetres."""
-    step, files = 1 / (8 * 43.5), []
     hidden = FittedDepth(
-        noise_factor=0.7 * step, inverse_step_per_m=step, depth_step_m=0.001, fill_rates=(0.93,)
+        noise_factor=0.7 * STEP, inverse_step_per_m=STEP, depth_step_m=0.001, fill_rates=(0.93,)
     )
-    for i, depth in enumerate((1.0, 1.7, 2.5)):
-        files.append(tmp_path / f"{i}.npy")
-        np.save(files[-1], wall(hidden, depth, 0.2, seed=i))
-    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
-    assert found.inverse_step_per_m == pytest.approx(step, rel=0.02)
+    found, _ = recovered(tmp_path, hidden, [(1.0, 0.2), (1.7, 0.2), (2.5, 0.2)])
+    assert found.inverse_step_per_m == pytest.approx(STEP, rel=0.02)
     assert found.depth_step_m == pytest.approx(0.001)
     assert found.noise_law_m(2.0) == pytest.approx(hidden.noise_law_m(2.0), rel=0.05)
     assert np.mean(found.fill_rates) == pytest.approx(0.93, abs=0.01)
@@ -206,11 +193,7 @@ def test_whole_millimetres_alone_are_no_steps_of_a_disparity(tmp_path):
     hidden = FittedDepth(
         noise_floor_m=0.0015, noise_factor=0.001, noise_power=1, depth_step_m=0.001
     )
-    files = []
-    for i, depth in enumerate((1.0, 1.7, 2.5)):
-        files.append(tmp_path / f"{i}.npy")
-        np.save(files[-1], wall(hidden, depth, 0.0, seed=i))
-    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
+    found, _ = recovered(tmp_path, hidden, [(1.0, 0.0), (1.7, 0.0), (2.5, 0.0)])
     assert found.inverse_step_per_m == 0
     assert found.noise_law_m(2.0) == pytest.approx(0.0035, rel=0.05)
 
@@ -219,37 +202,29 @@ def test_whole_millimetres_alone_are_no_steps_of_a_disparity(tmp_path):
 @pytest.mark.parametrize("size", [0.6, 4.0])
 def test_smooth_noise_below_a_step_is_found_to_be_smooth(size, tmp_path):
     """Rounding tears neighbours apart; a simulation with the same steps knows by how much."""
-    step, files = 1 / (8 * 43.5), []
-    hidden = FittedDepth(noise_factor=0.3 * step, inverse_step_per_m=step, correlation_px=size)
-    for i, (depth, tilt) in enumerate(POSES[:4]):
-        files.append(tmp_path / f"{i}.npy")
-        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
+    hidden = FittedDepth(noise_factor=0.3 * STEP, inverse_step_per_m=STEP, correlation_px=size)
+    found, _ = recovered(tmp_path, hidden)
     assert found.correlation_px == pytest.approx(size, rel=0.15)
 
 
 @pytest.mark.parametrize(("rate", "hole"), [(0.9, 1.0), (0.6, 3.0), (0.5, 8.0)])
 def test_holes_of_any_size_count(rate, hole, tmp_path):
-    hidden, files = FittedDepth(fill_rates=(rate,), hole_px=hole), []
-    for i, (depth, tilt) in enumerate(POSES[:4]):
-        files.append(tmp_path / f"{i}.npy")
-        np.save(files[-1], wall(hidden, depth, tilt, seed=i))
-    found, _ = fitted(tmp_path, files, f"intrinsics={camera_of(hidden)}")
+    found, _ = recovered(tmp_path, FittedDepth(fill_rates=(rate,), hole_px=hole))
     # Four frames hold some 300 holes a frame of the largest size: a few per cent of chance.
     assert np.mean(found.fill_rates) == pytest.approx(rate, abs=0.01 + 0.004 * hole)
     assert found.hole_px == pytest.approx(hole, rel=0.15)
 
 
 def test_the_shadow_of_a_thing_is_no_hole_of_the_wall(tmp_path):
-    image = wall(FittedDepth(noise_factor=0.001), 2.0, 5, seed=0)
-    image[200:300, 300:400] = 1.2
-    image[200:300, 280:300] = np.nan
+    image = wall(replace(SMALL, noise_factor=0.001), 2.0, 5, seed=0)
+    image[60:90, 90:120] = 1.2
+    image[60:90, 84:90] = np.nan
     np.save(tmp_path / "a.npy", image)
-    found, _ = fitted(tmp_path, [tmp_path / "a.npy"], "focal=580")
+    found, _ = fitted(tmp_path, [tmp_path / "a.npy"], "focal=180")
     assert min(found.fill_rates) == 1
 
 
-@pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds beside the checkout")
+@pytest.mark.skipif(not KINECT.is_dir(), reason="no real Kinect clouds next to the checkout")
 def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
     files = sorted(KINECT.glob("*.pcd"))[:4]
     found, _ = fitted(tmp_path, files, "focal=575")

@@ -4,7 +4,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from qs3.errors import ConfigError
 from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import FillHoles, Median, NeighbourCheck, Quantiser, SmallRegions
 from qs3.sensors.matching.triangulation import Triangulation
@@ -112,19 +111,3 @@ def test_triangulation_says_what_it_dropped():
     assert list(reason[0]) == [0, 0, 0, *[Reason.FILTERED] * 2, Reason.DARK, Reason.FILTERED]
     depth, _, reason = geometry.depth(match, Quantiser(), [])
     assert list(reason[0]) == [0, 0, 0, Reason.RANGE, Reason.RANGE, Reason.DARK, 0]
-
-
-@pytest.mark.parametrize(
-    ("make", "key"),
-    [
-        (lambda: Median(4), "size_px"),
-        (lambda: NeighbourCheck(2), "size_px"),
-        (lambda: NeighbourCheck(min_share=1.5), "min_share"),
-        (lambda: SmallRegions(max_step_px=0), "max_step_px"),
-        (lambda: FillHoles(0), "max_width_px"),
-        (lambda: Quantiser(-1), "steps_per_px"),
-    ],
-)
-def test_settings_out_of_range_are_refused(make, key):
-    with pytest.raises(ConfigError, match=key):
-        make()

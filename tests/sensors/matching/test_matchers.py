@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from qs3.errors import ConfigError
 from qs3.sensors.matching import (
     CensusMatcher,
     NormalisedCorrelation,
@@ -12,26 +11,7 @@ from qs3.sensors.matching import (
     StereoBlockMatcher,
 )
 from qs3.sensors.pixel_status import Reason
-
-FINE = 16  # positions a pixel
-
-
-def dots(height, width, seed):
-    """Blurred dots on [h, width * FINE] positions, 0..220."""
-    rng = np.random.default_rng(seed)
-    lit = (rng.random((height, width * FINE)) < 0.15 / FINE).astype(np.float32)
-    soft = cv2.GaussianBlur(lit, (0, 0), sigmaX=0.9 * FINE, sigmaY=0.9)
-    return soft / np.quantile(soft, 0.99) * 220
-
-
-def seen(texture, shift_px, seed=None, noise=2.0):
-    """The texture as an image, moved to the right by shift_px."""
-    height = len(texture)
-    image = np.roll(texture, round(shift_px * FINE), axis=1).reshape(height, -1, FINE).mean(axis=2)
-    if seed is not None:
-        image = image + np.random.default_rng(seed).normal(0, noise, image.shape)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
-
+from tests.sensors.matching.textures import FINE, dots, seen
 
 MATCHERS = {
     "block": StereoBlockMatcher(64, 19),
@@ -40,15 +20,15 @@ MATCHERS = {
     "census": CensusMatcher(64),
 }
 # Error of the median in one sub-pixel phase, rms of a pixel, mean of the medians over all phases.
+# Census has a test of its own.
 BARS = {
     "block": (0.05, 0.06, 0.01),
     "semi-global": (0.13, 0.11, 0.01),  # steps of 1/16 px, stretched against locking
     "correlation": (0.04, 0.06, 0.005),
-    "census": (0.02, 0.05, 0.005),
 }
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", BARS)
 def test_all_sub_pixel_phases_come_back(name):
     single, spread, pooled = BARS[name]
     medians = []
@@ -89,13 +69,6 @@ def test_an_image_without_texture_matches_nowhere(name):
     found = MATCHERS[name].match(flat, flat)
     assert np.isnan(found.disparity).all()
     assert (found.reason != Reason.OK).all()
-
-
-def test_block_matching_and_census_say_that_it_is_dark():
-    flat = np.zeros((40, 160), np.uint8)
-    for name in ("block", "census"):
-        reason = MATCHERS[name].match(flat, flat).reason
-        assert (reason[10:-10, 90:-20] == Reason.DARK).mean() > 0.99
 
 
 @pytest.mark.parametrize("name", MATCHERS)
@@ -155,20 +128,3 @@ def test_the_left_right_check_drops_what_the_other_camera_does_not_see(make):
     )
     assert np.isfinite(on).mean() < 0.5
     assert np.isfinite(on).mean() <= np.isfinite(off).mean()
-
-
-@pytest.mark.parametrize(
-    ("make", "key"),
-    [
-        (lambda: SemiGlobalMatcher(50), "num_disparities"),
-        (lambda: SemiGlobalMatcher(block_size=4), "block_size"),
-        (lambda: SemiGlobalMatcher(mode="fast"), "mode"),
-        (lambda: SemiGlobalMatcher(p1=100, p2=50), "p1 < p2"),
-        (lambda: NormalisedCorrelation(window_px=4), "window_px"),
-        (lambda: CensusMatcher(window_px=8), "window_px"),
-        (lambda: CensusMatcher(paths=5), "paths"),
-    ],
-)
-def test_settings_out_of_range_are_refused(make, key):
-    with pytest.raises(ConfigError, match=key):
-        make()

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.errors import ConfigError
 from qs3.sensors.optics.blender_filmic import FilmicCamera, filmic
 
 BLENDER = """
@@ -79,10 +78,3 @@ def test_the_background_shows_where_the_object_does_not_cover_the_pixel():
     picture = camera.expose(0.2 * covered, 1.0, np.random.default_rng(0))
     wanted = filmic(0.2 * covered + 0.05 * (1 - covered))
     np.testing.assert_array_equal(picture, np.rint(wanted))
-
-
-def test_settings_out_of_range_are_refused():
-    with pytest.raises(ConfigError, match=r"background must be >= 0"):
-        FilmicCamera(background=-1)
-    with pytest.raises(ConfigError, match=r"faintest must be > 0"):
-        FilmicCamera(faintest=0)

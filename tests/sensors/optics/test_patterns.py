@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.sensors.optics.patterns import PictureSlide, Speckle
 
 
@@ -38,11 +38,6 @@ def test_a_tile_repeats_and_a_seed_decides():
     np.testing.assert_array_equal(slide[:32, :40], slide[32:64, 80:120])
     np.testing.assert_array_equal(slide, Speckle(20, 16, tiles=3, dot_px=2, seed=4).slide)
     assert (slide != Speckle(20, 16, tiles=3, dot_px=2, seed=5).slide).any()
-
-
-def test_a_fill_that_cannot_be_reached_is_refused():
-    with pytest.raises(ConfigError, match=r"pattern\.fill 0\.2 cannot be reached with spacing 1"):
-        Speckle(fill=0.2, spacing=1)
 
 
 def test_dots_of_different_brightness_stand_where_the_equal_ones_do():

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import look_at
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
@@ -40,11 +39,6 @@ def test_the_slide_repeats_in_tiles_and_holds_the_dots_of_its_pattern():
     # Decoded after interpolation: less light than a linear slide of the same dots.
     linear = cv2.resize(plain.slide, slide.slide.shape[::-1], interpolation=cv2.INTER_LINEAR)
     assert 0.5 * linear.mean() < slide.slide.mean() < 0.9 * linear.mean()
-
-
-def test_detail_below_one_is_refused():
-    with pytest.raises(ConfigError, match=r"pattern\.detail must be >= 1"):
-        ReleasedSlide(detail=0)
 
 
 SCENE = """

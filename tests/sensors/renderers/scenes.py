@@ -7,6 +7,14 @@ import numpy as np
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.base import Body, Projector, Scene
+from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+
+RENDERERS = {
+    "blender": lambda: BlenderRenderer(),
+    "mitsuba": lambda: MitsubaRenderer(),
+    "mitsuba_scalar": lambda: MitsubaRenderer(variant="scalar_rgb"),
+}
 
 
 def quad(corners: list[list[float]], albedo: float = 1.0, label: int = 1) -> Body:

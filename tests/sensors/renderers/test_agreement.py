@@ -12,12 +12,6 @@ from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.sensors.renderers.scenes import busy_camera, busy_scene, dots, moved, wall
 
-SHAPES = {
-    "sphere": lambda: trimesh.creation.icosphere(subdivisions=3, radius=0.22),
-    "box": lambda: trimesh.creation.box((0.3, 0.28, 0.35)),
-    "torus": lambda: trimesh.creation.torus(0.18, 0.07),
-}
-
 
 def disparity_px(left, right):
     """[h, w] float32 from OpenCV's block matching, NaN where it found none."""
@@ -27,9 +21,9 @@ def disparity_px(left, right):
     return np.where(found > 0, found, np.nan)
 
 
-@pytest.mark.parametrize("shape", list(SHAPES))
-def test_radiance_and_disparity_agree(shape):
-    solid = SHAPES[shape]()
+def test_radiance_geometry_and_disparity_agree():
+    """On a box; solids and furniture are compared as the paper's sensor."""
+    solid = trimesh.creation.box((0.3, 0.28, 0.35))
     turn = trimesh.transformations.rotation_matrix(0.6, [1, 1, 0.3])
     solid.apply_transform(trimesh.transformations.translation_matrix([0, 0, 0.9]) @ turn)
     mesh = Mesh(np.asarray(solid.vertices), np.asarray(solid.faces))

@@ -4,8 +4,6 @@ f = 1500 px, baseline 0.1 m, 3 to 5 m away, the paper's law of poses and its sli
 images go through a camera without noise and a matcher that does not quantise.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 import trimesh
@@ -46,25 +44,8 @@ def mesh_of(name):
     return items[{"lamp": 1, "plant": 2}.get(name, 3)].load()
 
 
-@dataclass(frozen=True)
-class Difference:
-    median_px: float
-    p95_px: float
-    fill: tuple[float, float]  # percent of the object's pixels that have a disparity
-    bias_px: float
-    of_truth_px: float
-    labels: int  # pixels that see the object in one and not in the other
-
-    def __str__(self):
-        return (
-            f"|difference| median {self.median_px:.4f}, 95 % {self.p95_px:.3f} px; median signed "
-            f"{self.bias_px:+.4f} px; fill {self.fill[0]:.2f} and {self.fill[1]:.2f} %; "
-            f"{self.labels} labels differ; median of |Blender - truth| {self.of_truth_px:.3f} px"
-        )
-
-
 def compare(name, samples, window_px=None):
-    """Blender against Mitsuba on one object; `window_px` limits the render to its middle."""
+    """Check Blender against Mitsuba on one object; `window_px` limits the render to its middle."""
     rng = np.random.default_rng(0)
     mesh = UnitCube().place(mesh_of(name), rng, name)
     (pose,) = AnchoredViews(count=1).poses(rng, mesh.bounds, name)
@@ -96,14 +77,15 @@ def compare(name, samples, window_px=None):
     on = (images[0].label == 1) & (images[1].label == 1)
     both = on & np.isfinite(found[0]) & np.isfinite(found[1])
     difference = (found[0] - found[1])[both]
-    return Difference(
-        float(np.median(np.abs(difference))),
-        float(np.percentile(np.abs(difference), 95)),
-        (100 * np.isfinite(found[0])[on].mean(), 100 * np.isfinite(found[1])[on].mean()),
-        float(np.median(difference)),
-        float(np.nanmedian(np.abs(found[0] - PX_M / images[0].depth_m)[both])),
-        int((images[0].label != images[1].label).sum()),
-    )
+    fill = [100 * np.isfinite(match)[on].mean() for match in found]
+    assert np.median(np.abs(difference)) < 0.05
+    assert np.percentile(np.abs(difference), 95) < 0.5
+    assert abs(np.median(difference)) < 0.01
+    assert abs(fill[0] - fill[1]) < 2
+    assert (images[0].label != images[1].label).sum() < 10
+    # and it is the object that was measured
+    assert min(fill) > 50
+    assert np.nanmedian(np.abs(found[0] - PX_M / images[0].depth_m)[both]) < 0.2
 
 
 def middle_of(window, side_px):
@@ -116,28 +98,12 @@ def middle_of(window, side_px):
     return [Window(left, top, width, height), Window(left - last, top, wider, height)]
 
 
-def check(found):
-    assert found.median_px < 0.05
-    assert found.p95_px < 0.5
-    assert abs(found.fill[0] - found.fill[1]) < 2
-    assert abs(found.bias_px) < 0.01
-    assert found.labels < 10
-    # and it is the object that was measured
-    assert min(found.fill) > 50
-    assert found.of_truth_px < 0.2
-
-
 @pytest.mark.parametrize("name", [*FURNITURE, *SOLIDS])
-def test_disparities_agree_in_a_window(name, record_property):
-    found = compare(name, samples=8, window_px=180)
-    record_property("agreement", str(found))
-    check(found)
+def test_disparities_agree_in_a_window(name):
+    compare(name, samples=8, window_px=180)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*FURNITURE, *SOLIDS])
-def test_disparities_agree_on_the_whole_object(name, capsys):
-    found = compare(name, samples=16)
-    with capsys.disabled():
-        print(f"\n{name}: {found}")  # noqa: T201
-    check(found)
+def test_disparities_agree_on_the_whole_object(name):
+    compare(name, samples=16)

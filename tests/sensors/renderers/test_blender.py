@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from qs3.errors import RenderError
+from qs3.sensors.renderers import blender
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.exr import read_exr
+from tests.sensors.renderers.scenes import busy_camera, busy_scene
 
 
 def test_missing_bpy_says_what_to_install(monkeypatch):
@@ -30,22 +32,17 @@ def test_missing_library_names_the_packages(monkeypatch, tmp_path):
 def test_nothing_is_left_in_blender():
     import bpy
 
-    from tests.sensors.renderers.scenes import busy_camera, busy_scene
-
     renderer = BlenderRenderer(samples=1)
     renderer.render(busy_scene(), [busy_camera()], seed=0, geometry=[True])
     for kind in ("objects", "meshes", "materials", "lights", "cameras", "images", "worlds"):
         assert len(getattr(bpy.data, kind)) == 0
 
 
-def test_failure_inside_blender_is_told(monkeypatch):
-    import qs3.sensors.renderers.blender as module
-    from tests.sensors.renderers.scenes import busy_camera, busy_scene
-
+def test_failure_inside_blender_is_reported(monkeypatch):
     def fail(*_args):
         raise RuntimeError("Error: cannot save")
 
-    monkeypatch.setattr(module, "_aim", fail)
+    monkeypatch.setattr(blender, "_aim", fail)
     renderer = BlenderRenderer(samples=1)
     with pytest.raises(RenderError, match="cannot save"):
         renderer.render(busy_scene(), [busy_camera()], seed=0, geometry=[True])
@@ -54,7 +51,7 @@ def test_failure_inside_blender_is_told(monkeypatch):
     assert np.isfinite(image.depth_m).any()
 
 
-def test_file_that_is_no_exr_is_refused(tmp_path):
+def test_file_that_is_not_an_exr_is_refused(tmp_path):
     path = tmp_path / "x.exr"
     path.write_bytes(b"\x89PNG and more")
     with pytest.raises(RenderError, match="not an EXR"):
