@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 import logging
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -15,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from qs3.classes import ALIASES, known_as
-from qs3.data.manifest import ManifestRow
+from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
 from qs3.errors import ConfigError, DataError
 from qs3.utils.locks import locked
@@ -185,7 +186,43 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
         os.rename(building, folder)
 
 
-def class_of(name: str, classes: Sequence[str], where: str) -> str:
+def cloud_id(cls: str, split: str, name: str) -> str:
+    """An id: class, split and name, as far as they are known."""
+    return "/".join(part for part in (cls, split, name) if part)
+
+
+def file_item(
+    path: Path, root: Path, cls: str, split: str, load: Callable[[Path], np.ndarray], name: str = ""
+) -> Item:
+    """The one cloud of a file below `root`; its name is that of the file unless given."""
+    id_ = cloud_id(cls, split, name or path.stem)
+    row = ManifestRow(id_, cls, split, origin=path.relative_to(root).as_posix())
+    return Item(row, str(path), functools.partial(load, path))
+
+
+def unique(items: Iterable[Item]) -> list[Item]:
+    """The items themselves, if their ids differ by more than case: not all systems tell it.
+
+    Raises:
+        DataError: names two files of one id.
+    """
+    found: dict[str, Item] = {}
+    for item in items:
+        other = found.setdefault(item.row.id.casefold(), item)
+        if other is not item:
+            raise DataError(f"{item.where} and {other.where} have one name; rename one")
+    return list(found.values())
+
+
+def by_class(items: Iterable[Item], classes: Sequence[str]) -> list[Item]:
+    """Sorted by split, class (none before all) and id."""
+    label = {name: i for i, name in enumerate(classes)}
+    return sorted(
+        items, key=lambda i: (SPLITS.index(i.row.split), label.get(i.row.cls, -1), i.row.id)
+    )
+
+
+def class_of(name: str, classes: Sequence[str], where: str | Path) -> str:
     """The class that a published name means, whatever its case; see `qs3.classes.ALIASES`.
 
     Raises:
@@ -200,7 +237,7 @@ def class_of(name: str, classes: Sequence[str], where: str) -> str:
     return found
 
 
-def split_of(name: str, where: str) -> str:
+def split_of(name: str, where: str | Path) -> str:
     """The split that a published name means."""
     splits = {"train": "train", "test": "test", "validation": "validation", "val": "validation"}
     if name.casefold() not in splits:
@@ -236,6 +273,16 @@ def visible(folder: Path, root: Path) -> list[Path]:
                 f"{folder / name!r}: a name with control or broken characters; rename it"
             )
     return [inside(folder / name, root) for name in clear]
+
+
+def folders_in(folder: Path, root: Path) -> Iterator[Path]:
+    """The visible folders in one, in order; see `visible`."""
+    return (path for path in visible(folder, root) if path.is_dir())
+
+
+def files_in(folder: Path, root: Path, suffix: str) -> Iterator[Path]:
+    """The visible files with this extension, in any case; see `visible`."""
+    return (p for p in visible(folder, root) if p.suffix.lower() == suffix and p.is_file())
 
 
 def check_cloud(cloud: np.ndarray, points: int, where: str) -> np.ndarray:
