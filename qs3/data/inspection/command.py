@@ -54,12 +54,12 @@ def compare_command(
         facts = compare(a, b, bounds, advance)
     folder = make_folder(out or OUT / f"{_file_name(a)}-{_file_name(b)}")
     write_json(folder / "comparison.json", facts)
-    write_text(folder / "comparison.md", of_pair(facts))
+    text = of_pair(facts)
+    write_text(folder / "comparison.md", text)
     split = next((name for name in a.data.counts() if name in b.data.counts()), None)
     if split:
         both = {f"A: {a.label}": a.data, f"B: {b.label}": b.data}
         scan_picture(both, folder / "clouds.png", split=split)
-    text = of_pair(facts, markdown=False)
     picture = " and clouds.png" if split else ""
     return f"{text}\nsaved comparison.json, comparison.md{picture} in {folder}"
 

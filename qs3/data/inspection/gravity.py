@@ -38,7 +38,6 @@ class Verdict:
         cls: class name.
         clouds: how many were looked at.
         up: direction with the best mean score, one of `UPS`.
-        votes: share of the clouds that each direction wins, in the order of `UPS`.
         axis_share: share of the clouds whose best direction lies along the axis of `up`.
         sign_share: share of the clouds that prefer `up` to its opposite.
         axis_sure: the axis is told from the other two by most clouds and beyond chance.
@@ -48,7 +47,6 @@ class Verdict:
     cls: str
     clouds: int
     up: str
-    votes: tuple[float, ...]
     axis_share: float
     sign_share: float
     axis_sure: bool
@@ -56,9 +54,8 @@ class Verdict:
 
     def contradicts(self, up: str = "+z") -> bool:
         """Whether the evidence is clear and against `up`."""
-        if self.axis_sure and self.up[1] != up[1]:
-            return True
-        return self.axis_sure and self.sign_sure and self.up != up
+        wrong_sign = self.sign_sure and self.up != up
+        return self.axis_sure and (self.up[1] != up[1] or wrong_sign)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,18 +96,15 @@ class UpModel:
         """Which way is up in clouds [n, P, 3] of one class; one direction for all of them."""
         score = self.scores(clouds, cls)
         best = int(score.mean(axis=0).argmax())
-        opposite = best ^ 1
-        votes = np.bincount(score.argmax(axis=1), minlength=6) / len(score)
         along = score.reshape(-1, 3, 2).max(axis=2)  # [n, 3 axes]
         axis = best // 2
         rival = max((a for a in range(3) if a != axis), key=lambda a: along[:, a].mean())
-        sign_share, sign_sure = _prefers(score[:, best] - score[:, opposite])
+        sign_share, sign_sure = _prefers(score[:, best] - score[:, best ^ 1])
         return Verdict(
             cls=cls,
             clouds=len(score),
             up=UPS[best],
-            votes=tuple(float(v) for v in votes),
-            axis_share=float(votes[best] + votes[opposite]),
+            axis_share=float((score.argmax(axis=1) // 2 == axis).mean()),
             sign_share=sign_share,
             axis_sure=_prefers(along[:, axis] - along[:, rival])[1],
             sign_sure=sign_sure,
@@ -235,20 +229,16 @@ def describe(clouds: Float[np.ndarray, "n p 3"]) -> Float[np.ndarray, "n 6 f"]:
         )
         uu, vv, uv = uu - mean_u**2, vv - mean_v**2, uv - mean_u * mean_v
         middle, spread = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv**2)
-        found.append(
-            np.concatenate(
-                [
-                    np.sqrt(count / points),
-                    _slice_mean(cell, count, np.hypot(u, v)),
-                    np.sqrt(np.maximum(middle + spread, 0)),
-                    np.sqrt(np.maximum(middle - spread, 0)),
-                    np.hypot(mean_u, mean_v),
-                    tall,
-                    np.sort((high - low)[:, 0], axis=1),
-                ],
-                axis=1,
-            )
+        parts = (
+            np.sqrt(count / points),
+            _slice_mean(cell, count, np.hypot(u, v)),
+            np.sqrt(np.maximum(middle + spread, 0)),
+            np.sqrt(np.maximum(middle - spread, 0)),
+            np.hypot(mean_u, mean_v),
+            tall,
+            np.sort((high - low)[:, 0], axis=1),
         )
+        found.append(np.concatenate(parts, axis=1))
     return np.stack(found, axis=1)
 
 

@@ -103,7 +103,7 @@ def distance_to_mesh(
     about its centre comes within the bound. `rng` decides how fast that is, not the result.
     """
     points = np.asarray(points, dtype=np.float64)
-    samples = surface_points(mesh, _SAMPLES, rng)
+    samples = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
     best = cKDTree(samples).query(points)[0] * (1 + 1e-6)
     corners = mesh.vertices[mesh.faces]
     centres = corners.mean(axis=1)
@@ -141,8 +141,3 @@ def _to_triangle(
         inside &= (np.cross(end - start, points - start) * normal).sum(1) >= 0
     height = np.abs(((points - a) * normal).sum(1)) / np.maximum(twice, 1e-30)
     return np.where(inside, np.minimum(height, best), best)
-
-
-def surface_points(mesh: Mesh, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """`count` points, uniform on the mesh."""
-    return surface_sample(mesh.vertices, mesh.faces, count, rng)

@@ -9,11 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.data.scannet.labels import is_scene
+from qs3.data.scannet.labels import is_scene, read_text
 from qs3.data.scannet.sens import is_rigid
 from qs3.errors import DataError, MissingDataError
 
-_MAX_INFO_BYTES = 1 << 20
+_SUFFIXES = {
+    "sens": ".sens",
+    "instances": "_2d-instance-filt.zip",
+    "labels": "_2d-label-filt.zip",
+    "aggregation": ".aggregation.json",
+    "info": ".txt",
+}
 
 
 @dataclass(frozen=True)
@@ -39,25 +45,13 @@ class SceneFiles:
     @staticmethod
     def find(folder: Path, split: str) -> SceneFiles:
         """Those in a scene's folder, under ScanNet's names."""
-
-        def there(suffix: str) -> Path | None:
-            path = folder / f"{folder.name}{suffix}"
-            return path if path.is_file() else None
-
-        return SceneFiles(
-            scene=folder.name,
-            split=split,
-            sens=there(".sens"),
-            instances=there("_2d-instance-filt.zip"),
-            labels=there("_2d-label-filt.zip"),
-            aggregation=there(".aggregation.json"),
-            info=there(".txt"),
-        )
+        paths = {role: folder / f"{folder.name}{suffix}" for role, suffix in _SUFFIXES.items()}
+        there = {role: path if path.is_file() else None for role, path in paths.items()}
+        return SceneFiles(folder.name, split, **there)
 
     def sizes(self) -> dict[str, int]:
         """Bytes of each file, by its role: another size means another file."""
-        roles = ("sens", "instances", "labels", "aggregation", "info")
-        paths = {role: getattr(self, role) for role in roles}
+        paths = {role: getattr(self, role) for role in _SUFFIXES}
         return {role: path.stat().st_size for role, path in paths.items() if path is not None}
 
 
@@ -114,9 +108,7 @@ def read_alignment(path: Path | None, scene: str) -> np.ndarray:
     """
     if path is None:
         raise DataError(f"{scene}.txt is not there, so the scene cannot be aligned (align=false)")
-    if path.stat().st_size > _MAX_INFO_BYTES:
-        raise DataError(f"{path} is too large for a scene's information")
-    text = path.read_bytes().decode("utf-8", "replace")
+    text = read_text(path, "a scene's information")
     match = re.search(r"^\s*axisAlignment\s*=(.*)$", text, re.MULTILINE)
     try:
         matrix = np.array([float(word) for word in match[1].split()] if match else [])

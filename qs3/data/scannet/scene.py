@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class SceneResult:
     frames_used: int = 0
     frames_lost: int = 0
     frames_unmasked: int = 0
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
     reason: str = ""
 
 
@@ -89,7 +89,7 @@ def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) 
     objects = tuple(
         _finish(one, sightings[one], crops[one], denied[one], settings, align) for one in labelled
     )
-    return SceneResult(files, objects, len(scan.sens), len(frames), lost, unmasked, tuple(notes))
+    return SceneResult(files, objects, len(scan.sens), len(frames), lost, unmasked, notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,14 +100,15 @@ class _Scan:
     instances: MaskArchive
     labels: MaskArchive | None
     settings: Extraction
+    known: dict[tuple[int, int], Registration] = field(default_factory=dict)
 
-    def registration(self, known: dict, mask: np.ndarray, frame: int) -> Registration:
+    def registration(self, mask: np.ndarray, frame: int) -> Registration:
         """That of the mask's resolution, made once."""
         shape = (mask.shape[0], mask.shape[1])
-        if shape not in known:
+        if shape not in self.known:
             where = f"{self.instances.path}, frame {frame}"
-            known[shape] = Registration(self.sens.header, shape, where)
-        return known[shape]
+            self.known[shape] = Registration(self.sens.header, shape, where)
+        return self.known[shape]
 
     def object_ids(
         self, registration: Registration, mask: np.ndarray, depth_m: np.ndarray
@@ -132,14 +133,13 @@ def _first_pass(
 ) -> dict[Labelled, Sightings]:
     """How much of which object each frame shows."""
     sightings = {one: Sightings() for one in labelled}
-    known: dict = {}
     for frame in frames:
         mask = scan.instances.read(frame)
-        there = np.bincount(mask.ravel(), minlength=1)
-        shown = [one for one in labelled if _count(there, one) > 0]
+        there = np.flatnonzero(np.bincount(mask.ravel()))
+        shown = [one for one in labelled if one.object_id + 1 in there]
         if not shown:
             continue
-        registration = scan.registration(known, mask, frame)
+        registration = scan.registration(mask, frame)
         depth_m, pose = scan.sens.depth_m(frame), scan.sens.poses[frame]
         ids, _ = scan.object_ids(registration, mask, depth_m)
         for one in shown:
@@ -162,10 +162,9 @@ def _second_pass(
     for one, frames in chosen.items():
         for frame in frames:
             of_frame[frame].append(one)
-    known: dict = {}
     for frame in sorted(of_frame):
         mask = scan.instances.read(frame)
-        registration = scan.registration(known, mask, frame)
+        registration = scan.registration(mask, frame)
         depth_m, pose = scan.sens.depth_m(frame), scan.sens.poses[frame]
         ids, where = scan.object_ids(registration, mask, depth_m)
         labels = _labels(scan, frame, mask.shape)
@@ -247,8 +246,3 @@ def _finish(
         fused_points=len(fused),
         cloud=sampled(fused, settings.points),
     )
-
-
-def _count(there: np.ndarray, one: Labelled) -> int:
-    value = one.object_id + 1
-    return int(there[value]) if value < len(there) else 0
