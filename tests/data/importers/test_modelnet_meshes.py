@@ -9,9 +9,7 @@ import torch
 from scipy.stats import chi2_contingency, chisquare
 
 from qs3.classes import CLASSES
-from qs3.data.importers.base import import_into
 from qs3.data.importers.modelnet_meshes import ModelNetMeshes, sample_file
-from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError, MeshError
 from qs3.meshes.io import load_mesh
 from tests.fixtures.modelnet import OTHERS, TEN, off_text, write_off_tree
@@ -179,23 +177,6 @@ def test_a_cloud_depends_on_its_own_seed_only(modelnet, tmp_path):
     assert all(np.array_equal(first[key], fewer[key]) for key in fewer)
 
 
-def test_into_the_store(modelnet, tmp_path):
-    hashes = set()
-    for name in ("one", "two"):
-        import_into(tmp_path / name, ModelNetMeshes(modelnet), name="m", classes=CLASSES)
-        hashes.add(open_pointset(tmp_path / name).sha256)
-    assert len(hashes) == 1
-    data = open_pointset(tmp_path / "one")
-    assert data.points.shape == (30, 2048, 3)
-    assert data.meta["imported"]["seed"] == 0
-
-
-def test_all_forty_classes_keep_their_own_names(modelnet):
-    names = tuple(sorted([*TEN, *OTHERS]))
-    _, rows = ModelNetMeshes(modelnet, points=4).read(names)
-    assert {row.cls for row in rows} == set(names)
-
-
 @pytest.mark.skipif(not ARRAYS.is_file(), reason="../shared/data is not there")
 def test_counts_of_the_official_split(tmp_path):
     """Names and split of PointDA-10's list, put into ModelNet40's folders; no file is opened."""
@@ -260,20 +241,6 @@ def test_readers_on_odd_and_damaged_files(tmp_path, text, message, pyg):
     else:
         with pytest.raises(MeshError, match=rf"{re.escape(str(path))}: .*{message}"):
             sample_file(path, 16, 0)
-
-
-def test_damage_stops_the_import_or_is_recorded(tmp_path):
-    write_off_tree(tmp_path / "m", SPLITS)
-    damaged = tmp_path / "m" / "sofa" / "train" / "sofa_0002.off"
-    damaged.write_text(damaged.read_text()[:300])
-    with pytest.raises(DataError, match=r"sofa_0002\.off: is truncated"):
-        import_into(tmp_path / "s", ModelNetMeshes(tmp_path / "m"), name="m", classes=CLASSES)
-    assert not (tmp_path / "s").exists()
-    skipping = ModelNetMeshes(tmp_path / "m", on_error="skip")
-    import_into(tmp_path / "s", skipping, name="m", classes=CLASSES)
-    (row,) = [row for row in read_manifest(tmp_path / "s", CLASSES) if row.status != "ok"]
-    assert row.id == "sofa/train/sofa_0002"
-    assert "truncated" in row.reason
 
 
 def test_wrong_folders(tmp_path):
