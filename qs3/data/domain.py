@@ -122,12 +122,12 @@ class Domain:
         importer = self.importer()
         if importer is not None and importer.is_there():
             return
-        lines = [f"domain {self.name}: {self.label} is not there. Looked for:"]
         unfinished = is_begun(self.folder)
-        state = "   (begun but not finished)" if unfinished else ""
-        lines.append(f"  {self.folder / 'meta.yaml'}{state}")
-        if importer is not None:
-            lines += [f"  {pattern}" for pattern in importer.looks_for()]
+        lines = [
+            f"domain {self.name}: {self.label} is not there. Looked for:",
+            f"  {self.folder / 'meta.yaml'}{'   (begun but not finished)' * unfinished}",
+            *(f"  {pattern}" for pattern in (importer.looks_for() if importer else [])),
+        ]
         if self.how_to_get:
             lines.append(f"Where to get it: {self.how_to_get.strip()}")
         if self.make:
@@ -173,11 +173,8 @@ class Domain:
                 if have.get(cls, 0) != count
             ]
         if problems:
-            log.warning(
-                "%s does not have the published numbers of clouds: %s",
-                self.label,
-                ", ".join(problems),
-            )
+            text = "%s does not have the published numbers of clouds: %s"
+            log.warning(text, self.label, ", ".join(problems))
 
     def _refuse_stale(self, importer: Importer) -> None:
         """Raise DataError if the store was imported with other settings than today's."""
@@ -199,8 +196,7 @@ class Domain:
             changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
             if len(changed) > 1:  # of other settings there is more to say than a digest
                 changed = [key for key in changed if key != "files"]
-            was = {key: imported.get(key) for key in changed}
-            wanted = {key: now.get(key) for key in changed}
+            was, wanted = ({key: of.get(key) for key in changed} for of in (imported, now))
             raise DataError(
                 f"{self.folder} was imported with {was}, the config says {wanted}; delete the "
                 "folder to import it again, or give another `path`"

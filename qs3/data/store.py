@@ -46,6 +46,7 @@ __all__ = [
     "ManifestRow",
     "PointSet",
     "counts_text",
+    "evenly",
     "is_begun",
     "is_finished",
     "open_pointset",
@@ -99,6 +100,11 @@ class PointSet:
         """[n] int64 positions of a split's clouds, in the dataset's order."""
         return np.flatnonzero(self.splits == split)
 
+    def members(self, cls: str) -> np.ndarray:
+        """[n] int64 positions of a class's clouds; none of a name that is not a class here."""
+        known = cls in self.classes
+        return np.flatnonzero(self.labels == self.classes.index(cls) if known else [])
+
     def split(self, split: str) -> PointSet:
         """The clouds of one split, in order; a view of the memmap if they are adjacent.
 
@@ -133,6 +139,12 @@ class PointSet:
             for split in SPLITS
             if np.any(self.splits == split)
         }
+
+
+def evenly(positions: np.ndarray, most: int) -> list[int]:
+    """At most so many of some positions [n], at even steps from the first on."""
+    few = min(most, len(positions))
+    return [int(positions[i * len(positions) // few]) for i in range(few)]
 
 
 def counts_text(data: PointSet, without: str, missing: Mapping[str, int]) -> list[str]:
@@ -283,15 +295,12 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     )
 
 
-def open_table(
-    folder: str | Path, name: str = "provenance", verify: bool = True
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray, tuple[str, ...]]:
     """Open what a dataset knows of each point of its variant "points".
 
     Args:
         folder: of the dataset.
         name: of the table, by file stem.
-        verify: also compare the file's SHA-256 with meta.yaml.
 
     Returns:
         [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names
@@ -310,7 +319,7 @@ def open_table(
             "with it (for provenance: provenance=true)"
         )
     columns = tuple(tables[name])
-    return _open_array(folder, name, meta, len(columns), verify), columns
+    return _open_array(folder, name, meta, len(columns), verify=True), columns
 
 
 def _meta_of_finished(folder: Path) -> dict[str, Any]:
@@ -382,14 +391,13 @@ def _check_arrays(
     tables: Mapping[str, Sequence[str]],
 ) -> tuple[int, int, int]:
     """The common shape of all clouds, after checking that all arrays fit the manifest."""
-    if "points" in tables:
-        raise DataError(f"dataset {name!r}: 'points' is not a table; arrays are {sorted(arrays)}")
-    if unknown := sorted(set(tables) - set(arrays)):
-        raise DataError(
-            f"dataset {name!r}: tables {unknown} are not arrays; arrays are {sorted(arrays)}"
-        )
     if "points" not in arrays:
         raise DataError(f"dataset {name!r} needs an array 'points', got {sorted(arrays)}")
+    if wrong := sorted(set(tables) - set(arrays) | set(tables) & {"points"}):
+        raise DataError(
+            f"dataset {name!r}: tables {wrong} are not arrays beyond 'points'; arrays are "
+            f"{sorted(arrays)}"
+        )
     for key, array in arrays.items():
         if not key.isidentifier() or key in ("manifest", "meta"):
             raise DataError(f"an array of dataset {name!r} cannot be called {key!r}")

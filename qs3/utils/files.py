@@ -16,8 +16,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from qs3.errors import Qs3Error
 
 _CHUNK = 1 << 20
@@ -89,12 +87,6 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def write_npy(path: str | os.PathLike[str], array: np.ndarray) -> None:
-    """Replace `path` by `array` as .npy (never a pickle), atomically."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, array, allow_pickle=False)
-
-
 def sha256_file(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file's bytes as 64 hex digits, read in pieces of 1 MiB."""
     digest = hashlib.sha256()
@@ -104,23 +96,15 @@ def sha256_file(path: str | os.PathLike[str]) -> str:
     return digest.hexdigest()
 
 
-def remove_leftovers(folder: str | os.PathLike[str], *, of: str | None = None) -> list[Path]:
+def remove_leftovers(folder: str | os.PathLike[str]) -> None:
     """Delete temporary files that a killed process left directly in `folder`.
 
-    Call it only where nobody else is writing (under `locked`, or on one's own run folder).
-
-    Args:
-        folder: where to look; nothing happens if it does not exist.
-        of: only leftovers of the file with this name.
-
-    Returns:
-        What was deleted.
+    Call it only where nobody else is writing (under `locked`, or on one's own run folder). Nothing
+    happens if there is no such folder.
     """
-    pattern = f".{of or '*'}.*.tmp*"
-    leftovers = sorted(p for p in Path(folder).glob(pattern) if p.is_file())
-    for path in leftovers:
-        path.unlink(missing_ok=True)
-    return leftovers
+    for path in Path(folder).glob(".*.*.tmp*"):
+        if path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

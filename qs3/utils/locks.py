@@ -22,13 +22,7 @@ def locked(path: str | os.PathLike[str]) -> Iterator[None]:
     Raises:
         Qs3Error: the file cannot be made.
     """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(path, "ab")  # noqa: SIM115 (closed below)
-    except OSError as error:
-        raise Qs3Error(f"cannot write the lock {path}: {error.strerror or error}") from error
-    with file:
+    with _open_lock(Path(path)) as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
@@ -74,8 +68,10 @@ def check_idle(folder: Path) -> None:
 
 def _open_lock(path: Path) -> BinaryIO:
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         return open(path, "ab")
     except OSError as error:
         raise Qs3Error(
-            f"cannot write {path} ({error}); check the permissions or choose another folder"
+            f"cannot write the lock {path} ({error.strerror or error}); check the permissions or "
+            "choose another folder"
         ) from error

@@ -93,7 +93,7 @@ class Processes:
 
     They are spawned, because neither Blender nor threads survive a fork; they leave Ctrl-C to
     their parent, and end with it however it ends. A task whose process dies is tried once more,
-    in a new process beside which no other one works.
+    in a new process while no other one works.
 
     Args:
         workers: how many at once.

@@ -107,7 +107,7 @@ def _is_in_place(place: Path, source: Source) -> bool:
 def _place(
     source: Source, missing: dict[Part, Path], archive: Path, root: str, published: Path
 ) -> None:
-    """Unpack into a folder beside the final ones, find the parts, and rename them into place."""
+    """Unpack into a folder next to the final ones, find the parts, and rename them into place."""
     building = published / f".{source.name}.unpacking"
     shutil.rmtree(building, ignore_errors=True)  # what a killed run left
     sha256 = sha256_file(archive)

@@ -16,9 +16,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from qs3.classes import ALIASES, known_as
+from qs3.config.checks import check_choice, check_int
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.utils.locks import locked
 from qs3.utils.progress import shown
 
@@ -60,10 +61,8 @@ class Importer(abc.ABC):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
-        if self.points < 1:
-            raise ConfigError(f"points of {type(self).__name__} is {self.points}, must be >= 1")
-        if self.on_error not in ("stop", "skip"):
-            raise ConfigError(f"on_error is {self.on_error!r}, expected 'stop' or 'skip'")
+        check_int("published.points", self.points, 1)
+        check_choice("published.on_error", self.on_error, ("stop", "skip"))
 
     @property
     def root(self) -> Path:
@@ -137,7 +136,7 @@ class Importer(abc.ABC):
         return {"format": type(self).__name__, **values}
 
     def changes(self, origins: Collection[str]) -> str:
-        """What is different from an import, in words, if its `settings` had another "files".
+        """What is different from an import, if its `settings` had another "files".
 
         Args:
             origins: of the imported manifest.
@@ -149,7 +148,7 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
     """Read the published files and put the finished store at `folder`, all or nothing.
 
     Several processes may ask at once (a sweep): one imports, the others wait and find it done.
-    The store is built beside `folder` and renamed, so a kill leaves nothing at `folder`.
+    The store is built next to `folder` and renamed, so a kill leaves nothing at `folder`.
 
     Raises:
         DataError: damaged files, or `folder` holds something else.

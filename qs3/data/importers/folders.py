@@ -139,12 +139,12 @@ class CloudFolder(Importer):
         """See `Importer`: which files are new, gone, or neither and so changed."""
         had = {_NUMBER.sub("", origin) for origin in origins}
         have = {os.fsdecode(name) for name, _, _ in _stats(self.root)}
-        told = [
+        parts = [
             f"{len(names)} {what} ({', '.join(sorted(names)[:3])}{', ...' * (len(names) > 3)})"
             for names, what in ((have - had, "added"), (had - have, "removed"))
             if names
         ]
-        return f"the files in {self.root}: {', '.join(told) or 'some have changed'}"
+        return f"the files in {self.root}: {', '.join(parts) or 'some have changed'}"
 
     def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
         """See `Importer`: at most P points, the farthest."""

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.clouds.files import parse_cloud
+from qs3.config.checks import check_choice
 from qs3.data.importers.base import Importer, Item, by_class, file_item, files_in, folders_in
 from qs3.errors import ConfigError, DataError
 
-_REALITIES = ("Real", "Synthetic")
 _SENSORS = ("kinect", "realsense")
 
 
@@ -38,8 +38,7 @@ class GraspNetPC(Importer):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "sensors", list(self.sensors))
-        if self.reality not in _REALITIES:
-            raise ConfigError(f"reality is {self.reality!r}, expected one of {_REALITIES}")
+        check_choice("published.reality", self.reality, ("Real", "Synthetic"))
         if not self.sensors or set(self.sensors) - set(_SENSORS):
             raise ConfigError(f"sensors are {self.sensors}, expected some of {_SENSORS}")
 

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.classes import ALIASES
+from qs3.config.checks import check_int
 from qs3.data.importers.base import (
     Importer,
     Item,
@@ -34,7 +35,7 @@ from qs3.data.importers.base import (
     unique,
 )
 from qs3.data.importers.trees import list_tree
-from qs3.errors import ConfigError, DataError, MeshError
+from qs3.errors import DataError, MeshError
 from qs3.utils.seeding import derive
 
 _WHERE = ("", "raw", "ModelNet40", "ModelNet10")  # below the folder, the tree may lie here
@@ -52,8 +53,7 @@ class ModelNetMeshes(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.seed < 0:
-            raise ConfigError(f"seed of {type(self).__name__} is {self.seed}, must be >= 0")
+        check_int("published.seed", self.seed, 0)
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

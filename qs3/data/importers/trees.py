@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from qs3.clouds.files import parse_cloud
+from qs3.config.checks import check_choice
 from qs3.data.importers.base import (
     Importer,
     Item,
@@ -27,7 +28,7 @@ from qs3.data.importers.base import (
     y_up_to_z_up,
 )
 from qs3.data.manifest import SPLITS
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 
 _SCANNET = re.compile(r"/(scene\d{4})_\d{2}(?:_|$)")
 
@@ -50,8 +51,7 @@ class TreeImporter(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.up not in ("y", "z"):
-            raise ConfigError(f"up of {type(self).__name__} is {self.up!r}, expected 'y' or 'z'")
+        check_choice("published.up", self.up, ("y", "z"))
         object.__setattr__(self, "up_z_classes", list(self.up_z_classes))
 
     def looks_for(self) -> list[str]:

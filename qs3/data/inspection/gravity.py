@@ -25,6 +25,8 @@ UPS: tuple[str, ...] = ("+z", "-z", "+x", "-x", "+y", "-y")
 
 _SLICES = 10
 _POINTS = 512  # of a cloud that are looked at
+_JUDGED = 100  # clouds a class
+_SHAPES = 40  # of the catalogue a class, to learn from
 _RIDGE = 100.0
 _SURE_SHARE = 0.6  # of the clouds that prefer the best direction to the second best
 _SURE_SD = 3.0  # standard errors between their mean scores
@@ -52,10 +54,9 @@ class Verdict:
     axis_sure: bool
     sign_sure: bool
 
-    def contradicts(self, up: str = "+z") -> bool:
-        """Whether the evidence is clear and against `up`."""
-        wrong_sign = self.sign_sure and self.up != up
-        return self.axis_sure and (self.up[1] != up[1] or wrong_sign)
+    def contradicts(self) -> bool:
+        """Whether the evidence is clear and against +z."""
+        return self.axis_sure and (self.up[1] != "z" or (self.sign_sure and self.up == "-z"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,6 @@ def judge_set(
     labels: Int[np.ndarray, " n"],
     classes: Sequence[str],
     model: UpModel | None = None,
-    limit: int = 100,
     seed: int = 0,
 ) -> list[Verdict]:
     """A verdict for each class that occurs and that the model knows.
@@ -126,8 +126,7 @@ def judge_set(
         labels: positions in `classes`; negative: unknown, passed over.
         classes: names.
         model: what upright objects look like; None: the embedded catalogue's.
-        limit: clouds a class at most, drawn with `seed`.
-        seed: of that draw.
+        seed: draws a hundred clouds of each class, if there are more.
     """
     model = model or catalogue_model()
     verdicts = []
@@ -136,15 +135,15 @@ def judge_set(
         if cls not in model.weights or len(members) == 0:
             continue
         rng = np.random.default_rng([seed, label])
-        chosen = np.sort(rng.permutation(members)[:limit])
+        chosen = np.sort(rng.permutation(members)[:_JUDGED])
         verdicts.append(model.judge(np.stack([points[i] for i in chosen]), cls))
     return verdicts
 
 
 @cache
-def catalogue_model(shapes: int = 40) -> UpModel:
+def catalogue_model() -> UpModel:
     """The model of the embedded catalogue: whole surfaces, and scans from above, with noise."""
-    return UpModel.fit({cls: upright_examples(cls, shapes) for cls in CLASSES})
+    return UpModel.fit({cls: upright_examples(cls, _SHAPES) for cls in CLASSES})
 
 
 def upright_examples(cls: str, shapes: int, seed: int = 7) -> Float[np.ndarray, "n 512 3"]:
@@ -175,16 +174,16 @@ def turned(cloud: Float[np.ndarray, "*b 3"], yaw_rad: float) -> Float[np.ndarray
 
 
 def seen_from_above(
-    cloud: Float[np.ndarray, "p 3"], rng: np.random.Generator, views: int = 4
+    cloud: Float[np.ndarray, "p 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "m 3"]:
-    """The points that are in front in one of some views, 15 to 45 degrees above the horizon."""
-    cells = 50
+    """The points that are in front in one of four views, 15 to 45 degrees above the horizon."""
+    cells, views = 50, 4
     centred = cloud - cloud.mean(axis=0)
     size = max(float(np.abs(centred).max()), 1e-12)
     kept = np.zeros(len(cloud), dtype=bool)
     first, arc = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2.6)
     for view in range(views):
-        azimuth = first + arc * view / max(views - 1, 1)
+        azimuth = first + arc * view / (views - 1)
         elevation = np.deg2rad(rng.uniform(15, 45))
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
         away = np.array([np.cos(azimuth), np.sin(azimuth), 0]) * np.cos(elevation)

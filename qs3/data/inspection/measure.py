@@ -81,7 +81,9 @@ def compare(a: Opened, b: Opened, bounds: Bounds, advance: Advance = lambda: Non
     Raises:
         ConfigError: they have no class in common.
     """
-    common = [cls for cls in a.data.classes if _members(a, cls).size and _members(b, cls).size]
+    common = [
+        cls for cls in a.data.classes if a.data.members(cls).size and b.data.members(cls).size
+    ]
     if not common:
         raise ConfigError(f"{a.label} and {b.label} have no class in common")
     count = min(NET_POINTS, a.data.points.shape[1], b.data.points.shape[1])
@@ -183,16 +185,10 @@ def _told_apart(
     }
 
 
-def _members(opened: Opened, cls: str) -> np.ndarray:
-    data = opened.data
-    known = cls in data.classes
-    return np.flatnonzero(data.labels == data.classes.index(cls)) if known else np.array([], int)
-
-
 def _of_each(opened: Opened, classes: list[str], limit: int, seed: int) -> list[np.ndarray]:
     """For each class up to `limit` rows, the same ones for every limit's beginning."""
     found = []
     for cls in classes:
         rng = np.random.default_rng([seed, 2, opened.data.classes.index(cls)])
-        found.append(rng.permutation(_members(opened, cls))[:limit])
+        found.append(rng.permutation(opened.data.members(cls))[:limit])
     return found

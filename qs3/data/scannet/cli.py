@@ -17,7 +17,7 @@ _PATHS = {
     "val": 'scannetv2_val.txt, from there too; becomes the split "test", as in PointDA-10',
     "out": "folder of the dataset; conf/domain/depthscannet10.yaml expects data/depthscannet10",
 }
-_KINDS: dict[type, Kind] = {bool: FLAG, int: whole(0), float: NUMBER, str: text()}
+_KINDS: dict[type, Kind] = {int: whole(0), float: NUMBER, str: text()}
 _SETTINGS = tuple(
     Option(one.name, _KINDS[type(one.default)], one.metadata["help"], one.default)
     for one in fields(Extraction)

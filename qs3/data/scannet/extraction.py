@@ -114,7 +114,7 @@ def extract(
         make = partial(_worker, label_map, settings, parts, alone=workers == 0)
         results = _results(make, parts, found, workers)
         pointset = _write(out, scans, results, recipe)
-        _report(pointset, results, found, out)
+        _report(pointset, results, out)
     return pointset
 
 
@@ -258,27 +258,24 @@ def _versions() -> dict[str, str]:
 def _say_found(found: Found) -> None:
     splits = [files.split for files in found.scenes]
     log.info("%d scenes of train and %d of test are there", *map(splits.count, ("train", "test")))
-    if found.absent:
-        log.info("%d scenes of the lists are not, first %s", len(found.absent), found.absent[0])
-    if found.unlisted:
-        log.info("%d scenes are in neither list, first %s", len(found.unlisted), found.unlisted[0])
+    for scenes, where in (
+        (found.absent, "of the lists are not"),
+        (found.unlisted, "are unlisted"),
+    ):
+        if scenes:
+            log.info("%d scenes %s, first %s", len(scenes), where, scenes[0])
 
 
-def _report(pointset: PointSet, results: Sequence[SceneResult], found: Found, out: Path) -> None:
+def _report(pointset: PointSet, results: Sequence[SceneResult], out: Path) -> None:
     """Counts a class, what was left out, and the content hash."""
     missed = (o.labelled.cls for result in results for o in result.objects if o.cloud is None)
     for line in counts_text(pointset, "skipped", Counter(missed)):
         log.info("%s", line)
-    lost = sum(result.frames_lost for result in results)
-    log.info("%d frames were left out for their pose", lost)
+    log.info("%d frames were left out for their pose", sum(r.frames_lost for r in results))
     failed = [result for result in results if result.reason]
     for result in failed[:_FAILURES_SHOWN]:
         log.warning("failed: %s: %s", result.files.scene, result.reason)
     if failed:
-        log.warning(
-            "%d of %d scenes failed (%s); repair or download them and run the same command again",
-            len(failed),
-            len(results),
-            SCENES,
-        )
+        advice = "repair or download them and run the same command again"
+        log.warning("%d of %d scenes failed (%s); %s", len(failed), len(results), SCENES, advice)
     log.info("in %s, content hash %s", out, pointset.sha256[:16])

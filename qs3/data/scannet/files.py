@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from qs3.data.scannet.labels import is_scene, read_text
-from qs3.data.scannet.sens import is_rigid
+from qs3.data.scannet.labels import is_scene
 from qs3.errors import DataError, MissingDataError
 
 _SUFFIXES = {
@@ -18,7 +14,6 @@ _SUFFIXES = {
     "instances": "_2d-instance-filt.zip",
     "labels": "_2d-label-filt.zip",
     "aggregation": ".aggregation.json",
-    "info": ".txt",
 }
 
 
@@ -30,8 +25,8 @@ class SceneFiles:
         scene: its name, e.g. "scene0000_00".
         split: "train" or "test".
         sens, instances: the recording and the zip of instance masks; both are needed.
-        labels, aggregation: zip of label masks and list of objects; one of them is needed.
-        info: <scene>.txt, needed to align.
+        aggregation: the list of objects; needed.
+        labels: the zip of label masks, which checks the classes.
     """
 
     scene: str
@@ -40,7 +35,6 @@ class SceneFiles:
     instances: Path | None
     labels: Path | None
     aggregation: Path | None
-    info: Path | None
 
     @staticmethod
     def find(folder: Path, split: str) -> SceneFiles:
@@ -48,6 +42,17 @@ class SceneFiles:
         paths = {role: folder / f"{folder.name}{suffix}" for role, suffix in _SUFFIXES.items()}
         there = {role: path if path.is_file() else None for role, path in paths.items()}
         return SceneFiles(folder.name, split, **there)
+
+    def need(self, role: str) -> Path:
+        """The file of a role, such as "sens".
+
+        Raises:
+            DataError: it is not there.
+        """
+        path: Path | None = getattr(self, role)
+        if path is None:
+            raise DataError(f"{self.scene}{_SUFFIXES[role]} is not there; download it")
+        return path
 
     def sizes(self) -> dict[str, int]:
         """Bytes of each file, by its role: another size means another file."""
@@ -98,25 +103,3 @@ def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> Found
         unlisted=tuple(name for name in there if name not in split_of),
         absent=tuple(sorted(set(split_of) - set(there))),
     )
-
-
-def read_alignment(path: Path | None, scene: str) -> np.ndarray:
-    """[4, 4] `axisAlignment` of <scene>.txt, which turns about z and shifts.
-
-    Raises:
-        DataError: it is not there, or tilts the scene.
-    """
-    if path is None:
-        raise DataError(f"{scene}.txt is not there, so the scene cannot be aligned (align=false)")
-    text = read_text(path, "a scene's information")
-    match = re.search(r"^\s*axisAlignment\s*=(.*)$", text, re.MULTILINE)
-    try:
-        matrix = np.array([float(word) for word in match[1].split()] if match else [])
-    except ValueError as error:
-        raise DataError(f"{path}: axisAlignment holds {error}") from error
-    if matrix.size != 16:
-        raise DataError(f"{path} has no axisAlignment of 16 numbers (align=false does without)")
-    matrix = matrix.reshape(4, 4)
-    if not is_rigid(matrix) or not np.allclose(matrix[2, :3], (0, 0, 1), rtol=0, atol=1e-3):
-        raise DataError(f"{path}: axisAlignment does not turn about z: {matrix.tolist()}")
-    return matrix

@@ -54,7 +54,7 @@ class Labelled:
 
     Attributes:
         object_id: `objectId` of the aggregation; its mask's pixels are this + 1.
-        label: the annotators' word, or the class where it came from the label masks.
+        label: the annotators' word.
         cls: one of `qs3.classes.CLASSES`.
     """
 
@@ -77,7 +77,7 @@ def read_label_map(path: str | Path, column: str = "category") -> LabelMap:
     """
     if column not in COLUMNS:
         raise ConfigError(f"column must be one of {COLUMNS}, got {column!r}")
-    lines = read_text(path, "the label map").splitlines()
+    lines = _text(path, "the label map").splitlines()
     reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
     header = reader.fieldnames or []
     raw = "raw_category" if "raw_category" in header else "category"
@@ -114,7 +114,7 @@ def read_objects(path: str | Path, label_map: LabelMap) -> tuple[list[Labelled],
         DataError: it is not an aggregation.
     """
     try:
-        document = json.loads(read_text(path, "the aggregation"))
+        document = json.loads(_text(path, "the aggregation"))
         groups = [(group["objectId"], group["label"]) for group in document["segGroups"]]
         others = sum(group.get("id", group["objectId"]) != group["objectId"]
                      for group in document["segGroups"])  # fmt: skip
@@ -149,7 +149,7 @@ def read_scene_list(path: str | Path) -> list[str]:
         MissingDataError: there is no such file.
         DataError: a line is not a scene's name, or there are none.
     """
-    scenes = [line.strip() for line in read_text(path, "a scene list").splitlines() if line.strip()]
+    scenes = [line.strip() for line in _text(path, "a scene list").splitlines() if line.strip()]
     for scene in scenes:
         if not is_scene(scene):
             raise DataError(f"{path}: {scene!r} is not a scene; a line is like scene0000_00")
@@ -163,13 +163,7 @@ def is_scene(name: str) -> bool:
     return re.fullmatch(r"scene\d{4}_\d{2}", name) is not None
 
 
-def read_text(path: str | Path, what: str) -> str:
-    """A text file of ScanNet, of at most 256 MiB.
-
-    Raises:
-        MissingDataError: there is no such file.
-        DataError: it is too large, or cannot be read.
-    """
+def _text(path: str | Path, what: str) -> str:
     try:
         if Path(path).stat().st_size > _MAX_TEXT_BYTES:
             raise DataError(f"{path} is too large for {what}")

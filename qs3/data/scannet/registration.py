@@ -99,9 +99,9 @@ class Registration:
         return local @ pose[:3, :3].T + pose[:3, 3]
 
     def _visible(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """[n] bool: nothing clearly nearer lies in the point's cell or one beside it.
+        """[n] bool: nothing clearly nearer lies in the point's cell or one next to it.
 
-        The cells beside it stand for sides of a nearer thing that only the colour camera sees:
+        The cells next to it stand for sides of a nearer thing that only the colour camera sees:
         no depth was measured there. It costs what lies behind an edge a few pixels.
         """
         height, width = self._mask_shape

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from qs3.data.scannet.files import SceneFiles, read_alignment
+from qs3.data.scannet.files import SceneFiles
 from qs3.data.scannet.labels import Labelled, LabelMap, read_objects
 from qs3.data.scannet.masks import INSTANCES, LABELS, MaskArchive
 from qs3.data.scannet.objects import ObjectCloud, Sightings, sampled
@@ -21,8 +21,6 @@ from qs3.data.scannet.registration import Registration, agreed
 from qs3.data.scannet.sens import SensFile
 from qs3.data.scannet.settings import Extraction
 from qs3.errors import DataError
-
-_VOTES = 4  # every how many rows and columns of a mask vote where there is no aggregation
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,38 +54,27 @@ def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) 
     Raises:
         DataError: a file is missing or damaged.
     """
-    if files.sens is None or files.instances is None:
-        lacks = ".sens" if files.sens is None else "_2d-instance-filt.zip"
-        raise DataError(f"{files.scene}{lacks} is not there; download it")
-    if files.labels is None and files.aggregation is None:
-        raise DataError(
-            f"neither {files.scene}.aggregation.json nor {files.scene}_2d-label-filt.zip is there, "
-            "so nobody knows what the objects are; download them"
-        )
-    align = read_alignment(files.info, files.scene) if settings.align else np.eye(4)
+    sens, instances = files.need("sens"), files.need("instances")
+    labelled, notes = read_objects(files.need("aggregation"), label_map)
     with ExitStack() as stack:
         scan = _Scan(
-            sens=stack.enter_context(SensFile(files.sens)),
-            instances=stack.enter_context(MaskArchive(files.instances, INSTANCES)),
+            sens=stack.enter_context(SensFile(sens)),
+            instances=stack.enter_context(MaskArchive(instances, INSTANCES)),
             labels=stack.enter_context(MaskArchive(files.labels, LABELS)) if files.labels else None,
             settings=settings,
         )
         frames, lost, unmasked = _usable_frames(scan)
         if not frames:
             raise DataError(
-                f"{files.sens}: none of its {len(scan.sens)} frames has a finite pose and a mask"
+                f"{sens}: none of its {len(scan.sens)} frames has a finite pose and a mask"
             )
-        if files.aggregation:
-            labelled, notes = read_objects(files.aggregation, label_map)
-        else:
-            labelled, notes = _voted(scan, frames, label_map), ["classes voted by label masks"]
         if files.labels is None:
             notes = [*notes, "no label masks to check the classes"]
         sightings = _first_pass(scan, frames, labelled)
         chosen = {one: sightings[one].viewpoints(settings.views) for one in labelled}
         crops, denied = _second_pass(scan, chosen, label_map)
     objects = tuple(
-        _finish(one, sightings[one], crops[one], denied[one], settings, align) for one in labelled
+        _finish(one, sightings[one], crops[one], denied[one], settings) for one in labelled
     )
     return SceneResult(files, objects, len(scan.sens), len(frames), lost, unmasked, notes)
 
@@ -195,33 +182,12 @@ def _labels(scan: _Scan, frame: int, shape: tuple[int, ...]) -> np.ndarray | Non
     return labels
 
 
-def _voted(scan: _Scan, frames: Sequence[int], label_map: LabelMap) -> list[Labelled]:
-    """Objects and classes where there is no aggregation: what most pixels of a mask are called."""
-    assert scan.labels is not None
-    votes: dict[tuple[int, int], int] = defaultdict(int)
-    for frame in frames:
-        mask = scan.instances.read(frame)
-        labels = _labels(scan, frame, mask.shape)
-        assert labels is not None
-        few = (slice(None, None, _VOTES), slice(None, None, _VOTES))
-        pairs = mask[few].astype(np.int64) << 16 | labels[few]
-        for pair, count in zip(*np.unique(pairs, return_counts=True), strict=True):
-            votes[int(pair) >> 16, int(pair) & 0xFFFF] += int(count)
-    objects = []
-    for number in sorted({instance for instance, _ in votes} - {0}):
-        label = max((n for i, n in votes if i == number), key=lambda n: (votes[number, n], -n))
-        if cls := label_map.class_of_id.get(label):
-            objects.append(Labelled(number - 1, cls, cls))
-    return objects
-
-
 def _finish(
     one: Labelled,
     sightings: Sightings,
     crops: Mapping[int, np.ndarray],
     denied: int,
     settings: Extraction,
-    align: np.ndarray,
 ) -> ObjectCloud:
     """The object's cloud from its crops, or why there is none."""
     nothing = ObjectCloud(one, (), len(sightings.frames), 0, None)
@@ -239,7 +205,6 @@ def _finish(
             nothing, reason=f"the label masks of all {denied} chosen frames give it another class"
         )
     fused = np.concatenate([crops[frame] for frame in sorted(crops)]).astype(np.float64)
-    fused = fused @ align[:3, :3].T + align[:3, 3]
     return replace(
         nothing,
         frames=tuple(sorted(crops)),

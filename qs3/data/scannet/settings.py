@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from qs3.config.checks import check_bool, check_choice, check_float, check_int
+from qs3.config.checks import check_choice, check_float, check_int
 from qs3.data.scannet.labels import COLUMNS
 from qs3.errors import ConfigError
 
@@ -33,7 +33,6 @@ class Extraction:
     depth_min_m: float = _setting(0.1, "nearer depths are left out")
     depth_max_m: float = _setting(10.0, "farther depths are left out")
     margin_px: int = _setting(1, "pixels about a mask's pixel that must show the same object, too")
-    align: bool = _setting(False, "turn scenes about z by their axisAlignment (needs <scene>.txt)")
     column: str = _setting(
         "category", "of the label map; or raw_category: the annotators' very words"
     )
@@ -47,5 +46,4 @@ class Extraction:
         far = check_float("depth_max_m", self.depth_max_m)
         if not 0 < near < far < float("inf"):
             raise ConfigError(f"0 < depth_min_m < depth_max_m must hold, got {near} and {far}")
-        check_bool("align", self.align)
         check_choice("column", self.column, COLUMNS)
