@@ -336,11 +336,23 @@ def _meta_of_finished(folder: Path) -> dict[str, Any]:
 def _open_array(
     folder: Path, name: str, meta: Mapping[str, Any], columns: int, verify: bool
 ) -> np.ndarray:
-    path = folder / f"{name}.npy"
-    array = _map(path, (meta["clouds"], meta["points"], columns))
+    """[N, P, columns] float32 memmap; its header, size and hash must be what they were."""
+    path, shape = folder / f"{name}.npy", (meta["clouds"], meta["points"], columns)
+    header = _header(shape)
+    expected = len(header) + 4 * int(np.prod(shape))
+    try:
+        with open(path, "rb") as file:
+            found = file.read(len(header))
+        size = path.stat().st_size
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
+    if size != expected:
+        raise DataError(f"{path} has {size} bytes, expected {expected} for {shape}; {AGAIN}")
+    if found != header:
+        raise DataError(f"{path} has not the header of a float32 array {shape}; {AGAIN}")
     if verify and sha256_file(path) != meta["sha256"][name]:
         raise DataError(f"{path} is damaged (its SHA-256 is not the one in {_META}); {AGAIN}")
-    return array
+    return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)
 
 
 def read_meta(folder: str | Path) -> dict[str, Any]:
@@ -426,23 +438,6 @@ def _header(shape: tuple[int, ...]) -> bytes:
         file, {"descr": "<f4", "fortran_order": False, "shape": shape}
     )
     return file.getvalue()
-
-
-def _map(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
-    """[N, P, 3] float32 memmap, after comparing header and size with what they must be."""
-    header = _header(shape)
-    expected = len(header) + 4 * int(np.prod(shape))
-    try:
-        with open(path, "rb") as file:
-            found = file.read(len(header))
-        size = path.stat().st_size
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
-    if size != expected:
-        raise DataError(f"{path} has {size} bytes, expected {expected} for {shape}; {AGAIN}")
-    if found != header:
-        raise DataError(f"{path} has not the header of a float32 array {shape}; {AGAIN}")
-    return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)
 
 
 def _check_finite(path: Path, points: np.ndarray, ids: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
-from qs3.utils.pool import engine
+from qs3.utils.pool import Processes
 from qs3.utils.progress import shown
 from qs3.utils.seeding import derive
 
@@ -85,7 +85,7 @@ def sample_all(
 def _fill(result: np.ndarray, points: np.ndarray, begins: Sequence[int], processes: int) -> None:
     chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
     _, starts, count = result.shape
-    outcomes = engine(processes).run(partial(_sampler, count, starts), chunks)
+    outcomes = Processes(processes).run(partial(_sampler, count, starts), chunks)
     for outcome in shown(outcomes, "sampling points", total=len(begins)):
         if outcome.result is None:
             raise ChildProcessError("a process died twice")

@@ -26,6 +26,20 @@ from qs3.utils.progress import shown
 log = logging.getLogger(__name__)
 
 
+_UP = {
+    "z": ((0, 1, 2), (1, 1, 1)),
+    "-z": ((0, 1, 2), (1, -1, -1)),
+    "y": ((0, 2, 1), (1, -1, 1)),
+    "-y": ((0, 2, 1), (1, 1, -1)),
+    "x": ((2, 1, 0), (-1, 1, 1)),
+    "-x": ((2, 1, 0), (1, 1, -1)),
+}
+"""Axis that points up -> which columns with which signs give x y z with z up: rotations by 90°."""
+
+UP_AXES: tuple[str, ...] = tuple(_UP)
+"""What `up` may be."""
+
+
 class Item(NamedTuple):
     """One published cloud before it is read.
 
@@ -305,9 +319,10 @@ def check_cloud(cloud: np.ndarray, points: int, where: str) -> np.ndarray:
     return cloud if len(cloud) == points else cloud[np.arange(points) % len(cloud)]
 
 
-def y_up_to_z_up(cloud: np.ndarray) -> np.ndarray:
-    """(x, y, z) -> (x, -z, y): a rotation by 90 degrees about x. [..., 3] to [..., 3]."""
-    return np.stack([cloud[..., 0], -cloud[..., 2], cloud[..., 1]], axis=-1)
+def turned(cloud: np.ndarray, up: str) -> np.ndarray:
+    """[..., 3] of which the axis `up` of `UP_AXES` points up, turned by 90 degrees to z up."""
+    columns, signs = _UP[up]
+    return cloud[..., columns] * np.array(signs, dtype=cloud.dtype)
 
 
 def _check_complete(

@@ -37,12 +37,14 @@ from qs3.clouds.files import (
 )
 from qs3.config.checks import check_choice, check_int
 from qs3.data.importers.base import (
+    UP_AXES,
     Importer,
     Item,
     by_class,
     class_of,
     cloud_id,
     split_of,
+    turned,
     unique,
     visible,
 )
@@ -56,18 +58,6 @@ _SPLIT_NAMES = ("train", "test", "val", "validation")
 _MANY = (".npy", ".npz", ".h5", ".hdf5")
 _ENDS = tuple(suffix.encode() for suffix in SUFFIXES)
 _NUMBER = re.compile(r"\[\d+\]$")  # of the cloud in its file, at the end of an origin
-_UP = {
-    "z": ((0, 1, 2), (1, 1, 1)),
-    "-z": ((0, 1, 2), (1, -1, -1)),
-    "y": ((0, 2, 1), (1, -1, 1)),
-    "-y": ((0, 2, 1), (1, 1, -1)),
-    "x": ((2, 1, 0), (-1, 1, 1)),
-    "-x": ((2, 1, 0), (1, 1, -1)),
-}
-"""Axis that points up -> which columns with which signs give x y z with z up: rotations by 90°."""
-
-UP_AXES: tuple[str, ...] = tuple(_UP)
-"""What `up` may be."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +82,7 @@ class CloudFolder(Importer):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("published.layout", self.layout, LAYOUTS)
-        check_choice("published.up", self.up, tuple(_UP))
+        check_choice("published.up", self.up, UP_AXES)
         check_int("published.test_every", self.test_every, 0)
         if self.test_every == 1:
             raise ConfigError("published.test_every=1 leaves nothing for training; 0 tests nothing")
@@ -156,8 +146,7 @@ class CloudFolder(Importer):
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        columns, signs = _UP[self.up]
-        return cloud[:, columns] * np.array(signs, dtype=cloud.dtype)
+        return turned(cloud, self.up)
 
     def _layout(self, classes: Sequence[str]) -> str:
         """The layout in the names of the folders.

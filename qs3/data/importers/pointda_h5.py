@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.clouds.files import own_dataset
-from qs3.data.importers.base import Importer, Item, cloud_id, inside, y_up_to_z_up
+from qs3.data.importers.base import Importer, Item, cloud_id, inside, turned
 from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
 
@@ -54,7 +54,7 @@ class PointDAH5(Importer):
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        cloud = y_up_to_z_up(cloud)
+        cloud = turned(cloud, "y")
         return cloud * _MIRROR if self.undo_mirror else cloud
 
     def _files(self) -> list[tuple[str, int, Path]]:

@@ -18,7 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from qs3.data.importers.base import Importer, Item, by_class, y_up_to_z_up
+from qs3.data.importers.base import Importer, Item, by_class, turned
 from qs3.data.importers.pointda_h5 import h5_items
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class ScanObjectNN(Importer):
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        return y_up_to_z_up(cloud)
+        return turned(cloud, "y")
 
     def _files(self) -> list[tuple[str, Path]]:
         name = f"objectdataset{self.variant}.h5"

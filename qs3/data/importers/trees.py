@@ -17,6 +17,7 @@ import numpy as np
 from qs3.clouds.files import parse_cloud
 from qs3.config.checks import check_choice
 from qs3.data.importers.base import (
+    UP_AXES,
     Importer,
     Item,
     class_of,
@@ -24,8 +25,8 @@ from qs3.data.importers.base import (
     files_in,
     folders_in,
     split_of,
+    turned,
     unique,
-    y_up_to_z_up,
 )
 from qs3.data.manifest import SPLITS
 from qs3.errors import DataError
@@ -41,8 +42,8 @@ class TreeImporter(Importer):
     which the code of the lineage lists them, and by which it cuts off its validation part.
 
     Attributes:
-        up: axis that points up in the files, "z" or "y"; y is turned to z.
-        up_z_classes: classes whose files have z up although `up` is "y" (ShapeNet10's plants).
+        up: axis that points up in the files, one of `UP_AXES`.
+        up_z_classes: classes whose files have z up whatever `up` is (ShapeNet10's plants).
     """
 
     up: str = "z"
@@ -51,7 +52,7 @@ class TreeImporter(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("published.up", self.up, ("y", "z"))
+        check_choice("published.up", self.up, UP_AXES)
         object.__setattr__(self, "up_z_classes", list(self.up_z_classes))
 
     def looks_for(self) -> list[str]:
@@ -70,7 +71,7 @@ class TreeImporter(Importer):
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        return y_up_to_z_up(cloud) if self.up == "y" and cls not in self.up_z_classes else cloud
+        return cloud if cls in self.up_z_classes else turned(cloud, self.up)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,12 +45,6 @@ def counts(data: PointSet) -> Numbers:
         "unlabelled": unlabelled,
         "splits": splits,
     }
-
-
-def prior(data: PointSet) -> Float[np.ndarray, " classes"]:
-    """Share of each class among the labelled clouds."""
-    known = data.labels[data.labels >= 0]
-    return np.bincount(known, minlength=len(data.classes)) / max(len(known), 1)
 
 
 def extents(data: PointSet, chosen: np.ndarray) -> Numbers:
@@ -162,22 +156,19 @@ def copies(data: PointSet, rows: Sequence[ManifestRow]) -> Numbers:
 
     `leaks` are those of them that lie on both sides of train and test.
     """
-    clouds: dict[str, list[int]] = defaultdict(list)
-    for i in range(len(data)):
-        cloud = np.ascontiguousarray(data.points[i], dtype="<f4") + np.float32(0)  # no -0
-        order = np.lexsort(cloud.T)
-        clouds[hashlib.sha256(cloud[order].tobytes()).hexdigest()].append(i)
+    clouds: dict[bytes, list[int]] = defaultdict(list)
+    for i, points in enumerate(data.points):
+        cloud = np.ascontiguousarray(points, dtype="<f4") + np.float32(0)  # no -0
+        clouds[hashlib.sha256(cloud[np.lexsort(cloud.T)].tobytes()).digest()].append(i)
     same = [found for found in clouds.values() if len(found) > 1]
     meshes: dict[str, set[str]] = defaultdict(set)
     for row in rows:
         if row.mesh_sha256:
             meshes[row.mesh_sha256].add(row.split)
-    kinds = [{str(data.splits[i]) for i in found} for found in same]
-    labels = [{int(data.labels[i]) for i in found} for found in same]
     return {
         "clouds": sum(len(found) - 1 for found in same),
-        "leaks": sum(_leak(kind) for kind in kinds),
-        "contradicting_labels": sum(len(found) > 1 for found in labels),
+        "leaks": sum(_leak(data.splits[found]) for found in same),
+        "contradicting_labels": sum(len(set(data.labels[found].tolist())) > 1 for found in same),
         "groups": [[data.ids[i] for i in found] for found in same],
         "meshes": len(meshes) or None,
         "leaking_meshes": sum(_leak(splits) for splits in meshes.values()),
@@ -214,5 +205,6 @@ def groups(data: PointSet, chosen: np.ndarray) -> dict[str, np.ndarray]:
     return {name: rows for name, rows in found.items() if len(rows)}
 
 
-def _leak(splits: set[str]) -> bool:
-    return "test" in splits and len(splits) > 1
+def _leak(splits: Iterable[str]) -> bool:
+    found = {str(split) for split in splits}
+    return "test" in found and len(found) > 1

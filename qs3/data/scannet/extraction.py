@@ -40,7 +40,7 @@ from qs3.data.store import (
 from qs3.errors import DataError, Qs3Error
 from qs3.utils.files import make_folder, sha256_file, write_text
 from qs3.utils.locks import locked
-from qs3.utils.pool import engine
+from qs3.utils.pool import Processes
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
@@ -159,7 +159,7 @@ def _results(
     total = len(found.scenes)
     failed = {}
     with progress_bar("scenes", total=total, done=total - len(tasks)) as advance:
-        for outcome in engine(workers).run(make_worker, tasks):
+        for outcome in Processes(workers).run(make_worker, tasks):
             if reason := _DIED if outcome.died else outcome.result:
                 log.warning("%s: %s", outcome.name, reason)
                 failed[outcome.name] = reason

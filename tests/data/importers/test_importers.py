@@ -11,7 +11,7 @@ import pytest
 
 from qs3.clouds.files import parse_cloud
 from qs3.data.importers import NamedArrays, NpyTree, PointDAH5, XyzTree, import_into
-from qs3.data.importers.base import check_cloud, y_up_to_z_up
+from qs3.data.importers.base import check_cloud
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError
 from tests.data.importers.test_own_clouds import Trap
@@ -161,12 +161,6 @@ def test_npy_axes(tmp_path):
     assert plant.tolist() == cloud.tolist()
 
 
-def test_turning_is_a_rotation():
-    matrix = y_up_to_z_up(np.eye(3)).T
-    assert np.linalg.det(matrix) == pytest.approx(1)
-    assert (matrix @ [0, 1, 0]).tolist() == [0, 0, 1]
-
-
 def test_npy_header_damaged_anywhere(tmp_path):
     path = tmp_path / "x.npy"
     np.save(path, np.ones((4, 3), "f4"))
@@ -314,7 +308,7 @@ def test_truncated_files_of_all_clouds(tmp_path, kind):
 
 
 def test_wrong_settings(tmp_path):
-    for settings in ({"points": 0}, {"up": "x"}, {"on_error": "ignore"}):
+    for settings in ({"points": 0}, {"up": "w"}, {"on_error": "ignore"}):
         with pytest.raises(ConfigError):
             XyzTree(tmp_path, **settings)
 
