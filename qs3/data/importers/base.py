@@ -25,7 +25,6 @@ from qs3.utils.progress import shown
 
 log = logging.getLogger(__name__)
 
-
 _UP = {
     "z": ((0, 1, 2), (1, 1, 1)),
     "-z": ((0, 1, 2), (1, -1, -1)),

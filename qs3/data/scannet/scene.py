@@ -81,7 +81,7 @@ def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) 
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """The open files of a scene."""
+    """The open files of a scene, and where depth pixels fall in masks of each size so far."""
 
     sens: SensFile
     instances: MaskArchive
