@@ -34,17 +34,16 @@ def contact_sheet(
     heads: Sequence[str] = (),
     note: str = "",
 ) -> Path:
-    """Save a sheet of clouds, row by row.
+    """Save a sheet of clouds as a PNG, row by row.
 
     Args:
         points: clouds [P, 3], z up; None leaves a place empty.
         titles: one a cloud, drawn below it.
         path: of the PNG.
         columns: panels in a row.
-        heading: a line above all.
-        rows: what stands before each row; none: nothing does.
-        heads: what stands above each column, "symbol: words" on two lines; none: nothing does.
-        note: a line below all.
+        heading, note: a line above all, and one below all.
+        rows: what stands before each row, if anything.
+        heads: what stands above each column, "symbol: words" on two lines.
 
     Raises:
         DataError: there is nothing to draw.
@@ -84,12 +83,6 @@ def class_sheet(
 
     A row is a class; without labels they come from first to last. They are taken at even steps:
     scans of one mesh are neighbours in a dataset.
-
-    Args:
-        data: the domain's.
-        path: of the PNG.
-        split: which split.
-        heading: a line above all.
 
     Raises:
         DataError: the split is empty.
@@ -134,7 +127,7 @@ def scan_picture(
     object is the same; else it is the domain's first of that class.
 
     Args:
-        domains: by column title, such as "S: SpeckleNet10": symbol and words, drawn on two lines.
+        domains: by column title, such as "S: SpeckleNet10".
         path: of the PNG.
         split: which split the objects come from.
         note: a line below all.

@@ -115,7 +115,7 @@ class Domain:
         """Find out, in milliseconds, whether `open` has something to open.
 
         Raises:
-            MissingDataError: lists the files looked for, where to get them, and the commands.
+            MissingDataError: what was looked for, where to get it, and the commands.
         """
         if is_finished(self.folder):
             return

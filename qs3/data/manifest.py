@@ -67,15 +67,10 @@ _INTEGERS = ("index", "seed", "views", "valid_points")
 def read_manifest(
     folder: str | Path, classes: Sequence[str], sha256: str | None = None
 ) -> list[ManifestRow]:
-    """All rows of a dataset's manifest.csv, failed ones included, checked.
-
-    Args:
-        folder: of the dataset.
-        classes: the names that may occur.
-        sha256: what the file's hash must be, or None.
+    """All rows of a dataset's manifest.csv, failed ones included.
 
     Raises:
-        DataError: names the line.
+        DataError: a row is wrong (names the line), or the hash is not `sha256`, if that is given.
     """
     path = Path(folder) / MANIFEST
     try:

@@ -47,10 +47,9 @@ class PartFiles:
         return (self.folder / RECIPE).is_file()
 
     def check(self, recipe: Mapping[str, Any]) -> None:
-        """Check that the folder was begun with the same recipe.
+        """Raise ConfigError (what differs, what to do) if the folder was begun otherwise.
 
         Raises:
-            ConfigError: lists what differs, and says what to do.
             DataError: there is no recipe that can be read.
         """
         path = self.folder / RECIPE
@@ -70,11 +69,7 @@ class PartFiles:
             )
 
     def begin(self, recipe: Mapping[str, Any]) -> None:
-        """Start, or continue what was made with the same recipe.
-
-        Raises:
-            ConfigError, DataError: as `check`.
-        """
+        """Start, or continue what was made with the same recipe; raises as `check`."""
         if self.have_recipe:
             self.check(recipe)
         else:
@@ -97,11 +92,7 @@ class PartFiles:
         write_bytes(self._path(name), file.getvalue())
 
     def read(self, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The note and the arrays of one part.
-
-        Raises:
-            DataError: it is damaged, or not there.
-        """
+        """The note and the arrays of one part; DataError if it is damaged or not there."""
         path = self._path(name)
         try:
             with np.load(path, allow_pickle=False) as file:

@@ -67,7 +67,7 @@ def to_pyg(
 
     Args:
         source: an open dataset, a domain, or the name of a domain in conf/domain.
-        split: "train", "validation" or "test"; None: all clouds.
+        split: None: all clouds.
         transform: applied whenever a cloud is taken.
 
     Raises:
@@ -91,7 +91,8 @@ def from_pyg(
 ) -> PointSet:
     """Write datasets of PyG as one of ours, which a domain can name by its `path`.
 
-    Their transforms are applied once. z should be up (`Domain.gravity`).
+    Their transforms are applied once. z should be up (`Domain.gravity`). Points are kept bit by bit
+    where they are float32 and not thinned.
 
     Args:
         datasets: by split ("train", "validation", "test"). Each cloud has `pos` [n, 3], and all or
@@ -99,12 +100,9 @@ def from_pyg(
         folder: of the new dataset.
         classes: names in the order of `y`; None: `classes` of the first dataset, if it has any;
             without labels the benchmark's ten.
-        points: number of points a cloud; larger clouds are thinned to their farthest points, one
-            after another from their first one. None: all clouds must have the same.
+        points: of a cloud; larger ones are thinned to their farthest points, from the first on.
+            None: all clouds must have the same number.
         name: of the new dataset; None: that of the folder.
-
-    Returns:
-        The dataset, opened. Points are kept bit by bit where they are float32 and not thinned.
 
     Raises:
         ConfigError: there is something in the folder, or the classes are not known.
@@ -191,8 +189,7 @@ def _classes(given: Sequence[str] | None, dataset: Any, labels: list[int | None]
 def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) -> Tensor:
     """Edges from the k nearest neighbours of each point to it, as PyG's `knn_graph` has them.
 
-    For nets of PyG's layers (EdgeConv, PointNetConv, ...). Batches of clouds of one size take one
-    search; others one a cloud.
+    Clouds of one size take one search a batch; others one a cloud.
 
     Args:
         x: [n, c] positions or features of all clouds of a batch, on any device.

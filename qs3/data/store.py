@@ -67,7 +67,6 @@ class PointSet:
     """A dataset in memory's terms; the clouds themselves stay on disk until they are indexed.
 
     Attributes:
-        name: of the dataset.
         classes: names; a label is a position in this tuple.
         points: [N, P, 3] float32, read only (a memmap, or a copy after `split`).
         labels: [N] int64; all -1 if the dataset has no labels.
@@ -150,10 +149,7 @@ def evenly(positions: np.ndarray, most: int) -> list[int]:
 def counts_text(data: PointSet, without: str, missing: Mapping[str, int]) -> list[str]:
     """Lines of a table for the log: clouds by class and split, and objects without one.
 
-    Args:
-        data: the dataset.
-        without: heading of the last column: "failed".
-        missing: by class, how many objects gave no cloud.
+    Those are counted by class in `missing`, under the heading `without`, such as "failed".
     """
     counts = data.counts()
     rows = [["clouds", *counts, without]]
@@ -205,9 +201,6 @@ def write_pointset(
         tables: which of the arrays are not clouds but say something of each point, with the names
             of their columns: they are [N, P, columns], and no variant to train on.
 
-    Returns:
-        The dataset, variant "points".
-
     Raises:
         DataError: arrays and rows do not fit together, or a value is not finite.
         Qs3Error: the folder cannot be written.
@@ -257,8 +250,8 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     Args:
         folder: of the dataset.
         variant: which array, by file stem.
-        verify: also compare the files' SHA-256 with meta.yaml (about 1 s for 500 MB); without it
-            the manifest's is still compared.
+        verify: also compare the array's SHA-256 with meta.yaml (about 1 s for 500 MB); the
+            manifest's is always compared.
 
     Raises:
         MissingDataError: there is no such folder, or it was not finished.
@@ -297,10 +290,6 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
 
 def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray, tuple[str, ...]]:
     """Open what a dataset knows of each point of its variant "points".
-
-    Args:
-        folder: of the dataset.
-        name: of the table, by file stem.
 
     Returns:
         [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names

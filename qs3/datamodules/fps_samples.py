@@ -60,11 +60,7 @@ def sample_all(
 ) -> Int[np.ndarray, "n starts count"]:
     """The same, with a progress bar on a terminal, and by several processes if it takes long.
 
-    Args:
-        points: clouds, e.g. a memmap.
-        count: points of a sample.
-        starts: samples of a cloud.
-        processes: how many; None asks the machine. The result does not depend on it.
+    How many, None asks the machine; the result does not depend on it.
     """
     if processes is None:
         processes = min(

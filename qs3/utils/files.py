@@ -25,8 +25,8 @@ _CHUNK = 1 << 20
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path in the folder of `path`; rename it to `path` if the block succeeds.
 
-    The temporary name keeps the extension (some writers choose the format by it). If the block
-    raises, the temporary file is removed and `path` stays as it was.
+    It has the same extension (some writers choose the format by it). If the block raises, the
+    temporary file is removed and `path` stays as it was.
 
     Raises:
         Qs3Error: the folder or file cannot be written (permission, full disk, a file in the way).
@@ -57,11 +57,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
-    """Make a folder and its parents unless they are there.
-
-    Raises:
-        Qs3Error: it cannot be made or written to.
-    """
+    """Make a folder and its parents; Qs3Error if it cannot be made or written to."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -49,8 +49,8 @@ def fetch(
     Args:
         url: of the file (http, https), or of its page for people where `drive` is given.
         path: where it shall lie.
-        sha256: hex digits, if they are known; a file that has others is fetched again.
-        size: bytes, if they are known.
+        sha256: hex digits, if known; a file that has others is fetched again.
+        size: in bytes, if known.
         drive: its id on Google Drive.
 
     Raises:

@@ -43,15 +43,14 @@ def provide(
     Args:
         source: of the catalogue.
         into: the data folder, `paths.data_dir` of a run.
-        accept_terms: the agreement that the person has made, e.g. "scannet"; "" for none.
+        accept_terms: the agreement that the person has made, e.g. "scannet".
         mirror: base address of a copy of the archives; each lies there as `Source.file`.
         archive: an archive that is here already, e.g. downloaded with a browser.
         root: folder in the archive to take, where it cannot be found out.
         keep: keep the archive after unpacking; it is then not fetched again when a folder is lost.
 
     Returns:
-        The folders, in the order of `source.parts`; those that somebody else had put there before
-        are among them, untouched.
+        The folders, in the order of `source.parts`, also those that somebody else had put there.
 
     Raises:
         AgreementError: `source.agreement` was not accepted.

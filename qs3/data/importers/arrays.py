@@ -55,11 +55,7 @@ class NamedArrays(Importer):
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The four arrays, with shapes and kinds checked.
-
-    Raises:
-        DataError: damaged, pickled, an array missing, too large, or of another shape.
-    """
+    """The four arrays; DataError if damaged, pickled, too large, missing or of another shape."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(info.file_size for info in archive.infolist())

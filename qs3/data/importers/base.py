@@ -115,16 +115,11 @@ class Importer(abc.ABC):
         return cloud
 
     def read(self, classes: Sequence[str]) -> tuple[list[np.ndarray], list[ManifestRow]]:
-        """Read everything.
-
-        Args:
-            classes: the names in label order; each must occur in each split that there is.
-
-        Returns:
-            [P, 3] float32 clouds with z up, and their rows (plus rows of what was skipped).
+        """Read everything: [P, 3] float32 clouds with z up, and their rows and those skipped.
 
         Raises:
-            DataError: names the file, the line or item, and what is wrong.
+            DataError: names the file, the line or item, and what is wrong; or one of the classes
+                does not occur in a split, if the dataset is `complete`.
         """
         clouds, rows = [], []
         for row, where, load in shown(self.items(classes), f"importing {self.root.name}"):
@@ -149,11 +144,7 @@ class Importer(abc.ABC):
         return {"format": type(self).__name__, **values}
 
     def changes(self, origins: Collection[str]) -> str:
-        """What is different from an import, if its `settings` had another "files".
-
-        Args:
-            origins: of the imported manifest.
-        """
+        """How the files differ from an import of other "files"; `origins` of its manifest."""
         return f"the files in {self.root}"
 
 
@@ -235,11 +226,7 @@ def by_class(items: Iterable[Item], classes: Sequence[str]) -> list[Item]:
 
 
 def class_of(name: str, classes: Sequence[str], where: str | Path) -> str:
-    """The class that a published name means, whatever its case; see `qs3.classes.ALIASES`.
-
-    Raises:
-        DataError: none of the classes.
-    """
+    """The class that a name means, in any case (`qs3.classes.ALIASES`); DataError if none."""
     found = known_as(name, classes)
     if found is None:
         raise DataError(
@@ -250,7 +237,7 @@ def class_of(name: str, classes: Sequence[str], where: str | Path) -> str:
 
 
 def split_of(name: str, where: str | Path) -> str:
-    """The split that a published name means."""
+    """The split that a published name means; DataError if none."""
     splits = {"train": "train", "test": "test", "validation": "validation", "val": "validation"}
     if name.casefold() not in splits:
         raise DataError(f"{where}: unknown split {name!r}; known are {', '.join(splits)}")
@@ -258,11 +245,7 @@ def split_of(name: str, where: str | Path) -> str:
 
 
 def inside(path: Path, root: Path) -> Path:
-    """The path itself, unless it is a link that leads out of `root` (an unpacked archive's trick).
-
-    Raises:
-        DataError: it is.
-    """
+    """The path itself; DataError if it is a link out of `root` (an unpacked archive's trick)."""
     if path.is_symlink() and not path.resolve().is_relative_to(root.resolve()):
         raise DataError(f"{path} is a link that leads out of {root}; copy the files instead")
     return path

@@ -149,11 +149,7 @@ class CloudFolder(Importer):
         return turned(cloud, self.up)
 
     def _layout(self, classes: Sequence[str]) -> str:
-        """The layout in the names of the folders.
-
-        Raises:
-            DataError: they fit none.
-        """
+        """The layout in the names of the folders; DataError if they fit none."""
         if self.layout != "auto":
             return self.layout
         folders = [e for e in visible(self.root, self.root) if e.is_dir()]

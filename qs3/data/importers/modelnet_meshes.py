@@ -5,12 +5,10 @@ keeps the same tree in `raw/`. Points are uniform on the area, as PyG's SamplePo
 draw them; every object has its own seed, made from the dataset's seed and the object's id, so the
 order of reading changes nothing. The files stand on z, in the units of their makers.
 
-The files are read by `qs3.meshes`, not by `torch_geometric.io.read_off`. Both give the same
-vertices and triangles for files that are as they should be, joined first lines ("OFF490 518 0")
-included, ours about eight times as fast. But PyG's reader (2.8.1) passes over polygons of more than
-four corners, drops the last face if the file does not end with a line break, and takes truncated
-files, vertices that are not finite and faces with vertices that do not exist, all without a word;
-damage that it does notice is an IndexError or ValueError that names no file. A test holds all this.
+The files are read by `qs3.meshes`, not by `torch_geometric.io.read_off`. Both read the same from
+files that are as they should be. But PyG's reader (2.8.1) passes over polygons of more than four
+corners and takes truncated files, vertices that are not finite and faces with vertices that do not
+exist, all without a word; a test shows it.
 """
 
 from __future__ import annotations

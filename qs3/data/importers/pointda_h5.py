@@ -68,17 +68,10 @@ class PointDAH5(Importer):
 
 
 def h5_items(path: Path, root: Path, split: str, names: Sequence[str], digits: int) -> list[Item]:
-    """The clouds of one file, which may not be a link out of `root`, in the file's order.
-
-    Args:
-        path: the file; it is read.
-        root: of the dataset.
-        split: of all its clouds.
-        names: of the classes, by label.
-        digits: of a cloud's number in its id.
+    """The clouds of one file below `root`, in its order; `names` of the classes by label.
 
     Raises:
-        DataError: as `read_h5`; or the link.
+        DataError: as `read_h5`; or the file is a link out of `root`.
     """
     data, labels = read_h5(inside(path, root), len(names))
     items = []

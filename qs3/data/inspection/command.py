@@ -18,16 +18,7 @@ OUT = Path("out/inspection")
 def inspect_command(
     domain: str, overrides: Mapping[str, str], bounds: Bounds, out: str | None = None
 ) -> str:
-    """Inspect one domain and save what was found.
-
-    Args:
-        domain, overrides: see `open_named`.
-        bounds: how much is looked at.
-        out: folder of the results.
-
-    Returns:
-        The text for the terminal.
-    """
+    """Inspect one domain (see `open_named`), save what was found; the text for the terminal."""
     opened = open_named(domain, overrides)
     steps = min(bounds.sample, len(opened.data))
     with progress_bar(f"inspecting {opened.name}", total=steps) as advance:

@@ -49,10 +49,8 @@ class Opened:
 def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
     """Open a domain by the name of its config, or a store by its folder.
 
-    Args:
-        name: of conf/domain/NAME.yaml, or a folder with a finished dataset.
-        overrides: keys of the domain's config (`variant`, `published.folder`) or `paths.data_dir`;
-            for a folder only `variant`.
+    Overrides are keys of the domain's config (`variant`, `published.folder`) or `paths.data_dir`;
+    for a folder only `variant`.
 
     Raises:
         ConfigError: there is no such domain, or no such key.

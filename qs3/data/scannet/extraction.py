@@ -71,6 +71,8 @@ def extract(
 
     A second call with the same `out` waits for the first, and then finds its work.
 
+    Scenes that fail are in scenes.csv with the reason, and are tried again by the next call.
+
     Args:
         scans: ScanNet's folder of scenes.
         labels: scannetv2-labels.combined.tsv.
@@ -79,10 +81,6 @@ def extract(
         settings: None is the defaults.
         workers: processes; 0 works in this one.
         force: delete what is at `out` first.
-
-    Returns:
-        The dataset. Scenes that failed are in scenes.csv with the reason, and are tried again
-        by the next call.
 
     Raises:
         ConfigError: `out` was made with other settings.
@@ -130,11 +128,7 @@ def _worker(
 def _try_scene(
     label_map: LabelMap, settings: Extraction, parts: SceneParts, files: SceneFiles
 ) -> str:
-    """Extract a scene and write its part; else why there is none.
-
-    Raises:
-        Qs3Error: the part cannot be written; it would be the same with every scene.
-    """
+    """Extract a scene and write its part; else why there is none. Raises if it cannot write."""
     try:
         result = extract_scene(files, label_map, settings)
     except Qs3Error as error:

@@ -76,11 +76,7 @@ class Found:
 
 
 def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> Found:
-    """The scenes in a folder, one folder each, with the split that the lists give them.
-
-    Args:
-        scans: holds scene0000_00/ and so on.
-        train, test: names of scenes.
+    """The scenes in `scans`, one folder each, with the split that the lists of names give them.
 
     Raises:
         MissingDataError: there is no such folder, or no scene of the lists in it.

@@ -36,19 +36,10 @@ _BROKEN = (
 
 
 class MaskArchive:
-    """An open zip of masks; a context manager.
-
-    Attributes:
-        path: the file.
-        frames: which frames it holds.
-    """
+    """An open zip of masks; a context manager."""
 
     def __init__(self, path: str | Path, folder: str) -> None:
-        """Open the zip and look through its names.
-
-        Args:
-            path: the file.
-            folder: the masks' folder in it: `INSTANCES` or `LABELS`.
+        """Open the zip; `folder` of the masks in it is `INSTANCES` or `LABELS`.
 
         Raises:
             DataError: it is damaged, or holds no masks or two of a frame.
@@ -76,11 +67,7 @@ class MaskArchive:
         self._zip.close()
 
     def read(self, frame: int) -> np.ndarray:
-        """[h, w] uint8 or uint16, the mask of a frame.
-
-        Raises:
-            DataError: there is none, or it is not a grey PNG of a sensible size.
-        """
+        """[h, w] uint8 or uint16, the mask of a frame; DataError if none, or as `read_png`."""
         where = f"{self.path}, frame {frame}"
         member = self._members.get(frame)
         if member is None:

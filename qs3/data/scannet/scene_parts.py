@@ -56,22 +56,14 @@ class SceneParts(PartFiles):
         self.write(result.files.scene, note, clouds)
 
     def done(self, files: SceneFiles) -> bool:
-        """Whether there is a part of the scene, made from files of these sizes for this split.
-
-        Raises:
-            DataError: the part is damaged.
-        """
+        """Whether there is a part of the scene, made from files of these sizes for this split."""
         if not self.has(files.scene):
             return False
         note, _ = self.read(files.scene)
         return note["split"] == files.split and note["sizes"] == files.sizes()
 
     def load(self, files: SceneFiles) -> SceneResult:
-        """One scene.
-
-        Raises:
-            DataError: the part is damaged, or gone.
-        """
+        """One scene; DataError if its part is damaged, or gone."""
         note, clouds = self.read(files.scene)
         objects = []
         for one in note["objects"]:
