@@ -338,7 +338,7 @@ def _open_array(
     if size != expected:
         raise DataError(f"{path} has {size} bytes, expected {expected} for {shape}; {AGAIN}")
     if found != header:
-        raise DataError(f"{path} has not the header of a float32 array {shape}; {AGAIN}")
+        raise DataError(f"{path} does not have the header of a float32 array {shape}; {AGAIN}")
     if verify and sha256_file(path) != meta["sha256"][name]:
         raise DataError(f"{path} is damaged (its SHA-256 is not the one in {_META}); {AGAIN}")
     return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)

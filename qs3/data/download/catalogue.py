@@ -87,5 +87,5 @@ def find(name: str) -> Source:
     if name in known:
         return known[name]
     raise ConfigError(
-        f"{name!r} is nothing that can be downloaded; known are {', '.join([*known, *BY_HAND])}"
+        f"{name!r} cannot be downloaded; known are {', '.join([*known, *BY_HAND])}"
     )

@@ -23,7 +23,7 @@ from qs3.classes import CLASSES
 from qs3.config.checks import check_int
 from qs3.data.dataset_folder import RECIPE, delete_dataset
 from qs3.data.manifest import ManifestRow
-from qs3.data.scannet.files import Found, SceneFiles, find_scenes
+from qs3.data.scannet.files import SceneFiles, find_scenes
 from qs3.data.scannet.labels import LabelMap, read_label_map, read_scene_list
 from qs3.data.scannet.objects import ObjectCloud
 from qs3.data.scannet.scene import SceneResult, extract_scene
@@ -91,7 +91,7 @@ def extract(
     check_int("workers", workers, 0)
     scans, out = scans.absolute(), out.absolute()
     label_map = read_label_map(labels, settings.column)
-    found = find_scenes(scans, read_scene_list(train), read_scene_list(val))
+    scenes = find_scenes(scans, read_scene_list(train), read_scene_list(val))
     recipe = {
         "settings": dataclasses.asdict(settings),
         "labels": {"sha256": sha256_file(labels)},
@@ -108,9 +108,8 @@ def extract(
             log.info("%s is finished, and its parts were deleted: nothing to do", out)
             return open_pointset(out)
         parts.begin(recipe)
-        _say_found(found)
         make = partial(_worker, label_map, settings, parts, alone=workers == 0)
-        results = _results(make, parts, found, workers)
+        results = _results(make, parts, scenes, workers)
         pointset = _write(out, scans, results, recipe)
         _report(pointset, results, out)
     return pointset
@@ -145,12 +144,12 @@ def _try_scene(
 def _results(
     make_worker: Callable[[], Callable[[SceneFiles], str]],
     parts: SceneParts,
-    found: Found,
+    scenes: Sequence[SceneFiles],
     workers: int,
 ) -> list[SceneResult]:
     """One a scene, by name: from the parts, which are made where they are not there yet."""
-    tasks = [(files.scene, files) for files in found.scenes if not parts.done(files)]
-    total = len(found.scenes)
+    tasks = [(files.scene, files) for files in scenes if not parts.done(files)]
+    total = len(scenes)
     failed = {}
     with progress_bar("scenes", total=total, done=total - len(tasks)) as advance:
         for outcome in Processes(workers).run(make_worker, tasks):
@@ -163,7 +162,7 @@ def _results(
         SceneResult(files, reason=failed[files.scene])
         if files.scene in failed
         else parts.load(files)
-        for files in found.scenes
+        for files in scenes
     ]
 
 
@@ -247,17 +246,6 @@ def _versions() -> dict[str, str]:
         "opencv": cv2.__version__,
         "fpsample": version("fpsample"),
     }
-
-
-def _say_found(found: Found) -> None:
-    splits = [files.split for files in found.scenes]
-    log.info("%d scenes of train and %d of test are there", *map(splits.count, ("train", "test")))
-    for scenes, where in (
-        (found.absent, "of the lists are not"),
-        (found.unlisted, "are unlisted"),
-    ):
-        if scenes:
-            log.info("%d scenes %s, first %s", len(scenes), where, scenes[0])
 
 
 def _report(pointset: PointSet, results: Sequence[SceneResult], out: Path) -> None:

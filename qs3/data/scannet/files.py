@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.data.scannet.labels import is_scene
 from qs3.errors import DataError, MissingDataError
+
+log = logging.getLogger(__name__)
 
 _SUFFIXES = {
     "sens": ".sens",
@@ -60,22 +63,7 @@ class SceneFiles:
         return {role: path.stat().st_size for role, path in paths.items() if path is not None}
 
 
-@dataclass(frozen=True)
-class Found:
-    """The scenes in a folder.
-
-    Attributes:
-        scenes: those of the lists that are there, by name.
-        unlisted: folders of scenes that are in neither list.
-        absent: scenes of the lists that are not there.
-    """
-
-    scenes: tuple[SceneFiles, ...]
-    unlisted: tuple[str, ...]
-    absent: tuple[str, ...]
-
-
-def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> Found:
+def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> list[SceneFiles]:
     """The scenes in `scans`, one folder each, with the split that the lists of names give them.
 
     Raises:
@@ -94,8 +82,11 @@ def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> Found
             f"{scans} holds none of the {len(split_of)} scenes of the lists, only {len(there)} "
             "others; it should hold folders like scene0000_00 (ScanNet's folder `scans`)"
         )
-    return Found(
-        scenes=tuple(scenes),
-        unlisted=tuple(name for name in there if name not in split_of),
-        absent=tuple(sorted(set(split_of) - set(there))),
-    )
+    splits = [files.split for files in scenes]
+    log.info("%d scenes of train and %d of test are there", *map(splits.count, ("train", "test")))
+    absent = sorted(set(split_of) - set(there))
+    unlisted = [name for name in there if name not in split_of]
+    for names, what in ((absent, "of the lists are not there"), (unlisted, "are unlisted")):
+        if names:
+            log.info("%d scenes %s, first %s", len(names), what, names[0])
+    return scenes

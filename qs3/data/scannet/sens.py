@@ -227,13 +227,13 @@ def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     k = matrix[:3, :3]
     plain = np.isfinite(k).all() and k[0, 0] > 0 and k[1, 1] > 0
     if not plain or not np.allclose(k[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
-        raise DataError(f"{where} are those of no camera: {k.tolist()}")
+        raise DataError(f"{where} are not those of a camera: {k.tolist()}")
     return k.copy()
 
 
 def _extrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     if not is_rigid(matrix):
-        raise DataError(f"{where} are not rigid motion: {matrix.tolist()}")
+        raise DataError(f"{where} are not a rigid motion: {matrix.tolist()}")
     return matrix.copy()
 
 
