@@ -29,7 +29,6 @@ class Outcome(Generic[Result]):
     """What became of a task.
 
     Attributes:
-        name: of the task.
         result: what the worker returned; None if it died.
         died: the task's process ended twice before it was done: out of memory, a crash, or killed.
     """

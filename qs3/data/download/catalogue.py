@@ -86,6 +86,4 @@ def find(name: str) -> Source:
     known = {source.name: source for source in SOURCES}
     if name in known:
         return known[name]
-    raise ConfigError(
-        f"{name!r} cannot be downloaded; known are {', '.join([*known, *BY_HAND])}"
-    )
+    raise ConfigError(f"{name!r} cannot be downloaded; known are {', '.join([*known, *BY_HAND])}")

@@ -40,12 +40,10 @@ UP_AXES: tuple[str, ...] = tuple(_UP)
 
 
 class Item(NamedTuple):
-    """One published cloud before it is read.
+    """One published cloud before it is read: its row, as far as it is known.
 
-    Attributes:
-        row: its manifest row, as far as it is known.
-        where: how a message names it: the file, or file and number.
-        load: gives the raw [n, 3] array; raises DataError if it is damaged.
+    `where` names it in messages (file, or file and number); `load` gives the raw [n, 3] array or
+    raises DataError.
     """
 
     row: ManifestRow

@@ -61,12 +61,7 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class UpModel:
-    """What upright objects of each class look like.
-
-    Attributes:
-        mean, scale: [F] of the descriptions by class.
-        weights: [2 F] by class.
-    """
+    """What upright objects look like, by class: mean, scale [F] of descriptions; weights [2F]."""
 
     mean: Mapping[str, np.ndarray]
     scale: Mapping[str, np.ndarray]
@@ -121,12 +116,8 @@ def judge_set(
 ) -> list[Verdict]:
     """A verdict for each class that occurs and that the model knows.
 
-    Args:
-        points: clouds, any unit.
-        labels: positions in `classes`; negative: unknown, passed over.
-        classes: names.
-        model: what upright objects look like; None: the embedded catalogue's.
-        seed: draws a hundred clouds of each class, if there are more.
+    Labels are positions in `classes`; negative ones are passed over. The model is that of the
+    embedded catalogue unless given; `seed` draws a hundred clouds of a class, if there are more.
     """
     model = model or catalogue_model()
     verdicts = []

@@ -15,15 +15,9 @@ from qs3.errors import ConfigError
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A dataset and what to call it.
+    """A dataset, its manifest's rows (also of failed objects), and what to call it.
 
-    Attributes:
-        name: short, for file names.
-        label: title and symbol.
-        folder: of the store.
-        variant: array of the store.
-        data: the clouds.
-        rows: the manifest, failed objects included.
+    `name` is short, for file names; `label` has title and symbol.
     """
 
     name: str

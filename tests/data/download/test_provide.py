@@ -128,17 +128,13 @@ def test_pointda_is_taken_apart(site, tmp_path, tmp_path_factory):
     assert len(PointDAH5(places[2]).read(fixtures.CLASSES)[1]) == 30
 
 
-def test_another_archive_is_refused_and_shown(site, tmp_path, tmp_path_factory):
+def test_archives_with_no_tree_or_several(site, tmp_path, tmp_path_factory):
     folder = tmp_path_factory.mktemp("author")
     fixtures.write_npy_tree(folder / "a", SPLITS)
-    site.files["/specklenet10.zip"] = File(zipped(folder))
+    site.files["/specklenet40.zip"] = File(zipped(folder))
     with pytest.raises(DataError, match=r"(?s)Wanted is <class>.*a/chair/train: 2 files"):
-        get(site, "specklenet10", tmp_path)
+        get(site, "specklenet40", tmp_path)
     assert visible(tmp_path / "published") == []
-
-
-def test_several_trees_in_one_archive(site, tmp_path, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("author")
     for name in ("noisy", "clean"):
         fixtures.write_xyz_tree(folder / name, SPLITS)
     site.files["/specklenet10.zip"] = File(zipped(folder))
@@ -148,7 +144,7 @@ def test_several_trees_in_one_archive(site, tmp_path, tmp_path_factory):
         get(site, "specklenet10", tmp_path, root="noise")
     (place,) = get(site, "specklenet10", tmp_path, root="noisy/")
     assert json.loads((place / MARK).read_text())["root"] == "noisy"
-    assert len(site.requests) == 1
+    assert len(site.requests) == 2
     with pytest.raises(ConfigError, match="several parts"):
         get(site, "pointda10", tmp_path, root="a", accept_terms="scannet")
 
