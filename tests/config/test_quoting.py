@@ -54,10 +54,9 @@ def test_an_interpolation_stays_one_where_it_was_typed():
     assert quoted("${paths.data_dir}/x") == "${paths.data_dir}/x"
 
 
-@pytest.mark.parametrize("name", ["a, b (c) [d] it's ${x}", "1"])
-def test_every_path_of_ours_reaches_the_config(name, tmp_path):
+def test_every_path_of_ours_reaches_the_config(tmp_path):
     """The toy's words, and those of a table's cells."""
-    folder = tmp_path / name
+    folder = tmp_path / "1, b (c) [d] it's ${x}"
     cfg = composed("train", *toy_overrides(folder))
     paths = [cfg.paths.data_dir, cfg.paths.log_dir, cfg.paths.warmup_dir]
     assert paths == [str(folder / part) for part in ("data", "logs", "warmups")]

@@ -32,7 +32,6 @@ def published(tmp_path_factory):
     splits = {"train": 8, "test": 4}
     for name in PUBLISHED:
         fixtures.write_domain(name, folder, splits)
-    fixtures.write_xyz_tree(folder / "published" / "specklenet10", splits)
     return folder / "published"
 
 
@@ -55,7 +54,6 @@ def importers(at):
         "scannet10": PointDAH5(at / "scannet10"),
         "scannet10, mirrored": PointDAH5(at / "scannet10", undo_mirror=False),
         "depthscannet10": XyzTree(at / "depthscannet10"),
-        "specklenet10": XyzTree(at / "specklenet10"),
     }
 
 

@@ -67,7 +67,7 @@ def test_scanobjectnn_leaves_out_other_classes_and_says_so(
     np.testing.assert_array_equal(found, np.stack([raw[:, 0], -raw[:, 2], raw[:, 1]], 1))
 
 
-def test_graspnet_takes_the_sensors_that_are_asked_for(tmp_path: Path) -> None:
+def test_graspnet_takes_the_sensors_that_are_asked_for_and_stops_at_damage(tmp_path: Path) -> None:
     fixtures.write_domain("graspnetpc10", tmp_path, SPLITS)
     both = domain("graspnetpc10", tmp_path).open()
     assert set(both.splits) == {"train"}
@@ -77,9 +77,7 @@ def test_graspnet_takes_the_sensors_that_are_asked_for(tmp_path: Path) -> None:
     assert set(real.splits) == {"train", "test"}
     assert both.classes == real.classes == tuple("0123456789")
 
-
-def test_a_damaged_file_stops_the_import_or_is_recorded(tmp_path: Path) -> None:
-    fixtures.write_domain("graspnetpc10", tmp_path, SPLITS)
+    # A damaged file stops the import, or is recorded.
     root = tmp_path / "published" / "graspnetpc10" / "train" / "Real" / "kinect"
     path = root / "3" / "scene_0003_0001.xyz"
     lines = path.read_text().splitlines()
