@@ -185,22 +185,18 @@ class Domain:
         now = importer.settings()
         if not importer.is_there():  # the published files were put away after the import
             now.update({key: imported.get(key) for key in ("folder", "files") if key in now})
-        if now != imported:
-            if "files" in imported and now == {**imported, "files": now.get("files")}:
-                origins = {row.origin for row in read_manifest(self.folder, meta["classes"])}
-                raise DataError(
-                    f"{self.folder} is not what its folder holds today: "
-                    f"{importer.changes(origins)}; delete {self.folder} to import it again, or "
-                    "give another `path`"
-                )
-            changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
-            if len(changed) > 1:  # of other settings there is more to say than a digest
-                changed = [key for key in changed if key != "files"]
-            was, wanted = ({key: of.get(key) for key in changed} for of in (imported, now))
-            raise DataError(
-                f"{self.folder} was imported with {was}, the config says {wanted}; delete the "
-                "folder to import it again, or give another `path`"
-            )
+        changed = {key for key in {*now, *imported} if now.get(key) != imported.get(key)}
+        if not changed:
+            return
+        if changed == {"files"}:
+            origins = {row.origin for row in read_manifest(self.folder, meta["classes"])}
+            problem = f"{self.folder} is not what its folder holds today: "
+            problem += f"{importer.changes(origins)}; delete {self.folder}"
+        else:  # of other settings there is more to say than a digest
+            keys = sorted(changed - {"files"})
+            was, wanted = ({key: of.get(key) for key in keys} for of in (imported, now))
+            problem = f"{self.folder} was imported with {was}, the config says {wanted}; delete it"
+        raise DataError(f"{problem} to import it again, or give another `path`")
 
 
 def check_all(*domains: Domain) -> None:
