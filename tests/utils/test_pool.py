@@ -185,7 +185,7 @@ def test_processes_end_with_their_parent_while_they_work(tmp_path, how):
     try:
         assert until(lambda: len(children(process.pid)) >= 3)  # two workers, a resource tracker
         workers = children(process.pid)
-        time.sleep(3)  # they are at work
+        time.sleep(1)  # they are at work, or about to be
         process.send_signal(how)
         _, errors = process.communicate(timeout=60)
     finally:
