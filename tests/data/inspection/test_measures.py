@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from trimesh.triangles import closest_point
 
 from qs3.data.inspection import gap, measures
 from qs3.data.inspection.measure import WITHIN, Bounds, compare
@@ -17,7 +18,6 @@ from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
 from qs3.utils.seeding import object_rng
 from tests.commands import main
-from tests.data.scannet.rooms import distances
 from tests.fixtures import published as fixtures
 
 
@@ -75,6 +75,13 @@ def test_a_cloud_in_train_and_test_is_a_leak(tmp_path):
     found = measures.copies(data, rows)
     assert (found["clouds"], found["leaks"], found["contradicting_labels"]) == (2, 1, 1)
     assert (found["meshes"], found["leaking_meshes"]) == (2, 1)
+
+
+def distances(points, mesh):
+    """[n] distance of each point from a mesh, by that from every triangle."""
+    corners = mesh.vertices[mesh.faces]  # [f, 3, 3]
+    every = (closest_point(corners, np.tile(p, (len(corners), 1))) - p for p in points)
+    return np.array([np.linalg.norm(to, axis=1).min() for to in every])
 
 
 def test_distance_to_a_mesh_is_that_of_brute_force():

@@ -148,33 +148,3 @@ def write_lists(root, train, val):
     (root / "train.txt").write_text("\n".join(train) + "\n")
     (root / "val.txt").write_text("\n".join(val) + "\n")
     write_label_map(root / "labels.tsv")
-
-
-def distances(points, mesh):
-    """[n] exact distance of each point from a mesh's surface, metres, by brute force."""
-    corners = mesh.vertices[mesh.faces].astype(np.float64)  # [f, 3, 3]
-    nearest = np.empty(len(points))
-    for start in range(0, len(points), 64):
-        p = points[start : start + 64, None, :].astype(np.float64)  # [c, 1, 3]
-        nearest[start : start + 64] = _to_triangles(p, corners).min(axis=1)
-    return nearest
-
-
-def _to_triangles(p, corners):
-    """[c, f] distances: to the plane where the foot is inside, else to the nearest edge."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    size = np.linalg.norm(normal, axis=1)
-    unit = normal / np.where(size > 0, size, 1)[:, None]
-    height = np.einsum("cfk,fk->cf", p - a, unit)
-    inside = size[None] > 0
-    best = np.full(height.shape, np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        edge = end - start
-        to = p - start
-        inside = inside & (np.einsum("cfk,fk->cf", to, np.cross(unit, edge)) >= 0)
-        length2 = np.einsum("fk,fk->f", edge, edge)
-        along = np.einsum("cfk,fk->cf", to, edge) / np.where(length2 > 0, length2, 1)
-        foot = start + np.clip(along, 0, 1)[..., None] * edge
-        best = np.minimum(best, np.linalg.norm(p - foot, axis=2))
-    return np.where(inside, np.abs(height), best)
