@@ -32,7 +32,6 @@ PATTERNS = (
     r"test_notebooks\.py::test_0",
     r"test_experiments\.py::test_experiment_runs\[(?!qs3_s2d|supervised_d|pointdan_s2d|own_scans)",
     r"data/inspection/test_measures\.py::test_inspect_says_and_saves",
-    r"data/scannet/test_extraction\.py::test_(plain_nearest|each_cloud_lies)",
     r"data/test_gravity_axis\.py::test_the_(embedded_catalogue|real_modelnet10)",
     r"data/inspection/test_measures\.py::test_compare_says_and_saves",
     r"sensors/bench/test_bench\.py::test_simulated_tables",

@@ -13,22 +13,14 @@ _COMPARE = {">": operator.gt, ">=": operator.ge}
 
 
 def check_int(key: str, value: Any, least: int) -> int:
-    """The value, if it is a whole number not below `least`.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """The value; ConfigError unless it is a whole number not below `least`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ConfigError(f"{key} must be a whole number >= {least}, got {value!r}")
     return value
 
 
 def check_float(key: str, value: Any, allowed: str = "") -> float:
-    """The value, if it is a number, and within `allowed` if that is given; see `check_ranges`.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """The value; ConfigError unless it is a number, within `allowed` if given (`check_ranges`)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ConfigError(f"{key} must be a number, got {value!r}")
     if allowed:
@@ -37,22 +29,14 @@ def check_float(key: str, value: Any, allowed: str = "") -> float:
 
 
 def check_bool(key: str, value: Any) -> bool:
-    """The value, if it is true or false.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """The value; ConfigError unless it is true or false."""
     if not isinstance(value, bool):
         raise ConfigError(f"{key} must be true or false, got {value!r}")
     return value
 
 
 def check_choice(key: str, value: Any, allowed: Sequence[str]) -> str:
-    """The value, if it is one of the allowed ones.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """The value; ConfigError unless it is one of the allowed ones."""
     if value not in allowed:
         raise ConfigError(f"{key} must be one of {tuple(allowed)}, got {value!r}")
     return value
@@ -61,14 +45,11 @@ def check_choice(key: str, value: Any, allowed: Sequence[str]) -> str:
 def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
     """Check numbers of an object, e.g. `check_ranges(self, "sensor.", fill_px=">= 0")`.
 
-    Args:
-        settings: has the numbers as attributes.
-        prefix: goes before their names in a message.
-        ranges: by attribute, as a message says it: "> 0", ">= 1", "odd >= 3", an interval such as
-            "[0, 1)", or "odd [3, 15]". None passes; NaN and what is not a number do not.
+    A range is as a message says it: "> 0", ">= 1", "odd >= 3", an interval such as "[0, 1)", or
+    "odd [3, 15]". None passes; NaN and what is not a number do not.
 
     Raises:
-        ConfigError: names the first that is outside.
+        ConfigError: names the first that is outside, after `prefix`.
     """
     for name, allowed in ranges.items():
         if (value := getattr(settings, name)) is not None:

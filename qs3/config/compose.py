@@ -36,8 +36,8 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
     Args:
         command: "train" or "generate"; None composes the overrides alone (`+sensor=NAME`).
         overrides: words of its command line.
-        place: prefix of the message of an error, such as "domain=modelnet10: ".
-        more: for `hydra.compose`, such as `return_hydra_config`.
+        place: begins the message of an error: "domain=modelnet10: ".
+        more: for `hydra.compose`.
 
     Raises:
         ConfigError: no such group, choice or key.

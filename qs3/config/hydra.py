@@ -45,11 +45,8 @@ def _tags(*, _root_: DictConfig) -> list[str]:
 def _gpu_in_turn(gpus: int | None = None) -> int:
     """The GPU for this job: its number in the sweep, modulo `gpus`; 0 outside of a sweep.
 
-    Whatever process a job runs in: a variable such as CUDA_VISIBLE_DEVICES would come too late in
-    a process that has run a job before.
-
-    Args:
-        gpus: how many there are; None: as many as CUDA finds.
+    A variable such as CUDA_VISIBLE_DEVICES would come too late in a process that has run a job
+    before. `gpus` is how many there are; None: as many as CUDA finds.
     """
     if gpus is None:
         import torch  # counts without occupying a GPU

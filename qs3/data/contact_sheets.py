@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from qs3.data.store import PointSet
+from qs3.data.store import PointSet, evenly
 from qs3.errors import DataError
 from qs3.geometry.orthographic import project
 from qs3.utils.files import atomic_path
 from qs3.utils.plotting import GRID, INK, PANEL, SOFT, blank, cloud_colours
 
-_PANEL = 1.45  # inches
+_PANEL, _TITLE = 1.45, 0.22  # inches
 _DPI = 130
+_SHEET, _ROW = 60, 6  # clouds of a class sheet, and in its rows
 
 
 def contact_sheet(
@@ -27,19 +28,22 @@ def contact_sheet(
     titles: Sequence[str],
     path: str | Path,
     *,
-    columns: int = 6,
+    columns: int = _ROW,
     heading: str = "",
     rows: Sequence[str] = (),
+    heads: Sequence[str] = (),
+    note: str = "",
 ) -> Path:
-    """Save a sheet of clouds, row by row.
+    """Save a sheet of clouds as a PNG, row by row.
 
     Args:
         points: clouds [P, 3], z up; None leaves a place empty.
         titles: one a cloud, drawn below it.
         path: of the PNG.
         columns: panels in a row.
-        heading: a line above all.
-        rows: what stands before each row; none: nothing does.
+        heading, note: a line above all, and one below all.
+        rows: what stands before each row, if anything.
+        heads: what stands above each column, "symbol: words" on two lines.
 
     Raises:
         DataError: there is nothing to draw.
@@ -47,48 +51,52 @@ def contact_sheet(
     if not points or len(points) != len(titles):
         raise DataError(f"a contact sheet of {len(points)} clouds with {len(titles)} titles")
     columns = min(columns, len(points))
+    left, bottom = (0.95 if rows else 0.0), (0.25 if note else 0.0)
+    top = (0.45 if heading else 0.1) + (0.35 if heads else 0.0)
     lines = -(-len(points) // columns)
-    top, left = (0.45 if heading else 0.1), (0.95 if rows else 0.0)
-    figure = _Figure(left + columns * _PANEL, lines * (_PANEL + 0.22) + top)
+    height = lines * (_PANEL + _TITLE) + top + bottom
+    figure = _Figure(left + columns * _PANEL, height)
     for i, (cloud, title) in enumerate(zip(points, titles, strict=True)):
         row, column = divmod(i, columns)
-        x, y = left + column * _PANEL, figure.height - top - (row + 1) * (_PANEL + 0.22) + 0.22
+        x, y = left + column * _PANEL, height - top - (row + 1) * (_PANEL + _TITLE) + _TITLE
         if column == 0 and row < len(rows):
             figure.text(left - 0.1, y + _PANEL / 2, rows[row], size=9, align="right")
         if cloud is not None:
             figure.panel(x, y, cloud)
-            figure.text(x + _PANEL / 2, y - 0.06, title, size=7, color=SOFT)
+        figure.text(x + _PANEL / 2, y - 0.06, title, size=7, color=SOFT)
+    for column, head in enumerate(heads[:columns]):
+        symbol, _, words = head.rpartition(": ")
+        x = left + (column + 0.5) * _PANEL
+        figure.text(x, height - top + 0.25, symbol, size=10, weight="bold")
+        figure.text(x, height - top + 0.1, words, size=7.5, color=SOFT)
     if heading:
-        figure.text(figure.width / 2, figure.height - 0.24, heading, size=11, weight="bold")
+        figure.text(figure.width / 2, height - 0.24, heading, size=11, weight="bold")
+    if note:
+        figure.text(figure.width / 2, 0.14, note, size=8, color=SOFT)
     return figure.save(path)
 
 
 def class_sheet(
-    data: PointSet, path: str | Path, *, split: str = "train", heading: str = "", most: int = 60
+    data: PointSet, path: str | Path, *, split: str = "train", heading: str = ""
 ) -> Path:
-    """Save a sheet of a split's clouds: a row a class, or, without labels, from first to last.
+    """Save a sheet of up to 60 of a split's clouds, two a class at least.
 
-    Args:
-        data: the domain's.
-        path: of the PNG.
-        split: which split.
-        heading: a line above all.
-        most: clouds on the sheet, as long as two of a class fit; six a row. They are taken at
-            even steps: scans of one mesh stand side by side in a dataset.
+    A row is a class; without labels they come from first to last. They are taken at even steps:
+    scans of one mesh are neighbours in a dataset.
 
     Raises:
         DataError: the split is empty.
     """
-    part, columns = data.split(split), 6
+    part, columns = data.split(split), _ROW
     rows: tuple[str, ...] = ()
     shown: Sequence[int | None]
     if data.labelled:
-        columns = max(2, min(columns, most // len(part.classes)))
-        members = {cls: _members(part, cls) for cls in part.classes}
+        columns = max(2, min(columns, _SHEET // len(part.classes)))
+        members = {cls: part.members(cls) for cls in part.classes}
         rows = tuple(cls for cls, own in members.items() if len(own))
-        shown = [i for cls in rows for i in padded(_evenly(members[cls], columns), columns)]
+        shown = [i for cls in rows for i in padded(evenly(members[cls], columns), columns)]
     else:
-        shown = _evenly(np.arange(len(part)), most)
+        shown = evenly(np.arange(len(part)), _SHEET)
     return contact_sheet(
         [None if i is None else np.asarray(part.points[i]) for i in shown],
         ["" if i is None else short(part.ids[i]) for i in shown],
@@ -104,38 +112,24 @@ def padded(row: Sequence[int], columns: int) -> list[int | None]:
     return [*row, *[None] * (columns - len(row))]
 
 
-def _evenly(members: np.ndarray, most: int) -> list[int]:
-    """At most so many of them, at even steps from the first on."""
-    few = min(most, len(members))
-    return [int(members[i * len(members) // few]) for i in range(few)]
-
-
-def short(id_: str, letters: int = 22) -> str:
+def short(id_: str) -> str:
     """The end of an id, as a panel has room for."""
     name = id_.rsplit("/", 1)[-1]
-    return name if len(name) <= letters else f"…{name[1 - letters :]}"
+    return name if len(name) <= 22 else f"…{name[-21:]}"
 
 
 def scan_picture(
-    domains: Mapping[str, PointSet],
-    path: str | Path,
-    *,
-    split: str = "train",
-    blocks: int = 2,
-    heading: str = "",
-    note: str = "",
+    domains: Mapping[str, PointSet], path: str | Path, *, split: str = "train", note: str = ""
 ) -> Path:
-    """Save one object of each class (a row) as each domain has it (a column).
+    """Save one object of each class as each domain has it, two classes a row.
 
     Where domains share ids (a cloud and its clean twin, surface samples of the same mesh) the
     object is the same; else it is the domain's first of that class.
 
     Args:
-        domains: by column title, such as "S: SpeckleNet10": symbol and words, drawn on two lines.
+        domains: by column title, such as "S: SpeckleNet10".
         path: of the PNG.
         split: which split the objects come from.
-        blocks: the classes are set side by side in so many blocks.
-        heading: a line above all.
         note: a line below all.
 
     Raises:
@@ -143,37 +137,24 @@ def scan_picture(
     """
     if not domains:
         raise DataError("a picture of no domains")
-    sets = {title: data.split(split) for title, data in domains.items()}
-    classes = next(iter(sets.values())).classes
-    blocks = min(blocks, len(classes))
-    rows = -(-len(classes) // blocks)
-    left, gap, top, bottom = 0.95, 0.15, 0.5 + 0.35 * bool(heading), 0.1 + 0.25 * bool(note)
-    block = left + len(sets) * _PANEL + gap
-    figure = _Figure(blocks * block, rows * _PANEL + top + bottom)
-    for i, cls in enumerate(classes):
-        x, y = (i // rows) * block, figure.height - top - (i % rows + 1) * _PANEL
-        figure.text(x + left - 0.1, y + _PANEL / 2, cls, size=10, align="right")
-        for j, cloud in enumerate(_same_object(list(sets.values()), cls)):
-            if cloud is None:
-                figure.text(x + left + (j + 0.5) * _PANEL, y + _PANEL / 2, "none", color=SOFT)
-            else:
-                figure.panel(x + left + j * _PANEL, y, cloud)
-    for k in range(blocks):
-        for j, title in enumerate(sets):
-            x = k * block + left + (j + 0.5) * _PANEL
-            symbol, _, words = title.rpartition(": ")
-            figure.text(x, figure.height - top + 0.29, symbol, size=10, weight="bold")
-            figure.text(x, figure.height - top + 0.12, words, size=7.5, color=SOFT)
-    if heading:
-        figure.text(figure.width / 2, figure.height - 0.26, heading, size=12, weight="bold")
-    if note:
-        figure.text(figure.width / 2, 0.18, note, size=8, color=SOFT)
-    return figure.save(path)
+    sets = [data.split(split) for data in domains.values()]
+    classes = sets[0].classes
+    half = -(-len(classes) // 2)
+    order = [cls for i in range(half) for cls in classes[i::half]]
+    clouds = {cls: _same_object(sets, cls) for cls in order}
+    return contact_sheet(
+        [cloud for of in clouds.values() for cloud in of],
+        [cls if c is not None else f"no {cls}" for cls, of in clouds.items() for c in of],
+        path,
+        columns=2 * len(sets),
+        heads=[*domains] * 2,
+        note=note,
+    )
 
 
 def _same_object(sets: Sequence[PointSet], cls: str) -> list[np.ndarray | None]:
     """A cloud of the class from each set, of the object that most sets have; None if none."""
-    ids = [[data.ids[i] for i in _members(data, cls)] for data in sets]
+    ids = [[data.ids[i] for i in data.members(cls)] for data in sets]
     everywhere = {name: sum(name in own for own in ids) for own in ids for name in own}
     best = max(everywhere, key=lambda name: everywhere[name], default=None)
     found: list[np.ndarray | None] = []
@@ -181,11 +162,6 @@ def _same_object(sets: Sequence[PointSet], cls: str) -> list[np.ndarray | None]:
         name = best if best in own else next(iter(own), None)
         found.append(None if name is None else np.asarray(data.points[data.ids.index(name)]))
     return found
-
-
-def _members(data: PointSet, cls: str) -> np.ndarray:
-    known = cls in data.classes
-    return np.flatnonzero(data.labels == data.classes.index(cls)) if known else np.array([], int)
 
 
 class _Figure:
@@ -203,9 +179,8 @@ class _Figure:
         box = ((x + pad) / w, (y + pad) / h, side / w, side / h)
         axes: Any = self._figure.add_axes(box, facecolor=PANEL)
         seen, depth, height = project(cloud)
-        colour = cloud_colours(height, depth)
         size = float(np.clip(2600 / len(cloud), 0.9, 9.0))
-        axes.scatter(*seen.T, s=size, c=colour, linewidths=0)
+        axes.scatter(*seen.T, s=size, c=cloud_colours(height, depth), linewidths=0)
         axes.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), xticks=[], yticks=[])
         for spine in axes.spines.values():
             spine.set(color=GRID, linewidth=0.6)
@@ -221,11 +196,7 @@ class _Figure:
         )  # fmt: skip
 
     def save(self, path: str | Path) -> Path:
-        """Write the PNG, atomically and without a date in it.
-
-        In 256 colours: that cannot be seen, and a third of the bytes is left. A sheet of 60 clouds
-        lies in the folder of each run.
-        """
+        """Write the PNG, atomically and without a date, in 256 colours: a third of the bytes."""
         from PIL import Image
 
         self._figure.canvas.draw()

@@ -1,4 +1,4 @@
-"""The names of what lies in a dataset's folder beside the store's own files, and deleting it all.
+"""The names of what lies in a dataset's folder next to the store's own files, and deleting it all.
 
 recipe.json   what the parts were made with; another recipe is refused
 parts/        one file an object or scene, until the store is written

@@ -115,19 +115,19 @@ class Domain:
         """Find out, in milliseconds, whether `open` has something to open.
 
         Raises:
-            MissingDataError: lists the files looked for, where to get them, and the commands.
+            MissingDataError: what was looked for, where to get it, and the commands.
         """
         if is_finished(self.folder):
             return
         importer = self.importer()
         if importer is not None and importer.is_there():
             return
-        lines = [f"domain {self.name}: {self.label} is not there. Looked for:"]
         unfinished = is_begun(self.folder)
-        state = "   (begun but not finished)" if unfinished else ""
-        lines.append(f"  {self.folder / 'meta.yaml'}{state}")
-        if importer is not None:
-            lines += [f"  {pattern}" for pattern in importer.looks_for()]
+        lines = [
+            f"domain {self.name}: {self.label} is not there. Looked for:",
+            f"  {self.folder / 'meta.yaml'}{'   (begun but not finished)' * unfinished}",
+            *(f"  {pattern}" for pattern in (importer.looks_for() if importer else [])),
+        ]
         if self.how_to_get:
             lines.append(f"Where to get it: {self.how_to_get.strip()}")
         if self.make:
@@ -173,11 +173,8 @@ class Domain:
                 if have.get(cls, 0) != count
             ]
         if problems:
-            log.warning(
-                "%s does not have the published numbers of clouds: %s",
-                self.label,
-                ", ".join(problems),
-            )
+            text = "%s does not have the published numbers of clouds: %s"
+            log.warning(text, self.label, ", ".join(problems))
 
     def _refuse_stale(self, importer: Importer) -> None:
         """Raise DataError if the store was imported with other settings than today's."""
@@ -188,23 +185,18 @@ class Domain:
         now = importer.settings()
         if not importer.is_there():  # the published files were put away after the import
             now.update({key: imported.get(key) for key in ("folder", "files") if key in now})
-        if now != imported:
-            if "files" in imported and now == {**imported, "files": now.get("files")}:
-                origins = {row.origin for row in read_manifest(self.folder, meta["classes"])}
-                raise DataError(
-                    f"{self.folder} is not what its folder holds today: "
-                    f"{importer.changes(origins)}; delete {self.folder} to import it again, or "
-                    "give another `path`"
-                )
-            changed = sorted(k for k in {*now, *imported} if now.get(k) != imported.get(k))
-            if len(changed) > 1:  # of other settings there is more to say than a digest
-                changed = [key for key in changed if key != "files"]
-            was = {key: imported.get(key) for key in changed}
-            wanted = {key: now.get(key) for key in changed}
-            raise DataError(
-                f"{self.folder} was imported with {was}, the config says {wanted}; delete the "
-                "folder to import it again, or give another `path`"
-            )
+        changed = {key for key in {*now, *imported} if now.get(key) != imported.get(key)}
+        if not changed:
+            return
+        if changed == {"files"}:
+            origins = {row.origin for row in read_manifest(self.folder, meta["classes"])}
+            problem = f"{self.folder} is not what its folder holds today: "
+            problem += f"{importer.changes(origins)}; delete {self.folder}"
+        else:  # of other settings there is more to say than a digest
+            keys = sorted(changed - {"files"})
+            was, wanted = ({key: of.get(key) for key in keys} for of in (imported, now))
+            problem = f"{self.folder} was imported with {was}, the config says {wanted}; delete it"
+        raise DataError(f"{problem} to import it again, or give another `path`")
 
 
 def check_all(*domains: Domain) -> None:

@@ -19,9 +19,7 @@ _GENERATE = ["python", "generate.py"]
 def check_or_make(source: Domain, target: Domain, make_source: bool) -> None:
     """Find out, in milliseconds, whether both domains are there; make the source if that is asked.
 
-    Raises:
-        MissingDataError: lists what is missing and how to get it.
-        ConfigError, Qs3Error: see `make_if_missing`.
+    Raises MissingDataError, which lists all that is missing, or as `make_if_missing`.
     """
     if make_source:
         target.check()  # before minutes are spent on the source

@@ -56,34 +56,21 @@ class ManifestRow:
     index: int | None = None
 
 
-_COLUMNS: tuple[tuple[str, str], ...] = (  # of manifest.csv: (header, field)
-    ("index", "index"),
-    ("id", "id"),
-    ("class", "cls"),
-    ("split", "split"),
-    ("seed", "seed"),
-    ("mesh_sha256", "mesh_sha256"),
-    ("origin", "origin"),
-    ("views", "views"),
-    ("valid_points", "valid_points"),
-    ("status", "status"),
-    ("reason", "reason"),
+_COLUMNS = (
+    *("index", "id", "class", "split", "seed", "mesh_sha256"),
+    *("origin", "views", "valid_points", "status", "reason"),
 )
+_FIELDS = tuple("cls" if column == "class" else column for column in _COLUMNS)
 _INTEGERS = ("index", "seed", "views", "valid_points")
 
 
 def read_manifest(
     folder: str | Path, classes: Sequence[str], sha256: str | None = None
 ) -> list[ManifestRow]:
-    """All rows of a dataset's manifest.csv, failed ones included, checked.
-
-    Args:
-        folder: of the dataset.
-        classes: the names that may occur.
-        sha256: what the file's hash must be, or None.
+    """All rows of a dataset's manifest.csv, failed ones included.
 
     Raises:
-        DataError: names the line.
+        DataError: a row is wrong (names the line), or the hash is not `sha256`, if that is given.
     """
     path = Path(folder) / MANIFEST
     try:
@@ -137,9 +124,9 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
 
 def to_csv(rows: Sequence[ManifestRow]) -> str:
     """The text of manifest.csv; line breaks inside a value become spaces."""
-    lines = [[header for header, _ in _COLUMNS]]
+    lines: list[Sequence[str]] = [_COLUMNS]
     for row in rows:
-        values = [getattr(row, field) for _, field in _COLUMNS]
+        values = [getattr(row, field) for field in _FIELDS]
         lines.append(["" if v is None else " ".join(str(v).splitlines()) for v in values])
     return csv_text(lines)
 
@@ -149,19 +136,18 @@ def _from_csv(text: str, path: Path) -> list[ManifestRow]:
         header, *lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     except (csv.Error, ValueError) as error:
         raise DataError(f"{path} is empty or damaged ({error}); {AGAIN}") from error
-    if header != [name for name, _ in _COLUMNS]:
-        raise DataError(f"{path}, line 1: the columns are not {[n for n, _ in _COLUMNS]}")
+    if tuple(header) != _COLUMNS:
+        raise DataError(f"{path}, line 1: the columns are not {', '.join(_COLUMNS)}")
     rows = []
     for number, values in enumerate(lines, start=2):
         if len(values) != len(_COLUMNS):
             raise DataError(f"{path}, line {number}: {len(values)} columns, not {len(_COLUMNS)}")
         fields: dict[str, Any] = {}
-        for (name, field), value in zip(_COLUMNS, values, strict=True):
+        for field, value in zip(_FIELDS, values, strict=True):
             try:
-                fields[field] = (int(value) if value else None) if name in _INTEGERS else value
+                fields[field] = (int(value) if value else None) if field in _INTEGERS else value
             except ValueError as error:
-                raise DataError(
-                    f"{path}, line {number}: {name} is {value!r}, not a number"
-                ) from error
+                where = f"{path}, line {number}"
+                raise DataError(f"{where}: {field} is {value!r}, not a number") from error
         rows.append(ManifestRow(**fields))
     return rows

@@ -47,10 +47,9 @@ class PartFiles:
         return (self.folder / RECIPE).is_file()
 
     def check(self, recipe: Mapping[str, Any]) -> None:
-        """Check that the folder was begun with the same recipe.
+        """Raise ConfigError (what differs, what to do) if the folder was begun otherwise.
 
         Raises:
-            ConfigError: lists what differs, and says what to do.
             DataError: there is no recipe that can be read.
         """
         path = self.folder / RECIPE
@@ -70,11 +69,7 @@ class PartFiles:
             )
 
     def begin(self, recipe: Mapping[str, Any]) -> None:
-        """Start, or continue what was made with the same recipe.
-
-        Raises:
-            ConfigError, DataError: as `check`.
-        """
+        """Start, or continue what was made with the same recipe; raises as `check`."""
         if self.have_recipe:
             self.check(recipe)
         else:
@@ -97,11 +92,7 @@ class PartFiles:
         write_bytes(self._path(name), file.getvalue())
 
     def read(self, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """The note and the arrays of one part.
-
-        Raises:
-            DataError: it is damaged, or not there.
-        """
+        """The note and the arrays of one part; DataError if it is damaged or not there."""
         path = self._path(name)
         try:
             with np.load(path, allow_pickle=False) as file:
@@ -128,24 +119,27 @@ class PartFiles:
 
 
 def _differences(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]]:
-    if isinstance(old, dict) and isinstance(new, dict):
-        out = []
-        for name in [*old, *(n for n in new if n not in old)]:
-            inner = f"{key}.{name}" if key else name
-            out += _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
-        return out
     if old == new:
         return []
-    if isinstance(old, list) and isinstance(new, list) and key == "objects":
-        gone, come = sorted(set(old) - set(new)), sorted(set(new) - set(old))
+    if isinstance(old, dict) and isinstance(new, dict):
         return [
-            (
-                key,
-                f"{len(old)}{f', among them {gone[0]!r}' if gone else ''}",
-                f"{len(new)}{f', among them {come[0]!r}' if come else ''}",
+            difference
+            for name in dict.fromkeys([*old, *new])
+            for difference in _differences(
+                old.get(name, "nothing"),
+                new.get(name, "nothing"),
+                f"{key}.{name}" if key else name,
             )
         ]
+    if key == "objects" and isinstance(old, list) and isinstance(new, list):
+        return [(key, _sample(old, new), _sample(new, old))]
     return [(key, _short(old), _short(new))]
+
+
+def _sample(some: list, others: list) -> str:
+    """How many there are, and the first that the others lack."""
+    missing = sorted(set(some) - set(others))
+    return f"{len(some)}{f', among them {missing[0]!r}' if missing else ''}"
 
 
 def _short(value: Any) -> str:

@@ -14,7 +14,7 @@ neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ def to_pyg(
 
     Args:
         source: an open dataset, a domain, or the name of a domain in conf/domain.
-        split: "train", "validation" or "test"; None: all clouds.
+        split: None: all clouds.
         transform: applied whenever a cloud is taken.
 
     Raises:
@@ -91,7 +91,8 @@ def from_pyg(
 ) -> PointSet:
     """Write datasets of PyG as one of ours, which a domain can name by its `path`.
 
-    Their transforms are applied once. z should be up (`Domain.gravity`).
+    Their transforms are applied once. z should be up (`Domain.gravity`). Points are kept bit by bit
+    where they are float32 and not thinned.
 
     Args:
         datasets: by split ("train", "validation", "test"). Each cloud has `pos` [n, 3], and all or
@@ -99,12 +100,9 @@ def from_pyg(
         folder: of the new dataset.
         classes: names in the order of `y`; None: `classes` of the first dataset, if it has any;
             without labels the benchmark's ten.
-        points: number of points a cloud; larger clouds are thinned to their farthest points, one
-            after another from their first one. None: all clouds must have the same.
+        points: of a cloud; larger ones are thinned to their farthest points, from the first on.
+            None: all clouds must have the same number.
         name: of the new dataset; None: that of the folder.
-
-    Returns:
-        The dataset, opened. Points are kept bit by bit where they are float32 and not thinned.
 
     Raises:
         ConfigError: there is something in the folder, or the classes are not known.
@@ -113,15 +111,15 @@ def from_pyg(
     folder = Path(folder)
     if is_finished(folder) or is_begun(folder):
         raise ConfigError(f"{folder} holds something already; delete it or choose another folder")
-    taken = [
-        (split, number, _read(item, f"cloud {number} of {split!r}"))
+    taken = {
+        (split, number): _read(dataset[number], f"cloud {number} of {split!r}")
         for split, dataset in datasets.items()
-        for number, item in enumerate(_items(dataset))
-    ]
+        for number in range(len(dataset))  # PyG's way of iterating needs an IndexError to end
+    }
     if not taken:
         raise DataError("there are no clouds in these datasets")
-    names = _classes(classes, next(iter(datasets.values())), [y for *_, (_, y, _) in taken])
-    sizes = [len(pos) for *_, (pos, _, _) in taken]
+    names = _classes(classes, next(iter(datasets.values())), [y for _, y, _ in taken.values()])
+    sizes = [len(pos) for pos, _, _ in taken.values()]
     if points is None and len(set(sizes)) > 1:
         raise DataError(
             f"the clouds have {min(sizes)} to {max(sizes)} points: give points=, to which larger "
@@ -129,7 +127,7 @@ def from_pyg(
         )
     points = points or sizes[0]
     clouds, rows = [], []
-    for split, number, (pos, y, key) in taken:
+    for (split, number), (pos, y, key) in taken.items():
         if len(pos) < points:
             raise DataError(
                 f"cloud {number} of {split!r} has {len(pos)} points, fewer than points={points}; "
@@ -148,11 +146,6 @@ def from_pyg(
         rows=rows,
         meta={"made_from": "a dataset of torch_geometric"},
     )
-
-
-def _items(dataset: Any) -> Iterable[Any]:
-    """Not `iter(dataset)`: PyG's old way of iterating ends at an IndexError only."""
-    return (dataset[i] for i in range(len(dataset)))
 
 
 def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str]:
@@ -196,8 +189,7 @@ def _classes(given: Sequence[str] | None, dataset: Any, labels: list[int | None]
 def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) -> Tensor:
     """Edges from the k nearest neighbours of each point to it, as PyG's `knn_graph` has them.
 
-    For nets of PyG's layers (EdgeConv, PointNetConv, ...). Batches of clouds of one size take one
-    search; others one a cloud.
+    Clouds of one size take one search a batch; others one a cloud.
 
     Args:
         x: [n, c] positions or features of all clouds of a batch, on any device.
@@ -215,17 +207,16 @@ def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) ->
     if x.ndim != 2 or k < 1 or (batch is not None and batch.shape != x.shape[:1]):
         raise DataError(f"knn_graph wants x [n, c], batch [n] and k >= 1, got x {list(x.shape)}")
     if batch is None:
-        sizes = [len(x)]
+        batch = x.new_zeros(len(x), dtype=torch.int64)
     elif (batch.diff() < 0).any():
         raise DataError("knn_graph wants the points of each cloud together: batch is not sorted")
-    else:
-        sizes = batch.unique_consecutive(return_counts=True)[1].tolist()
-    if len(set(sizes)) == 1 and len(x):
+    sizes = batch.unique_consecutive(return_counts=True)[1].tolist()
+    if len(set(sizes)) == 1:
         return _edges(x.view(len(sizes), sizes[0], -1), k, loop)
-    starts = np.cumsum([0, *sizes])
+    starts = np.cumsum([0, *sizes]).tolist()
     parts = [
-        _edges(x[start : start + size][None], k, loop) + int(start)
-        for start, size in zip(starts, sizes, strict=False)
+        _edges(cloud[None], k, loop) + start
+        for start, cloud in zip(starts, x.split(sizes), strict=False)
     ]
     return torch.cat([x.new_empty((2, 0), dtype=torch.int64), *parts], dim=1)
 

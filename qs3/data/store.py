@@ -46,6 +46,7 @@ __all__ = [
     "ManifestRow",
     "PointSet",
     "counts_text",
+    "evenly",
     "is_begun",
     "is_finished",
     "open_pointset",
@@ -66,7 +67,6 @@ class PointSet:
     """A dataset in memory's terms; the clouds themselves stay on disk until they are indexed.
 
     Attributes:
-        name: of the dataset.
         classes: names; a label is a position in this tuple.
         points: [N, P, 3] float32, read only (a memmap, or a copy after `split`).
         labels: [N] int64; all -1 if the dataset has no labels.
@@ -98,6 +98,11 @@ class PointSet:
     def indices(self, split: str) -> np.ndarray:
         """[n] int64 positions of a split's clouds, in the dataset's order."""
         return np.flatnonzero(self.splits == split)
+
+    def members(self, cls: str) -> np.ndarray:
+        """[n] int64 positions of a class's clouds; none of a name that is not a class here."""
+        known = cls in self.classes
+        return np.flatnonzero(self.labels == self.classes.index(cls) if known else [])
 
     def split(self, split: str) -> PointSet:
         """The clouds of one split, in order; a view of the memmap if they are adjacent.
@@ -135,13 +140,16 @@ class PointSet:
         }
 
 
+def evenly(positions: np.ndarray, most: int) -> list[int]:
+    """At most so many of some positions [n], at even steps from the first on."""
+    few = min(most, len(positions))
+    return [int(positions[i * len(positions) // few]) for i in range(few)]
+
+
 def counts_text(data: PointSet, without: str, missing: Mapping[str, int]) -> list[str]:
     """Lines of a table for the log: clouds by class and split, and objects without one.
 
-    Args:
-        data: the dataset.
-        without: heading of the last column: "failed".
-        missing: by class, how many objects gave no cloud.
+    Those are counted by class in `missing`, under the heading `without`, such as "failed".
     """
     counts = data.counts()
     rows = [["clouds", *counts, without]]
@@ -193,9 +201,6 @@ def write_pointset(
         tables: which of the arrays are not clouds but say something of each point, with the names
             of their columns: they are [N, P, columns], and no variant to train on.
 
-    Returns:
-        The dataset, variant "points".
-
     Raises:
         DataError: arrays and rows do not fit together, or a value is not finite.
         Qs3Error: the folder cannot be written.
@@ -245,8 +250,8 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     Args:
         folder: of the dataset.
         variant: which array, by file stem.
-        verify: also compare the files' SHA-256 with meta.yaml (about 1 s for 500 MB); without it
-            the manifest's is still compared.
+        verify: also compare the array's SHA-256 with meta.yaml (about 1 s for 500 MB); the
+            manifest's is always compared.
 
     Raises:
         MissingDataError: there is no such folder, or it was not finished.
@@ -283,15 +288,8 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     )
 
 
-def open_table(
-    folder: str | Path, name: str = "provenance", verify: bool = True
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray, tuple[str, ...]]:
     """Open what a dataset knows of each point of its variant "points".
-
-    Args:
-        folder: of the dataset.
-        name: of the table, by file stem.
-        verify: also compare the file's SHA-256 with meta.yaml.
 
     Returns:
         [N, P, columns] float32, read only, row by row that of `PointSet.points`; and the names
@@ -310,7 +308,7 @@ def open_table(
             "with it (for provenance: provenance=true)"
         )
     columns = tuple(tables[name])
-    return _open_array(folder, name, meta, len(columns), verify), columns
+    return _open_array(folder, name, meta, len(columns), verify=True), columns
 
 
 def _meta_of_finished(folder: Path) -> dict[str, Any]:
@@ -327,11 +325,23 @@ def _meta_of_finished(folder: Path) -> dict[str, Any]:
 def _open_array(
     folder: Path, name: str, meta: Mapping[str, Any], columns: int, verify: bool
 ) -> np.ndarray:
-    path = folder / f"{name}.npy"
-    array = _map(path, (meta["clouds"], meta["points"], columns))
+    """[N, P, columns] float32 memmap; its header, size and hash must be what they were."""
+    path, shape = folder / f"{name}.npy", (meta["clouds"], meta["points"], columns)
+    header = _header(shape)
+    expected = len(header) + 4 * int(np.prod(shape))
+    try:
+        with open(path, "rb") as file:
+            found = file.read(len(header))
+        size = path.stat().st_size
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
+    if size != expected:
+        raise DataError(f"{path} has {size} bytes, expected {expected} for {shape}; {AGAIN}")
+    if found != header:
+        raise DataError(f"{path} does not have the header of a float32 array {shape}; {AGAIN}")
     if verify and sha256_file(path) != meta["sha256"][name]:
         raise DataError(f"{path} is damaged (its SHA-256 is not the one in {_META}); {AGAIN}")
-    return array
+    return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)
 
 
 def read_meta(folder: str | Path) -> dict[str, Any]:
@@ -382,14 +392,13 @@ def _check_arrays(
     tables: Mapping[str, Sequence[str]],
 ) -> tuple[int, int, int]:
     """The common shape of all clouds, after checking that all arrays fit the manifest."""
-    if "points" in tables:
-        raise DataError(f"dataset {name!r}: 'points' is not a table; arrays are {sorted(arrays)}")
-    if unknown := sorted(set(tables) - set(arrays)):
-        raise DataError(
-            f"dataset {name!r}: tables {unknown} are not arrays; arrays are {sorted(arrays)}"
-        )
     if "points" not in arrays:
         raise DataError(f"dataset {name!r} needs an array 'points', got {sorted(arrays)}")
+    if wrong := sorted(set(tables) - set(arrays) | set(tables) & {"points"}):
+        raise DataError(
+            f"dataset {name!r}: tables {wrong} are not arrays beyond 'points'; arrays are "
+            f"{sorted(arrays)}"
+        )
     for key, array in arrays.items():
         if not key.isidentifier() or key in ("manifest", "meta"):
             raise DataError(f"an array of dataset {name!r} cannot be called {key!r}")
@@ -418,23 +427,6 @@ def _header(shape: tuple[int, ...]) -> bytes:
         file, {"descr": "<f4", "fortran_order": False, "shape": shape}
     )
     return file.getvalue()
-
-
-def _map(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
-    """[N, P, 3] float32 memmap, after comparing header and size with what they must be."""
-    header = _header(shape)
-    expected = len(header) + 4 * int(np.prod(shape))
-    try:
-        with open(path, "rb") as file:
-            found = file.read(len(header))
-        size = path.stat().st_size
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
-    if size != expected:
-        raise DataError(f"{path} has {size} bytes, expected {expected} for {shape}; {AGAIN}")
-    if found != header:
-        raise DataError(f"{path} has not the header of a float32 array {shape}; {AGAIN}")
-    return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)
 
 
 def _check_finite(path: Path, points: np.ndarray, ids: Sequence[str]) -> None:

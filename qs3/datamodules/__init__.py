@@ -13,7 +13,7 @@ __all__ = ["AdaptationData", "DepthScanNetData", "DomainData", "ModelNetData", "
 
 
 def __getattr__(name: str) -> Any:
-    """The data modules: they import torch, which the phases beside them do without."""
+    """The data modules: they import torch, which the phases do without."""
     if name in __all__:
         place = "adaptation" if name == "AdaptationData" else "domain"
         return getattr(import_module(f"qs3.datamodules.{place}"), name)

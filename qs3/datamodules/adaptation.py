@@ -164,17 +164,12 @@ class AdaptationData(LightningDataModule):
 
     def val_dataloader(self) -> Batches:
         """Validation clouds of the labelled domain, all of them in every process."""
-        table = Table(self.validation.clouds, {f"y_{self.owner}": self.validation.labels})
-        return Batches(
-            {"source": table}, self.eval_batch_size, seed=self.seed, epoch=0, shuffle=False
-        )
+        labels = {f"y_{self.owner}": self.validation.labels}
+        return self._in_order("source", Table(self.validation.clouds, labels))
 
     def predict_dataloader(self) -> Batches:
         """The target's training clouds, in order and without labels."""
-        table = Table(self.target.clouds, {})
-        return Batches(
-            {"target": table}, self.eval_batch_size, seed=self.seed, epoch=0, shuffle=False
-        )
+        return self._in_order("target", Table(self.target.clouds, {}))
 
     def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
         """Augment training batches, each domain with its own randomness."""
@@ -195,6 +190,10 @@ class AdaptationData(LightningDataModule):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore `state_dict`."""
         self.pseudo = (state_dict["index"], state_dict["labels"]) if state_dict else None
+
+    def _in_order(self, name: str, table: Table) -> Batches:
+        size = self.eval_batch_size
+        return Batches({name: table}, size, seed=self.seed, epoch=0, shuffle=False)
 
     def _labelled(self) -> Table:
         y = f"y_{self.owner}"

@@ -75,11 +75,9 @@ class Batches:
             again and again, each time in a new order.
         batch_size: clouds of each domain in a batch. A last batch of one cloud (batch
             normalisation cannot use it) joins the one before.
-        seed: of the run.
-        epoch: counted from 0.
+        seed, epoch: of the run, and counted from 0.
         shuffle: False keeps the tables' order, and each cloud's sample 0 (evaluation).
-        rank: of this process; each takes every `world`-th cloud, and as many as the others.
-        world: number of processes.
+        rank, world: of `world` processes each takes every `world`-th cloud, as many as the others.
     """
 
     def __init__(

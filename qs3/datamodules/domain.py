@@ -26,12 +26,12 @@ from qs3.datamodules.splits import (
     Labelled,
     Unlabelled,
     first_of_class,
+    labels_of,
     load_clouds,
     subsample_splits,
-    with_labels,
 )
 from qs3.datamodules.validation_split import RULES
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 
 SAMPLERS = ("shuffled", "balanced")
 
@@ -149,7 +149,7 @@ class DomainData(LightningDataModule):
 
     def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
         """Augment training batches, on their device."""
-        # Lightning could not tell a batch's size for `self.log` if these numbers stayed beside it.
+        # Lightning could not tell a batch's size for `self.log` if these numbers stayed in it.
         result = {key: value for key, value in batch.items() if key not in ("index", "epoch")}
         if self.augment is None or self.trainer is None or not self.trainer.training:
             return result
@@ -169,10 +169,16 @@ class DomainData(LightningDataModule):
         self.train, self.validation = train.at(chosen), train.at(held_out)
 
     def _load(self, dataset: PointSet, split: str, starts: int) -> Labelled | Unlabelled:
-        clouds = load_clouds(dataset, split, self.points, starts, self.cache_dir)
+        found = load_clouds(dataset, split, self.points, starts, self.cache_dir)
         if not self.has_labels:
-            return clouds
-        return with_labels(clouds, dataset, split, self.asks)
+            return found
+        labels = labels_of(dataset, split)
+        if labels is None:
+            raise ConfigError(
+                f"{self.asks} needs labels, but the clouds of {dataset.name} have none; label "
+                "them, or choose another dataset or method"
+            )
+        return Labelled(found.clouds, found.ids, labels)
 
     def _loader(
         self, part: Labelled | Unlabelled | None, batch_size: int, shuffle: bool = False

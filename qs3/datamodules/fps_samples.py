@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
-from qs3.utils.pool import engine
+from qs3.utils.pool import Processes
 from qs3.utils.progress import shown
 from qs3.utils.seeding import derive
 
@@ -60,11 +60,7 @@ def sample_all(
 ) -> Int[np.ndarray, "n starts count"]:
     """The same, with a progress bar on a terminal, and by several processes if it takes long.
 
-    Args:
-        points: clouds, e.g. a memmap.
-        count: points of a sample.
-        starts: samples of a cloud.
-        processes: how many; None asks the machine. The result does not depend on it.
+    How many, None asks the machine; the result does not depend on it.
     """
     if processes is None:
         processes = min(
@@ -85,7 +81,7 @@ def sample_all(
 def _fill(result: np.ndarray, points: np.ndarray, begins: Sequence[int], processes: int) -> None:
     chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
     _, starts, count = result.shape
-    outcomes = engine(processes).run(partial(_sampler, count, starts), chunks)
+    outcomes = Processes(processes).run(partial(_sampler, count, starts), chunks)
     for outcome in shown(outcomes, "sampling points", total=len(begins)):
         if outcome.result is None:
             raise ChildProcessError("a process died twice")

@@ -13,10 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from qs3.data.store import PointSet
+from qs3.data.store import PointSet, evenly
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
-from qs3.errors import ConfigError
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,27 +62,6 @@ def labels_of(dataset: PointSet, split: str) -> Int[Tensor, " n"] | None:
     return torch.from_numpy(np.array(dataset.labels[dataset.indices(split)]))
 
 
-def with_labels(clouds: Unlabelled, dataset: PointSet, split: str, what: str) -> Labelled:
-    """The clouds of `load_clouds` with their labels.
-
-    Args:
-        clouds: of this split.
-        dataset: theirs.
-        split: theirs.
-        what: who asks for labels, for the message.
-
-    Raises:
-        ConfigError: the dataset has no labels.
-    """
-    labels = labels_of(dataset, split)
-    if labels is None:
-        raise ConfigError(
-            f"{what} needs labels, but the clouds of {dataset.name} have none; label them, or "
-            "choose another dataset or method"
-        )
-    return Labelled(clouds.clouds, clouds.ids, labels)
-
-
 def subsample_splits(dataset: PointSet, count: int) -> PointSet:
     """At most `count` clouds of each split, at even steps; for `debug=fast`.
 
@@ -91,9 +69,7 @@ def subsample_splits(dataset: PointSet, count: int) -> PointSet:
     """
     chosen: list[int] = []
     for split in dataset.counts():
-        members = dataset.indices(split)
-        few = min(count, len(members))
-        chosen += [int(members[i * len(members) // few]) for i in range(few)]
+        chosen += evenly(dataset.indices(split), count)
     return dataset.at(np.sort(chosen))
 
 

@@ -49,9 +49,8 @@ def stratified(
 ) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " v"]]:
     """(train, validation): of each class a fifth of its objects validates, rounded, at least one.
 
-    A class's objects are sorted by a hash of (`STRATIFIED_SEED`, id) and the first ones taken, so
-    the split is the same for every run and in whatever order the clouds are stored. The only
-    object of a class stays in training. Both parts are sorted by id.
+    They are the first by a hash of (`STRATIFIED_SEED`, id), so the split is the same for every run
+    and order of clouds. The only object of a class trains. Both parts are sorted by id.
 
     Raises:
         DataError: no class has two objects, or an object has scans of two classes.

@@ -19,7 +19,7 @@ from qs3.generation.recipes import Cloud, Recipe
 from qs3.generation.view_files import DiskError, disk_errors_travel
 from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
-from qs3.utils.pool import Processes, engine
+from qs3.utils.pool import Processes
 
 log = logging.getLogger(__name__)
 
@@ -133,7 +133,7 @@ def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]
     deaths = 0
     make_worker = partial(_Scanner, job, saves=workers > 0)
     tasks = ((item.id, item) for item in items)
-    for outcome in engine(workers, OBJECTS_PER_WORKER).run(make_worker, tasks):
+    for outcome in Processes(workers, OBJECTS_PER_WORKER).run(make_worker, tasks):
         deaths = deaths + 1 if outcome.died else 0
         if deaths == patience:
             raise RenderError(

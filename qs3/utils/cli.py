@@ -33,7 +33,7 @@ class Kind(NamedTuple):
 
     Attributes:
         word: stands for it in the help.
-        read: the value of a text; ValueError if it is none.
+        read: the value of a text; ValueError if there is none.
         must: what it has to be, for messages.
     """
 
@@ -107,11 +107,7 @@ class Option:
     choices: Callable[[], Iterable[str]] = tuple
 
     def read(self, words: str) -> Any:
-        """The value of a text.
-
-        Raises:
-            ConfigError: it has none.
-        """
+        """The value of a text; ConfigError if it has none."""
         try:
             if words:
                 return self.kind.read(words)

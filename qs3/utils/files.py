@@ -16,8 +16,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from qs3.errors import Qs3Error
 
 _CHUNK = 1 << 20
@@ -27,8 +25,8 @@ _CHUNK = 1 << 20
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path in the folder of `path`; rename it to `path` if the block succeeds.
 
-    The temporary name keeps the extension (some writers choose the format by it). If the block
-    raises, the temporary file is removed and `path` stays as it was.
+    It has the same extension (some writers choose the format by it). If the block raises, the
+    temporary file is removed and `path` stays as it was.
 
     Raises:
         Qs3Error: the folder or file cannot be written (permission, full disk, a file in the way).
@@ -59,11 +57,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
-    """Make a folder and its parents unless they are there.
-
-    Raises:
-        Qs3Error: it cannot be made or written to.
-    """
+    """Make a folder and its parents; Qs3Error if it cannot be made or written to."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -89,12 +83,6 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def write_npy(path: str | os.PathLike[str], array: np.ndarray) -> None:
-    """Replace `path` by `array` as .npy (never a pickle), atomically."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, array, allow_pickle=False)
-
-
 def sha256_file(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file's bytes as 64 hex digits, read in pieces of 1 MiB."""
     digest = hashlib.sha256()
@@ -104,23 +92,15 @@ def sha256_file(path: str | os.PathLike[str]) -> str:
     return digest.hexdigest()
 
 
-def remove_leftovers(folder: str | os.PathLike[str], *, of: str | None = None) -> list[Path]:
+def remove_leftovers(folder: str | os.PathLike[str]) -> None:
     """Delete temporary files that a killed process left directly in `folder`.
 
-    Call it only where nobody else is writing (under `locked`, or on one's own run folder).
-
-    Args:
-        folder: where to look; nothing happens if it does not exist.
-        of: only leftovers of the file with this name.
-
-    Returns:
-        What was deleted.
+    Call it only where nobody else is writing (under `locked`, or on one's own run folder). Nothing
+    happens if there is no such folder.
     """
-    pattern = f".{of or '*'}.*.tmp*"
-    leftovers = sorted(p for p in Path(folder).glob(pattern) if p.is_file())
-    for path in leftovers:
-        path.unlink(missing_ok=True)
-    return leftovers
+    for path in Path(folder).glob(".*.*.tmp*"):
+        if path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

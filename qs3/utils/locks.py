@@ -17,18 +17,8 @@ _NAME = ".lock"
 
 @contextlib.contextmanager
 def locked(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold an exclusive lock on the file `path` (created, never deleted); wait for others.
-
-    Raises:
-        Qs3Error: the file cannot be made.
-    """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(path, "ab")  # noqa: SIM115 (closed below)
-    except OSError as error:
-        raise Qs3Error(f"cannot write the lock {path}: {error.strerror or error}") from error
-    with file:
+    """Hold an exclusive lock on the file `path` (created, never deleted); wait for others."""
+    with _open_lock(Path(path)) as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
@@ -39,15 +29,11 @@ def owned(
     doing: str = "training in",
     advice: str = "wait for it, stop it, or choose another seed or experiment_name",
 ) -> Iterator[None]:
-    """Own the folder until the block, or the process, ends (however it ends); never wait.
-
-    Args:
-        folder: made if it is not there.
-        doing: what the other process does to the folder, for the message.
-        advice: what to do about it.
+    """Own a folder, made if need be, until the block or the process ends; never wait.
 
     Raises:
-        Qs3Error: another process owns it, or it cannot be made or written to.
+        Qs3Error: another process owns it (`doing` something in it; with `advice`), or it cannot
+            be made or written to.
     """
     folder = make_folder(folder)
     with _open_lock(folder / _NAME) as file:
@@ -74,8 +60,10 @@ def check_idle(folder: Path) -> None:
 
 def _open_lock(path: Path) -> BinaryIO:
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         return open(path, "ab")
     except OSError as error:
         raise Qs3Error(
-            f"cannot write {path} ({error}); check the permissions or choose another folder"
+            f"cannot write the lock {path} ({error.strerror or error}); check the permissions or "
+            "choose another folder"
         ) from error

@@ -41,12 +41,7 @@ def save_png(figure: Figure, path: Path) -> None:
 
 
 def cloud_colours(height: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """[P, 3] colours of points: by height, and paler with distance.
-
-    Args:
-        height: [P] from 0 to 1.
-        depth: [P] from 0 (far) to 1 (near).
-    """
+    """[P, 3] colours: by height [P] in 0..1, and paler by depth [P] from 0 (far) to 1 (near)."""
     from matplotlib import colormaps
 
     near = (0.35 + 0.65 * depth)[:, None]

@@ -1,8 +1,5 @@
 """Tasks in several processes; one that kills its process costs only itself.
 
-An engine takes named tasks and gives their outcomes, each as soon as it is there. Two are here;
-a cluster's queue could stand behind the same protocol.
-
 Each worker has a pipe of its own and one task at a time. A process that is killed in the middle
 of a message therefore spoils nobody else's, and which task it had is known.
 """
@@ -19,32 +16,44 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-ResultOut = TypeVar("ResultOut", covariant=True)
 
 _STOP_S = 10.0  # how long a worker may take to end before it is killed
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome(Generic[ResultOut]):
+class Outcome(Generic[Result]):
     """What became of a task.
 
     Attributes:
-        name: of the task.
         result: what the worker returned; None if it died.
         died: the task's process ended twice before it was done: out of memory, a crash, or killed.
     """
 
     name: str
-    result: ResultOut | None
+    result: Result | None
     died: bool = False
 
 
-class Engine(Protocol):
-    """Something that does tasks."""
+@dataclass(frozen=True)
+class Processes:
+    """Does named tasks in processes of this machine, and gives each outcome as soon as it is there.
+
+    They are spawned, because neither Blender nor threads survive a fork; they leave Ctrl-C to
+    their parent, and end with it however it ends. A task whose process dies is tried once more,
+    in a new process while no other one works.
+
+    Args:
+        workers: how many at once; 0 does the tasks here, one after the other (for tests and
+            debuggers).
+        tasks_per_process: after so many a process is replaced (where memory creeps).
+    """
+
+    workers: int
+    tasks_per_process: int | None = None
 
     def run(
         self,
@@ -63,56 +72,20 @@ class Engine(Protocol):
 
         Raises:
             Exception: what a worker raises ends everything; failures that must not are results.
+            OSError: there can be no more processes.
         """
-        ...
-
-
-def engine(workers: int, tasks_per_process: int | None = None) -> Engine:
-    """`ThisProcess` for 0 workers (for tests and debuggers), else `Processes`."""
-    return Processes(workers, tasks_per_process) if workers else ThisProcess()
-
-
-@dataclass(frozen=True)
-class ThisProcess:
-    """Does the tasks here, one after the other."""
-
-    def run(
-        self,
-        make_worker: Callable[[], Callable[[Task], Result]],
-        tasks: Iterable[tuple[str, Task]],
-    ) -> Iterator[Outcome[Result]]:
-        """See `Engine.run`."""
+        if self.workers:
+            yield from self._run(make_worker, tasks)
+            return
         work = make_worker()
         for name, task in tasks:
             yield Outcome(name, work(task))
 
-
-@dataclass(frozen=True)
-class Processes:
-    """Does the tasks in processes of this machine.
-
-    They are spawned, because neither Blender nor threads survive a fork; they leave Ctrl-C to
-    their parent, and end with it however it ends. A task whose process dies is tried once more,
-    in a new process beside which no other one works.
-
-    Args:
-        workers: how many at once.
-        tasks_per_process: after so many a process is replaced (where memory creeps).
-    """
-
-    workers: int
-    tasks_per_process: int | None = None
-
-    def run(
+    def _run(
         self,
         make_worker: Callable[[], Callable[[Task], Result]],
         tasks: Iterable[tuple[str, Task]],
     ) -> Iterator[Outcome[Result]]:
-        """See `Engine.run`.
-
-        Raises:
-            OSError: there can be no more processes.
-        """
         waiting = iter(tasks)
         crew: list[_Worker] = []
         suspects: list[tuple[str, Any]] = []

@@ -21,15 +21,9 @@ SECONDS_BETWEEN_LINES = 10.0
 
 @contextmanager
 def progress_bar(label: str, *, total: int, done: int = 0) -> Iterator[Callable[[], None]]:
-    """Show how far a loop is, with rate and time left.
+    """Show how far a loop is, with rate and time left; gives a function to call after each step.
 
-    Args:
-        label: what is going on.
-        total: steps in all.
-        done: steps that an earlier run has done.
-
-    Yields:
-        A function to call after each step.
+    Of `total` steps an earlier run has `done` some.
     """
     if sys.stderr.isatty():
         with _rich_bar(label, total, done) as advance:
@@ -41,10 +35,7 @@ def progress_bar(label: str, *, total: int, done: int = 0) -> Iterator[Callable[
 def shown(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
     """Iterate with a bar on a terminal that goes away at the end; silent elsewhere.
 
-    Args:
-        items: to iterate over.
-        label: what is going on.
-        total: how many there are, if `items` has no length.
+    `total` says how many there are, if `items` has no length.
     """
     from rich.console import Console
     from rich.progress import track
@@ -57,9 +48,7 @@ def shown(items: Iterable[T], label: str, total: int | None = None) -> Iterator[
 def terminal_bar(*fields: str, transient: bool = False) -> Progress:
     """A bar on stderr, to be started: description, bar, steps of all, `fields`, time gone and left.
 
-    Args:
-        fields: formats of rich, e.g. "epochs," or "{task.fields[rate]}".
-        transient: whether it goes away at the end.
+    Fields are formats of rich: "epochs," or "{task.fields[rate]}". A transient bar goes away.
     """
     from rich.console import Console
     from rich.progress import (

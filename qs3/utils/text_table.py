@@ -20,10 +20,7 @@ _LATEX = {
 def aligned(rows: Rows, *, numbers: bool = False, rule: bool = True) -> list[str]:
     """Lines for a terminal: columns as wide as their widest entry, two spaces between them.
 
-    Args:
-        rows: header first; all of one length.
-        numbers: whether all columns but the first are flush right.
-        rule: whether there is a line of dashes below the header.
+    With `numbers` all columns but the first are flush right; `rule` is dashes below the header.
     """
     lines = ["  ".join(cells).rstrip() for cells in _padded(rows, numbers)]
     if rule:

@@ -39,11 +39,10 @@ def test_any_text_is_read_back(text):
     assert understood(override("folder", text)) == text
 
 
-@pytest.mark.parametrize("text", FOLDERS)
-def test_odd_names_of_folders_are_read_back(text):
-    assert understood(override("folder", text)) == text
-    again = shlex.split(shlex.join([override("folder", text)]))  # as a shell would hand it over
-    assert understood(again[0]) == text
+def test_odd_names_of_folders_survive_a_shell():
+    for text in FOLDERS:
+        (word,) = shlex.split(shlex.join([override("folder", text)]))
+        assert understood(word) == text
 
 
 @pytest.mark.parametrize("text", ["/home/me/logs", "a_b-c.d", "../x", "dgcnn", "a+b"])
@@ -55,10 +54,9 @@ def test_an_interpolation_stays_one_where_it_was_typed():
     assert quoted("${paths.data_dir}/x") == "${paths.data_dir}/x"
 
 
-@pytest.mark.parametrize("name", ["a, b (c) [d] it's ${x}", "1"])
-def test_every_path_of_ours_reaches_the_config(name, tmp_path):
+def test_every_path_of_ours_reaches_the_config(tmp_path):
     """The toy's words, and those of a table's cells."""
-    folder = tmp_path / name
+    folder = tmp_path / "1, b (c) [d] it's ${x}"
     cfg = composed("train", *toy_overrides(folder))
     paths = [cfg.paths.data_dir, cfg.paths.log_dir, cfg.paths.warmup_dir]
     assert paths == [str(folder / part) for part in ("data", "logs", "warmups")]

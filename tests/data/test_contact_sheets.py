@@ -74,7 +74,7 @@ def test_same_object_in_all_domains_where_possible(tmp_path):
     for found, (data, index) in zip(beds, [(a, 1), (b, 0), (c, 0)], strict=True):
         np.testing.assert_array_equal(found, data.points[index])
     assert [x is None for x in _same_object([a, b, c], "sofa")] == [True, True, False]
-    path = scan_picture({"A": a, "B: words": b, "C": c}, tmp_path / "p.png", heading="h", note="n")
+    path = scan_picture({"A": a, "B: words": b, "C": c}, tmp_path / "p.png", note="n")
     assert path.stat().st_size > 5000
 
 

@@ -14,7 +14,6 @@ from qs3.data.importers import NamedArrays, NpyTree, PointDAH5, XyzTree
 from qs3.data.inspection.gravity import (
     UPS,
     UpModel,
-    catalogue_model,
     judge_set,
     upright_examples,
 )
@@ -33,7 +32,6 @@ def published(tmp_path_factory):
     splits = {"train": 8, "test": 4}
     for name in PUBLISHED:
         fixtures.write_domain(name, folder, splits)
-    fixtures.write_xyz_tree(folder / "published" / "specklenet10", splits)
     return folder / "published"
 
 
@@ -56,7 +54,6 @@ def importers(at):
         "scannet10": PointDAH5(at / "scannet10"),
         "scannet10, mirrored": PointDAH5(at / "scannet10", undo_mirror=False),
         "depthscannet10": XyzTree(at / "depthscannet10"),
-        "specklenet10": XyzTree(at / "specklenet10"),
     }
 
 
@@ -96,17 +93,6 @@ class _NoTurn(PointDAH5):
         return cloud
 
 
-def clouds_of(catalogue_seed, count):
-    """Surface samples of the embedded catalogue, as `domain=modelnet10` makes them, 256 points."""
-    rng = np.random.default_rng(0)
-    items = Catalogue(seed=catalogue_seed, train=count, test=0).items()
-    points = []
-    for item in items:
-        mesh = item.load()
-        points.append(surface_sample(mesh.vertices, mesh.faces, 512, rng))
-    return np.stack(points), np.array([CLASSES.index(item.cls) for item in items])
-
-
 def check_upright(found):
     """Every class along z; the sign wherever the shape tells it, for eight classes at least."""
     for v in found:
@@ -116,7 +102,12 @@ def check_upright(found):
 
 
 def test_the_embedded_catalogue_stands_on_z():
-    points, labels = clouds_of(catalogue_seed=0, count=16)
+    """Surface samples as `domain=modelnet10` makes them."""
+    rng = np.random.default_rng(0)
+    items = Catalogue(seed=0, train=16, test=0).items()
+    meshes = [item.load() for item in items]
+    points = np.stack([surface_sample(m.vertices, m.faces, 512, rng) for m in meshes])
+    labels = np.array([CLASSES.index(item.cls) for item in items])
     check_upright(judge_set(points, labels, CLASSES))
 
 
@@ -132,19 +123,26 @@ def test_the_real_modelnet10_stands_on_z():
     assert all(v.up[1] == "y" for v in turned)
 
 
+THREE = ("chair", "table", "lamp")
+
+
+@pytest.fixture(scope="module")
+def some():
+    """A model of three classes of the catalogue, and other objects of them."""
+    model = UpModel.fit({cls: upright_examples(cls, 20) for cls in THREE})
+    return model, {cls: upright_examples(cls, 6, seed=11) for cls in THREE}
+
+
 @pytest.mark.parametrize("up", range(6))
-def test_each_direction_is_found(up):
+def test_each_direction_is_found(some, up):
     """Turned clouds of the catalogue: the verdict turns with them."""
-    model = catalogue_model()
+    model, clouds = some
     axis, sign = "xyz".index(UPS[up][1]), 1 if UPS[up][0] == "+" else -1
     matrix = np.zeros((3, 3))
     matrix[axis, 2] = sign
     matrix[(axis + 1) % 3, 0] = 1
     matrix[(axis + 2) % 3, 1] = sign
     assert np.linalg.det(matrix) == pytest.approx(1)
-    for cls in ("chair", "table", "lamp"):
-        clouds = upright_examples(cls, 6, seed=11) @ matrix.T
-        verdict = model.judge(clouds, cls)
-        assert verdict.up == UPS[up]
-        assert verdict.axis_sure
-        assert verdict.sign_sure
+    for cls in THREE:
+        verdict = model.judge(clouds[cls] @ matrix.T, cls)
+        assert (verdict.up, verdict.axis_sure, verdict.sign_sure) == (UPS[up], True, True)

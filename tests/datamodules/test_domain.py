@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra.utils import instantiate
 from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
@@ -168,7 +167,8 @@ def test_a_resumed_training_goes_on_with_the_epochs_of_an_uninterrupted_one(data
 def test_clouds_are_augmented_while_training_and_then_alone(data_dir, tmp_path):
     turn = Augment(jitter_sigma=0.0)
     settings: dict[str, Any] = {"points": 32, "batch_size": 8, "fps_starts": 1}
-    plain, turned, again, own = Mine(), Mine(), Mine(), {}
+    plain, turned, again = Mine(), Mine(), Mine()
+    own: dict[Any, Any] = {}
     for module, augment in ((plain, None), (turned, turn), (again, turn)):
         data = SpeckleNetData(**settings, augment=augment, data_dir=data_dir)
         fitting = trainer_of(tmp_path)
@@ -185,21 +185,6 @@ def test_clouds_are_augmented_while_training_and_then_alone(data_dir, tmp_path):
     assert len({round(turn, 4) for turn in torch.cat(turns).tolist()}) > 100  # of 2 times 58
     for a, b in zip(own[plain], own[turned], strict=True):
         assert torch.equal(a, b)
-
-    shown: list[torch.Tensor] = []
-
-    class Shown(Mine):
-        def judge(self, name: str, batch: dict[str, Any]) -> None:
-            shown.append(batch["points"])
-
-    module, data = Shown(), SpeckleNetData(**settings, augment=turn, data_dir=data_dir)
-    fitting = trainer_of(tmp_path, 1)
-    fitting.fit(module, data)  # with Lightning's two batches before the first epoch
-    for batch in shown:
-        assert any(torch.equal(batch, b["points"]) for b in data.val_dataloader())
-    shown.clear()
-    fitting.test(module, data, verbose=False)
-    assert torch.equal(torch.cat(shown), own[plain][1])
 
 
 def test_a_module_that_only_predicts_takes_a_domain_without_labels(data_dir, trainer):
@@ -240,18 +225,6 @@ def test_training_clouds_are_divided_once(data_dir):
     assert set(other.validation.ids) != set(data.validation.ids)
 
 
-def test_setup_is_harmless_when_it_is_repeated(data_dir):
-    data = made(data_dir)
-    held = (data.whole, data.train, data.validation, data.test)
-    epoch = clouds_of(made(data_dir).train_dataloader())
-    for stage in ("fit", "validate", "test", "predict", None):
-        data.setup(stage)
-    data.prepare_data()
-    assert all(a is b for a, b in zip(held, (data.whole, data.train, data.validation, data.test),
-                                      strict=True))  # fmt: skip
-    assert torch.equal(clouds_of(data.train_dataloader()), epoch)
-
-
 @pytest.mark.parametrize(
     ("stage", "ready"), [("fit", "train val"), ("validate", "train val"), ("test", "test predict")]
 )
@@ -261,6 +234,10 @@ def test_a_stage_loads_what_it_needs(data_dir, stage, ready):
         with pytest.raises(DataError, match=r"specklenet10: .* not loaded; call setup\(\)"):
             getattr(data, f"{name}_dataloader")()
     data.setup(stage)
+    held = (data.whole, data.train, data.validation, data.test)
+    data.setup(stage)  # harmless
+    again = (data.whole, data.train, data.validation, data.test)
+    assert all(a is b for a, b in zip(held, again, strict=True))
     for name in ready.split():
         assert len(list(getattr(data, f"{name}_dataloader")())) > 0
     assert (data.train is None) == ("train" not in ready)
@@ -319,19 +296,16 @@ def test_a_few_clouds_of_each_split_or_class(data_dir, tmp_path):
     few = made(data_dir, clouds_a_split=9, cache_dir=tmp_path)
     assert (len(few.whole.ids), len(few.test.ids)) == (9, 9)
     assert [sum(id_.startswith(cls) for id_ in few.whole.ids) for cls in CLASSES] == [3, 3, 3]
-    assert few.sha256 == made(data_dir, cache_dir=tmp_path / "c").sha256
+    cached, again = (made(data_dir, cache_dir=tmp_path / "c") for _ in range(2))
+    plain = clouds_of(made(data_dir).train_dataloader())
+    assert torch.equal(clouds_of(cached.train_dataloader()), plain)
+    assert torch.equal(clouds_of(again.train_dataloader()), plain)
+    assert few.sha256 == cached.sha256
     assert not list(tmp_path.glob("*.npy"))  # what is cached are whole splits
     assert list((tmp_path / "c").glob("*.npy"))
     first = made(data_dir, clouds_a_class=5)
     assert first.whole.ids == tuple(f"{cls}/train/{i:03d}" for cls in CLASSES for i in range(5))
     assert len(first.test.ids) == 24
-
-
-def test_cached_points_are_the_same_points(data_dir, tmp_path):
-    plain = clouds_of(made(data_dir).train_dataloader())
-    for _ in range(2):
-        cached = made(data_dir, cache_dir=tmp_path)
-        assert torch.equal(clouds_of(cached.train_dataloader()), plain)
 
 
 # --- names, configs, errors --------------------------------------------------------------------
@@ -351,24 +325,6 @@ def test_each_has_its_domain_and_says_what_is_missing(kind, name, tmp_path):
     assert data.domain.folder == tmp_path / name
     with pytest.raises(MissingDataError, match=rf"{name}(.|\n)*meta\.yaml"):
         data.prepare_data()
-
-
-def test_hydra_builds_one_by_its_name(data_dir):
-    target = "qs3.datamodules.domain.SpeckleNetData"
-    augment = {"_target_": "qs3.datamodules.augment.Augment", "jitter_sigma": 0.02}
-    words = {"points": 32, "batch_size": 8, "data_dir": str(data_dir), "augment": augment}
-    data = instantiate({"_target_": target, **words})
-    assert isinstance(data, SpeckleNetData)
-    assert data.augment == Augment(jitter_sigma=0.02)
-    data.setup("fit")
-    assert torch.equal(
-        clouds_of(data.train_dataloader()), clouds_of(made(data_dir).train_dataloader())
-    )
-
-
-def test_a_domain_of_ones_own(data_dir):
-    own = Domain("mine", "M", "Mine", data_dir / "kinectsim10", simulated=True)
-    assert len(made(data_dir, domain=own).whole.ids) == 72
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
-import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -85,42 +85,30 @@ def test_other_settings_have_another_file(tmp_path, other):
     assert first.read_bytes() == before
 
 
-def test_other_version_is_not_read(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("what", "now"), [("_VERSION", 3), ("version", lambda name: "0.0")])
+def test_the_cache_of_another_version_or_fpsample_is_redone(tmp_path, monkeypatch, what, now):
     numbers(tmp_path)
-    monkeypatch.setattr(qs3.datamodules.fps_cache, "_VERSION", 3)
+    monkeypatch.setattr(qs3.datamodules.fps_cache, what, now)
     assert numbers(tmp_path)[1]
 
 
-def test_the_cache_of_another_fpsample_is_redone(tmp_path, monkeypatch, caplog):
-    numbers(tmp_path)
-    monkeypatch.setattr(qs3.datamodules.fps_cache, "version", lambda name: "0.0")
-    assert numbers(tmp_path)[1]
-    assert "another version" in caplog.text
+DAMAGES = {
+    "empty": lambda data: b"",
+    "header only": lambda data: data[:100],
+    "truncated": lambda data: data[:-50],
+    "without checksum": lambda data: data[:-32],
+    "one bit": lambda data: data[:200] + bytes([data[200] ^ 1]) + data[201:],
+    "something else": lambda data: b"not an array, but long enough for a checksum" * 3,
+}
 
 
-def damage(kind: str, data: bytes) -> bytes:
-    middle = len(data) // 2
-    return {
-        "empty": b"",
-        "header only": data[:100],
-        "truncated": data[:-50],
-        "without checksum": data[:-32],
-        "one bit": data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :],
-        "something else": b"no array at all, but long enough to hold a checksum" * 3,
-    }[kind]
-
-
-@pytest.mark.parametrize(
-    "kind",
-    ["empty", "header only", "truncated", "without checksum", "one bit", "something else"],
-)
-def test_damaged_cache_is_redone(tmp_path, caplog, kind):
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_damaged_cache_is_redone(tmp_path, caplog, damage):
     first, _ = numbers(tmp_path)
     file = cached(tmp_path)
-    sound = file.read_bytes()
-    expected = np.array(first)
+    sound, expected = file.read_bytes(), np.array(first)
     file.unlink()  # as writers do: the old map stays what it was
-    file.write_bytes(damage(kind, sound))
+    file.write_bytes(damage(sound))
     order, sampled = numbers(tmp_path)
     assert sampled
     assert np.array_equal(order, expected)
@@ -178,28 +166,22 @@ def test_interrupted_and_done_again(tmp_path, monkeypatch):
     assert np.array_equal(order, sample(CLOUDS, 10, 2))
 
 
-_RUN = """
-import sys, pathlib, numpy as np, qs3.datamodules.fps_cache as p
-real = p.sample_all
-def said(*args):
-    print("sampled")
-    return real(*args)
-p.sample_all = said
-clouds = np.random.default_rng(0).normal(size=(400, 200, 3)).astype("f4")
-p.prepare(clouds, 100, starts=2, cache_dir=pathlib.Path(sys.argv[1]), key="key")
-"""
+def test_of_two_runs_that_start_together_one_samples(tmp_path, monkeypatch):
+    calls = []
 
+    def slow(*args):
+        calls.append(args)
+        time.sleep(0.3)
+        return sample(*args)
 
-def test_of_two_runs_that_start_together_one_samples(tmp_path):
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", _RUN, str(tmp_path)], stdout=subprocess.PIPE, text=True
-        )
-        for _ in range(2)
-    ]
-    said = "".join(process.communicate()[0] for process in both)
-    assert all(process.returncode == 0 for process in both)
-    assert said.count("sampled") == 1
+    monkeypatch.setattr(qs3.datamodules.fps_cache, "sample_all", slow)
+    with ThreadPoolExecutor(2) as both:
+        runs = [
+            both.submit(prepare, CLOUDS, 10, starts=2, cache_dir=tmp_path, key="key")
+            for _ in range(2)
+        ]
+    assert len(calls) == 1
+    np.testing.assert_array_equal(runs[0].result().order, runs[1].result().order)
 
 
 def test_only_old_leftovers_are_removed(tmp_path):

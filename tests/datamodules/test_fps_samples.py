@@ -31,12 +31,6 @@ def test_each_sample_is_farthest_point_sampling_from_its_start():
             assert np.array_equal(chosen, farthest_point_sampling_np(ball, 10, start))
 
 
-def test_other_starts_are_other_points():
-    order = sample(CLOUDS, 10, 4)
-    sets = {frozenset(chosen.tolist()) for chosen in order[0]}
-    assert len(sets) == 4
-
-
 def test_indices_that_do_not_fit_into_sixteen_bits():
     cloud = np.random.default_rng(1).normal(size=(1, 40_000, 3)).astype(np.float32)
     order = sample(cloud, 300, 1)

@@ -19,16 +19,14 @@ from qs3.utils import files
 from qs3.utils.locks import locked
 
 
-def test_writes_text_bytes_json_npy(tmp_path):
+def test_writes_text_bytes_json(tmp_path):
     files.write_text(tmp_path / "a" / "b.txt", "grüße\n")
     assert (tmp_path / "a" / "b.txt").read_bytes() == "grüße\n".encode()
     files.write_json(tmp_path / "c.json", {"b": 1, "a": [0.5, None]})
     assert (
         tmp_path / "c.json"
     ).read_text() == '{\n  "b": 1,\n  "a": [\n    0.5,\n    null\n  ]\n}\n'
-    files.write_npy(tmp_path / "d.npy", np.arange(6).reshape(2, 3))
-    assert np.load(tmp_path / "d.npy").tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "c.json", "d.npy"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "c.json"]
 
 
 def test_json_refuses_nan_and_keeps_the_old_file(tmp_path):
@@ -94,10 +92,9 @@ def test_sha256(tmp_path):
 def test_leftovers_are_found_by_name_and_nothing_else_is_touched(tmp_path):
     for name in (".a.npy.x1.tmp.npy", ".b.csv.x2.tmp.csv", "a.npy", ".hidden", ".x.lock"):
         (tmp_path / name).write_text("")
-    assert [p.name for p in files.remove_leftovers(tmp_path, of="b.csv")] == [".b.csv.x2.tmp.csv"]
-    assert [p.name for p in files.remove_leftovers(tmp_path)] == [".a.npy.x1.tmp.npy"]
+    files.remove_leftovers(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == [".hidden", ".x.lock", "a.npy"]
-    assert files.remove_leftovers(tmp_path / "absent") == []
+    files.remove_leftovers(tmp_path / "absent")
 
 
 def test_kill_9_leaves_old_or_new(tmp_path):

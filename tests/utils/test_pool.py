@@ -1,4 +1,4 @@
-"""The engines: the same outcomes here and in processes, and processes that die."""
+"""The pool: the same outcomes here and in processes, and processes that die."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import DataError
-from qs3.utils.pool import Processes, engine
+from qs3.utils.pool import Processes
 
 
 class Strange(Exception):
@@ -59,11 +59,11 @@ def squares(n):
 
 @pytest.mark.parametrize("workers", [0, 1, 3])
 def test_any_number_of_workers_gives_the_same(workers):
-    outcomes = engine(workers).run(make, squares(7))
+    outcomes = Processes(workers).run(make, squares(7))
     assert sorted((o.name, o.result, o.died) for o in outcomes) == [
         (f"task {i}", i * i, False) for i in range(7)
     ]
-    assert list(engine(workers).run(make, [])) == []
+    assert list(Processes(workers).run(make, [])) == []
 
 
 def test_a_deadly_task_costs_only_itself_and_an_unlucky_one_nothing(tmp_path):
@@ -93,9 +93,9 @@ def no_worker():
 def test_errors_end_everything_and_stay_what_they_are(workers):
     tasks = [("bad", ("raise", DataError("broken file"))), *squares(3)]
     with pytest.raises(DataError, match="broken file"):
-        list(engine(workers).run(make, tasks))
+        list(Processes(workers).run(make, tasks))
     with pytest.raises(DataError, match="no licence"):
-        list(engine(workers).run(no_worker, squares(3)))
+        list(Processes(workers).run(no_worker, squares(3)))
 
 
 def test_an_error_says_where_it_was_raised():
@@ -185,7 +185,7 @@ def test_processes_end_with_their_parent_while_they_work(tmp_path, how):
     try:
         assert until(lambda: len(children(process.pid)) >= 3)  # two workers, a resource tracker
         workers = children(process.pid)
-        time.sleep(3)  # they are at work
+        time.sleep(1)  # they are at work, or about to be
         process.send_signal(how)
         _, errors = process.communicate(timeout=60)
     finally:

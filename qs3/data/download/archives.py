@@ -47,13 +47,10 @@ class _Member(NamedTuple):
 
 
 def unpack(archive: Path, into: Path) -> list[str]:
-    """Unpack into the new folder `into`.
+    """Unpack a .zip, .tar, .tar.gz, .tar.bz2 or .tar.xz, whatever its name, into a new folder.
 
-    Mac OS's companions (`__MACOSX`, `._name`) are left out.
-
-    Args:
-        archive: .zip, .tar, .tar.gz, .tar.bz2 or .tar.xz, whatever its name.
-        into: must not exist; after an error it holds a part, which the caller deletes.
+    Mac OS's companions (`__MACOSX`, `._name`) are left out. After an error `into` holds a part,
+    which the caller deletes.
 
     Returns:
         The files, relative to `into`, with slashes.
@@ -101,11 +98,7 @@ def unpack(archive: Path, into: Path) -> list[str]:
 
 
 def _safe_path(name: str, where: str) -> PurePosixPath:
-    """A member's path below the folder that is unpacked into.
-
-    Raises:
-        DataError: it could lead out of that folder, on this system or another.
-    """
+    """A member's path; DataError if it could lead out of the folder, on this system or another."""
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or re.search(r"[\x00-\x1f\x7f\\]|^[^/]*:", name):
         raise DataError(f"{where}: the name leads out of the folder, or has odd signs; refused")
@@ -137,14 +130,8 @@ def _tar_members(archive: Path) -> Iterator[_Member]:
 def find_folder(files: Iterable[str], holds: str, named: str = "", at_least: int = 10) -> str:
     """The folder of an unpacked archive that an importer reads: nobody promises how it is nested.
 
-    Args:
-        files: of the archive, relative to its top, with slashes.
-        holds: a regular expression that the files' paths, relative to the folder, match.
-        named: a regular expression for the folder's own name; "" if any will do.
-        at_least: files that must match.
-
-    Returns:
-        The folder, relative to the top ("" is the top itself).
+    For `holds`, `named` and `at_least` see `Part`. `files` and the result are relative to the
+    archive's top, with slashes; "" is the top itself.
 
     Raises:
         DataError: there is none, or there are several.

@@ -15,15 +15,10 @@ _FILE: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("sources.yaml").
 
 @dataclass(frozen=True)
 class Part:
-    """One folder of an archive, and where it goes.
+    """One folder of an archive, and where it goes; sources.yaml explains the keys.
 
-    Attributes:
-        folder: below `<data_dir>/published`.
-        holds: a regular expression that its files' paths, relative to it, match.
-        says: the same for people.
-        at_least: files that must match.
-        domains: that read it, as on the command line.
-        named: a regular expression for its own name in the archive; "" if any will do.
+    `holds` and `named` are regular expressions: for paths of files relative to the folder, of which
+    `at_least` so many must match, and for the folder's own name in the archive ("": any will do).
     """
 
     folder: str
@@ -36,19 +31,9 @@ class Part:
 
 @dataclass(frozen=True)
 class Source:
-    """One archive that somebody publishes.
+    """One archive that somebody publishes; sources.yaml explains the keys.
 
-    Attributes:
-        name: as on the command line.
-        title: in a sentence.
-        terms: of use.
-        parts: what is taken from it.
-        address: of the file; of one on Google Drive, of its page for people.
-        drive: its id on Google Drive, or "".
-        agreement: what must be given as accept_terms= first, or "".
-        size: in bytes where it is known, else None.
-        sha256: of the file where it is known, else None.
-        size_says: for people.
+    `address` is that of the file, or, if it is on Google Drive with the id `drive`, of its page.
     """
 
     name: str
@@ -97,14 +82,8 @@ AGREEMENTS: dict[str, str] = _FILE["agreements"]
 
 
 def find(name: str) -> Source:
-    """The source of this name.
-
-    Raises:
-        ConfigError: there is none; lists them.
-    """
+    """The source of this name; ConfigError, with a list, if there is none."""
     known = {source.name: source for source in SOURCES}
     if name in known:
         return known[name]
-    raise ConfigError(
-        f"{name!r} is nothing that can be downloaded; known are {', '.join([*known, *BY_HAND])}"
-    )
+    raise ConfigError(f"{name!r} cannot be downloaded; known are {', '.join([*known, *BY_HAND])}")

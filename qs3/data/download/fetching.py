@@ -49,8 +49,8 @@ def fetch(
     Args:
         url: of the file (http, https), or of its page for people where `drive` is given.
         path: where it shall lie.
-        sha256: hex digits, if they are known; a file that has others is fetched again.
-        size: bytes, if they are known.
+        sha256: hex digits, if known; a file that has others is fetched again.
+        size: in bytes, if known.
         drive: its id on Google Drive.
 
     Raises:
@@ -101,9 +101,8 @@ class Resuming:
             except _DROPPED as error:
                 failures = 1 if self._done() > before else failures + 1
                 if failures >= self.tries:
-                    raise DownloadError(
-                        f"{url}: {error}, {failures} times in a row", url
-                    ) from error
+                    what = f"{url}: {error}, {failures} times in a row"
+                    raise DownloadError(what, url) from error
                 wait_s = min(self.wait_s * 2 ** (failures - 1), 60.0)
                 log.warning("%s: %s; next try in %.0f s", url, error, wait_s)
                 time.sleep(wait_s)
@@ -126,9 +125,8 @@ class Resuming:
             start, total = _extent(answer)
             if done and answer.status_code == 416 and total == done:
                 return  # nothing is missing
-            says = {"url": url, "size": total}
-            says |= {"etag": answer.headers.get("ETag")}
-            says |= {"modified": answer.headers.get("Last-Modified")}
+            etag, modified = map(answer.headers.get, ("ETag", "Last-Modified"))
+            says = {"url": url, "size": total, "etag": etag, "modified": modified}
             other = start != done or (done and says != note)
             if other and answer.status_code in (206, 416):
                 self.note.unlink(missing_ok=True)
@@ -156,14 +154,8 @@ class Resuming:
             raise DownloadError(f"{url}: {wrong}", url)
 
     def _write(self, answer: requests.Response, start: int, total: int | None) -> None:
-        bar = tqdm(
-            desc=self.part.stem,
-            total=total,
-            initial=start,
-            unit="B",
-            unit_scale=True,
-            disable=None,  # where there is no terminal
-        )
+        shown: dict[str, Any] = {"unit": "B", "unit_scale": True, "disable": None}  # no terminal
+        bar = tqdm(desc=self.part.stem, total=total, initial=start, **shown)
         with bar, open(self.part, "r+b" if start else "wb") as file:
             file.seek(start)
             for chunk in answer.iter_content(_CHUNK):
@@ -181,13 +173,10 @@ class Resuming:
         """What the server said of the part; {} if that is not known."""
         try:
             note = json.loads(self.note.read_bytes())
-            return (
-                note
-                if note.keys() == {"url", "size", "etag", "modified"} and note["url"] == url
-                else {}
-            )
+            whole = note.keys() == {"url", "size", "etag", "modified"}
         except (OSError, ValueError, AttributeError):
             return {}
+        return note if whole and note["url"] == url else {}
 
 
 def _extent(answer: requests.Response) -> tuple[int, int | None]:

@@ -43,15 +43,14 @@ def provide(
     Args:
         source: of the catalogue.
         into: the data folder, `paths.data_dir` of a run.
-        accept_terms: the agreement that the person has made, e.g. "scannet"; "" for none.
+        accept_terms: the agreement that the person has made, e.g. "scannet".
         mirror: base address of a copy of the archives; each lies there as `Source.file`.
         archive: an archive that is here already, e.g. downloaded with a browser.
         root: folder in the archive to take, where it cannot be found out.
         keep: keep the archive after unpacking; it is then not fetched again when a folder is lost.
 
     Returns:
-        The folders, in the order of `source.parts`; those that somebody else had put there before
-        are among them, untouched.
+        The folders, in the order of `source.parts`, also those that somebody else had put there.
 
     Raises:
         AgreementError: `source.agreement` was not accepted.
@@ -107,7 +106,7 @@ def _is_in_place(place: Path, source: Source) -> bool:
 def _place(
     source: Source, missing: dict[Part, Path], archive: Path, root: str, published: Path
 ) -> None:
-    """Unpack into a folder beside the final ones, find the parts, and rename them into place."""
+    """Unpack into a folder next to the final ones, find the parts, and rename them into place."""
     building = published / f".{source.name}.unpacking"
     shutil.rmtree(building, ignore_errors=True)  # what a killed run left
     sha256 = sha256_file(archive)

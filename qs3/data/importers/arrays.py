@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.data.importers.base import Importer, Item, class_of, split_of
-from qs3.data.manifest import SPLITS, ManifestRow
+from qs3.data.importers.base import Importer, Item, by_class, class_of, cloud_id, split_of
+from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
 
 _KEYS = ("points", "cls", "split", "name")
@@ -49,19 +49,13 @@ class NamedArrays(Importer):
             where = f"{self.path}, cloud {i} ({name})"
             cls = class_of(str(arrays["cls"][i]), classes, where)
             split = split_of(str(arrays["split"][i]), where)
-            row = ManifestRow(f"{cls}/{split}/{name}", cls, split, origin=f"{self.file}[{i}]")
+            row = ManifestRow(cloud_id(cls, split, name), cls, split, origin=f"{self.file}[{i}]")
             found.append(Item(row, where, functools.partial(arrays["points"].__getitem__, i)))
-        return sorted(
-            found, key=lambda f: (SPLITS.index(f.row.split), classes.index(f.row.cls), f.row.id)
-        )
+        return by_class(found, classes)
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The four arrays, with shapes and kinds checked.
-
-    Raises:
-        DataError: damaged, pickled, an array missing, too large, or of another shape.
-    """
+    """The four arrays; DataError if damaged, pickled, too large, missing or of another shape."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(info.file_size for info in archive.infolist())
@@ -71,12 +65,10 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
             if missing := [key for key in _KEYS if key not in file.files]:
                 raise DataError(f"{path} has no arrays {missing}; it has {file.files}")
             arrays = {key: file[key] for key in _KEYS}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # BadZipFile, zlib.error, pickled content, unknown compression ...
         raise DataError(f"{path}: not a readable .npz of plain arrays ({error})") from error
-    except Exception as error:  # zlib.error, NotImplementedError (unknown compression), ...
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path}: damaged ({error})") from error
     points = arrays["points"]
     if points.ndim != 3 or points.shape[2] != 3 or points.dtype.kind != "f":
         raise DataError(f"{path}: points is {points.dtype} {points.shape}, not floats [N, P, 3]")

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 import logging
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -15,22 +16,34 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from qs3.classes import ALIASES, known_as
-from qs3.data.manifest import ManifestRow
+from qs3.config.checks import check_choice, check_int
+from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.utils.locks import locked
 from qs3.utils.progress import shown
 
 log = logging.getLogger(__name__)
 
+_UP = {
+    "z": ((0, 1, 2), (1, 1, 1)),
+    "-z": ((0, 1, 2), (1, -1, -1)),
+    "y": ((0, 2, 1), (1, -1, 1)),
+    "-y": ((0, 2, 1), (1, 1, -1)),
+    "x": ((2, 1, 0), (-1, 1, 1)),
+    "-x": ((2, 1, 0), (1, 1, -1)),
+}
+"""Axis that points up -> which columns with which signs give x y z with z up: rotations by 90°."""
+
+UP_AXES: tuple[str, ...] = tuple(_UP)
+"""What `up` may be."""
+
 
 class Item(NamedTuple):
-    """One published cloud before it is read.
+    """One published cloud before it is read: its row, as far as it is known.
 
-    Attributes:
-        row: its manifest row, as far as it is known.
-        where: how a message names it: the file, or file and number.
-        load: gives the raw [n, 3] array; raises DataError if it is damaged.
+    `where` names it in messages (file, or file and number); `load` gives the raw [n, 3] array or
+    raises DataError.
     """
 
     row: ManifestRow
@@ -59,10 +72,8 @@ class Importer(abc.ABC):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
-        if self.points < 1:
-            raise ConfigError(f"points of {type(self).__name__} is {self.points}, must be >= 1")
-        if self.on_error not in ("stop", "skip"):
-            raise ConfigError(f"on_error is {self.on_error!r}, expected 'stop' or 'skip'")
+        check_int("published.points", self.points, 1)
+        check_choice("published.on_error", self.on_error, ("stop", "skip"))
 
     @property
     def root(self) -> Path:
@@ -102,16 +113,11 @@ class Importer(abc.ABC):
         return cloud
 
     def read(self, classes: Sequence[str]) -> tuple[list[np.ndarray], list[ManifestRow]]:
-        """Read everything.
-
-        Args:
-            classes: the names in label order; each must occur in each split that there is.
-
-        Returns:
-            [P, 3] float32 clouds with z up, and their rows (plus rows of what was skipped).
+        """Read everything: [P, 3] float32 clouds with z up, and their rows and those skipped.
 
         Raises:
-            DataError: names the file, the line or item, and what is wrong.
+            DataError: names the file, the line or item, and what is wrong; or one of the classes
+                does not occur in a split, if the dataset is `complete`.
         """
         clouds, rows = [], []
         for row, where, load in shown(self.items(classes), f"importing {self.root.name}"):
@@ -136,11 +142,7 @@ class Importer(abc.ABC):
         return {"format": type(self).__name__, **values}
 
     def changes(self, origins: Collection[str]) -> str:
-        """What is different from an import, in words, if its `settings` had another "files".
-
-        Args:
-            origins: of the imported manifest.
-        """
+        """How the files differ from an import of other "files"; `origins` of its manifest."""
         return f"the files in {self.root}"
 
 
@@ -148,7 +150,7 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
     """Read the published files and put the finished store at `folder`, all or nothing.
 
     Several processes may ask at once (a sweep): one imports, the others wait and find it done.
-    The store is built beside `folder` and renamed, so a kill leaves nothing at `folder`.
+    The store is built next to `folder` and renamed, so a kill leaves nothing at `folder`.
 
     Raises:
         DataError: damaged files, or `folder` holds something else.
@@ -185,12 +187,44 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
         os.rename(building, folder)
 
 
-def class_of(name: str, classes: Sequence[str], where: str) -> str:
-    """The class that a published name means, whatever its case; see `qs3.classes.ALIASES`.
+def cloud_id(cls: str, split: str, name: str) -> str:
+    """An id: class, split and name, as far as they are known."""
+    return "/".join(part for part in (cls, split, name) if part)
+
+
+def file_item(
+    path: Path, root: Path, cls: str, split: str, load: Callable[[Path], np.ndarray], name: str = ""
+) -> Item:
+    """The one cloud of a file below `root`; its name is that of the file unless given."""
+    id_ = cloud_id(cls, split, name or path.stem)
+    row = ManifestRow(id_, cls, split, origin=path.relative_to(root).as_posix())
+    return Item(row, str(path), functools.partial(load, path))
+
+
+def unique(items: Iterable[Item]) -> list[Item]:
+    """The items themselves, if their ids differ by more than case: not all systems tell it.
 
     Raises:
-        DataError: none of the classes.
+        DataError: names two files of one id.
     """
+    found: dict[str, Item] = {}
+    for item in items:
+        other = found.setdefault(item.row.id.casefold(), item)
+        if other is not item:
+            raise DataError(f"{item.where} and {other.where} have one name; rename one")
+    return list(found.values())
+
+
+def by_class(items: Iterable[Item], classes: Sequence[str]) -> list[Item]:
+    """Sorted by split, class (none before all) and id."""
+    label = {name: i for i, name in enumerate(classes)}
+    return sorted(
+        items, key=lambda i: (SPLITS.index(i.row.split), label.get(i.row.cls, -1), i.row.id)
+    )
+
+
+def class_of(name: str, classes: Sequence[str], where: str | Path) -> str:
+    """The class that a name means, in any case (`qs3.classes.ALIASES`); DataError if none."""
     found = known_as(name, classes)
     if found is None:
         raise DataError(
@@ -200,8 +234,8 @@ def class_of(name: str, classes: Sequence[str], where: str) -> str:
     return found
 
 
-def split_of(name: str, where: str) -> str:
-    """The split that a published name means."""
+def split_of(name: str, where: str | Path) -> str:
+    """The split that a published name means; DataError if none."""
     splits = {"train": "train", "test": "test", "validation": "validation", "val": "validation"}
     if name.casefold() not in splits:
         raise DataError(f"{where}: unknown split {name!r}; known are {', '.join(splits)}")
@@ -209,11 +243,7 @@ def split_of(name: str, where: str) -> str:
 
 
 def inside(path: Path, root: Path) -> Path:
-    """The path itself, unless it is a link that leads out of `root` (an unpacked archive's trick).
-
-    Raises:
-        DataError: it is.
-    """
+    """The path itself; DataError if it is a link out of `root` (an unpacked archive's trick)."""
     if path.is_symlink() and not path.resolve().is_relative_to(root.resolve()):
         raise DataError(f"{path} is a link that leads out of {root}; copy the files instead")
     return path
@@ -238,6 +268,16 @@ def visible(folder: Path, root: Path) -> list[Path]:
     return [inside(folder / name, root) for name in clear]
 
 
+def folders_in(folder: Path, root: Path) -> Iterator[Path]:
+    """The visible folders in one, in order; see `visible`."""
+    return (path for path in visible(folder, root) if path.is_dir())
+
+
+def files_in(folder: Path, root: Path, suffix: str) -> Iterator[Path]:
+    """The visible files with this extension, in any case; see `visible`."""
+    return (p for p in visible(folder, root) if p.suffix.lower() == suffix and p.is_file())
+
+
 def check_cloud(cloud: np.ndarray, points: int, where: str) -> np.ndarray:
     """[P, 3] float32 from [n, 3] with 1 <= n <= P, filled up by repeating from the first point.
 
@@ -259,9 +299,10 @@ def check_cloud(cloud: np.ndarray, points: int, where: str) -> np.ndarray:
     return cloud if len(cloud) == points else cloud[np.arange(points) % len(cloud)]
 
 
-def y_up_to_z_up(cloud: np.ndarray) -> np.ndarray:
-    """(x, y, z) -> (x, -z, y): a rotation by 90 degrees about x. [..., 3] to [..., 3]."""
-    return np.stack([cloud[..., 0], -cloud[..., 2], cloud[..., 1]], axis=-1)
+def turned(cloud: np.ndarray, up: str) -> np.ndarray:
+    """[..., 3] of which the axis `up` of `UP_AXES` points up, turned by 90 degrees to z up."""
+    columns, signs = _UP[up]
+    return cloud[..., columns] * np.array(signs, dtype=cloud.dtype)
 
 
 def _check_complete(

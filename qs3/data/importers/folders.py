@@ -11,12 +11,14 @@ name_0000, name_0001, ... If it has labels, numbers count the classes from 0 and
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import logging
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -31,12 +33,22 @@ from qs3.clouds.files import (
     measured,
     npy_clouds,
     parse_clouds,
-    read_clouds,
     split_prefix,
 )
 from qs3.config.checks import check_choice, check_int
-from qs3.data.importers.base import Importer, Item, class_of, split_of, visible
-from qs3.data.manifest import SPLITS, ManifestRow
+from qs3.data.importers.base import (
+    UP_AXES,
+    Importer,
+    Item,
+    by_class,
+    class_of,
+    cloud_id,
+    split_of,
+    turned,
+    unique,
+    visible,
+)
+from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError, DataError
 
 log = logging.getLogger(__name__)
@@ -46,18 +58,6 @@ _SPLIT_NAMES = ("train", "test", "val", "validation")
 _MANY = (".npy", ".npz", ".h5", ".hdf5")
 _ENDS = tuple(suffix.encode() for suffix in SUFFIXES)
 _NUMBER = re.compile(r"\[\d+\]$")  # of the cloud in its file, at the end of an origin
-_UP = {
-    "z": ((0, 1, 2), (1, 1, 1)),
-    "-z": ((0, 1, 2), (1, -1, -1)),
-    "y": ((0, 2, 1), (1, -1, 1)),
-    "-y": ((0, 2, 1), (1, 1, -1)),
-    "x": ((2, 1, 0), (-1, 1, 1)),
-    "-x": ((2, 1, 0), (1, 1, -1)),
-}
-"""Axis that points up -> which columns with which signs give x y z with z up: rotations by 90°."""
-
-UP_AXES: tuple[str, ...] = tuple(_UP)
-"""What `up` may be."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class CloudFolder(Importer):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("published.layout", self.layout, LAYOUTS)
-        check_choice("published.up", self.up, tuple(_UP))
+        check_choice("published.up", self.up, UP_AXES)
         check_int("published.test_every", self.test_every, 0)
         if self.test_every == 1:
             raise ConfigError("published.test_every=1 leaves nothing for training; 0 tests nothing")
@@ -108,27 +108,18 @@ class CloudFolder(Importer):
         """
         layout = self._layout(classes)
         log.info("%s is read in the layout %s", self.root, layout)
-        rows: dict[str, Item] = {}
         last = _LastFile()
+        found: list[Item] = []
         for path in _files(self.root, self.root):
             cls, split = self._place(path, layout, classes)
             stem = path.stem
             if not cls and layout == "none":  # any depth; elsewhere the folders are class or split
                 stem = path.relative_to(self.root).with_suffix("").as_posix()
-            for item in self._of_file(path, cls, split, stem, classes, last):
-                name = item.row.id.casefold()  # other systems do not tell a.xyz from A.XYZ
-                if name in rows:
-                    raise DataError(
-                        f"{item.where} and {rows[name].where} have one name; rename one"
-                    )
-                rows[name] = item
+            found += self._of_file(path, cls, split, stem, classes, last)
+        found = unique(found)
         if self.test_every and layout == "class":
-            rows = _with_tests(rows, self.test_every)
-        order = {name: i for i, name in enumerate(classes)}
-        return sorted(
-            rows.values(),
-            key=lambda f: (SPLITS.index(f.row.split), order.get(f.row.cls, -1), f.row.id),
-        )
+            found = _with_tests(found, self.test_every)
+        return by_class(found, classes)
 
     def settings(self) -> dict[str, Any]:
         """See `Importer`; with a digest of the files' names, sizes and times of change."""
@@ -138,12 +129,12 @@ class CloudFolder(Importer):
         """See `Importer`: which files are new, gone, or neither and so changed."""
         had = {_NUMBER.sub("", origin) for origin in origins}
         have = {os.fsdecode(name) for name, _, _ in _stats(self.root)}
-        told = [
+        parts = [
             f"{len(names)} {what} ({', '.join(sorted(names)[:3])}{', ...' * (len(names) > 3)})"
             for names, what in ((have - had, "added"), (had - have, "removed"))
             if names
         ]
-        return f"the files in {self.root}: {', '.join(told) or 'some have changed'}"
+        return f"the files in {self.root}: {', '.join(parts) or 'some have changed'}"
 
     def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
         """See `Importer`: at most P points, the farthest."""
@@ -155,15 +146,10 @@ class CloudFolder(Importer):
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        columns, signs = _UP[self.up]
-        return cloud[:, columns] * np.array(signs, dtype=cloud.dtype)
+        return turned(cloud, self.up)
 
     def _layout(self, classes: Sequence[str]) -> str:
-        """The layout in the names of the folders.
-
-        Raises:
-            DataError: they fit none.
-        """
+        """The layout in the names of the folders; DataError if they fit none."""
         if self.layout != "auto":
             return self.layout
         folders = [e for e in visible(self.root, self.root) if e.is_dir()]
@@ -196,37 +182,30 @@ class CloudFolder(Importer):
         cls, split = "", "train"
         for kind, name in zip(wanted, parts, strict=True):
             if kind == "class":
-                cls = class_of(name, classes, str(path))
+                cls = class_of(name, classes, path)
             else:
-                split = split_of(name, str(path))
+                split = split_of(name, path)
         return cls, split
 
     def _of_file(
-        self,
-        path: Path,
-        cls: str,
-        split: str,
-        stem: str,
-        classes: Sequence[str],
-        last: _LastFile,
+        self, path: Path, cls: str, split: str, stem: str, classes: Sequence[str], last: _LastFile
     ) -> list[Item]:
         """The clouds of a file; of those that may hold several only number and labels are kept."""
         origin = path.relative_to(self.root).as_posix()
-        row = ManifestRow(_id(cls, split, stem), cls, split, origin=origin)
-        if path.suffix.lower() not in _MANY:
-            return [Item(row, str(path), functools.partial(_only, path))]
-        labels: tuple[Any, ...] | None = None
+        number, many, labels = 1, False, None
+        numbered = path.suffix.lower() in _MANY
         try:
             if path.suffix.lower() == ".npy":
                 count = npy_clouds(path)
                 number, many = count or 1, count is not None
-            else:
+            elif numbered:
                 file = last.read(path)
                 number, many, labels = len(file.clouds), file.many, file.labels
         except DataError as error:
+            row = ManifestRow(cloud_id(cls, split, stem), cls, split, origin=origin)
             return [Item(row, str(path), functools.partial(_raise, error))]
         if not cls and (prefix := split_prefix(path.stem)) and many:
-            split = split_of(prefix, str(path))
+            split = split_of(prefix, path)
         found = []
         for i in range(number):
             where = f"{path}, cloud {i}" if many else str(path)
@@ -236,15 +215,15 @@ class CloudFolder(Importer):
                 own = cls or _label(labels, i, classes, where)
             except DataError as error:
                 load = functools.partial(_raise, error)
-            name = path.stem if own else stem
-            name = f"{name}_{i:04d}" if many else name
-            row = ManifestRow(_id(own, split, name), own, split, origin=f"{origin}[{i}]")
+            name = (path.stem if own else stem) + (f"_{i:04d}" if many else "")
+            place = f"{origin}[{i}]" if numbered else origin
+            row = ManifestRow(cloud_id(own, split, name), own, split, origin=place)
             found.append(Item(row, where, load))
         return found
 
 
 class _LastFile:
-    """The one file of several clouds that is in memory at a time."""
+    """The one file that is in memory at a time."""
 
     def __init__(self) -> None:
         self._path: Path | None = None
@@ -264,31 +243,23 @@ class _LastFile:
         if len(clouds) != of:
             raise DataError(f"{path} has {len(clouds)} clouds, a moment ago it had {of}")
         cloud, dropped = measured(clouds[number], where)
-        _tell(where, dropped)
+        if dropped:
+            log.info("%s: %d points that are NaN or infinite left out", where, dropped)
         return checked(cloud, where)
 
 
-def _with_tests(rows: dict[str, Item], every: int) -> dict[str, Item]:
-    """The last of every `every` of a class, in the order of names, goes to test."""
-    by_class: dict[str, list[Item]] = {}
-    for item in rows.values():
-        by_class.setdefault(item.row.cls, []).append(item)
-    result: dict[str, Item] = {}
-    for cls, items in by_class.items():
-        for number, item in enumerate(sorted(items, key=lambda i: i.row.id)):
-            if number % every == every - 1:
-                name = item.row.id.removeprefix(f"{cls}/train/")
-                item = item._replace(row=_moved(item.row, name))
-            result[item.row.id] = item
+def _with_tests(items: Iterable[Item], every: int) -> list[Item]:
+    """The last of every `every` of a class, in the order of ids, goes to test."""
+    seen: Counter[str] = Counter()
+    result = []
+    for item in sorted(items, key=lambda item: item.row.id):
+        row = item.row
+        seen[row.cls] += 1
+        if seen[row.cls] % every == 0:
+            id_ = cloud_id(row.cls, "test", row.id.removeprefix(f"{row.cls}/train/"))
+            item = item._replace(row=dataclasses.replace(row, id=id_, split="test"))
+        result.append(item)
     return result
-
-
-def _moved(row: ManifestRow, name: str) -> ManifestRow:
-    return ManifestRow(_id(row.cls, "test", name), row.cls, "test", origin=row.origin)
-
-
-def _id(cls: str, split: str, stem: str) -> str:
-    return "/".join(part for part in (cls, split, stem) if part)
 
 
 def _label(labels: tuple[Any, ...] | None, number: int, classes: Sequence[str], where: str) -> str:
@@ -344,17 +315,6 @@ def _digest(root: Path) -> str:
     """SHA-256 of `_stats`; of nothing if the folder is not there. About 5 us a file."""
     stats = sorted(_stats(root)) if root.is_dir() else []
     return hashlib.sha256(b"".join(b"%b\0%d\0%d\n" % row for row in stats)).hexdigest()
-
-
-def _only(path: Path) -> np.ndarray:
-    file = read_clouds(path)
-    _tell(str(path), file.dropped)
-    return file.clouds[0]
-
-
-def _tell(where: str, dropped: int) -> None:
-    if dropped:
-        log.info("%s: %d points that are NaN or infinite left out", where, dropped)
 
 
 def _raise(error: DataError) -> np.ndarray:

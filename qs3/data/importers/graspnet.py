@@ -9,17 +9,16 @@ split is one scene an object, so its frames are highly correlated.
 
 from __future__ import annotations
 
-import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.clouds.files import parse_cloud
-from qs3.data.importers.base import Importer, Item, visible
-from qs3.data.manifest import ManifestRow
+from qs3.config.checks import check_choice
+from qs3.data.importers.base import Importer, Item, by_class, file_item, files_in, folders_in
 from qs3.errors import ConfigError, DataError
 
-_REALITIES = ("Real", "Synthetic")
 _SENSORS = ("kinect", "realsense")
 
 
@@ -39,8 +38,7 @@ class GraspNetPC(Importer):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "sensors", list(self.sensors))
-        if self.reality not in _REALITIES:
-            raise ConfigError(f"reality is {self.reality!r}, expected one of {_REALITIES}")
+        check_choice("published.reality", self.reality, ("Real", "Synthetic"))
         if not self.sensors or set(self.sensors) - set(_SENSORS):
             raise ConfigError(f"sensors are {self.sensors}, expected some of {_SENSORS}")
 
@@ -60,24 +58,19 @@ class GraspNetPC(Importer):
             DataError: a folder that is not a class, or a link that leads out of the folder.
         """
         found = []
-        for split in ("train", "test"):
-            of_split = []
-            for sensor in self.sensors:
-                folder = self._folder(split, sensor)
-                if not folder.is_dir():
-                    continue  # the synthetic domain has no test split
-                for class_folder in (e for e in visible(folder, self.root) if e.is_dir()):
-                    if class_folder.name not in classes:
-                        raise DataError(
-                            f"{class_folder}: unknown class; known are {', '.join(classes)}"
-                        )
-                    of_split += [
-                        self._item(path, class_folder.name, split, sensor)
-                        for path in visible(class_folder, self.root)
-                        if path.suffix.lower() == ".xyz" and path.is_file()
-                    ]
-            found += sorted(of_split, key=lambda item: (classes.index(item.row.cls), item.row.id))
-        return found
+        for split, sensor in itertools.product(("train", "test"), self.sensors):
+            folder = self._folder(split, sensor)
+            if not folder.is_dir():
+                continue  # the synthetic domain has no test split
+            for class_folder in folders_in(folder, self.root):
+                if (cls := class_folder.name) not in classes:
+                    raise DataError(
+                        f"{class_folder}: unknown class; known are {', '.join(classes)}"
+                    )
+                for path in files_in(class_folder, self.root, ".xyz"):
+                    name = f"{sensor}_{path.stem}"
+                    found.append(file_item(path, self.root, cls, split, parse_cloud, name))
+        return by_class(found, classes)
 
     def object_of(self, id_: str) -> str:
         """See `Importer`: each class is one object."""
@@ -85,12 +78,3 @@ class GraspNetPC(Importer):
 
     def _folder(self, split: str, sensor: str) -> Path:
         return self.root / split / self.reality / sensor
-
-    def _item(self, path: Path, cls: str, split: str, sensor: str) -> Item:
-        row = ManifestRow(
-            f"{cls}/{split}/{sensor}_{path.stem}",
-            cls,
-            split,
-            origin=path.relative_to(self.root).as_posix(),
-        )
-        return Item(row, str(path), functools.partial(parse_cloud, path))

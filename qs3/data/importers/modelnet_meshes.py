@@ -5,31 +5,36 @@ keeps the same tree in `raw/`. Points are uniform on the area, as PyG's SamplePo
 draw them; every object has its own seed, made from the dataset's seed and the object's id, so the
 order of reading changes nothing. The files stand on z, in the units of their makers.
 
-The files are read by `qs3.meshes`, not by `torch_geometric.io.read_off`. Both give the same
-vertices and triangles for files that are as they should be, joined first lines ("OFF490 518 0")
-included, ours about eight times as fast. But PyG's reader (2.8.1) passes over polygons of more than
-four corners, drops the last face if the file does not end with a line break, and takes truncated
-files, vertices that are not finite and faces with vertices that do not exist, all without a word;
-damage that it does notice is an IndexError or ValueError that names no file. A test holds all this.
+The files are read by `qs3.meshes`, not by `torch_geometric.io.read_off`. Both read the same from
+files that are as they should be. But PyG's reader (2.8.1) passes over polygons of more than four
+corners and takes truncated files, vertices that are not finite and faces with vertices that do not
+exist, all without a word; a test shows it.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from qs3.classes import ALIASES
-from qs3.data.importers.base import Importer, Item, split_of, visible
-from qs3.data.manifest import SPLITS, ManifestRow
-from qs3.errors import ConfigError, DataError, MeshError
+from qs3.config.checks import check_int
+from qs3.data.importers.base import (
+    Importer,
+    Item,
+    by_class,
+    cloud_id,
+    file_item,
+    folders_in,
+    unique,
+)
+from qs3.data.importers.trees import list_tree
+from qs3.errors import DataError, MeshError
 from qs3.utils.seeding import derive
-
-log = logging.getLogger(__name__)
 
 _WHERE = ("", "raw", "ModelNet40", "ModelNet10")  # below the folder, the tree may lie here
 
@@ -46,8 +51,7 @@ class ModelNetMeshes(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.seed < 0:
-            raise ConfigError(f"seed of {type(self).__name__} is {self.seed}, must be >= 0")
+        check_int("published.seed", self.seed, 0)
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""
@@ -64,47 +68,24 @@ class ModelNetMeshes(Importer):
         """See `Importer`. By split, in it by class, in it by name.
 
         Raises:
-            DataError: two folders of one class, two files of one name, an unknown split, or a
-                link that leads out of the folder.
+            DataError: no tree, or as `list_tree`; or two files of one name.
         """
         tree = self._tree()
         if tree is None:
             raise DataError(f"{self.root} holds no folders <class>/{{train,test}}")
-        found: dict[str, Item] = {}
-        folders: dict[str, Path] = {}
-        other = []
-        for folder in _folders(tree, tree):
-            cls = wanted_class(folder.name, classes)
-            if cls is None:
-                other.append(folder.name)
-                continue
-            if cls in folders:
-                raise DataError(f"{folder} and {folders[cls]} are the same class")
-            folders[cls] = folder
-            for split_folder in _folders(folder, tree):
-                split = split_of(split_folder.name, str(folder))
-                for path in _off_files(split_folder, tree):
-                    item = self._item(path, tree, cls, split)
-                    if item.row.id in found:
-                        raise DataError(f"{path} and {found[item.row.id].where} have one name")
-                    found[item.row.id] = item
-        if other:
-            log.info("%s: %d folders of other classes are left alone", tree, len(other))
-        return sorted(
-            found.values(),
-            key=lambda f: (SPLITS.index(f.row.split), classes.index(f.row.cls), f.row.id),
-        )
+        found = list_tree(tree, ".off", functools.partial(wanted_class, classes=classes))
+        return by_class(unique(self._item(*one, tree) for one in found), classes)
 
-    def _item(self, path: Path, tree: Path, cls: str, split: str) -> Item:
-        name = f"{cls}/{split}/{path.stem}"
-        seed = derive(self.seed, "modelnet surface", name)
-        row = ManifestRow(name, cls, split, seed=seed, origin=str(path.relative_to(tree)))
-        return Item(row, str(path), functools.partial(sample_file, path, self.points, seed))
+    def _item(self, path: Path, cls: str, split: str, tree: Path) -> Item:
+        seed = derive(self.seed, "modelnet surface", cloud_id(cls, split, path.stem))
+        load = functools.partial(sample_file, points=self.points, seed=seed)
+        item = file_item(path, tree, cls, split, load)
+        return item._replace(row=dataclasses.replace(item.row, seed=seed))
 
     def _tree(self) -> Path | None:
         for below in _WHERE:
             tree = self.root / below
-            if tree.is_dir() and any((f / "train").is_dir() for f in _folders(tree, self.root)):
+            if tree.is_dir() and any((f / "train").is_dir() for f in folders_in(tree, self.root)):
                 return tree
         return None
 
@@ -134,11 +115,3 @@ def wanted_class(folder: str, classes: Sequence[str]) -> str | None:
     """
     name = folder.casefold()
     return next((c for c in (name, ALIASES.get(name)) if c in classes), None)
-
-
-def _folders(folder: Path, root: Path) -> Iterator[Path]:
-    return (path for path in visible(folder, root) if path.is_dir())
-
-
-def _off_files(folder: Path, root: Path) -> Iterator[Path]:
-    return (path for path in visible(folder, root) if path.suffix.lower() == ".off")

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.clouds.files import own_dataset
-from qs3.data.importers.base import Importer, Item, inside, y_up_to_z_up
+from qs3.data.importers.base import Importer, Item, cloud_id, inside, turned
 from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
 
@@ -46,23 +46,15 @@ class PointDAH5(Importer):
 
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`; reads the files, about 50 MB each."""
-        found = []
-        for split, _, path in self._files():
-            data, labels = read_h5(inside(path, self.root), len(classes))
-            for number, (cloud, label) in enumerate(zip(data, labels, strict=True)):
-                cls = classes[label]
-                row = ManifestRow(
-                    id=f"{cls}/{split}/{path.stem}_{number:04d}",
-                    cls=cls,
-                    split=split,
-                    origin=f"{path.name}[{number}]",
-                )
-                found.append(Item(row, f"{path}, cloud {number}", functools.partial(_same, cloud)))
-        return found
+        return [
+            item
+            for split, _, path in self._files()
+            for item in h5_items(path, self.root, split, classes, digits=4)
+        ]
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        cloud = y_up_to_z_up(cloud)
+        cloud = turned(cloud, "y")
         return cloud * _MIRROR if self.undo_mirror else cloud
 
     def _files(self) -> list[tuple[str, int, Path]]:
@@ -73,6 +65,21 @@ class PointDAH5(Importer):
         return sorted(
             ((m[1], int(m[2]), p) for m, p in found), key=lambda f: (f[0] == "test", f[1])
         )
+
+
+def h5_items(path: Path, root: Path, split: str, names: Sequence[str], digits: int) -> list[Item]:
+    """The clouds of one file below `root`, in its order; `names` of the classes by label.
+
+    Raises:
+        DataError: as `read_h5`; or the file is a link out of `root`.
+    """
+    data, labels = read_h5(inside(path, root), len(names))
+    items = []
+    for number, (cloud, label) in enumerate(zip(data, labels, strict=True)):
+        id_ = cloud_id(names[label], split, f"{path.stem}_{number:0{digits}d}")
+        row = ManifestRow(id_, names[label], split, origin=f"{path.name}[{number}]")
+        items.append(Item(row, f"{path}, cloud {number}", functools.partial(np.asarray, cloud)))
+    return items
 
 
 def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +114,3 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
     if bad := np.flatnonzero((labels < 0) | (labels >= classes)).tolist():
         raise DataError(f"{path}, cloud {bad[0]}: label {labels[bad[0]]} is not 0..{classes - 1}")
     return points, labels
-
-
-def _same(cloud: np.ndarray) -> np.ndarray:
-    return cloud

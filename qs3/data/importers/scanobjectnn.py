@@ -10,7 +10,6 @@ clouds of the others are left out, and how many is logged. bathtub, lamp and pla
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +18,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from qs3.data.importers.base import Importer, Item, inside, y_up_to_z_up
-from qs3.data.importers.pointda_h5 import read_h5
-from qs3.data.manifest import ManifestRow
+from qs3.data.importers.base import Importer, Item, by_class, turned
+from qs3.data.importers.pointda_h5 import h5_items
 
 log = logging.getLogger(__name__)
 
@@ -56,34 +54,17 @@ class ScanObjectNN(Importer):
 
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`; reads the files."""
-        found, other = [], 0
-        for split, path in self._files():
-            data, labels = read_h5(inside(path, self.root), len(NAMES))
-            of_split = []
-            for number, (cloud, label) in enumerate(zip(data, labels, strict=True)):
-                cls = OURS.get(NAMES[label], NAMES[label])
-                if cls not in classes:
-                    other += 1
-                    continue
-                name = f"{path.stem}_{number:05d}"
-                row = ManifestRow(
-                    f"{cls}/{split}/{name}", cls, split, origin=f"{path.name}[{number}]"
-                )
-                item = Item(row, f"{path}, cloud {number}", functools.partial(_same, cloud))
-                of_split.append(item)
-            found += sorted(of_split, key=lambda item: (classes.index(item.row.cls), item.row.id))
-        if other:
+        names = [OURS.get(name, name) for name in NAMES]
+        items = [i for s, path in self._files() for i in h5_items(path, self.root, s, names, 5)]
+        ours = [item for item in items if item.row.cls in classes]
+        if other := len(items) - len(ours):
             log.warning("%s: %d clouds of other classes are left out", self.root, other)
-        return found
+        return by_class(ours, classes)
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        return y_up_to_z_up(cloud)
+        return turned(cloud, "y")
 
     def _files(self) -> list[tuple[str, Path]]:
         name = f"objectdataset{self.variant}.h5"
         return [("train", self.root / f"training_{name}"), ("test", self.root / f"test_{name}")]
-
-
-def _same(cloud: np.ndarray) -> np.ndarray:
-    return cloud

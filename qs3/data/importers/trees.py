@@ -6,53 +6,44 @@ ModelNet10 and ShapeNet10 as .npy ([2048, 3] and [1024, 3]).
 
 from __future__ import annotations
 
-import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from qs3.clouds.files import parse_cloud
+from qs3.config.checks import check_choice
 from qs3.data.importers.base import (
+    UP_AXES,
     Importer,
     Item,
     class_of,
+    file_item,
+    files_in,
+    folders_in,
     split_of,
-    visible,
-    y_up_to_z_up,
+    turned,
+    unique,
 )
-from qs3.data.manifest import SPLITS, ManifestRow
-from qs3.errors import ConfigError, DataError
+from qs3.data.manifest import SPLITS
+from qs3.errors import DataError
 
 _SCANNET = re.compile(r"/(scene\d{4})_\d{2}(?:_|$)")
-
-
-class Entry(NamedTuple):
-    """One cloud's file, with its class and split in our names."""
-
-    path: Path
-    cls: str
-    split: str
-
-    @property
-    def id(self) -> str:
-        """Class, split and the file's name without its extension."""
-        return f"{self.cls}/{self.split}/{self.path.stem}"
 
 
 @dataclass(frozen=True)
 class TreeImporter(Importer):
     """The part of a tree's reading that does not depend on the files' format.
 
-    Clouds come split by split, in each class by class, in each sorted by name: the order in
+    Clouds come split by split, in each class by class, in each sorted by file name: the order in
     which the code of the lineage lists them, and by which it cuts off its validation part.
 
     Attributes:
-        up: axis that points up in the files, "z" or "y"; y is turned to z.
-        up_z_classes: classes whose files have z up although `up` is "y" (ShapeNet10's plants).
+        up: axis that points up in the files, one of `UP_AXES`.
+        up_z_classes: classes whose files have z up whatever `up` is (ShapeNet10's plants).
     """
 
     up: str = "z"
@@ -61,8 +52,7 @@ class TreeImporter(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.up not in ("y", "z"):
-            raise ConfigError(f"up of {type(self).__name__} is {self.up!r}, expected 'y' or 'z'")
+        check_choice("published.up", self.up, UP_AXES)
         object.__setattr__(self, "up_z_classes", list(self.up_z_classes))
 
     def looks_for(self) -> list[str]:
@@ -71,22 +61,17 @@ class TreeImporter(Importer):
 
     def is_there(self) -> bool:
         """See `Importer`: whether the folder has a subfolder."""
-        return self.root.is_dir() and any(e.is_dir() for e in visible(self.root, self.root))
+        return self.root.is_dir() and any(folders_in(self.root, self.root))
 
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`."""
-        return [
-            Item(
-                ManifestRow(e.id, e.cls, e.split, origin=str(e.path.relative_to(self.root))),
-                str(e.path),
-                functools.partial(parse_cloud, e.path),
-            )
-            for e in list_tree(self.root, self.suffix, classes)
-        ]
+        found = list_tree(self.root, self.suffix, lambda name: class_of(name, classes, self.root))
+        order = sorted(found, key=lambda f: (SPLITS.index(f[2]), classes.index(f[1]), f[0].name))
+        return unique(file_item(path, self.root, c, s, parse_cloud) for path, c, s in order)
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
-        return y_up_to_z_up(cloud) if self.up == "y" and cls not in self.up_z_classes else cloud
+        return cloud if cls in self.up_z_classes else turned(cloud, self.up)
 
 
 @dataclass(frozen=True)
@@ -111,33 +96,27 @@ class NpyTree(TreeImporter):
     suffix: ClassVar[str] = ".npy"
 
 
-def list_tree(root: Path, suffix: str, classes: Sequence[str]) -> list[Entry]:
-    """All clouds of `root/<class>/<split>/*suffix`, in the order of `TreeImporter`.
+def list_tree(
+    root: Path, suffix: str, class_named: Callable[[str], str | None]
+) -> list[tuple[Path, str, str]]:
+    """Path, class and split of all `root/<class>/<split>/*suffix`.
 
-    Hidden files and other extensions are passed over.
+    Hidden files, other extensions, and folders of no class (None) are passed over.
 
     Raises:
-        DataError: unknown class or split, two folders of one class, two files of one name, a
-            name that is not UTF-8, or a link that leads out of `root`.
+        DataError: unknown split, two folders of one class and split, a name that is not UTF-8,
+            or a link that leads out of `root`.
     """
-    entries: dict[str, Entry] = {}
+    found: list[tuple[Path, str, str]] = []
     folders: dict[tuple[str, str], Path] = {}
-    for class_folder in (e for e in visible(root, root) if e.is_dir()):
-        cls = class_of(class_folder.name, classes, str(root))
-        for split_folder in (e for e in visible(class_folder, root) if e.is_dir()):
-            split = split_of(split_folder.name, str(class_folder))
-            if (cls, split) in folders:
-                raise DataError(f"{split_folder} and {folders[cls, split]} are the same class")
-            folders[cls, split] = split_folder
-            for path in visible(split_folder, root):
-                if path.suffix.lower() != suffix or not path.is_file():
-                    continue
-                entry = Entry(path, cls, split)
-                name = entry.id.casefold()  # other systems do not tell a.xyz from A.XYZ
-                if name in entries:
-                    raise DataError(f"{path} and {entries[name].path} have one name; rename one")
-                entries[name] = entry
-    return sorted(
-        entries.values(),
-        key=lambda e: (SPLITS.index(e.split), classes.index(e.cls), e.path.name),
-    )
+    for class_folder in folders_in(root, root):
+        cls = class_named(class_folder.name)
+        if cls is None:
+            continue
+        for folder in folders_in(class_folder, root):
+            split = split_of(folder.name, class_folder)
+            other = folders.setdefault((cls, split), folder)
+            if other is not folder:
+                raise DataError(f"{folder} and {other} are the same class")
+            found += [(path, cls, split) for path in files_in(folder, root, suffix)]
+    return found

@@ -1,4 +1,1 @@
-"""What a dataset is like, measured: one domain, or two beside each other.
-
-`qs3 inspect` is its command. `facts` gives plain values, `words` makes text of them.
-"""
+"""What a dataset is like, measured (`qs3 inspect`), and the gap between two (`qs3 compare`)."""

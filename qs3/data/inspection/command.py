@@ -18,16 +18,7 @@ OUT = Path("out/inspection")
 def inspect_command(
     domain: str, overrides: Mapping[str, str], bounds: Bounds, out: str | None = None
 ) -> str:
-    """Inspect one domain and save what was found.
-
-    Args:
-        domain, overrides: see `open_named`.
-        bounds: how much is looked at.
-        out: folder of the results.
-
-    Returns:
-        The text for the terminal.
-    """
+    """Inspect one domain (see `open_named`), save what was found; the text for the terminal."""
     opened = open_named(domain, overrides)
     steps = min(bounds.sample, len(opened.data))
     with progress_bar(f"inspecting {opened.name}", total=steps) as advance:
@@ -54,12 +45,12 @@ def compare_command(
         facts = compare(a, b, bounds, advance)
     folder = make_folder(out or OUT / f"{_file_name(a)}-{_file_name(b)}")
     write_json(folder / "comparison.json", facts)
-    write_text(folder / "comparison.md", of_pair(facts))
+    text = of_pair(facts)
+    write_text(folder / "comparison.md", text)
     split = next((name for name in a.data.counts() if name in b.data.counts()), None)
     if split:
         both = {f"A: {a.label}": a.data, f"B: {b.label}": b.data}
         scan_picture(both, folder / "clouds.png", split=split)
-    text = of_pair(facts, markdown=False)
     picture = " and clouds.png" if split else ""
     return f"{text}\nsaved comparison.json, comparison.md{picture} in {folder}"
 

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.data.inspection.gravity import describe
-from qs3.data.inspection.measures import prior
 from qs3.data.store import PointSet
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
 
@@ -26,13 +25,18 @@ def priors(a: PointSet, b: PointSet) -> Numbers:
 
     Classes that one of the sets does not have count as frequency 0 there.
     """
-    p, q = (dict(zip(data.classes, prior(data).tolist(), strict=True)) for data in (a, b))
-    names = [*p, *(name for name in q if name not in p)]
+    p, q = _shares(a), _shares(b)
+    names = dict.fromkeys([*p, *q])
     by_class = {name: [p.get(name, 0.0), q.get(name, 0.0)] for name in names}
     return {
         "by_class": by_class,
         "total_variation": sum(abs(x - y) for x, y in by_class.values()) / 2,
     }
+
+
+def _shares(data: PointSet) -> dict[str, float]:
+    known = max(int(np.sum(data.labels >= 0)), 1)
+    return {cls: len(data.members(cls)) / known for cls in data.classes}
 
 
 def features(clouds: Float[np.ndarray, "n p 3"], more: Float[np.ndarray, "n m"]) -> np.ndarray:

@@ -25,6 +25,8 @@ UPS: tuple[str, ...] = ("+z", "-z", "+x", "-x", "+y", "-y")
 
 _SLICES = 10
 _POINTS = 512  # of a cloud that are looked at
+_JUDGED = 100  # clouds a class
+_SHAPES = 40  # of the catalogue a class, to learn from
 _RIDGE = 100.0
 _SURE_SHARE = 0.6  # of the clouds that prefer the best direction to the second best
 _SURE_SD = 3.0  # standard errors between their mean scores
@@ -38,7 +40,6 @@ class Verdict:
         cls: class name.
         clouds: how many were looked at.
         up: direction with the best mean score, one of `UPS`.
-        votes: share of the clouds that each direction wins, in the order of `UPS`.
         axis_share: share of the clouds whose best direction lies along the axis of `up`.
         sign_share: share of the clouds that prefer `up` to its opposite.
         axis_sure: the axis is told from the other two by most clouds and beyond chance.
@@ -48,27 +49,19 @@ class Verdict:
     cls: str
     clouds: int
     up: str
-    votes: tuple[float, ...]
     axis_share: float
     sign_share: float
     axis_sure: bool
     sign_sure: bool
 
-    def contradicts(self, up: str = "+z") -> bool:
-        """Whether the evidence is clear and against `up`."""
-        if self.axis_sure and self.up[1] != up[1]:
-            return True
-        return self.axis_sure and self.sign_sure and self.up != up
+    def contradicts(self) -> bool:
+        """Whether the evidence is clear and against +z."""
+        return self.axis_sure and (self.up[1] != "z" or (self.sign_sure and self.up == "-z"))
 
 
 @dataclass(frozen=True, eq=False)
 class UpModel:
-    """What upright objects of each class look like.
-
-    Attributes:
-        mean, scale: [F] of the descriptions by class.
-        weights: [2 F] by class.
-    """
+    """What upright objects look like, by class: mean, scale [F] of descriptions; weights [2F]."""
 
     mean: Mapping[str, np.ndarray]
     scale: Mapping[str, np.ndarray]
@@ -99,18 +92,15 @@ class UpModel:
         """Which way is up in clouds [n, P, 3] of one class; one direction for all of them."""
         score = self.scores(clouds, cls)
         best = int(score.mean(axis=0).argmax())
-        opposite = best ^ 1
-        votes = np.bincount(score.argmax(axis=1), minlength=6) / len(score)
         along = score.reshape(-1, 3, 2).max(axis=2)  # [n, 3 axes]
         axis = best // 2
         rival = max((a for a in range(3) if a != axis), key=lambda a: along[:, a].mean())
-        sign_share, sign_sure = _prefers(score[:, best] - score[:, opposite])
+        sign_share, sign_sure = _prefers(score[:, best] - score[:, best ^ 1])
         return Verdict(
             cls=cls,
             clouds=len(score),
             up=UPS[best],
-            votes=tuple(float(v) for v in votes),
-            axis_share=float(votes[best] + votes[opposite]),
+            axis_share=float((score.argmax(axis=1) // 2 == axis).mean()),
             sign_share=sign_share,
             axis_sure=_prefers(along[:, axis] - along[:, rival])[1],
             sign_sure=sign_sure,
@@ -122,18 +112,12 @@ def judge_set(
     labels: Int[np.ndarray, " n"],
     classes: Sequence[str],
     model: UpModel | None = None,
-    limit: int = 100,
     seed: int = 0,
 ) -> list[Verdict]:
     """A verdict for each class that occurs and that the model knows.
 
-    Args:
-        points: clouds, any unit.
-        labels: positions in `classes`; negative: unknown, passed over.
-        classes: names.
-        model: what upright objects look like; None: the embedded catalogue's.
-        limit: clouds a class at most, drawn with `seed`.
-        seed: of that draw.
+    Labels are positions in `classes`; negative ones are passed over. The model is that of the
+    embedded catalogue unless given; `seed` draws a hundred clouds of a class, if there are more.
     """
     model = model or catalogue_model()
     verdicts = []
@@ -142,15 +126,15 @@ def judge_set(
         if cls not in model.weights or len(members) == 0:
             continue
         rng = np.random.default_rng([seed, label])
-        chosen = np.sort(rng.permutation(members)[:limit])
+        chosen = np.sort(rng.permutation(members)[:_JUDGED])
         verdicts.append(model.judge(np.stack([points[i] for i in chosen]), cls))
     return verdicts
 
 
 @cache
-def catalogue_model(shapes: int = 40) -> UpModel:
+def catalogue_model() -> UpModel:
     """The model of the embedded catalogue: whole surfaces, and scans from above, with noise."""
-    return UpModel.fit({cls: upright_examples(cls, shapes) for cls in CLASSES})
+    return UpModel.fit({cls: upright_examples(cls, _SHAPES) for cls in CLASSES})
 
 
 def upright_examples(cls: str, shapes: int, seed: int = 7) -> Float[np.ndarray, "n 512 3"]:
@@ -181,16 +165,16 @@ def turned(cloud: Float[np.ndarray, "*b 3"], yaw_rad: float) -> Float[np.ndarray
 
 
 def seen_from_above(
-    cloud: Float[np.ndarray, "p 3"], rng: np.random.Generator, views: int = 4
+    cloud: Float[np.ndarray, "p 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "m 3"]:
-    """The points that are in front in one of some views, 15 to 45 degrees above the horizon."""
-    cells = 50
+    """The points that are in front in one of four views, 15 to 45 degrees above the horizon."""
+    cells, views = 50, 4
     centred = cloud - cloud.mean(axis=0)
     size = max(float(np.abs(centred).max()), 1e-12)
     kept = np.zeros(len(cloud), dtype=bool)
     first, arc = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2.6)
     for view in range(views):
-        azimuth = first + arc * view / max(views - 1, 1)
+        azimuth = first + arc * view / (views - 1)
         elevation = np.deg2rad(rng.uniform(15, 45))
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
         away = np.array([np.cos(azimuth), np.sin(azimuth), 0]) * np.cos(elevation)
@@ -235,20 +219,16 @@ def describe(clouds: Float[np.ndarray, "n p 3"]) -> Float[np.ndarray, "n 6 f"]:
         )
         uu, vv, uv = uu - mean_u**2, vv - mean_v**2, uv - mean_u * mean_v
         middle, spread = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv**2)
-        found.append(
-            np.concatenate(
-                [
-                    np.sqrt(count / points),
-                    _slice_mean(cell, count, np.hypot(u, v)),
-                    np.sqrt(np.maximum(middle + spread, 0)),
-                    np.sqrt(np.maximum(middle - spread, 0)),
-                    np.hypot(mean_u, mean_v),
-                    tall,
-                    np.sort((high - low)[:, 0], axis=1),
-                ],
-                axis=1,
-            )
+        parts = (
+            np.sqrt(count / points),
+            _slice_mean(cell, count, np.hypot(u, v)),
+            np.sqrt(np.maximum(middle + spread, 0)),
+            np.sqrt(np.maximum(middle - spread, 0)),
+            np.hypot(mean_u, mean_v),
+            tall,
+            np.sort((high - low)[:, 0], axis=1),
         )
+        found.append(np.concatenate(parts, axis=1))
     return np.stack(found, axis=1)
 
 

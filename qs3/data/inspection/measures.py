@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,36 +24,27 @@ VOXEL = 0.125
 _OUTLIER = 5.0  # a point is lonely if its 4th neighbour is so many times the cloud's median away
 _ODD_SIZE = 5.0  # an object's size is odd so many robust standard deviations from its class
 
+_SPACED = (
+    *("nn_low", "nn_median", "nn_high", "nn_variation", "voxel_variation", "lonely"),
+    *("directions", "below"),
+)
+
 Numbers = dict[str, Any]
 
 
 def counts(data: PointSet) -> Numbers:
-    """Clouds by split and class, totals, the largest class and how uneven the classes are."""
-    by_split = {
-        split: {cls: int(np.sum(labels == k)) for k, cls in enumerate(data.classes)}
-        for split in sorted(set(data.splits.tolist()), key=_split_order)
-        for labels in [data.labels[data.splits == split]]
+    """Clouds by split and class, and how many have no label."""
+    splits = {
+        split: {"clouds": len(data.indices(split)), "by_class": by_class}
+        for split, by_class in data.counts().items()
     }
     unlabelled = int(np.sum(data.labels < 0))
-    found: Numbers = {"clouds": len(data), "unlabelled": unlabelled, "splits": {}}
-    for split, numbers in by_split.items():
-        total = sum(numbers.values())
-        some = [n for n in numbers.values() if n]
-        largest = max(numbers, key=lambda cls: numbers[cls], default="") if some else ""
-        found["splits"][split] = {
-            "clouds": int(np.sum(data.splits == split)),
-            "by_class": numbers,
-            "largest_class": largest,
-            "largest_share": numbers[largest] / total if some else None,
-            "largest_over_smallest": max(some) / min(some) if some else None,
-        }
-    return found
-
-
-def prior(data: PointSet) -> Float[np.ndarray, " classes"]:
-    """Share of each class among the labelled clouds."""
-    known = data.labels[data.labels >= 0]
-    return np.bincount(known, minlength=len(data.classes)) / max(len(known), 1)
+    return {
+        "clouds": len(data),
+        "classes": data.classes,
+        "unlabelled": unlabelled,
+        "splits": splits,
+    }
 
 
 def extents(data: PointSet, chosen: np.ndarray) -> Numbers:
@@ -90,11 +81,8 @@ def extents(data: PointSet, chosen: np.ndarray) -> Numbers:
 
 def spacing(
     clouds: Sequence[Float[np.ndarray, "p 3"]], advance: Callable[[], None] = lambda: None
-) -> Numbers:
-    """Nearest-neighbour distances, density and coverage of clouds in the unit ball.
-
-    Copies of a point are counted first and then left out. All are arrays [clouds].
-    """
+) -> dict[str, np.ndarray]:
+    """What `one_cloud` gives of each, as arrays [clouds]."""
     rows = []
     for cloud in clouds:
         rows.append(one_cloud(cloud))
@@ -103,7 +91,7 @@ def spacing(
 
 
 def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
-    """Of one cloud, scaled to the unit ball.
+    """Spacing, density and coverage of a cloud in the unit ball, copies of a point left out.
 
     Returns:
         nn_median, nn_low, nn_high: distance to the nearest other point: median, 5 and 95 %.
@@ -116,32 +104,28 @@ def one_cloud(cloud: Float[np.ndarray, "p 3"]) -> dict[str, float]:
         radius: of the cloud as given.
     """
     distinct = np.unique(np.ascontiguousarray(cloud), axis=0)
-    copies = 1 - len(distinct) / len(cloud)
-    ball = unit_ball(distinct.astype(np.float64))
-    radius = float(np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max())
-    if len(distinct) < 5:
-        zeros = dict.fromkeys(
-            ("nn_median", "nn_low", "nn_high", "nn_variation", "voxel_variation", "lonely"), 0.0
-        )
-        return {**zeros, "copies": copies, "directions": 0.0, "below": 0.0, "radius": radius}
-    distance = cKDTree(ball).query(ball, k=[2, 5])[0]
-    nearest, fourth = distance.T
-    low, middle, high = np.percentile(nearest, [5, 50, 95])
-    _, inside = np.unique(np.floor(ball / VOXEL).astype(int), axis=0, return_counts=True)
-    return {
-        "nn_median": float(middle),
-        "nn_low": float(low),
-        "nn_high": float(high),
-        "nn_variation": float(nearest.std() / nearest.mean()),
-        "voxel_variation": float(inside.std() / inside.mean()),
-        "copies": copies,
-        "lonely": float((fourth > _OUTLIER * np.median(fourth)).mean()),
-        **_directions(ball),
-        "radius": radius,
+    whole = {
+        "copies": 1 - len(distinct) / len(cloud),
+        "radius": float(np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()),
     }
+    if len(distinct) < 5:
+        return {**dict.fromkeys(_SPACED, 0.0), **whole}
+    ball = unit_ball(distinct.astype(np.float64))
+    nearest, fourth = cKDTree(ball).query(ball, k=[2, 5])[0].T
+    _, inside = np.unique(np.floor(ball / VOXEL).astype(int), axis=0, return_counts=True)
+    lonely = (fourth > _OUTLIER * np.median(fourth)).mean()
+    values = (
+        *np.percentile(nearest, [5, 50, 95]),
+        nearest.std() / nearest.mean(),
+        inside.std() / inside.mean(),
+        lonely,
+        *_directions(ball),
+    )
+    return {**dict(zip(_SPACED, map(float, values), strict=True)), **whole}
 
 
-def _directions(ball: np.ndarray) -> dict[str, float]:
+def _directions(ball: np.ndarray) -> tuple[float, float]:
+    """Share of the bins of direction with a point in them: of all, and of the lowest third."""
     norm = np.linalg.norm(ball, axis=1)
     unit = ball[norm > 1e-9] / norm[norm > 1e-9, None]
     azimuth = np.arctan2(unit[:, 1], unit[:, 0]) % (2 * np.pi)
@@ -149,7 +133,7 @@ def _directions(ball: np.ndarray) -> dict[str, float]:
     ring = np.minimum(((unit[:, 2] + 1) / 2 * RINGS).astype(int), RINGS - 1)
     hit = np.zeros((RINGS, AZIMUTHS), dtype=bool)
     hit[ring, column] = True
-    return {"directions": float(hit.mean()), "below": float(hit[: RINGS // 3].mean())}
+    return hit.mean(), hit[: RINGS // 3].mean()
 
 
 def summary(values: Mapping[str, np.ndarray], members: Mapping[str, np.ndarray]) -> Numbers:
@@ -172,22 +156,19 @@ def copies(data: PointSet, rows: Sequence[ManifestRow]) -> Numbers:
 
     `leaks` are those of them that lie on both sides of train and test.
     """
-    clouds: dict[str, list[int]] = defaultdict(list)
-    for i in range(len(data)):
-        cloud = np.ascontiguousarray(data.points[i], dtype="<f4") + np.float32(0)  # no -0
-        order = np.lexsort(cloud.T)
-        clouds[hashlib.sha256(cloud[order].tobytes()).hexdigest()].append(i)
+    clouds: dict[bytes, list[int]] = defaultdict(list)
+    for i, points in enumerate(data.points):
+        cloud = np.ascontiguousarray(points, dtype="<f4") + np.float32(0)  # no -0
+        clouds[hashlib.sha256(cloud[np.lexsort(cloud.T)].tobytes()).digest()].append(i)
     same = [found for found in clouds.values() if len(found) > 1]
     meshes: dict[str, set[str]] = defaultdict(set)
     for row in rows:
         if row.mesh_sha256:
             meshes[row.mesh_sha256].add(row.split)
-    kinds = [{str(data.splits[i]) for i in found} for found in same]
-    labels = [{int(data.labels[i]) for i in found} for found in same]
     return {
         "clouds": sum(len(found) - 1 for found in same),
-        "leaks": sum(_leak(kind) for kind in kinds),
-        "contradicting_labels": sum(len(found) > 1 for found in labels),
+        "leaks": sum(_leak(data.splits[found]) for found in same),
+        "contradicting_labels": sum(len(set(data.labels[found].tolist())) > 1 for found in same),
         "groups": [[data.ids[i] for i in found] for found in same],
         "meshes": len(meshes) or None,
         "leaking_meshes": sum(_leak(splits) for splits in meshes.values()),
@@ -224,10 +205,6 @@ def groups(data: PointSet, chosen: np.ndarray) -> dict[str, np.ndarray]:
     return {name: rows for name, rows in found.items() if len(rows)}
 
 
-def _leak(splits: set[str]) -> bool:
-    return "test" in splits and len(splits) > 1
-
-
-def _split_order(split: str) -> int:
-    order = ("train", "validation", "test")
-    return order.index(split) if split in order else len(order)
+def _leak(splits: Iterable[str]) -> bool:
+    found = {str(split) for split in splits}
+    return "test" in found and len(found) > 1

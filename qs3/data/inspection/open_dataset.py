@@ -15,15 +15,9 @@ from qs3.errors import ConfigError
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A dataset and what to call it.
+    """A dataset, its manifest's rows (also of failed objects), and what to call it.
 
-    Attributes:
-        name: short, for file names.
-        label: title and symbol.
-        folder: of the store.
-        variant: array of the store.
-        data: the clouds.
-        rows: the manifest, failed objects included.
+    `name` is short, for file names; `label` has title and symbol.
     """
 
     name: str
@@ -49,10 +43,8 @@ class Opened:
 def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
     """Open a domain by the name of its config, or a store by its folder.
 
-    Args:
-        name: of conf/domain/NAME.yaml, or a folder with a finished dataset.
-        overrides: keys of the domain's config (`variant`, `published.folder`) or `paths.data_dir`;
-            for a folder only `variant`.
+    Overrides are keys of the domain's config (`variant`, `published.folder`) or `paths.data_dir`;
+    for a folder only `variant`.
 
     Raises:
         ConfigError: there is no such domain, or no such key.

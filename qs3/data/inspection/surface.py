@@ -35,13 +35,7 @@ _CATALOGUE = "qs3.meshes.catalogue.Catalogue"
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The meshes of a generated dataset, placed as they were scanned.
-
-    Attributes:
-        seed: of the dataset.
-        placing: how objects were put into the world.
-        items: by id.
-    """
+    """The meshes (by id) of a generated dataset, placed as they were scanned."""
 
     seed: int
     placing: Placing
@@ -62,11 +56,9 @@ class Surfaces:
 
 
 def surfaces_of(meta: dict[str, Any], meshes: Path | None = None) -> tuple[Surfaces | None, str]:
-    """The surfaces of a store, or None and why they are not known.
+    """The surfaces of a store by its `meta`, or None and why they are not known.
 
-    Args:
-        meta: of the store.
-        meshes: the folder of meshes that it was made from; None: the embedded catalogue.
+    `meshes` is the folder that it was made from, if it was not the embedded catalogue.
     """
     settings = meta.get("settings")
     if not isinstance(settings, dict):
@@ -103,7 +95,7 @@ def distance_to_mesh(
     about its centre comes within the bound. `rng` decides how fast that is, not the result.
     """
     points = np.asarray(points, dtype=np.float64)
-    samples = surface_points(mesh, _SAMPLES, rng)
+    samples = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
     best = cKDTree(samples).query(points)[0] * (1 + 1e-6)
     corners = mesh.vertices[mesh.faces]
     centres = corners.mean(axis=1)
@@ -126,23 +118,7 @@ def distance_to_mesh(
 def _to_triangle(
     points: Float[np.ndarray, "p 3"], corners: Float[np.ndarray, "p 3 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Distance of point i to triangle i: to its plane if the foot is inside, else to its sides."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    best = np.full(len(points), np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        side = end - start
-        along = ((points - start) * side).sum(1) / np.maximum((side**2).sum(1), 1e-30)
-        foot = start + np.clip(along, 0, 1)[:, None] * side
-        best = np.minimum(best, np.linalg.norm(points - foot, axis=1))
-    normal = np.cross(b - a, c - a)
-    twice = np.linalg.norm(normal, axis=1)
-    inside = twice > 1e-18
-    for start, end in ((a, b), (b, c), (c, a)):
-        inside &= (np.cross(end - start, points - start) * normal).sum(1) >= 0
-    height = np.abs(((points - a) * normal).sum(1)) / np.maximum(twice, 1e-30)
-    return np.where(inside, np.minimum(height, best), best)
+    """Distance of point i to triangle i."""
+    from trimesh.triangles import closest_point
 
-
-def surface_points(mesh: Mesh, count: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """`count` points, uniform on the mesh."""
-    return surface_sample(mesh.vertices, mesh.faces, count, rng)
+    return np.linalg.norm(closest_point(corners, points) - points, axis=1)

@@ -11,8 +11,8 @@ of PointDA-10's ScanNet10. What is not, is decided in `extraction.py` and `objec
     registration.py   which mask pixel a depth pixel falls on
     objects.py        viewpoints, fusion, sampling
     scene.py          one scene to its objects
-    extraction.py     all scenes: parts, resume, the dataset
-    pool.py           scenes in several processes
+    extraction.py     all scenes: processes, resume, the dataset
+    scene_parts.py    what is written of each scene on the way
     cli.py            the command: qs3 scannet --help
 
 Facts about ScanNet's files were taken from its public tools (github.com/ScanNet/ScanNet:

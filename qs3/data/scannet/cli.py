@@ -17,25 +17,17 @@ _PATHS = {
     "val": 'scannetv2_val.txt, from there too; becomes the split "test", as in PointDA-10',
     "out": "folder of the dataset; conf/domain/depthscannet10.yaml expects data/depthscannet10",
 }
-_SETTINGS = {
-    "points": "of a cloud (farthest point sampling)",
-    "min_points": "a frame counts if it shows more points of the object than this",
-    "views": "frames fused, far from each other in direction; fewer if there are fewer",
-    "stride": "look at every n-th frame only; 10 takes a tenth of the time",
-    "depth_min_m": "nearer depths are left out",
-    "depth_max_m": "farther depths are left out",
-    "margin_px": "pixels about a mask's pixel that must show the same object, too",
-    "align": "turn scenes about z by their axisAlignment (needs <scene>.txt)",
-    "column": "of the label map; or raw_category: the annotators' very words",
-}
-_DEFAULTS: dict[str, Any] = {field.name: field.default for field in fields(Extraction)}
-_KINDS: dict[type, Kind] = {bool: FLAG, int: whole(0), float: NUMBER, str: text()}
+_KINDS: dict[type, Kind] = {int: whole(0), float: NUMBER, str: text()}
+_SETTINGS = tuple(
+    Option(one.name, _KINDS[type(one.default)], one.metadata["help"], one.default)
+    for one in fields(Extraction)
+)
 
 
 def _extract(workers: int, force: bool, **given: Any) -> None:
     from qs3.data.scannet.extraction import extract
 
-    settings = Extraction(**{key: given.pop(key) for key in _SETTINGS})
+    settings = Extraction(**{option.key: given.pop(option.key) for option in _SETTINGS})
     extract(**given, workers=workers, force=force, settings=settings)
 
 
@@ -47,10 +39,7 @@ SCANNET = Command(
         *(Option(key, path(), meaning, required=True) for key, meaning in _PATHS.items()),
         Option("workers", whole(0), "processes; their number changes no byte", 1),
         Option("force", FLAG, "delete the dataset at out first", False),
-        *(
-            Option(key, _KINDS[type(_DEFAULTS[key])], meaning, _DEFAULTS[key])
-            for key, meaning in _SETTINGS.items()
-        ),
+        *_SETTINGS,
     ),
     (
         "qs3 scannet scans=SCANNET/scans labels=SCANNET/scannetv2-labels.combined.tsv \\",

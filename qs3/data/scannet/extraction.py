@@ -10,7 +10,8 @@ import dataclasses
 import hashlib
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,10 @@ from qs3.classes import CLASSES
 from qs3.config.checks import check_int
 from qs3.data.dataset_folder import RECIPE, delete_dataset
 from qs3.data.manifest import ManifestRow
-from qs3.data.scannet.files import Found, SceneFiles, find_scenes
-from qs3.data.scannet.labels import read_label_map, read_scene_list
+from qs3.data.scannet.files import SceneFiles, find_scenes
+from qs3.data.scannet.labels import LabelMap, read_label_map, read_scene_list
 from qs3.data.scannet.objects import ObjectCloud
-from qs3.data.scannet.pool import Job, all_scenes
-from qs3.data.scannet.scene import SceneResult
+from qs3.data.scannet.scene import SceneResult, extract_scene
 from qs3.data.scannet.scene_parts import SceneParts
 from qs3.data.scannet.settings import Extraction
 from qs3.data.store import (
@@ -37,9 +37,10 @@ from qs3.data.store import (
     read_meta,
     write_pointset,
 )
-from qs3.errors import DataError
+from qs3.errors import DataError, Qs3Error
 from qs3.utils.files import make_folder, sha256_file, write_text
 from qs3.utils.locks import locked
+from qs3.utils.pool import Processes
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
@@ -48,6 +49,7 @@ log = logging.getLogger(__name__)
 
 SCENES = "scenes.csv"
 _FAILURES_SHOWN = 5
+_DIED = "the worker process died twice on this scene (out of memory, or a crash)"
 _COLUMNS = (
     "scene", "split", "status", "objects", "clouds",
     "frames", "frames_used", "frames_lost", "frames_unmasked", "sha256", "notes",
@@ -69,6 +71,8 @@ def extract(
 
     A second call with the same `out` waits for the first, and then finds its work.
 
+    Scenes that fail are in scenes.csv with the reason, and are tried again by the next call.
+
     Args:
         scans: ScanNet's folder of scenes.
         labels: scannetv2-labels.combined.tsv.
@@ -77,10 +81,6 @@ def extract(
         settings: None is the defaults.
         workers: processes; 0 works in this one.
         force: delete what is at `out` first.
-
-    Returns:
-        The dataset. Scenes that failed are in scenes.csv with the reason, and are tried again
-        by the next call.
 
     Raises:
         ConfigError: `out` was made with other settings.
@@ -91,7 +91,7 @@ def extract(
     check_int("workers", workers, 0)
     scans, out = scans.absolute(), out.absolute()
     label_map = read_label_map(labels, settings.column)
-    found = find_scenes(scans, read_scene_list(train), read_scene_list(val))
+    scenes = find_scenes(scans, read_scene_list(train), read_scene_list(val))
     recipe = {
         "settings": dataclasses.asdict(settings),
         "labels": {"sha256": sha256_file(labels)},
@@ -108,32 +108,62 @@ def extract(
             log.info("%s is finished, and its parts were deleted: nothing to do", out)
             return open_pointset(out)
         parts.begin(recipe)
-        _say_found(found)
-        results = _results(Job(label_map, settings, parts), found, workers)
+        make = partial(_worker, label_map, settings, parts, alone=workers == 0)
+        results = _results(make, parts, scenes, workers)
         pointset = _write(out, scans, results, recipe)
-        _report(pointset, results, found, out)
+        _report(pointset, results, out)
     return pointset
 
 
-def _results(job: Job, found: Found, workers: int) -> list[SceneResult]:
+def _worker(
+    label_map: LabelMap, settings: Extraction, parts: SceneParts, alone: bool
+) -> Callable[[SceneFiles], str]:
+    """What a process does with each scene; `alone` if it is ours."""
+    if not alone:
+        cv2.setNumThreads(1)
+    return partial(_try_scene, label_map, settings, parts)
+
+
+def _try_scene(
+    label_map: LabelMap, settings: Extraction, parts: SceneParts, files: SceneFiles
+) -> str:
+    """Extract a scene and write its part; else why there is none. Raises if it cannot write."""
+    try:
+        result = extract_scene(files, label_map, settings)
+    except Qs3Error as error:
+        return str(error)
+    except MemoryError:
+        return "out of memory"
+    except Exception as error:  # one odd scene must not stop a thousand
+        log.exception("%s: unexpected error", files.scene)
+        return f"unexpected {type(error).__name__}: {error}"
+    parts.save(result)
+    return ""
+
+
+def _results(
+    make_worker: Callable[[], Callable[[SceneFiles], str]],
+    parts: SceneParts,
+    scenes: Sequence[SceneFiles],
+    workers: int,
+) -> list[SceneResult]:
     """One a scene, by name: from the parts, which are made where they are not there yet."""
-    todo = [files for files in found.scenes if not job.parts.done(files)]
-    total = len(found.scenes)
+    tasks = [(files.scene, files) for files in scenes if not parts.done(files)]
+    total = len(scenes)
     failed = {}
-    with progress_bar("scenes", total=total, done=total - len(todo)) as advance:
-        for done in all_scenes(job, todo, workers):
-            if done.reason:
-                log.warning("%s: %s", done.scene, done.reason)
-                failed[done.scene] = done.reason
+    with progress_bar("scenes", total=total, done=total - len(tasks)) as advance:
+        for outcome in Processes(workers).run(make_worker, tasks):
+            if reason := _DIED if outcome.died else outcome.result:
+                log.warning("%s: %s", outcome.name, reason)
+                failed[outcome.name] = reason
             advance()
-    job.parts.tidy()
-    results = []
-    for files in found.scenes:
-        if reason := failed.get(files.scene):
-            results.append(SceneResult(files, reason=reason))
-        else:
-            results.append(job.parts.load(files))
-    return results
+    parts.tidy()
+    return [
+        SceneResult(files, reason=failed[files.scene])
+        if files.scene in failed
+        else parts.load(files)
+        for files in scenes
+    ]
 
 
 def _write(
@@ -218,34 +248,16 @@ def _versions() -> dict[str, str]:
     }
 
 
-def _say_found(found: Found) -> None:
-    splits = [files.split for files in found.scenes]
-    log.info("%d scenes of train and %d of test are there", *map(splits.count, ("train", "test")))
-    if found.absent:
-        log.info("%d scenes of the lists are not, first %s", len(found.absent), found.absent[0])
-    if found.unlisted:
-        log.info(
-            "%d scenes are in neither list and are left out, first %s",
-            len(found.unlisted),
-            found.unlisted[0],
-        )
-
-
-def _report(pointset: PointSet, results: Sequence[SceneResult], found: Found, out: Path) -> None:
+def _report(pointset: PointSet, results: Sequence[SceneResult], out: Path) -> None:
     """Counts a class, what was left out, and the content hash."""
     missed = (o.labelled.cls for result in results for o in result.objects if o.cloud is None)
     for line in counts_text(pointset, "skipped", Counter(missed)):
         log.info("%s", line)
-    lost = sum(result.frames_lost for result in results)
-    log.info("%d frames were left out for their pose", lost)
+    log.info("%d frames were left out for their pose", sum(r.frames_lost for r in results))
     failed = [result for result in results if result.reason]
     for result in failed[:_FAILURES_SHOWN]:
         log.warning("failed: %s: %s", result.files.scene, result.reason)
     if failed:
-        log.warning(
-            "%d of %d scenes failed (%s); repair or download them and run the same command again",
-            len(failed),
-            len(results),
-            SCENES,
-        )
+        advice = "repair or download them and run the same command again"
+        log.warning("%d of %d scenes failed (%s); %s", len(failed), len(results), SCENES, advice)
     log.info("in %s, content hash %s", out, pointset.sha256[:16])

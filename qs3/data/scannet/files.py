@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import re
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from qs3.data.scannet.labels import is_scene
-from qs3.data.scannet.sens import is_rigid
 from qs3.errors import DataError, MissingDataError
 
-_MAX_INFO_BYTES = 1 << 20
+log = logging.getLogger(__name__)
+
+_SUFFIXES = {
+    "sens": ".sens",
+    "instances": "_2d-instance-filt.zip",
+    "labels": "_2d-label-filt.zip",
+    "aggregation": ".aggregation.json",
+}
 
 
 @dataclass(frozen=True)
@@ -24,8 +28,8 @@ class SceneFiles:
         scene: its name, e.g. "scene0000_00".
         split: "train" or "test".
         sens, instances: the recording and the zip of instance masks; both are needed.
-        labels, aggregation: zip of label masks and list of objects; one of them is needed.
-        info: <scene>.txt, needed to align.
+        aggregation: the list of objects; needed.
+        labels: the zip of label masks, which checks the classes.
     """
 
     scene: str
@@ -34,54 +38,33 @@ class SceneFiles:
     instances: Path | None
     labels: Path | None
     aggregation: Path | None
-    info: Path | None
 
     @staticmethod
     def find(folder: Path, split: str) -> SceneFiles:
         """Those in a scene's folder, under ScanNet's names."""
+        paths = {role: folder / f"{folder.name}{suffix}" for role, suffix in _SUFFIXES.items()}
+        there = {role: path if path.is_file() else None for role, path in paths.items()}
+        return SceneFiles(folder.name, split, **there)
 
-        def there(suffix: str) -> Path | None:
-            path = folder / f"{folder.name}{suffix}"
-            return path if path.is_file() else None
+    def need(self, role: str) -> Path:
+        """The file of a role, such as "sens".
 
-        return SceneFiles(
-            scene=folder.name,
-            split=split,
-            sens=there(".sens"),
-            instances=there("_2d-instance-filt.zip"),
-            labels=there("_2d-label-filt.zip"),
-            aggregation=there(".aggregation.json"),
-            info=there(".txt"),
-        )
+        Raises:
+            DataError: it is not there.
+        """
+        path: Path | None = getattr(self, role)
+        if path is None:
+            raise DataError(f"{self.scene}{_SUFFIXES[role]} is not there; download it")
+        return path
 
     def sizes(self) -> dict[str, int]:
         """Bytes of each file, by its role: another size means another file."""
-        roles = ("sens", "instances", "labels", "aggregation", "info")
-        paths = {role: getattr(self, role) for role in roles}
+        paths = {role: getattr(self, role) for role in _SUFFIXES}
         return {role: path.stat().st_size for role, path in paths.items() if path is not None}
 
 
-@dataclass(frozen=True)
-class Found:
-    """The scenes in a folder.
-
-    Attributes:
-        scenes: those of the lists that are there, by name.
-        unlisted: folders of scenes that are in neither list.
-        absent: scenes of the lists that are not there.
-    """
-
-    scenes: tuple[SceneFiles, ...]
-    unlisted: tuple[str, ...]
-    absent: tuple[str, ...]
-
-
-def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> Found:
-    """The scenes in a folder, one folder each, with the split that the lists give them.
-
-    Args:
-        scans: holds scene0000_00/ and so on.
-        train, test: names of scenes.
+def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> list[SceneFiles]:
+    """The scenes in `scans`, one folder each, with the split that the lists of names give them.
 
     Raises:
         MissingDataError: there is no such folder, or no scene of the lists in it.
@@ -99,32 +82,11 @@ def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> Found
             f"{scans} holds none of the {len(split_of)} scenes of the lists, only {len(there)} "
             "others; it should hold folders like scene0000_00 (ScanNet's folder `scans`)"
         )
-    return Found(
-        scenes=tuple(scenes),
-        unlisted=tuple(name for name in there if name not in split_of),
-        absent=tuple(sorted(set(split_of) - set(there))),
-    )
-
-
-def read_alignment(path: Path | None, scene: str) -> np.ndarray:
-    """[4, 4] `axisAlignment` of <scene>.txt, which turns about z and shifts.
-
-    Raises:
-        DataError: it is not there, or tilts the scene.
-    """
-    if path is None:
-        raise DataError(f"{scene}.txt is not there, so the scene cannot be aligned (align=false)")
-    if path.stat().st_size > _MAX_INFO_BYTES:
-        raise DataError(f"{path} is too large for a scene's information")
-    text = path.read_bytes().decode("utf-8", "replace")
-    match = re.search(r"^\s*axisAlignment\s*=(.*)$", text, re.MULTILINE)
-    try:
-        matrix = np.array([float(word) for word in match[1].split()] if match else [])
-    except ValueError as error:
-        raise DataError(f"{path}: axisAlignment holds {error}") from error
-    if matrix.size != 16:
-        raise DataError(f"{path} has no axisAlignment of 16 numbers (align=false does without)")
-    matrix = matrix.reshape(4, 4)
-    if not is_rigid(matrix) or not np.allclose(matrix[2, :3], (0, 0, 1), rtol=0, atol=1e-3):
-        raise DataError(f"{path}: axisAlignment does not turn about z: {matrix.tolist()}")
-    return matrix
+    splits = [files.split for files in scenes]
+    log.info("%d scenes of train and %d of test are there", *map(splits.count, ("train", "test")))
+    absent = sorted(set(split_of) - set(there))
+    unlisted = [name for name in there if name not in split_of]
+    for names, what in ((absent, "of the lists are not there"), (unlisted, "are unlisted")):
+        if names:
+            log.info("%d scenes %s, first %s", len(names), what, names[0])
+    return scenes

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from qs3.classes import ALIASES, CLASSES
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import DataError, MissingDataError
 
 NAMES: tuple[str, ...] = (
     "bathtub", "bed", "shelf", "cabinet", "chair", "lamp", "monitor", "plant", "couch", "table",
@@ -54,7 +54,7 @@ class Labelled:
 
     Attributes:
         object_id: `objectId` of the aggregation; its mask's pixels are this + 1.
-        label: the annotators' word, or the class where it came from the label masks.
+        label: the annotators' word.
         cls: one of `qs3.classes.CLASSES`.
     """
 
@@ -66,17 +66,12 @@ class Labelled:
 def read_label_map(path: str | Path, column: str = "category") -> LabelMap:
     """Read scannetv2-labels.combined.tsv (or ScanNet v1's, whose `category` is the raw word).
 
-    Args:
-        path: the file.
-        column: which words are compared with `NAMES`: "category" (tidied) or "raw_category".
+    `column` has the words that are compared with `NAMES`: "category" (tidied) or "raw_category".
 
     Raises:
-        ConfigError: the column is none of these.
         MissingDataError: there is no such file.
         DataError: it has other columns, or none of the ten names.
     """
-    if column not in COLUMNS:
-        raise ConfigError(f"column must be one of {COLUMNS}, got {column!r}")
     lines = _text(path, "the label map").splitlines()
     reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
     header = reader.fieldnames or []
@@ -104,11 +99,10 @@ def read_label_map(path: str | Path, column: str = "category") -> LabelMap:
 
 
 def read_objects(path: str | Path, label_map: LabelMap) -> tuple[list[Labelled], list[str]]:
-    """The objects of the ten classes in an aggregation.json, by `objectId`.
+    """The objects of the ten classes in an aggregation.json, by `objectId`, and what is odd.
 
-    Returns:
-        The objects, and what is odd: the same `objectId` under labels of different classes (such
-        an object is left out), or another `id` than `objectId`.
+    Odd is the same `objectId` under labels of different classes (such an object is left out), and
+    another `id` than `objectId`.
 
     Raises:
         DataError: it is not an aggregation.

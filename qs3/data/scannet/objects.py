@@ -69,7 +69,7 @@ class Sightings:
 
 
 def spread(towards_m: np.ndarray, points: Sequence[int], count: int) -> list[int]:
-    """Viewpoints in directions far from each other: farthest point sampling of the directions.
+    """Up to `count` viewpoints, in order: farthest point sampling of their directions.
 
     The first is the frame with most points; each next one is that whose direction from the
     object is farthest from those of all taken. Of equals the earliest is taken.
@@ -77,10 +77,6 @@ def spread(towards_m: np.ndarray, points: Sequence[int], count: int) -> list[int
     Args:
         towards_m: [n, 3] from the object's centre to the camera of each frame.
         points: of the object in each frame.
-        count: how many to take; all if there are no more.
-
-    Returns:
-        Positions in the order in which they are taken.
     """
     length = np.linalg.norm(towards_m, axis=1, keepdims=True)
     directions = towards_m / np.where(length > 0, length, 1.0)

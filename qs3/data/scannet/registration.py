@@ -25,16 +25,7 @@ class Registration:
     """The depth camera and the masks of one resolution."""
 
     def __init__(self, header: SensHeader, mask_shape: tuple[int, int], where: str) -> None:
-        """Prepare the rays.
-
-        Args:
-            header: of the recording.
-            mask_shape: height and width of the masks.
-            where: begins the error.
-
-        Raises:
-            DataError: the masks have another shape than the colour images.
-        """
+        """Prepare the rays for masks [h, w]; DataError if colour images have another shape."""
         height, width = mask_shape
         scale = (width / header.colour_width_px, height / header.colour_height_px)
         # Half a pixel of slack: a halved image of odd height is rounded.
@@ -61,15 +52,10 @@ class Registration:
         self._cell_px = _CELL_DEPTH_PX * max(1.0, self._focal[0] / header.depth_intrinsics[0, 0])
 
     def mask_pixels(self, depth_m: np.ndarray, near_m: float, far_m: float) -> np.ndarray:
-        """Where each depth pixel falls in the mask.
+        """Where each depth pixel falls in the mask: [h, w] int64, nearest position, flattened.
 
-        Args:
-            depth_m: [h, w] metres, 0 where nothing was measured.
-            near_m, far_m: depths outside are left out.
-
-        Returns:
-            [h, w] int64, position in the flattened mask, nearest; -1 where there is no depth,
-            outside the mask, or hidden from the colour camera.
+        It is -1 outside the mask, where a thing is hidden from the colour camera, and where the
+        depth [h, w] is 0 (nothing was measured), below `near_m` or above `far_m`.
         """
         rows, cols = np.nonzero((depth_m >= near_m) & (depth_m <= far_m))
         at = self._turned[rows, cols] * depth_m[rows, cols, None].astype(np.float64) + self._shift
@@ -88,20 +74,14 @@ class Registration:
         return found
 
     def world(self, depth_m: np.ndarray, keep: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """[n, 3] float64 points in the world, row-major.
-
-        Args:
-            depth_m: [h, w] metres.
-            keep: [h, w] bool, which pixels.
-            pose: [4, 4] world_from_depth.
-        """
+        """[n, 3] float64 world points of pixels `keep` [h, w] bool; `pose` is world_from_depth."""
         local = self._rays[keep] * depth_m[keep, None].astype(np.float64)
         return local @ pose[:3, :3].T + pose[:3, 3]
 
     def _visible(self, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """[n] bool: nothing clearly nearer lies in the point's cell or one beside it.
+        """[n] bool: nothing clearly nearer lies in the point's cell or one next to it.
 
-        The cells beside it stand for sides of a nearer thing that only the colour camera sees:
+        The cells next to it stand for sides of a nearer thing that only the colour camera sees:
         no depth was measured there. It costs what lies behind an edge a few pixels.
         """
         height, width = self._mask_shape
@@ -119,11 +99,8 @@ def agreed(mask: np.ndarray, margin_px: int) -> np.ndarray:
     """The mask, 0 where a pixel within `margin_px` is of something else.
 
     With a margin of 1 px a ray that misses an object by less than a pixel is not taken for it:
-    what it hits lies far behind, and farthest point sampling would keep every such point.
-
-    Args:
-        mask: [h, w] uint8 or uint16.
-        margin_px: 0 leaves the mask as it is.
+    what it hits lies far behind, and farthest point sampling would keep every such point. The mask
+    is [h, w] uint8 or uint16; a margin of 0 leaves it as it is.
     """
     if margin_px == 0:
         return mask

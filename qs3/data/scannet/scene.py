@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from qs3.data.scannet.files import SceneFiles, read_alignment
+from qs3.data.scannet.files import SceneFiles
 from qs3.data.scannet.labels import Labelled, LabelMap, read_objects
 from qs3.data.scannet.masks import INSTANCES, LABELS, MaskArchive
 from qs3.data.scannet.objects import ObjectCloud, Sightings, sampled
@@ -21,8 +21,6 @@ from qs3.data.scannet.registration import Registration, agreed
 from qs3.data.scannet.sens import SensFile
 from qs3.data.scannet.settings import Extraction
 from qs3.errors import DataError
-
-_VOTES = 4  # every how many rows and columns of a mask vote where there is no aggregation
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +44,7 @@ class SceneResult:
     frames_used: int = 0
     frames_lost: int = 0
     frames_unmasked: int = 0
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
     reason: str = ""
 
 
@@ -56,58 +54,48 @@ def extract_scene(files: SceneFiles, label_map: LabelMap, settings: Extraction) 
     Raises:
         DataError: a file is missing or damaged.
     """
-    if files.sens is None or files.instances is None:
-        lacks = ".sens" if files.sens is None else "_2d-instance-filt.zip"
-        raise DataError(f"{files.scene}{lacks} is not there; download it")
-    if files.labels is None and files.aggregation is None:
-        raise DataError(
-            f"neither {files.scene}.aggregation.json nor {files.scene}_2d-label-filt.zip is there, "
-            "so nobody knows what the objects are; download them"
-        )
-    align = read_alignment(files.info, files.scene) if settings.align else np.eye(4)
+    sens, instances = files.need("sens"), files.need("instances")
+    labelled, notes = read_objects(files.need("aggregation"), label_map)
     with ExitStack() as stack:
         scan = _Scan(
-            sens=stack.enter_context(SensFile(files.sens)),
-            instances=stack.enter_context(MaskArchive(files.instances, INSTANCES)),
+            sens=stack.enter_context(SensFile(sens)),
+            instances=stack.enter_context(MaskArchive(instances, INSTANCES)),
             labels=stack.enter_context(MaskArchive(files.labels, LABELS)) if files.labels else None,
             settings=settings,
         )
         frames, lost, unmasked = _usable_frames(scan)
         if not frames:
             raise DataError(
-                f"{files.sens}: none of its {len(scan.sens)} frames has a finite pose and a mask"
+                f"{sens}: none of its {len(scan.sens)} frames has a finite pose and a mask"
             )
-        if files.aggregation:
-            labelled, notes = read_objects(files.aggregation, label_map)
-        else:
-            labelled, notes = _voted(scan, frames, label_map), ["classes voted by label masks"]
         if files.labels is None:
             notes = [*notes, "no label masks to check the classes"]
         sightings = _first_pass(scan, frames, labelled)
         chosen = {one: sightings[one].viewpoints(settings.views) for one in labelled}
         crops, denied = _second_pass(scan, chosen, label_map)
     objects = tuple(
-        _finish(one, sightings[one], crops[one], denied[one], settings, align) for one in labelled
+        _finish(one, sightings[one], crops[one], denied[one], settings) for one in labelled
     )
-    return SceneResult(files, objects, len(scan.sens), len(frames), lost, unmasked, tuple(notes))
+    return SceneResult(files, objects, len(scan.sens), len(frames), lost, unmasked, notes)
 
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """The open files of a scene."""
+    """The open files of a scene, and where depth pixels fall in masks of each size so far."""
 
     sens: SensFile
     instances: MaskArchive
     labels: MaskArchive | None
     settings: Extraction
+    known: dict[tuple[int, int], Registration] = field(default_factory=dict)
 
-    def registration(self, known: dict, mask: np.ndarray, frame: int) -> Registration:
+    def registration(self, mask: np.ndarray, frame: int) -> Registration:
         """That of the mask's resolution, made once."""
         shape = (mask.shape[0], mask.shape[1])
-        if shape not in known:
+        if shape not in self.known:
             where = f"{self.instances.path}, frame {frame}"
-            known[shape] = Registration(self.sens.header, shape, where)
-        return known[shape]
+            self.known[shape] = Registration(self.sens.header, shape, where)
+        return self.known[shape]
 
     def object_ids(
         self, registration: Registration, mask: np.ndarray, depth_m: np.ndarray
@@ -132,14 +120,13 @@ def _first_pass(
 ) -> dict[Labelled, Sightings]:
     """How much of which object each frame shows."""
     sightings = {one: Sightings() for one in labelled}
-    known: dict = {}
     for frame in frames:
         mask = scan.instances.read(frame)
-        there = np.bincount(mask.ravel(), minlength=1)
-        shown = [one for one in labelled if _count(there, one) > 0]
+        there = np.flatnonzero(np.bincount(mask.ravel()))
+        shown = [one for one in labelled if one.object_id + 1 in there]
         if not shown:
             continue
-        registration = scan.registration(known, mask, frame)
+        registration = scan.registration(mask, frame)
         depth_m, pose = scan.sens.depth_m(frame), scan.sens.poses[frame]
         ids, _ = scan.object_ids(registration, mask, depth_m)
         for one in shown:
@@ -162,10 +149,9 @@ def _second_pass(
     for one, frames in chosen.items():
         for frame in frames:
             of_frame[frame].append(one)
-    known: dict = {}
     for frame in sorted(of_frame):
         mask = scan.instances.read(frame)
-        registration = scan.registration(known, mask, frame)
+        registration = scan.registration(mask, frame)
         depth_m, pose = scan.sens.depth_m(frame), scan.sens.poses[frame]
         ids, where = scan.object_ids(registration, mask, depth_m)
         labels = _labels(scan, frame, mask.shape)
@@ -196,33 +182,12 @@ def _labels(scan: _Scan, frame: int, shape: tuple[int, ...]) -> np.ndarray | Non
     return labels
 
 
-def _voted(scan: _Scan, frames: Sequence[int], label_map: LabelMap) -> list[Labelled]:
-    """Objects and classes where there is no aggregation: what most pixels of a mask are called."""
-    assert scan.labels is not None
-    votes: dict[tuple[int, int], int] = defaultdict(int)
-    for frame in frames:
-        mask = scan.instances.read(frame)
-        labels = _labels(scan, frame, mask.shape)
-        assert labels is not None
-        few = (slice(None, None, _VOTES), slice(None, None, _VOTES))
-        pairs = mask[few].astype(np.int64) << 16 | labels[few]
-        for pair, count in zip(*np.unique(pairs, return_counts=True), strict=True):
-            votes[int(pair) >> 16, int(pair) & 0xFFFF] += int(count)
-    objects = []
-    for number in sorted({instance for instance, _ in votes} - {0}):
-        label = max((n for i, n in votes if i == number), key=lambda n: (votes[number, n], -n))
-        if cls := label_map.class_of_id.get(label):
-            objects.append(Labelled(number - 1, cls, cls))
-    return objects
-
-
 def _finish(
     one: Labelled,
     sightings: Sightings,
     crops: Mapping[int, np.ndarray],
     denied: int,
     settings: Extraction,
-    align: np.ndarray,
 ) -> ObjectCloud:
     """The object's cloud from its crops, or why there is none."""
     nothing = ObjectCloud(one, (), len(sightings.frames), 0, None)
@@ -240,15 +205,9 @@ def _finish(
             nothing, reason=f"the label masks of all {denied} chosen frames give it another class"
         )
     fused = np.concatenate([crops[frame] for frame in sorted(crops)]).astype(np.float64)
-    fused = fused @ align[:3, :3].T + align[:3, 3]
     return replace(
         nothing,
         frames=tuple(sorted(crops)),
         fused_points=len(fused),
         cloud=sampled(fused, settings.points),
     )
-
-
-def _count(there: np.ndarray, one: Labelled) -> int:
-    value = one.object_id + 1
-    return int(there[value]) if value < len(there) else 0

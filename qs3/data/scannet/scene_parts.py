@@ -1,7 +1,7 @@
 """The unfinished dataset: the clouds of each scene in a file of their own.
 
-The parts stay beside the finished dataset: scenes that come later are added to them. They hold as
-much as the dataset, and may be deleted when it is complete.
+The parts stay next to the finished dataset: scenes that come later are added to them. They hold
+as much as the dataset, and may be deleted when it is complete.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from qs3.data.scannet.objects import ObjectCloud
 from qs3.data.scannet.scene import SceneResult
 from qs3.errors import DataError
 
-_COUNTS = ("frames", "frames_used", "frames_lost", "frames_unmasked")
+_PLAIN = ("frames", "frames_used", "frames_lost", "frames_unmasked", "notes")
 
 
 class SceneParts(PartFiles):
@@ -45,57 +45,29 @@ class SceneParts(PartFiles):
 
     def save(self, result: SceneResult) -> None:
         """Write one scene, atomically."""
+        objects = result.objects
         note = {
             "split": result.files.split,
             "sizes": result.files.sizes(),
-            **{key: getattr(result, key) for key in _COUNTS},
-            "notes": result.notes,
-            "objects": [
-                {
-                    **dataclasses.asdict(one.labelled),
-                    "frames": one.frames,
-                    "candidates": one.candidates,
-                    "fused_points": one.fused_points,
-                    "reason": one.reason,
-                }
-                for one in result.objects
-            ],
+            "plain": {key: getattr(result, key) for key in _PLAIN},
+            "objects": [dataclasses.asdict(dataclasses.replace(o, cloud=None)) for o in objects],
         }
-        clouds = {
-            str(one.labelled.object_id): one.cloud
-            for one in result.objects
-            if one.cloud is not None
-        }
+        clouds = {str(o.labelled.object_id): o.cloud for o in objects if o.cloud is not None}
         self.write(result.files.scene, note, clouds)
 
     def done(self, files: SceneFiles) -> bool:
-        """Whether there is a part of the scene, made from files of these sizes for this split.
-
-        Raises:
-            DataError: the part is damaged.
-        """
+        """Whether there is a part of the scene, made from files of these sizes for this split."""
         if not self.has(files.scene):
             return False
         note, _ = self.read(files.scene)
         return note["split"] == files.split and note["sizes"] == files.sizes()
 
     def load(self, files: SceneFiles) -> SceneResult:
-        """One scene.
-
-        Raises:
-            DataError: the part is damaged, or gone.
-        """
+        """One scene; DataError if its part is damaged, or gone."""
         note, clouds = self.read(files.scene)
-        objects = tuple(
-            ObjectCloud(
-                Labelled(one["object_id"], one["label"], one["cls"]),
-                tuple(one["frames"]),
-                one["candidates"],
-                one["fused_points"],
-                clouds.get(str(one["object_id"])),
-                one["reason"],
-            )
-            for one in note["objects"]
-        )
-        counts = {key: note[key] for key in _COUNTS}
-        return SceneResult(files, objects, **counts, notes=tuple(note["notes"]))
+        objects = []
+        for one in note["objects"]:
+            labelled = Labelled(**one.pop("labelled"))
+            one |= {"frames": tuple(one["frames"]), "cloud": clouds.get(str(labelled.object_id))}
+            objects.append(ObjectCloud(labelled, **one))
+        return SceneResult(files, tuple(objects), **note["plain"])

@@ -48,10 +48,8 @@ class SensHeader:
     """What holds for all frames.
 
     Attributes:
-        sensor: its name.
         colour_intrinsics, depth_intrinsics: [3, 3] float64, px; last row (0, 0, 1).
         base_from_colour, base_from_depth: [4, 4] float64 rigid: the extrinsics.
-        colour_width_px, colour_height_px, depth_width_px, depth_height_px: of the images.
         depth_compression: 0 raw, 1 zlib (both of uint16).
         depth_shift: depth units a metre.
         frames: how many there are.
@@ -83,17 +81,12 @@ class SensFile:
     found out at once. Images are read when they are asked for, so memory is that of one frame.
 
     Attributes:
-        path: the file.
         header: what holds for all frames.
         poses: [frames, 4, 4] float64 world_from_depth as stored; see `has_pose`.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open and check the file.
-
-        Raises:
-            DataError: it cannot be read, is not a recording, or is broken off; names the frame.
-        """
+        """Open the file; DataError (names the frame) if it is not a recording or broken off."""
         self.path = Path(path)
         try:
             self._file: BinaryIO = open(self.path, "rb")  # noqa: SIM115 (closed by close)
@@ -234,13 +227,13 @@ def _intrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     k = matrix[:3, :3]
     plain = np.isfinite(k).all() and k[0, 0] > 0 and k[1, 1] > 0
     if not plain or not np.allclose(k[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
-        raise DataError(f"{where} are those of no camera: {k.tolist()}")
+        raise DataError(f"{where} are not those of a camera: {k.tolist()}")
     return k.copy()
 
 
 def _extrinsics(matrix: np.ndarray, where: str) -> np.ndarray:
     if not is_rigid(matrix):
-        raise DataError(f"{where} are not rigid motion: {matrix.tolist()}")
+        raise DataError(f"{where} are not a rigid motion: {matrix.tolist()}")
     return matrix.copy()
 
 

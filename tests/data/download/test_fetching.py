@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import multiprocessing
 import os
 import socket
 import subprocess
@@ -213,19 +212,6 @@ def test_a_disk_that_fills_up(site, tmp_path):
     (tmp_path / "a.zip.part").symlink_to("/dev/full")
     with pytest.raises(Qs3Error, match=r"No space left .*what came is kept"):
         get(site, tmp_path)
-
-
-def _fetch(url, path):
-    os.environ["no_proxy"] = "*"
-    return fetch(url, path).stat().st_size
-
-
-def test_two_processes_fetch_once(site, tmp_path):
-    site.files["/a.zip"] = File(DATA, stall_s=0.5)
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        sizes = pool.starmap(_fetch, [(f"{site.address}/a.zip", tmp_path / "a.zip")] * 2)
-    assert sizes == [len(DATA)] * 2
-    assert len(site.requests) == 1
 
 
 WARNING = (  # in one line, as Google has it

@@ -92,9 +92,9 @@ def poses(count, turn_deg=200.0, height_m=1.5, radius_m=2.1):
     return found
 
 
-def exact_depth(the_room, pose, renderer, camera=DEPTH):
+def exact_depth(the_room, pose, renderer):
     """[h, w] what a perfect depth camera sees, metres."""
-    (image,) = renderer.render(the_room.scene, [Camera(camera, pose)], seed=1, geometry=[True])
+    (image,) = renderer.render(the_room.scene, [Camera(DEPTH, pose)], seed=1, geometry=[True])
     return image.depth_m
 
 
@@ -117,20 +117,17 @@ def label_image(the_room, mask):
     return lut[mask]
 
 
-def record(the_room, where, renderer, *, lost=(), camera=DEPTH, depth=exact_depth):
-    """A `Recording` and its masks; frames of `lost` have no pose and, as in ScanNet, empty masks.
-
-    `depth(the_room, pose, renderer, camera)` gives metres; another one than the exact is a sensor.
-    """
+def record(the_room, where, renderer, *, lost=()):
+    """A `Recording` and its masks; frames of `lost` have no pose and, as there, empty masks."""
     depths, masks, believed = [], {}, []
     for index, pose in enumerate(where):
-        depths.append(millimetres(depth(the_room, pose, renderer, camera)))
+        depths.append(millimetres(exact_depth(the_room, pose, renderer)))
         mask = mask_of(the_room, pose, renderer)
         masks[index] = np.zeros_like(mask) if index in lost else mask
         believed.append(LOST if index in lost else pose)
     recording = Recording(
         depths, believed,
-        intrinsics(camera.focal_px, camera.focal_px, camera.cx_px, camera.cy_px),
+        intrinsics(DEPTH.focal_px, DEPTH.focal_px, DEPTH.cx_px, DEPTH.cy_px),
         intrinsics(COLOUR.focal_px, COLOUR.focal_px, COLOUR.cx_px, COLOUR.cy_px),
         (COLOUR.width_px, COLOUR.height_px),
         BASE_FROM_DEPTH, BASE_FROM_COLOUR,
@@ -145,41 +142,9 @@ def write_scene(scans, scene, the_room, recording, masks):
     labels = {frame: label_image(the_room, mask) for frame, mask in masks.items()}
     write_zip(folder / f"{scene}_2d-label-filt.zip", "label-filt", labels)
     write_aggregation(folder / f"{scene}.aggregation.json", scene, the_room.words)
-    turn = " ".join(map(str, rigid((0, 0, 30), (1, 2, 0)).ravel()))
-    (folder / f"{scene}.txt").write_text(f"appVersionId = 0.0.42\naxisAlignment = {turn} \n")
 
 
 def write_lists(root, train, val):
     (root / "train.txt").write_text("\n".join(train) + "\n")
     (root / "val.txt").write_text("\n".join(val) + "\n")
     write_label_map(root / "labels.tsv")
-
-
-def distances(points, mesh):
-    """[n] exact distance of each point from a mesh's surface, metres, by brute force."""
-    corners = mesh.vertices[mesh.faces].astype(np.float64)  # [f, 3, 3]
-    nearest = np.empty(len(points))
-    for start in range(0, len(points), 64):
-        p = points[start : start + 64, None, :].astype(np.float64)  # [c, 1, 3]
-        nearest[start : start + 64] = _to_triangles(p, corners).min(axis=1)
-    return nearest
-
-
-def _to_triangles(p, corners):
-    """[c, f] distances: to the plane where the foot is inside, else to the nearest edge."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    normal = np.cross(b - a, c - a)
-    size = np.linalg.norm(normal, axis=1)
-    unit = normal / np.where(size > 0, size, 1)[:, None]
-    height = np.einsum("cfk,fk->cf", p - a, unit)
-    inside = size[None] > 0
-    best = np.full(height.shape, np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        edge = end - start
-        to = p - start
-        inside = inside & (np.einsum("cfk,fk->cf", to, np.cross(unit, edge)) >= 0)
-        length2 = np.einsum("fk,fk->f", edge, edge)
-        along = np.einsum("cfk,fk->cf", to, edge) / np.where(length2 > 0, length2, 1)
-        foot = start + np.clip(along, 0, 1)[..., None] * edge
-        best = np.minimum(best, np.linalg.norm(p - foot, axis=2))
-    return np.where(inside, np.abs(height), best)

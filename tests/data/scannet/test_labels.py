@@ -12,7 +12,7 @@ from qs3.data.scannet.labels import (
     read_objects,
     read_scene_list,
 )
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import DataError, MissingDataError
 from tests.data.scannet.writing import LABELS, write_aggregation, write_label_map
 
 
@@ -63,8 +63,6 @@ def test_a_map_that_is_none_is_told(tmp_path):
     write_label_map(path, [*LABELS, (70000, "bed", "bed")])
     with pytest.raises(DataError, match=r"line 19: the id is '70000'"):
         read_label_map(path)
-    with pytest.raises(ConfigError, match="column must be one of"):
-        read_label_map(path, "nyu40class")
 
 
 def test_objects_of_an_aggregation(tmp_path, label_map):
