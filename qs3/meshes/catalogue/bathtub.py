@@ -96,16 +96,8 @@ def built_in(draw: Draw) -> list[Mesh]:
     square, inside = rounded_outline(0.012), rounded_outline(draw.between(0.12, 0.35))
     head = draw.between(0.0, 0.08)  # a wider ledge at the tap end
     opening = (width - 2 * rim - head, depth - 2 * rim)
-    outer = [
-        p.ring_at(square(width - 2 * cut, depth - 2 * cut), z)
-        for cut, z in (
-            (inset, 0),
-            (inset, top - lip),
-            (0, top - lip),
-            (0, top - 0.008),
-            (0.008, top),
-        )
-    ]
+    side = [(inset, 0), (inset, top - lip), (0, top - lip), (0, top - 0.008), (0.008, top)]
+    outer = [p.ring_at(square(width - 2 * cut, depth - 2 * cut), z) for cut, z in side]
     hollow = hollow_rings(draw, inside, opening, floor, top, end)
     hollow = [ring - (end * head / 2, 0, 0) for ring in hollow]
     parts = [p.loft(np.stack([*outer, *hollow])), drain(width - head, floor, end)]

@@ -294,10 +294,8 @@ def leaf(
     side = _perpendicular(np.asarray(across, dtype=np.float64), tangents[len(path) // 2])
     rings = []
     for t, point, tangent in zip(np.linspace(0, 1, len(path)), path, tangents, strict=True):
-        rise, fall = (
-            np.sin(0.5 * np.pi * t / belly),
-            np.cos(0.5 * np.pi * (t - belly) / (1 - belly)),
-        )
+        rise = np.sin(0.5 * np.pi * t / belly)
+        fall = np.cos(0.5 * np.pi * (t - belly) / (1 - belly))
         share = max(float(rise if t < belly else fall), 0.06)
         half, lift = 0.5 * width * share, 0.5 * thickness * share**0.5 * np.cross(side, tangent)
         rings.append([point - half * side, point - lift, point + half * side, point + lift])

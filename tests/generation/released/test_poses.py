@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.command import generate
@@ -22,8 +21,8 @@ from qs3.meshes.mesh import Mesh
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.renderers.base import Body, Scene
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.generation.generating import composed as config
 
-CONF = str(Path(__file__).parents[3] / "conf")
 RELEASED = Path(__file__).parents[4] / "shared/data/qs3_release/pose_params.tar.gz"
 needs_release = pytest.mark.skipif(
     not RELEASED.is_file(), reason="the authors' pose_params.tar.gz is not in ../shared/data"
@@ -312,20 +311,11 @@ def test_generate_follows_the_poses_and_records_what_has_none(poses, tmp_path):
         lines += [" ".join(map(str, [3, *face])) for face in mesh.faces]
         path.write_text("\n".join(lines))
     overrides = [
-        "domain=specklenet10",
-        f"meshes={tmp_path / 'meshes'}",
-        "classes=[sofa]",
-        f"poses={poses}",
-        "renderer=mitsuba",
-        "renderer.samples=1",
-        "views=1",
-        "workers=0",
-        "recipe.points=256",
-        f"paths.data_dir={tmp_path / 'data'}",
+        *("domain=specklenet10", f"meshes={tmp_path / 'meshes'}", "classes=[sofa]"),
+        *(f"poses={poses}", "renderer=mitsuba", "renderer.samples=1", "views=1", "workers=0"),
+        *("recipe.points=256", f"paths.data_dir={tmp_path / 'data'}"),
     ]
-    with initialize_config_dir(CONF, version_base="1.3"):
-        cfg = compose("generate", overrides)
-        without = compose("generate", overrides[:3] + overrides[4:])
+    cfg, without = config(*overrides), config(*overrides[:3], *overrides[4:])
     pointset = generate(cfg)
     assert list(pointset.ids) == [ID]
     folder = tmp_path / "data/specklenet10"
