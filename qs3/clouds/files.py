@@ -78,7 +78,7 @@ def read_clouds(path: str | Path) -> CloudFile:
 def measured(cloud: np.ndarray, where: str) -> tuple[np.ndarray, int]:
     """[n, 3] without the points that are NaN or infinite, and how many these were.
 
-    Numbers too large for float32 are no such points: `checked` names them.
+    Numbers too large for float32 stay: `checked` names them.
 
     Raises:
         DataError: no point is left.
@@ -155,7 +155,7 @@ def _text(path: Path) -> CloudFile:
     lines = rows.splitlines()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # no rows: told below
+            warnings.simplefilter("ignore", UserWarning)  # no rows: reported below
             table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments="#", encoding="latin-1")
     except ValueError:
         table = None
@@ -342,7 +342,7 @@ _READERS: dict[str, Callable[[Path], CloudFile]] = {
     **{".h5": _hdf5, ".hdf5": _hdf5},
 }
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
-"""Of the formats that are read, in lower case."""
+"""Suffixes of the formats that are read, in lower case."""
 
 _SPLIT_PREFIX = re.compile(r"(train|test|val|validation)(?![a-z])", re.IGNORECASE)
 

@@ -95,7 +95,7 @@ def test_parts_without_a_recipe_are_not_taken_over(finished, meshes, tmp_path):
     np.testing.assert_array_equal(mine.points[0], finished[1].points[0])
 
 
-def test_a_mended_mesh_is_noticed(meshes, tmp_path):
+def test_a_repaired_mesh_is_noticed(meshes, tmp_path):
     mine = tmp_path / "meshes" / "chair" / "train"
     mine.mkdir(parents=True)
     good = (meshes / "chair/train/chair_0.ply").read_bytes()

@@ -1,4 +1,4 @@
-"""A disk that is full, a folder that cannot be used: told plainly, and nothing is lost."""
+"""A disk that is full, a folder that cannot be used: a clear message, and nothing is lost."""
 
 import contextlib
 import os

@@ -82,7 +82,7 @@ def test_float32_errs_no_more_than_twice_the_straight_one() -> None:
 
 
 def test_float32_gradients_err_no_more_than_twice_the_straight_ones() -> None:
-    """Of one layer: in a whole net a maximum that goes to another point outweighs all rounding."""
+    """One layer: in a whole net a maximum that goes to another point outweighs all rounding."""
     torch.manual_seed(0)
     exact = GroupedMLP(5, (32, 48, 64)).double()
     _scramble(exact)
@@ -130,7 +130,7 @@ ORIGINAL = {  # logits of the first cloud, norm of the gradient in the points
 
 @pytest.mark.parametrize(("variant", "training"), ORIGINAL)
 def test_numbers_of_an_original(variant: str, training: bool) -> None:
-    """Of yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/backbones.md."""
+    """Recorded from yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/backbones.md."""
     net = pointnet2(10, variant, dropout=0.0).double()
     fill([net])
     if variant == "msg":  # there the features come first

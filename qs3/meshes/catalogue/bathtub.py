@@ -49,7 +49,7 @@ def hollow_rings(
 def tap(draw: Draw, x: float, y: float, z: float, heading: float) -> list[Mesh]:
     """A spout and handles at (x, y), pointing by degrees from +x, on the rim at height z.
 
-    One beside the tub (z = 0) stands on a pipe of its own.
+    One next to the tub (z = 0) stands on a pipe of its own.
     """
     reach, rise = draw.between(0.12, 0.2), draw.between(0.08, 0.22)
     parts = [p.cylinder(0.028, 0.02, sides=12)]

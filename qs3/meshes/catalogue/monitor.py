@@ -123,7 +123,7 @@ def all_in_one(draw: Draw) -> list[Mesh]:
 
 
 def tv_pedestal(draw: Draw) -> list[Mesh]:
-    """An older, thick television: loudspeakers beside or below the screen, a broad foot."""
+    """An older, thick television: loudspeakers next to or below the screen, a broad foot."""
     diagonal, clear = draw.between(0.65, 1.15), draw.between(0.05, 0.1)
     width, height, thick = 0.872 * diagonal, 0.49 * diagonal, draw.between(0.06, 0.12)
     below = draw.chance(0.6)

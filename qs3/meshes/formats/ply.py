@@ -166,7 +166,7 @@ def _first_sizes(element: _Element, body: bytes, offset: int) -> list[int | None
 
 
 def _read_ragged(element: _Element, body: bytes, offset: int) -> tuple[dict, int]:
-    """Row by row; only lists are kept, for nobody needs the scalars beside them."""
+    """Row by row; only lists are kept: the scalars next to them are not needed."""
     starts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_dtype}
     sizes: dict[str, list[int]] = {name: [] for name in starts}
     for _ in range(element.count):
