@@ -1,7 +1,7 @@
 """Numbers of the authors' own nets, with weights and clouds by formula (`tests.models.by_formula`).
 
-Made once with their code on the CPU in float64, dropout 0; see docs/backbones.md. Each row: the ten
-logits of the first cloud and the norm of the gradient in all points.
+Made once with their code on the CPU in float64, dropout 0; see docs/reference/backbones.md. Each
+row: the ten logits of the first cloud and the norm of the gradient in all points.
 """
 
 from __future__ import annotations

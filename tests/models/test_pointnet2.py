@@ -130,7 +130,7 @@ ORIGINAL = {  # logits of the first cloud, norm of the gradient in the points
 
 @pytest.mark.parametrize(("variant", "training"), ORIGINAL)
 def test_numbers_of_an_original(variant: str, training: bool) -> None:
-    """Recorded from yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/backbones.md."""
+    """yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/reference/backbones.md."""
     net = pointnet2(10, variant, dropout=0.0).double()
     fill([net])
     if variant == "msg":  # there the features come first

@@ -167,7 +167,7 @@ def test_autocast_keeps_the_layers_in_float32() -> None:
 def test_numbers_of_the_original(
     relation: str, training: bool, logits: list[float], norm: float
 ) -> None:
-    """Recorded from SimpleView's and from the authors' repository; see docs/backbones.md."""
+    """SimpleView's and the authors' repository; see docs/reference/backbones.md."""
     model = rscnn(10, relation=relation, dropout=0.0).double()
     set_weights(model)
     if not training:  # they were recorded after the training step, which moved the norms

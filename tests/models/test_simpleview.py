@@ -246,7 +246,7 @@ def test_points_get_no_gradient_and_parameters_do() -> None:
     ],
 )
 def test_numbers_of_the_original(training: bool, logits: list[float], norm: float) -> None:
-    """Recorded from SimpleView's repository; see docs/backbones.md. Its images are float32."""
+    """SimpleView's repository, with float32 images; see docs/reference/backbones.md."""
     model = simpleview(10, dropout=0.0).double()
     set_weights(model)
     if not training:  # they were recorded after the training step, which moved the norms
