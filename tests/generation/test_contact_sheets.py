@@ -51,7 +51,7 @@ def test_force_takes_old_pictures_and_views_away(meshes, tmp_path):
         ".lock", "clouds.png", "config.yaml", "manifest.csv", "meta.yaml", "mine.txt", "points.npy",
         "recipe.json",
     }  # fmt: skip
-    assert len(open_pointset(folder)) == 15
+    assert len(open_pointset(folder)) == 9
 
 
 def test_one_scale_a_row(tmp_path):
