@@ -104,15 +104,19 @@ def test_a_repaired_mesh_is_noticed(meshes, tmp_path):
         for i in range(2):
             (mine.parent / split / f"c{i}.ply").write_bytes(good)
     (mine / "c0.ply").write_bytes(good[:200])
-    only = ["workers=0", "classes=[chair]"]
-    first = generate(config(tmp_path, tmp_path / "meshes", *only))
+
+    def made(*more):
+        settings = ("workers=0", "classes=[chair]", *more)
+        return generate(config(tmp_path, tmp_path / "meshes", *settings, domain="modelnet10"))
+
+    first = made()
     assert len(first.ids) == 3
-    row = read_manifest(tmp_path / "specklenet10", first.classes)
+    row = read_manifest(tmp_path / "modelnet10", first.classes)
     assert str(tmp_path) not in "".join(r.reason for r in row)
     (mine / "c0.ply").write_bytes(good)
     with pytest.raises(ConfigError, match=r"objects: 4, among them 'chair/train/c0"):
-        generate(config(tmp_path, tmp_path / "meshes", *only))
-    assert len(generate(config(tmp_path, tmp_path / "meshes", *only, "force=true")).ids) == 4
+        made()
+    assert len(made("force=true").ids) == 4
 
 
 def test_if_all_fail_nothing_is_left_in_the_way(meshes, tmp_path):

@@ -27,7 +27,7 @@ def run(arguments, largest_file=None):
     ("limit", "done", "more"),
     [
         pytest.param(20_000, "0 of 9", [], id="parts"),
-        pytest.param(340_000, "18 of 18", ["scans=2"], id="dataset"),
+        pytest.param(420_000, "18 of 18", ["scans=2"], id="dataset"),
     ],
 )
 def test_files_that_cannot_grow_stop_the_run_and_a_resume_completes_it(
