@@ -14,11 +14,12 @@ counted. Pickled arrays are refused unopened, sizes are checked before memory is
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,10 +56,7 @@ def read_cloud(path: str | Path) -> np.ndarray:
     Raises:
         DataError: names the file and what is wrong with it, or it holds several clouds.
     """
-    found = read_clouds(path)
-    if len(found.clouds) != 1:
-        raise DataError(f"{path} holds {len(found.clouds)} clouds, expected one")
-    return found.clouds[0]
+    return _only(path, read_clouds(path))
 
 
 def read_clouds(path: str | Path) -> CloudFile:
@@ -80,7 +78,7 @@ def read_clouds(path: str | Path) -> CloudFile:
 def measured(cloud: np.ndarray, where: str) -> tuple[np.ndarray, int]:
     """[n, 3] without the points that are NaN or infinite, and how many these were.
 
-    Numbers too large for float32 are no such points: `checked` names them.
+    Numbers too large for float32 stay: `checked` names them.
 
     Raises:
         DataError: no point is left.
@@ -140,10 +138,13 @@ def parse_cloud(path: str | Path) -> np.ndarray:
     Raises:
         DataError: names the file, and the line; or it holds several clouds.
     """
-    clouds = parse_clouds(path).clouds
-    if len(clouds) != 1:
-        raise DataError(f"{path} holds {len(clouds)} clouds, expected one")
-    return clouds[0]
+    return _only(path, parse_clouds(path))
+
+
+def _only(path: str | Path, found: CloudFile) -> np.ndarray:
+    if len(found.clouds) != 1:
+        raise DataError(f"{path} holds {len(found.clouds)} clouds, expected one")
+    return found.clouds[0]
 
 
 def _text(path: Path) -> CloudFile:
@@ -154,7 +155,7 @@ def _text(path: Path) -> CloudFile:
     lines = rows.splitlines()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # no rows: told below
+            warnings.simplefilter("ignore", UserWarning)  # no rows: reported below
             table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments="#", encoding="latin-1")
     except ValueError:
         table = None
@@ -196,13 +197,8 @@ def npy_clouds(path: Path) -> int | None:
     Raises:
         DataError: as `read_clouds`, but for the numbers themselves.
     """
-    try:
-        with open(path, "rb") as file:
-            shape, dtype = _npy_header(path, file)
-    except DataError:
-        raise
-    except Exception as error:  # as in `_npy`
-        raise DataError(f"{path}: not a readable .npy file ({error})") from error
+    with _readable(path, ".npy file"), open(path, "rb") as file:
+        shape, dtype = _npy_header(path, file)
     _check_array(path, shape, dtype)
     if len(shape) == 3 and not shape[0]:
         raise DataError(f"{path}: there are no clouds")
@@ -211,16 +207,14 @@ def npy_clouds(path: Path) -> int | None:
 
 def _npy_header(path: Path, file: Any) -> tuple[tuple[int, ...], np.dtype]:
     """Shape and type of numbers, after comparing them with the file's size."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a header written by Python 2
-        version = np.lib.format.read_magic(file)
-        read: Callable[..., Any] | None = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }.get(version)
-        if read is None:
-            raise ValueError(f"version {version} of the .npy format")
-        shape, _, dtype = read(file)
+    version = np.lib.format.read_magic(file)
+    read: Callable[..., Any] | None = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }.get(version)
+    if read is None:
+        raise ValueError(f"version {version} of the .npy format")
+    shape, _, dtype = read(file)
     if dtype.hasobject:
         raise DataError(f"{path}: a pickled array, refused; save it as plain numbers")
     size = path.stat().st_size
@@ -231,21 +225,15 @@ def _npy_header(path: Path, file: Any) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _npy(path: Path) -> CloudFile:
-    try:
-        with open(path, "rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a header written by Python 2
-            _npy_header(path, file)
-            file.seek(0)
-            array = np.load(file, allow_pickle=False)
-    except DataError:
-        raise
-    except Exception as error:  # numpy's parser of headers raises a dozen kinds
-        raise DataError(f"{path}: not a readable .npy file ({error})") from error
+    with _readable(path, ".npy file"), open(path, "rb") as file:
+        _npy_header(path, file)
+        file.seek(0)
+        array = np.load(file, allow_pickle=False)
     return _of_array(path, array)
 
 
 def _npz(path: Path) -> CloudFile:
-    try:
+    with _readable(path, ".npz of plain arrays"):
         with zipfile.ZipFile(path) as archive:
             size = sum(info.file_size for info in archive.infolist())
         if size > MAX_BYTES:
@@ -256,14 +244,22 @@ def _npz(path: Path) -> CloudFile:
             if key is None:
                 raise DataError(f"{path} has no array 'points'; it has {', '.join(names)}")
             array = file[key]
-            labels = next(
-                (file[name] for name in ("cls", "label", "labels") if name in names), None
-            )
+            label = next((name for name in ("cls", "label", "labels") if name in names), None)
+            labels = None if label is None else file[label]
+    return _of_array(path, array, labels)
+
+
+@contextlib.contextmanager
+def _readable(path: Path, what: str) -> Iterator[None]:
+    """Turn what numpy raises on damaged files, of a dozen kinds, into a DataError."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # a header written by Python 2
+            yield
     except DataError:
         raise
-    except Exception as error:  # zlib.error, BadZipFile, pickled content, unknown compression ...
-        raise DataError(f"{path}: not a readable .npz of plain arrays ({error})") from error
-    return _of_array(path, array, labels)
+    except Exception as error:
+        raise DataError(f"{path}: not a readable {what} ({error})") from error
 
 
 def _ply(path: Path) -> CloudFile:
@@ -346,7 +342,7 @@ _READERS: dict[str, Callable[[Path], CloudFile]] = {
     **{".h5": _hdf5, ".hdf5": _hdf5},
 }
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
-"""Of the formats that are read, in lower case."""
+"""Suffixes of the formats that are read, in lower case."""
 
 _SPLIT_PREFIX = re.compile(r"(train|test|val|validation)(?![a-z])", re.IGNORECASE)
 

@@ -57,7 +57,7 @@ class AnchoredViews:
         distance = rng.uniform(self.min_distance_m, self.max_distance_m)
         elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
         azimuth = rng.uniform(0, 2 * np.pi)
-        anchor = look_at(target_m + distance * _direction(azimuth, elevation), target_m)
+        anchor = look_at(target_m + distance * direction(azimuth, elevation), target_m)
         poses = [anchor]
         for _ in range(self.count - 1):
             pose = anchor.copy()
@@ -106,7 +106,7 @@ class HandheldViews:
             elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
             distance = radius + rng.uniform(self.min_distance_m, self.max_distance_m)
             aim = target_m + rng.normal(0, self.aim_m, 3)
-            poses.append(look_at(target_m + distance * _direction(azimuth, elevation), aim))
+            poses.append(look_at(target_m + distance * direction(azimuth, elevation), aim))
         return poses
 
 
@@ -135,7 +135,8 @@ class Drift:
         return out
 
 
-def _direction(azimuth_rad: float, elevation_rad: float) -> np.ndarray:
+def direction(azimuth_rad: float, elevation_rad: float) -> np.ndarray:
+    """[3] unit vector; the azimuth is from the x axis towards y."""
     flat = np.cos(elevation_rad)
     return np.array([flat * np.cos(azimuth_rad), flat * np.sin(azimuth_rad), np.sin(elevation_rad)])
 

@@ -27,7 +27,7 @@ from qs3.data.store import (
 )
 from qs3.errors import DataError
 from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
-from qs3.generation.disk import check_folder, disk_errors_told
+from qs3.generation.disk import check_folder, disk_errors_explained
 from qs3.generation.plan import (
     benchmark,
     check,
@@ -74,20 +74,17 @@ def generate(cfg: DictConfig) -> PointSet:
     parts = Parts(folder)
     job = Job(
         recipe=build(cfg.recipe),
-        make_renderer=partial(_make_renderer, OmegaConf.to_container(cfg.renderer, resolve=True)),
+        make_renderer=partial(build, OmegaConf.to_container(cfg.renderer, resolve=True)),
         seed=cfg.seed,
         keep=keep(cfg, items, folder),
         save=parts.save,
     )
     check_recipe(job.recipe, cfg)
     check_folder(folder, cfg.paths.data_dir)
+    other = "wait for it, or give another paths.data_dir"
     with (
-        owned(
-            folder,
-            doing="making the dataset in",
-            advice="wait for it, or give another paths.data_dir",
-        ),
-        disk_errors_told(folder, lambda: parts.state(len(items))),
+        owned(folder, doing="making the dataset in", advice=other),
+        disk_errors_explained(folder, lambda: parts.state(len(items))),
     ):
         if cfg.force:
             delete_dataset(folder)
@@ -123,10 +120,6 @@ def _check_strict(cfg: DictConfig, pointset: PointSet, items: list[MeshItem], fo
     failed = len(items) - len(pointset.ids)
     if cfg.strict and failed:
         raise DataError(f"{failed} of {len(items)} objects failed; see {folder / 'manifest.csv'}")
-
-
-def _make_renderer(settings: Any) -> Any:
-    return build(settings)
 
 
 def _scan_missing(
@@ -188,11 +181,7 @@ def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome], folder
 
 
 def _write(
-    domain: Domain,
-    items: list[MeshItem],
-    outcomes: list[Outcome],
-    recipe: dict[str, Any],
-    cfg: DictConfig,
+    domain: Domain, items: list[MeshItem], outcomes: list[Outcome], recipe: Any, cfg: DictConfig
 ) -> PointSet:
     good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
     rows = [
@@ -236,11 +225,7 @@ def _without_root(reason: str, cfg: DictConfig) -> str:
 
 
 def _report(
-    pointset: PointSet,
-    items: list[MeshItem],
-    outcomes: list[Outcome],
-    folder: Path,
-    seconds: float,
+    pointset: PointSet, items: list[MeshItem], outcomes: list[Outcome], folder: Path, seconds: float
 ) -> None:
     """Counts a class, failures with their reasons, where things are, and the content hash."""
     failures = [o for o in outcomes if o.cloud is None]

@@ -21,7 +21,7 @@ Arrays = Mapping[str, np.ndarray]
 def clouds_picture(
     path: Path, clouds: Mapping[str, Sequence[Arrays]], heading: str, twin: bool
 ) -> None:
-    """Save a row of clouds a class, each as measured and, beside it, from the true depth.
+    """Save a row of clouds a class, each as measured and next to it from the true depth.
 
     All panels of a row have one scale, which its label states; colour is the height.
 

@@ -1,4 +1,4 @@
-"""The disk of a dataset: a folder that cannot be used, and a disk that is full, told plainly."""
+"""The disk of a dataset: errors of a folder that cannot be used and of a full disk."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def check_folder(folder: Path, data_dir: str) -> None:
 
 
 @contextlib.contextmanager
-def disk_errors_told(folder: Path, state: Callable[[], str]) -> Iterator[None]:
+def disk_errors_explained(folder: Path, state: Callable[[], str]) -> Iterator[None]:
     """Say of a full disk how far the work is and how it continues.
 
     Args:

@@ -29,7 +29,7 @@ from qs3.sensors.base import DepthFrame, DepthSensor
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.seeding import object_rng
 
-_NOTHING = Keep()
+_BARE = Keep()
 
 
 class TooFewPointsError(DataError):
@@ -63,29 +63,12 @@ class Recipe(Protocol):
     needs_renderer: bool
 
     def make(
-        self,
-        mesh: Mesh,
-        object_id: str,
-        seed: int,
-        renderer: Renderer | None,
-        keep: Keep = _NOTHING,
+        self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
         """Make the cloud; TooFewPointsError, MeshError or RenderError say why not.
 
         `keep` asks for more than the cloud and never changes it.
         """
-        ...
-
-
-class Crop(Protocol):
-    """Which measurements belong to the object."""
-
-    def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
-        """[h, w] bool in the image; None keeps all."""
-        ...
-
-    def inside(self, points: np.ndarray, box_m: np.ndarray) -> np.ndarray:
-        """[M] bool for points [M, 3] in the world and the object's box [2, 3]."""
         ...
 
 
@@ -101,16 +84,17 @@ class BoxCrop:
     margin_m: float = 0.03
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
-        """No mask in the image: the box decides after back-projection."""
+        """[h, w] bool in the image; None: the box alone decides, after back-projection."""
         return None
 
     def inside(self, points: np.ndarray, box_m: np.ndarray) -> np.ndarray:
-        """[M] bool for points [M, 3] in the world."""
-        return _in_box(points, box_m, self.margin_m)
+        """[M] bool for points [M, 3] in the world and the object's box [2, 3]."""
+        low, high = box_m[0] - self.margin_m, box_m[1] + self.margin_m
+        return ((points >= low) & (points <= high)).all(axis=1)
 
 
 @dataclass(frozen=True)
-class MaskCrop:
+class MaskCrop(BoxCrop):
     """Keep the pixels of the object's mask and box, drawn as sloppily as annotations are.
 
     The mask of what is really seen grows or shrinks by a few pixels and is shifted, so that
@@ -124,10 +108,10 @@ class MaskCrop:
         margin_m: by which the object's axis-aligned box is enlarged.
     """
 
+    margin_m: float = 0.1
     min_grow_px: int = -1
     max_grow_px: int = 3
     max_shift_px: int = 2
-    margin_m: float = 0.1
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
         """[h, w] bool."""
@@ -141,14 +125,6 @@ class MaskCrop:
         move = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], dtype=np.float64)
         mask = cv2.warpAffine(mask, move, mask.shape[::-1], flags=cv2.INTER_NEAREST)
         return mask.astype(bool)
-
-    def inside(self, points: np.ndarray, box_m: np.ndarray) -> np.ndarray:
-        """[M] bool for points [M, 3] in the world."""
-        return _in_box(points, box_m, self.margin_m)
-
-
-def _in_box(points: np.ndarray, box_m: np.ndarray, margin_m: float) -> np.ndarray:
-    return ((points >= box_m[0] - margin_m) & (points <= box_m[1] + margin_m)).all(axis=1)
 
 
 @dataclass(frozen=True)
@@ -173,7 +149,7 @@ class Mesh2Point:
     scene: Surroundings = field(default_factory=Alone)
     views: Views = field(default_factory=AnchoredViews)
     drift: Drift = field(default_factory=Drift)
-    crop: Crop = field(default_factory=BoxCrop)
+    crop: BoxCrop = field(default_factory=BoxCrop)
     points: int = 2048
     min_points: int = 128
     min_view_points: int = 1
@@ -190,12 +166,7 @@ class Mesh2Point:
             object.__setattr__(self, "views", self.poses.views(self.views.count))
 
     def make(
-        self,
-        mesh: Mesh,
-        object_id: str,
-        seed: int,
-        renderer: Renderer | None,
-        keep: Keep = _NOTHING,
+        self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
         """See Recipe.make."""
         if renderer is None:
@@ -295,12 +266,7 @@ class SurfaceSamples:
     needs_renderer: bool = False
 
     def make(
-        self,
-        mesh: Mesh,
-        object_id: str,
-        seed: int,
-        renderer: Renderer | None,
-        keep: Keep = _NOTHING,
+        self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
         """See Recipe.make."""
         rng = object_rng(seed, object_id, 0)

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from qs3.meshes.mesh import Mesh, merge
+from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.base import Body
 
 
@@ -74,12 +74,9 @@ class Room:
             pieces.append(_piece(centre, away, floor, rng, largest_m=0.3))
         rest += [piece for piece in pieces if not _around_an_eye(piece, eyes_m)]
         albedos = rng.uniform(self.min_albedo, self.max_albedo, len(rest) + 1)
-        return (
-            Body(mesh, albedo=float(albedos[0]), label=1),
-            *(
-                Body(part, albedo=float(albedo), label=0)
-                for part, albedo in zip(rest, albedos[1:], strict=True)
-            ),
+        return tuple(
+            Body(part, albedo=float(albedo), label=int(part is mesh))
+            for part, albedo in zip([mesh, *rest], albedos, strict=True)
         )
 
 
@@ -102,10 +99,8 @@ def _wall(centre: np.ndarray, away: float, floor: float, angle: float) -> Mesh:
     along = np.array([-normal[1], normal[0], 0.0])
     foot = np.array([centre[0], centre[1], floor]) + away * normal
     up = np.array([0.0, 0.0, 2.6])
-    vertices = np.array(
-        [foot - 4 * along, foot + 4 * along, foot + 4 * along + up, foot - 4 * along + up]
-    )
-    return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+    left, right = foot - 4 * along, foot + 4 * along
+    return Mesh(np.array([left, right, right + up, left + up]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _piece(
@@ -127,11 +122,9 @@ def _piece(
 
 def _prism(ring: np.ndarray, bottom: float, top: float) -> Mesh:
     n = len(ring)
-    vertices = np.concatenate(
-        [np.column_stack([ring, np.full(n, bottom)]), np.column_stack([ring, np.full(n, top)])]
-    )
+    vertices = np.concatenate([np.column_stack([ring, np.full(n, z)]) for z in (bottom, top)])
     i = np.arange(n)
     j = (i + 1) % n
     walls = np.concatenate([np.stack([i, j, j + n], 1), np.stack([i, j + n, i + n], 1)])
     fan = np.stack([np.zeros(n - 2, int), i[1:-1], i[2:]], axis=1)
-    return merge([Mesh(vertices, np.concatenate([walls, fan[:, ::-1], fan + n]))])
+    return Mesh(vertices, np.concatenate([walls, fan[:, ::-1], fan + n]))

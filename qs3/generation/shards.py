@@ -39,12 +39,9 @@ class Parts(PartFiles):
         if not self.done(item_id):
             return None
         note, found = self.read(_name(item_id))
-        arrays = {name: array for name, array in found.items() if not name.startswith(_PREVIEW)}
-        preview = {
-            name.removeprefix(_PREVIEW): array
-            for name, array in found.items()
-            if name.startswith(_PREVIEW)
-        }
+        seen = {name: array for name, array in found.items() if name.startswith(_PREVIEW)}
+        arrays = {name: array for name, array in found.items() if name not in seen}
+        preview = {name.removeprefix(_PREVIEW): array for name, array in seen.items()}
         cloud = None
         if arrays:
             cloud = Cloud(arrays, note["views"], note["valid_points"], preview=preview)

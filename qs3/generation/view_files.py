@@ -18,6 +18,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import cv2
@@ -30,6 +31,7 @@ from qs3.sensors.base import DepthFrame
 from qs3.sensors.pixel_status import Reason
 from qs3.utils.files import remove_leftovers, write_bytes
 
+_MAPS = ("depth_m", "clean_m", "label", "cosine", "reason")  # of a DepthFrame
 _LONGEST_NAME = 200  # bytes; file systems allow 255, and the temporary name is longer
 _DARK = (24, 20, 18)  # BGR, where nothing was measured
 _LEAST_PX = 300  # height of a panel
@@ -103,11 +105,7 @@ def save_view(
     remove_leftovers(folder)
     k = frame.camera.intrinsics
     arrays: dict[str, np.ndarray] = {
-        "depth_m": frame.depth_m,
-        "clean_m": frame.clean_m,
-        "label": frame.label,
-        "cosine": frame.cosine,
-        "reason": frame.reason,
+        **{name: getattr(frame, name) for name in _MAPS},
         "reason_names": np.array([reason.name for reason in Reason]),
         **{f"image_{name}": image for name, image in frame.images.items()},
         "size_px": np.array([k.width_px, k.height_px]),
@@ -166,26 +164,16 @@ def load_views(root: Path, object_id: str) -> tuple[KeptView, ...]:
     return tuple(sorted(found, key=lambda view: view.number))
 
 
-def _kept(number: int, arrays: dict[str, np.ndarray]) -> KeptView:
+def _kept(number: int, arrays: dict[str, Any]) -> KeptView:
     width, height = (int(value) for value in arrays["size_px"])
     cx, cy = (float(value) for value in arrays["centre_px"])
     left, top, step = (int(value) for value in arrays["grid_px"])
     intrinsics = Intrinsics(width, height, float(arrays["focal_px"]), cx, cy)
     images = {name[6:]: image for name, image in arrays.items() if name.startswith("image_")}
-    frame = DepthFrame(
-        camera=Camera(intrinsics, arrays["world_from_camera"]),
-        left=left,
-        top=top,
-        step_px=step,
-        depth_m=arrays["depth_m"],
-        clean_m=arrays["clean_m"],
-        label=arrays["label"],
-        cosine=arrays["cosine"],
-        reason=arrays["reason"],
-        images=images,
-    )
-    believed = arrays["world_from_camera_believed"]
-    return KeptView(number, frame, arrays["world_from_camera"], believed)
+    pose, believed = arrays["world_from_camera"], arrays["world_from_camera_believed"]
+    maps = {name: arrays[name] for name in _MAPS}
+    frame = DepthFrame(Camera(intrinsics, pose), left, top, step, images=images, **maps)
+    return KeptView(number, frame, pose, believed)
 
 
 def view_picture(frame: DepthFrame) -> np.ndarray:

@@ -17,23 +17,21 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from qs3.classes import ALIASES, CLASSES, known_as
+from qs3.config.checks import check_choice, check_float
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.meshes.io import SUFFIXES, load_mesh
 from qs3.meshes.source import MeshItem
 
 SPLITS = ("train", "test")
 SPLIT_FOLDERS = {
-    "train": "train",
-    "test": "test",
-    "val": "train",
-    "valid": "train",
-    "validation": "train",
+    **{"train": "train", "test": "test"},
+    **dict.fromkeys(("val", "valid", "validation"), "train"),
 }
 HALVES = ("all", "first", "second")
 LAYOUTS = "expected class/train/name.off with class/test/name.off, or class/name.off"
@@ -73,10 +71,8 @@ class MeshFolder:
             unknown = [name for name in self.classes if name not in self.known]
             if unknown or not self.classes:
                 raise ConfigError(f"classes must be among {', '.join(self.known)}; got {unknown}")
-        if not 0 < self.test_fraction < 1:
-            raise ConfigError(f"test_fraction must be in (0, 1), got {self.test_fraction}")
-        if self.half not in HALVES:
-            raise ConfigError(f"half must be one of {', '.join(HALVES)}; got {self.half!r}")
+        check_float("test_fraction", self.test_fraction, "(0, 1)")
+        check_choice("half", self.half, HALVES)
 
     def items(self) -> list[MeshItem]:
         """The meshes, sorted by class, split and stem; no file is opened.
@@ -158,13 +154,16 @@ class MeshFolder:
         files = []
         for entry in _visible(folder):
             if entry.is_dir():
-                if entry.name.lower() not in allowed and (mesh := _any_mesh_below(entry)):
+                if entry.name.lower() not in allowed and (mesh := _mesh_below(entry)):
                     raise ConfigError(
                         f"{mesh} lies in a folder that is neither a class nor a split: {LAYOUTS}"
                     )
             elif entry.suffix.lower() in SUFFIXES:
                 self._refuse_link_outside(entry)
-                _refuse_odd_name(entry)
+                if not entry.name.isprintable():  # names go into manifests and messages
+                    raise ConfigError(
+                        f"{str(entry)!r} has unprintable characters in its name: rename it"
+                    )
                 if entry.is_file():
                     files.append(entry)
         return files
@@ -235,21 +234,12 @@ def _visible(folder: Path) -> list[Path]:
     ]
 
 
-def _any_mesh_below(folder: Path) -> Path | None:
-    return next(_meshes_below(folder), None)
-
-
-def _meshes_below(folder: Path) -> Iterator[Path]:
+def _mesh_below(folder: Path) -> Path | None:
     for parent, _, names in os.walk(folder):
         for name in names:
             if not name.startswith(".") and Path(name).suffix.lower() in SUFFIXES:
-                yield Path(parent, name)
-
-
-def _refuse_odd_name(file: Path) -> None:
-    """Names go into manifests and messages: no control characters, and valid Unicode."""
-    if not file.name.isprintable():
-        raise ConfigError(f"{str(file)!r} has unprintable characters in its name: rename it")
+                return Path(parent, name)
+    return None
 
 
 def _hash(purpose: str, cls: str, stem: str) -> str:

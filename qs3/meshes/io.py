@@ -37,7 +37,7 @@ _READERS: dict[str, Callable[[bytes, Path, Colliders], Triangles]] = {
 }
 
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
-"""Of the files that `load_mesh` reads, in lower case."""
+"""Suffixes of the files that `load_mesh` reads, in lower case."""
 
 
 def load_mesh(path: str | Path, keep_colliders: bool = False) -> Mesh:

@@ -121,6 +121,17 @@ def track(norm: nn.Module, mean: Tensor, var: Tensor, count: int) -> None:
     norm.running_var.lerp_(unbiased.to(norm.running_var), momentum)
 
 
+def statistics(norm: nn.Module, mean: Tensor, var: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """What a pass normalises by: these of the batch, which are `track`ed, or the running ones."""
+    norm = active(norm)
+    if uses_batch(norm):
+        track(norm, mean.detach(), var.detach(), count)
+        return mean, var
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    return norm.running_mean, norm.running_var
+
+
 @contextmanager
 def use_domain(net: nn.Module, domain: str) -> Iterator[None]:
     """Passes of `net` inside use the norms of `domain`; afterwards those of before.

@@ -183,7 +183,7 @@ def group(
         centres: some of the points.
         index: which.
         radius: of a ball, strict, in the unit of the cloud.
-        slots: members of a ball; with `relation="original"` those beside the centre.
+        slots: members of a ball; with `relation="original"` those next to the centre.
         relation: see the module.
     """
     if relation != "original":

@@ -9,7 +9,7 @@ from tests.generation.generating import config
 
 @pytest.fixture(scope="session")
 def meshes(tmp_path_factory):
-    """Three classes, two splits, two or three objects each."""
+    """Three classes of two objects in train and one in test."""
     root = tmp_path_factory.mktemp("meshes")
     solids = {
         "chair": lambda i: trimesh.creation.box((0.5, 0.5, 0.9 + 0.1 * i)),
@@ -17,11 +17,11 @@ def meshes(tmp_path_factory):
         "lamp": lambda i: trimesh.creation.icosphere(3, 0.3 + 0.05 * i),
     }
     for cls, make in solids.items():
-        for split, count in (("train", 3), ("test", 2)):
+        for split, count in (("train", 2), ("test", 1)):
             folder = root / cls / split
             folder.mkdir(parents=True)
             for i in range(count):
-                make(i + 3 * (split == "test")).export(folder / f"{cls}_{i}.ply")
+                make(i + 2 * (split == "test")).export(folder / f"{cls}_{i}.ply")
     return root
 
 

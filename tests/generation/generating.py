@@ -16,13 +16,15 @@ QUICK = [
 ]
 
 
+def composed(*overrides, name="generate"):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose(name, list(overrides))
+
+
 def config(data_dir, meshes=None, *overrides, domain="specklenet10"):
     where = [f"paths.data_dir={data_dir}", *([f"meshes={meshes}"] if meshes else [])]
-    settings = [] if domain.startswith("modelnet") else QUICK
-    if domain.startswith("modelnet"):
-        settings = ["classes=[chair,table,lamp]"]
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("generate", [f"domain={domain}", *settings, *where, *overrides])
+    settings = QUICK[-1:] if domain.startswith("modelnet") else QUICK
+    return composed(f"domain={domain}", *settings, *where, *overrides)
 
 
 def command(data_dir, meshes, *overrides):
@@ -35,4 +37,5 @@ def command(data_dir, meshes, *overrides):
 def fingerprint(folder):
     """Hash of every file of a finished dataset."""
     names = ("points.npy", "points_clean.npy", "manifest.csv", "meta.yaml")
+    names += ("clouds.png", "infrared.png")
     return {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in names}

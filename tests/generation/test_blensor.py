@@ -1,10 +1,7 @@
 """B: the same objects and views as S, and another sensor."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from qs3.config.hydra import build
@@ -15,13 +12,11 @@ from qs3.sensors.devices.blensor_kinect import DotMask
 from qs3.sensors.devices.fringe import FringeProjection
 from qs3.sensors.devices.gaussian_time_of_flight import GaussianTimeOfFlight
 from qs3.sensors.devices.time_of_flight import TimeOfFlight
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.generation.generating import composed
 
 
 def config(domain, *overrides):
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("generate", [f"domain={domain}", *overrides])
+    return composed(f"domain={domain}", *overrides)
 
 
 def test_b_is_s_but_for_its_name_and_its_sensor():

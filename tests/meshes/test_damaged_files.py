@@ -13,19 +13,26 @@ from qs3.meshes import io as files
 from qs3.meshes.io import load_mesh
 from tests.meshes.written import EXPORTS, dae, export, gltf, mixed_ply, save
 
+OTHERS = {
+    "mixed.ply": lambda: mixed_ply("<"),
+    "a.gltf": lambda: json.dumps(gltf()[0]).encode(),
+    "a.dae": lambda: dae().encode(),
+}
+every_format = pytest.mark.parametrize("name", [*EXPORTS, *OTHERS])
 
-@pytest.mark.parametrize("name", [*EXPORTS, "mixed.ply", "a.gltf", "a.dae"])
+
+def content_of(name):
+    return OTHERS[name]() if name in OTHERS else export(name)
+
+
+@every_format
 def test_cut_files_are_whole_or_refused(tmp_path, name):
     """At many lengths: the same mesh, or MeshError.
 
     Two formats cannot promise it everywhere. In text the last number may lose digits when
     nothing follows it; OBJ holds no counts, so it may lose whole faces.
     """
-    content = {
-        "mixed.ply": lambda: mixed_ply("<"),
-        "a.gltf": lambda: json.dumps(gltf()[0]).encode(),
-        "a.dae": lambda: dae().encode(),
-    }.get(name, lambda: export(name))()
+    content = content_of(name)
     whole = load_mesh(save(tmp_path, name, content)).sha256
     text = content.rstrip()
     last_number = len(text) - len(text.split()[-1])
@@ -45,13 +52,9 @@ def test_cut_files_are_whole_or_refused(tmp_path, name):
         assert survived <= 3
 
 
-@pytest.mark.parametrize("name", [*EXPORTS, "mixed.ply", "a.gltf", "a.dae"])
+@every_format
 def test_flipped_bytes_give_a_mesh_or_mesh_error(tmp_path, name):
-    content = {
-        "mixed.ply": lambda: mixed_ply(">"),
-        "a.gltf": lambda: json.dumps(gltf()[0]).encode(),
-        "a.dae": lambda: dae().encode(),
-    }.get(name, lambda: export(name))()
+    content = content_of(name)
     rng = np.random.default_rng(0)
     for _ in range(150):
         damaged = np.frombuffer(content, np.uint8).copy()

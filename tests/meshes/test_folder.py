@@ -48,15 +48,8 @@ def test_given_splits_are_kept_and_validation_is_train(tmp_path):
     assert [item.origin for item in items][:3] == [
         *("chair/train/a.off", "chair/Train/b.off", "chair/val/v.OBJ"),
     ]
-    assert items[0].cls == "chair"
-    assert items[0].split == "train"
+    assert (items[0].cls, items[0].split) == ("chair", "train")
     assert len(pickle.loads(pickle.dumps(items[0])).load().faces) == 1
-
-
-def test_all_ten_classes_by_default(tmp_path):
-    make(tmp_path, *(f"{name}/{split}/a.off" for name in CLASSES for split in ("train", "test")))
-    items = MeshFolder(tmp_path).items()
-    assert [item.cls for item in items] == [name for name in CLASSES for _ in range(2)]
 
 
 def test_names_of_other_datasets(tmp_path):
@@ -80,7 +73,8 @@ def test_unknown_folders(tmp_path):
     make(tmp_path, *(f"{name}/a.off" for name in CLASSES), "toilet/a.off")
     with pytest.raises(ConfigError, match=r"'toilet'.*bathtub.*night_stand.*classes="):
         MeshFolder(tmp_path).items()
-    assert len(MeshFolder(tmp_path, classes=CLASSES).items()) == 10
+    items = MeshFolder(tmp_path, classes=CLASSES).items()
+    assert [item.cls for item in items] == list(CLASSES)
     assert ids(tmp_path) == ["chair/train/a"]
 
 
@@ -185,7 +179,7 @@ def test_split_depends_on_names_only_and_hardly_on_company(tmp_path):
     assert [n.replace("table", "chair") for n in tables] != first
 
 
-@pytest.mark.parametrize("n", [2, 3, 7, 50])
+@pytest.mark.parametrize("n", [2, 7])
 def test_halves_share_nothing_and_miss_nothing(tmp_path, n):
     make(tmp_path, *(f"chair/{split}/c{i}.off" for split in ("train", "test") for i in range(n)))
     first, second = ids(tmp_path, half="first"), ids(tmp_path, half="second")

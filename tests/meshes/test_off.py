@@ -16,7 +16,6 @@ from tests.meshes.written import SQUARE_OFF, refused, save
         "OFF\n4 2 0\n",
         "OFF4 2 0\n",  # ModelNet40
         "OFF 4 2 0\n",
-        "OFF\r\n4 2 0\r\n",
         "OFF\n4 2\n",
         "# a comment\nOFF # another\n\n# and one\n4 2 5 # edges\n\n",
         "\ufeffOFF\n4 2 0\n",

@@ -82,6 +82,10 @@ def gltf(**changes):
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype="<f4")
     indices = np.array([0, 1, 2, 2, 1, 3, 0, 1, 2, 3, 1, 0, 3, 2], dtype="<u2")
     blob = points.tobytes() + indices.tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+    points_alone = {"attributes": {"POSITION": 0}}
+    triangles = {**points_alone, "indices": 1}
+    strips = [{**points_alone, "indices": i, "mode": 5} for i in (2, 3)]
     accessor = {"bufferView": 1, "componentType": 5123, "type": "SCALAR"}
     tree = {
         "asset": {"version": "2.0"},
@@ -92,16 +96,7 @@ def gltf(**changes):
             {"mesh": 0, "camera": 0, "rotation": [0, 0, 2**-0.5, 2**-0.5]},
             {"mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 7, 1]},
         ],
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": {"POSITION": 0}, "indices": 1},
-                    {"attributes": {"POSITION": 0}, "indices": 2, "mode": 5},
-                    {"attributes": {"POSITION": 0}, "indices": 3, "mode": 5},
-                    {"attributes": {"POSITION": 0}, "mode": 0},
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [triangles, *strips, {**points_alone, "mode": 0}]}],
         "accessors": [
             {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4},
             {**accessor, "count": 6},
@@ -112,12 +107,7 @@ def gltf(**changes):
             {"buffer": 0, "byteLength": 48},
             {"buffer": 0, "byteOffset": 48, "byteLength": 28},
         ],
-        "buffers": [
-            {
-                "byteLength": 76,
-                "uri": "data:application/octet-stream;base64," + base64.b64encode(blob).decode(),
-            }
-        ],
+        "buffers": [{"byteLength": 76, "uri": uri}],
     }
     return {**tree, **changes}, blob
 

@@ -29,7 +29,7 @@ def clouds(b: int = 4, n: int = 600) -> Tensor:
 
 
 def gradient_norm(model: nn.Module) -> float:
-    """Of all parameters together."""
+    """Norm of the gradients of all parameters together."""
     return float(
         sum(p.grad.square().sum() for p in model.parameters() if p.grad is not None) ** 0.5
     )

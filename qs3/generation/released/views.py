@@ -8,6 +8,7 @@ import numpy as np
 
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
+from qs3.generation.camera_poses import direction
 from qs3.geometry.cameras import look_at, rotation_xyz
 from qs3.meshes.mesh import Mesh
 
@@ -53,15 +54,11 @@ class GrowingJitterViews:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise ConfigError(f"views must be at least 1, got {self.count}: set views=N")
-        for low, high in (
-            ("min_distance_m", "max_distance_m"),
-            ("min_elevation_deg", "max_elevation_deg"),
-            ("min_azimuth_deg", "max_azimuth_deg"),
-        ):
-            if not getattr(self, low) <= getattr(self, high):
+        for name in ("distance_m", "elevation_deg", "azimuth_deg"):
+            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
+            if not low <= high:
                 raise ConfigError(
-                    f"recipe.views.{low} must not exceed {high}, got {getattr(self, low)} and "
-                    f"{getattr(self, high)}"
+                    f"recipe.views.min_{name} must not exceed max_{name}, got {low} and {high}"
                 )
         drift = ("shift_sigma_m", "turn_sigma_rad", "max_shift_m", "max_turn_rad")
         check_ranges(self, "recipe.views.", min_distance_m="> 0", **dict.fromkeys(drift, ">= 0"))
@@ -74,9 +71,7 @@ class GrowingJitterViews:
         distance = rng.uniform(self.min_distance_m, self.max_distance_m)
         elevation = np.deg2rad(rng.uniform(self.min_elevation_deg, self.max_elevation_deg))
         azimuth = np.deg2rad(rng.uniform(self.min_azimuth_deg, self.max_azimuth_deg))
-        flat = np.cos(elevation)
-        direction = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-        anchor = look_at(target_m + distance * direction, target_m)
+        anchor = look_at(target_m + distance * direction(azimuth, elevation), target_m)
         angles = euler_xyz(anchor[:3, :3] @ _FLIP)
         poses = [anchor]
         for i in range(1, self.count):

@@ -49,7 +49,7 @@ def hollow_rings(
 def tap(draw: Draw, x: float, y: float, z: float, heading: float) -> list[Mesh]:
     """A spout and handles at (x, y), pointing by degrees from +x, on the rim at height z.
 
-    One beside the tub (z = 0) stands on a pipe of its own.
+    One next to the tub (z = 0) stands on a pipe of its own.
     """
     reach, rise = draw.between(0.12, 0.2), draw.between(0.08, 0.22)
     parts = [p.cylinder(0.028, 0.02, sides=12)]
@@ -96,16 +96,8 @@ def built_in(draw: Draw) -> list[Mesh]:
     square, inside = rounded_outline(0.012), rounded_outline(draw.between(0.12, 0.35))
     head = draw.between(0.0, 0.08)  # a wider ledge at the tap end
     opening = (width - 2 * rim - head, depth - 2 * rim)
-    outer = [
-        p.ring_at(square(width - 2 * cut, depth - 2 * cut), z)
-        for cut, z in (
-            (inset, 0),
-            (inset, top - lip),
-            (0, top - lip),
-            (0, top - 0.008),
-            (0.008, top),
-        )
-    ]
+    side = [(inset, 0), (inset, top - lip), (0, top - lip), (0, top - 0.008), (0.008, top)]
+    outer = [p.ring_at(square(width - 2 * cut, depth - 2 * cut), z) for cut, z in side]
     hollow = hollow_rings(draw, inside, opening, floor, top, end)
     hollow = [ring - (end * head / 2, 0, 0) for ring in hollow]
     parts = [p.loft(np.stack([*outer, *hollow])), drain(width - head, floor, end)]

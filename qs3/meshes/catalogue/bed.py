@@ -153,11 +153,8 @@ def crib(draw: Draw) -> list[Mesh]:
 def bunk(draw: Draw) -> list[Mesh]:
     """Two beds over each other, or a loft bed, with guard rails and a ladder."""
     width, length, tall = draw.between(0.8, 1.0), draw.between(1.9, 2.05), draw.between(1.5, 1.8)
-    post, high, low = (
-        draw.between(0.05, 0.09),
-        draw.between(0.7, 0.78) * tall,
-        draw.between(0.22, 0.4),
-    )
+    post, high = draw.between(0.05, 0.09), draw.between(0.7, 0.78) * tall
+    low = draw.between(0.22, 0.4)
     x, y, thick = width / 2 + post / 2, length / 2 + post / 2, draw.between(0.12, 0.18)
     parts = f.four_legs(2 * x, 2 * y, tall, p.rectangle(post, post))
     for level in [high] if draw.chance(0.25) else [low, high]:

@@ -14,50 +14,27 @@ from qs3.meshes.mesh import Mesh
 
 TRAIN = {
     "open_shelves": Case(
-        bay=(0.4, 0.9),
-        bays=(1, 3),
-        depth=(0.22, 0.36),
-        height=(1.2, 2.2),
-        lift=(0.0, 0.1),
-        layouts=((("open", 1.0, (0.28, 0.42)),),),
-        feet=("plinth", "plinth", "square"),
-        board=(0.015, 0.03),
-        back=0.6,
-        fill=(0.0, 0.95),
-        top=False,
+        bay=(0.4, 0.9), bays=(1, 3), depth=(0.22, 0.36), height=(1.2, 2.2), lift=(0.0, 0.1),
+        layouts=((("open", 1.0, (0.28, 0.42)),),), feet=("plinth", "plinth", "square"),
+        board=(0.015, 0.03), back=0.6, fill=(0.0, 0.95), top=False,
     ),
     "cube_grid": Case(
-        bay=(0.33, 0.4),
-        bays=(1, 5),
-        depth=(0.29, 0.4),
-        height=(0.7, 1.9),
-        lift=(0.0, 0.0),
+        bay=(0.33, 0.4), bays=(1, 5), depth=(0.29, 0.4), height=(0.7, 1.9), lift=(0.0, 0.0),
         layouts=(
-            (("open", 1.0, (0.33, 0.4)),),
-            (("open", 1.0, (0.33, 0.4)),),
+            (("open", 1.0, (0.33, 0.4)),), (("open", 1.0, (0.33, 0.4)),),
             (("drawer", 0.25, (0.16, 0.4)), ("open", 0.75, (0.33, 0.4))),
         ),
-        board=(0.016, 0.04),
-        back=0.4,
-        fill=(0.2, 0.9),
-        top=False,
+        board=(0.016, 0.04), back=0.4, fill=(0.2, 0.9), top=False,
     ),
     "lower_doors": Case(
-        bay=(0.4, 0.75),
-        bays=(1, 3),
-        depth=(0.28, 0.42),
-        height=(1.6, 2.2),
-        lift=(0.04, 0.1),
+        bay=(0.4, 0.75), bays=(1, 3), depth=(0.28, 0.42), height=(1.6, 2.2), lift=(0.04, 0.1),
         layouts=tuple(
             ((kind, low, (0.2, 0.4)), ("open", 1 - low, (0.27, 0.38)))
             for kind, low in (("door", 0.24), ("door", 0.38), ("drawer", 0.3))
         ),
-        alike=True,
-        feet=("plinth", "square", "bun"),
-        board=(0.018, 0.028),
-        fill=(0.3, 0.95),
+        alike=True, feet=("plinth", "square", "bun"), board=(0.018, 0.028), fill=(0.3, 0.95),
     ),
-}
+}  # fmt: skip
 TEST = {
     "low_wide": Case(
         bay=(0.4, 0.7), bays=(1, 4), depth=(0.2, 0.36), height=(0.3, 1.1), lift=(0.0, 0.16),
@@ -73,11 +50,8 @@ def metal_rack(draw: Draw) -> list[Mesh]:
     width, depth = draw.between(0.6, 1.2), draw.between(0.3, 0.45)
     height, post, board = draw.between(1.1, 2.0), draw.between(0.018, 0.035), 0.022
     x, y, round_posts = (width - post) / 2, (depth - post) / 2, draw.chance(0.4)
-    parts = []
-    for sx, sy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-        at = (sx * x, sy * y, 0)
-        shape = p.cylinder(post / 2, height) if round_posts else p.box((post, post, height))
-        parts.append(p.move(shape, at))
+    shape = p.cylinder(post / 2, height) if round_posts else p.box((post, post, height))
+    parts = [p.move(shape, (sx * x, sy * y, 0)) for sx in (-1, 1) for sy in (-1, 1)]
     levels = np.linspace(draw.between(0.08, 0.2), height - board, draw.count(4, 6))
     fill, room = draw.pick(0.0, 0.6, 0.9), (depth - 0.02, float(levels[1] - levels[0]) - board)
     for z in levels.tolist():

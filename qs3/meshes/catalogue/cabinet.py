@@ -11,54 +11,32 @@ from qs3.meshes.mesh import Mesh
 
 TRAIN = {
     "night_stand": Case(
-        bay=(0.36, 0.6),
-        bays=(1, 1),
-        depth=(0.32, 0.46),
-        height=(0.3, 0.48),
-        lift=(0.04, 0.25),
+        bay=(0.36, 0.6), bays=(1, 1), depth=(0.32, 0.46), height=(0.3, 0.48), lift=(0.04, 0.25),
         layouts=(
-            (("drawer", 1.0, (0.13, 0.4)),),
-            (("open", 0.62, WHOLE), ("drawer", 0.38, WHOLE)),
+            (("drawer", 1.0, (0.13, 0.4)),), (("open", 0.62, WHOLE), ("drawer", 0.38, WHOLE)),
             (("door", 0.62, WHOLE), ("drawer", 0.38, WHOLE)),
         ),
         feet=("plinth", "square", "tapered"),
     ),
     "chest_of_drawers": Case(
-        bay=(0.6, 0.85),
-        bays=(1, 2),
-        depth=(0.38, 0.55),
-        height=(0.6, 1.15),
-        lift=(0.03, 0.18),
-        layouts=((("drawer", 1.0, (0.15, 0.28)),),),
-        alike=True,
+        bay=(0.6, 0.85), bays=(1, 2), depth=(0.38, 0.55), height=(0.6, 1.15), lift=(0.03, 0.18),
+        layouts=((("drawer", 1.0, (0.15, 0.28)),),), alike=True,
     ),
     "wardrobe": Case(
-        bay=(0.42, 0.56),
-        bays=(1, 4),
-        depth=(0.5, 0.65),
-        height=(1.7, 2.2),
-        lift=(0.04, 0.14),
+        bay=(0.42, 0.56), bays=(1, 4), depth=(0.5, 0.65), height=(1.7, 2.2), lift=(0.04, 0.14),
         layouts=(
-            (("door", 1.0, WHOLE),),
-            (("drawer", 0.22, (0.2, 0.5)), ("door", 0.78, WHOLE)),
+            (("door", 1.0, WHOLE),), (("drawer", 0.22, (0.2, 0.5)), ("door", 0.78, WHOLE)),
         ),
-        alike=True,
-        feet=("plinth", "plinth", "square", "bun"),
+        alike=True, feet=("plinth", "plinth", "square", "bun"),
     ),
     "sideboard": Case(
-        bay=(0.36, 0.6),
-        bays=(3, 4),
-        depth=(0.36, 0.5),
-        height=(0.42, 0.68),
-        lift=(0.08, 0.3),
+        bay=(0.36, 0.6), bays=(3, 4), depth=(0.36, 0.5), height=(0.42, 0.68), lift=(0.08, 0.3),
         layouts=(
-            (("door", 1.0, WHOLE),),
-            (("drawer", 1.0, (0.14, 0.3)),),
-            (("open", 1.0, (0.2, 0.35)),),
+            (("door", 1.0, WHOLE),), (("drawer", 1.0, (0.14, 0.3)),), (("open", 1.0, (0.2, 0.35)),),
         ),
         feet=("tapered", "tapered", "square", "plinth"),
     ),
-}
+}  # fmt: skip
 TEST = {
     "filing": Case(
         bay=(0.38, 0.48), bays=(1, 2), depth=(0.5, 0.65), height=(0.55, 1.35), lift=(0.02, 0.07),

@@ -55,11 +55,8 @@ class Case:
 
 def build(draw: Draw, case: Case, width: float = 0.0) -> list[Mesh]:
     """One piece on the floor, its middle at the origin; `width` overrules that of the bays."""
-    bays, depth, height = (
-        draw.count(*case.bays),
-        draw.between(*case.depth),
-        draw.between(*case.height),
-    )
+    bays = draw.count(*case.bays)
+    depth, height = draw.between(*case.depth), draw.between(*case.height)
     width = width or bays * draw.between(*case.bay)
     each, board, look = width / bays, draw.between(*case.board), j.any_look(draw, *case.fronts)
     lift, fill = draw.between(*case.lift), draw.between(*case.fill)

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from qs3.classes import CLASSES
+from qs3.config.checks import check_choice, check_int
 from qs3.errors import ConfigError
 from qs3.meshes.catalogue.family import Draw, Family
 from qs3.meshes.mesh import Mesh, merge
@@ -49,8 +50,7 @@ class Catalogue:
         object.__setattr__(self, "classes", classes)
         if isinstance(self.seed, bool) or not isinstance(self.seed, int):
             raise ConfigError(f"the catalogue's seed must be an integer, got {self.seed!r}")
-        if self.families not in ("split", "all"):
-            raise ConfigError(f'families must be "split" or "all", got {self.families!r}')
+        check_choice("catalogue.families", self.families, ("split", "all"))
         for split in SPLITS:
             counts = getattr(self, split)
             if isinstance(counts, Mapping):
@@ -65,9 +65,7 @@ class Catalogue:
         if isinstance(counts, Mapping) and cls not in counts:
             raise ConfigError(f"{split} gives no count for the class {cls}: add one, 0 for none")
         count = counts[cls] if isinstance(counts, Mapping) else counts
-        if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-            raise ConfigError(f"{split}: the count of {cls} must be 0 or more, got {count!r}")
-        return count
+        return check_int(f"catalogue.{split} of {cls}", count, 0)
 
     def items(self) -> list[MeshItem]:
         """All objects, ordered by class, split (train first) and index; no mesh is made yet."""

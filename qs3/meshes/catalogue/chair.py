@@ -109,11 +109,10 @@ def swivel(draw: Draw) -> list[Mesh]:
     seat, reach, start = draw.between(0.42, 0.54), draw.between(0.27, 0.34), draw.between(0, 72)
     out: list[Mesh] = []
     for spoke in range(5):
-        bar = p.beam((0.02, 0, 0.11), (reach, 0, 0.075), (0.05, 0.035), 0.6)
-        wheels = [
-            p.rod((reach, y, 0.028), (reach, y + 0.02, 0.028), 0.028) for y in (-0.024, 0.004)
-        ]
-        out += [p.turn(part, start + 72 * spoke) for part in (bar, *wheels)]
+        parts = [p.beam((0.02, 0, 0.11), (reach, 0, 0.075), (0.05, 0.035), 0.6)]
+        for y in (-0.024, 0.004):
+            parts.append(p.rod((reach, y, 0.028), (reach, y + 0.02, 0.028), 0.028))
+        out += [p.turn(part, start + 72 * spoke) for part in parts]
     out += [
         p.lathe([(0.04, 0.08), (0.035, 0.16), (0.022, 0.17), (0.022, seat - 0.08)], sides=14),
         p.box((0.20, 0.24, 0.035), (0, 0.02, seat - 0.11)),
@@ -168,11 +167,8 @@ def tube_chair(draw: Draw) -> list[Mesh]:
 
 def wing_chair(draw: Draw) -> list[Mesh]:
     """A fully upholstered easy chair with a high back and, mostly, wings."""
-    width, depth, foot = (
-        draw.between(0.68, 0.82),
-        draw.between(0.66, 0.78),
-        draw.between(0.08, 0.17),
-    )
+    width, depth = draw.between(0.68, 0.82), draw.between(0.66, 0.78)
+    foot = draw.between(0.08, 0.17)
     seat, top = draw.between(0.42, 0.48), draw.between(0.92, 1.12)
     arm, rest, rake = draw.between(0.09, 0.14), draw.between(0.58, 0.66), draw.between(6, 12)
     x, y, leg = width / 2 - arm / 2, depth / 2, f.leg_section(draw.chance(0.5), 0.045)
@@ -185,13 +181,9 @@ def wing_chair(draw: Draw) -> list[Mesh]:
     out += f.both_sides(p.rounded_box((arm, depth - 0.04, rest - foot), (x, -0.02, foot), 0.04))
     if draw.chance(0.75):
         lean, reach = (top - foot) * float(np.tan(np.radians(rake))), draw.between(0.14, 0.26)
-        wing = [
-            (y - 0.05, rest - 0.08),
-            (y + lean - 0.06, top - 0.03),
-            (y - 0.1 - reach * 0.6, top - 0.07),
-            (y - 0.1 - reach, rest + 0.12),
-            (y - 0.2 - reach, rest - 0.08),
-        ]
+        wing = [(y - 0.05, rest - 0.08), (y + lean - 0.06, top - 0.03)]
+        wing += [(y - 0.1 - reach * 0.6, top - 0.07), (y - 0.1 - reach, rest + 0.12)]
+        wing.append((y - 0.2 - reach, rest - 0.08))
         out += f.both_sides(p.move(p.extrude(wing, 0.06, "x"), (x - 0.03, 0, 0)))
     return out
 

@@ -20,17 +20,12 @@ def post(
 ) -> Mesh:
     """A leg whose cross-sections stay level, so that it stands flat on the floor.
 
-    Args:
-        path: centres of the sections from bottom to top.
-        section: [N, 2] outline around its centre.
-        scale: enlarges the section at each point of the path.
+    `section` is an outline [N, 2]; `path` leads from bottom to top, `scale` is one for each of its
+    points.
     """
     factors = [1.0] * len(path) if scale is None else scale
-    rings = [
-        p.ring_at(section * factor, 0.0) + np.asarray(point)
-        for point, factor in zip(path, factors, strict=True)
-    ]
-    return p.loft(np.stack(rings))
+    pairs = zip(path, factors, strict=True)
+    return p.loft(np.stack([p.ring_at(section * f, 0.0) + np.asarray(at) for at, f in pairs]))
 
 
 def four_legs(
@@ -44,13 +39,8 @@ def four_legs(
 ) -> list[Mesh]:
     """Straight legs at the corners of width x depth (between centres, at the upper end).
 
-    Args:
-        width: distance of the centres along x.
-        depth: distance of the centres along y.
-        height: length of the legs.
-        section: [N, 2] outline at the upper end.
-        splay: how far each foot stands out along x and along y.
-        foot: scale of the section at the floor.
+    `section` is their outline [N, 2] at the upper end, `foot` its scale at the floor; each foot
+    stands out by `splay` along x and along y.
     """
     legs = []
     for sx in (-1, 1):

@@ -124,10 +124,8 @@ def drawer(
     if pulled > 0:
         w, h, middle = width - 0.03, 0.75 * height, y + depth / 2 - 0.015
         parts.append(p.box((w, depth - 0.03, 0.01), (x, middle, z + 0.02)))
-        for s in (-1, 1):
-            parts.append(
-                p.box((0.012, depth - 0.03, h), (x + s * (w / 2 - 0.006), middle, z + 0.02))
-            )
+        for side in (x - (w / 2 - 0.006), x + (w / 2 - 0.006)):
+            parts.append(p.box((0.012, depth - 0.03, h), (side, middle, z + 0.02)))
         parts.append(p.box((w, 0.012, h), (x, y + depth - 0.036, z + 0.02)))
     return [p.move(part, (0, -pulled, 0)) for part in parts]
 
@@ -203,9 +201,6 @@ def contents(
         tall = min(0.85 * height, draw.between(0.12, 0.32))
         shape = [(0.6, 0), (1.0, 0.35), (0.9, 0.6), (0.35, 0.85), (0.5, 1), (0.4, 1), (0.25, 0.85)]
         return [p.lathe([(s * r, t * tall) for s, t in shape], middle, sides=14)]
-    size = (
-        min(draw.between(0.4, 0.85) * width, 0.4),
-        0.8 * depth,
-        draw.between(0.3, 0.75) * height,
-    )
-    return [p.box((*size[:2], min(size[2], 0.25)), (left + 0.5 * width, middle[1], z))]
+    wide = min(draw.between(0.4, 0.85) * width, 0.4)
+    size = (wide, 0.8 * depth, min(draw.between(0.3, 0.75) * height, 0.25))
+    return [p.box(size, (left + 0.5 * width, middle[1], z))]

@@ -132,7 +132,7 @@ def spot_pole(draw: Draw) -> list[Mesh]:
 
 
 def gooseneck(draw: Draw) -> list[Mesh]:
-    """A bent tube over a foot, a bell at its end; for the desk or, large, beside a chair."""
+    """A bent tube over a foot, a bell at its end; for the desk or, large, next to a chair."""
     large = draw.chance(0.4)
     height = draw.between(1.15, 1.6) if large else draw.between(0.32, 0.5)
     reach = draw.between(0.25, 0.5) if large else draw.between(0.16, 0.28)

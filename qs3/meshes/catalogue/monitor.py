@@ -72,11 +72,8 @@ def flat_stand(draw: Draw) -> list[Mesh]:
 def tube(draw: Draw) -> list[Mesh]:
     """A deep body that narrows backwards, a bulged glass, a swivel foot or a case below."""
     width, height = draw.between(0.34, 0.5), draw.between(0.32, 0.44)
-    depth, mask, edge = (
-        draw.between(0.34, 0.48),
-        draw.between(0.06, 0.14),
-        draw.between(0.025, 0.045),
-    )
+    depth, mask = draw.between(0.34, 0.48), draw.between(0.06, 0.14)
+    edge = draw.between(0.025, 0.045)
     shape, narrow = p.rounded_rectangle(width, height, 0.02), draw.between(0.5, 0.72)
     low, clear = draw.between(0.0, 0.12) * height, draw.between(0.03, 0.16)
     stages = [(1.0, 0.0), (1.0, mask), (0.88, mask + 0.02), (narrow, 0.85 * depth)]
@@ -126,7 +123,7 @@ def all_in_one(draw: Draw) -> list[Mesh]:
 
 
 def tv_pedestal(draw: Draw) -> list[Mesh]:
-    """An older, thick television: loudspeakers beside or below the screen, a broad foot."""
+    """An older, thick television: loudspeakers next to or below the screen, a broad foot."""
     diagonal, clear = draw.between(0.65, 1.15), draw.between(0.05, 0.1)
     width, height, thick = 0.872 * diagonal, 0.49 * diagonal, draw.between(0.06, 0.12)
     below = draw.chance(0.6)

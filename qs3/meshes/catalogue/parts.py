@@ -30,13 +30,10 @@ def loft(
     start: Vector | None = None,
     end: Vector | None = None,
 ) -> Mesh:
-    """Skin over rings [K, N, 3].
+    """Skin over rings [K, N, 3]: corresponding points of consecutive closed curves.
 
-    Args:
-        rings: corresponding points of consecutive closed curves.
-        loop: the last ring continues in the first (a torus, an open-ended thick shade).
-        start: apex that closes the first ring; its mean by default.
-        end: apex that closes the last ring; its mean by default.
+    With `loop` the last ring continues in the first (a torus, an open-ended thick shade); else the
+    apexes `start` and `end`, by default their means, close the first and the last one.
     """
     rings = np.asarray(rings, dtype=np.float64)
     k, n = rings.shape[:2]
@@ -279,14 +276,10 @@ def beam(p: Vector, q: Vector, size: tuple[float, float], end: float = 1.0) -> M
 def leaf(
     path: np.ndarray, width: float, *, across: Vector, thickness: float = 0.003, belly: float = 0.4
 ) -> Mesh:
-    """A leaf or blade along a path [K, 3]: pointed at the end, widest at the fraction `belly`.
+    """A leaf or blade along its midrib [K, 3], widest at the fraction `belly`, pointed at the end.
 
-    Args:
-        path: midrib from stem to tip.
-        width: greatest width in metres.
-        across: direction of the width (made perpendicular to the path).
-        thickness: at the midrib.
-        belly: where along the path it is widest, in (0, 1).
+    `across` is the direction of its greatest width (made perpendicular to the path), `thickness`
+    that of the midrib.
     """
     path = np.asarray(path, dtype=np.float64)
     steps = np.gradient(path, axis=0)
@@ -294,10 +287,8 @@ def leaf(
     side = _perpendicular(np.asarray(across, dtype=np.float64), tangents[len(path) // 2])
     rings = []
     for t, point, tangent in zip(np.linspace(0, 1, len(path)), path, tangents, strict=True):
-        rise, fall = (
-            np.sin(0.5 * np.pi * t / belly),
-            np.cos(0.5 * np.pi * (t - belly) / (1 - belly)),
-        )
+        rise = np.sin(0.5 * np.pi * t / belly)
+        fall = np.cos(0.5 * np.pi * (t - belly) / (1 - belly))
         share = max(float(rise if t < belly else fall), 0.06)
         half, lift = 0.5 * width * share, 0.5 * thickness * share**0.5 * np.cross(side, tangent)
         rings.append([point - half * side, point - lift, point + half * side, point + lift])

@@ -217,7 +217,7 @@ def _buffer(uri: str | None, binary: bytes | None, folder: Path, most: int) -> b
     if not path.is_relative_to(folder):
         raise MeshError(f"refers to {uri!r}, which lies outside of its folder")
     if not path.is_file():
-        raise MeshError(f"refers to {uri!r}, which is not there: put it beside the mesh")
+        raise MeshError(f"refers to {uri!r}, which is not there: put it next to the mesh")
     if path.stat().st_size > most:
         raise MeshError(f"refers to more than {MAX_BUFFER_BYTES} bytes in other files")
     return path.read_bytes()

@@ -59,7 +59,7 @@ def _plain_triangles(body: bytes, vertex_count: int, face_count: int) -> Triangl
 
 
 def _by_lines(body: bytes, vertex_count: int, face_count: int) -> Triangles:
-    """Polygons, colours and all else that takes lines to be told apart."""
+    """Polygons of several sizes, colours: read line by line."""
     rows = [line for line in lines(body) if not line.isspace()]
     if len(rows) < vertex_count + face_count:
         raise MeshError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -120,53 +121,40 @@ def _dtype(kind: str, order: str, text: bool) -> np.dtype:
 
 
 def _read_element(element: _Element, body: bytes, offset: int) -> tuple[dict, int]:
-    """Columns by name, lists as (sizes [N], items [sum(sizes)]); and the offset behind."""
-    sizes = _first_sizes(element, body, offset)
-    row = np.dtype(
-        [
-            field
-            for i, (p, size) in enumerate(zip(element.properties, sizes, strict=True))
-            for field in _fields(i, p, size)
-        ]
-    )
+    """Columns by name, lists as (sizes [N], items [sum(sizes)]); and the offset behind.
+
+    Most files have lists of the same length in all rows: that of the first row is tried.
+    """
+    fields: list[tuple] = []
+    sizes: dict[int, int] = {}  # of the lists in the first row
+    place = offset
+    for i, prop in enumerate(element.properties):
+        size = 1
+        if prop.count_dtype is not None:
+            size = sizes[i] = _size(element, prop.count_dtype, body, place) if element.count else 0
+            fields.append((f"n{i}", prop.count_dtype))
+            place += prop.count_dtype.itemsize
+        fields.append((f"p{i}", prop.dtype, (size,)) if i in sizes else (f"p{i}", prop.dtype))
+        place += size * prop.dtype.itemsize
+    row = np.dtype(fields)
     end = offset + element.count * row.itemsize
     if end <= len(body):
         table = np.frombuffer(body, row, element.count, offset)
-        if all((table[f"n{i}"] == size).all() for i, size in enumerate(sizes) if size is not None):
-            columns = {
-                p.name: table[f"p{i}"]
-                if size is None
-                else (np.full(element.count, size), table[f"p{i}"].reshape(-1))
-                for i, (p, size) in enumerate(zip(element.properties, sizes, strict=True))
-            }
+        if all((table[f"n{i}"] == size).all() for i, size in sizes.items()):
+            columns: dict[str, Any] = {}
+            for i, prop in enumerate(element.properties):
+                items: Any = table[f"p{i}"]
+                if i in sizes:
+                    items = np.full(element.count, sizes[i]), items.reshape(-1)
+                columns[prop.name] = items
             return columns, end
-    if all(size is None for size in sizes):
+    if not sizes:
         raise _truncated(element)
     return _read_ragged(element, body, offset)
 
 
-def _fields(index: int, prop: _Property, size: int | None) -> list[tuple]:
-    if size is None:
-        return [(f"p{index}", prop.dtype)]
-    return [(f"n{index}", prop.count_dtype), (f"p{index}", prop.dtype, (size,))]
-
-
-def _first_sizes(element: _Element, body: bytes, offset: int) -> list[int | None]:
-    """Lengths of the lists in the first row: most files have the same in all rows."""
-    sizes: list[int | None] = []
-    for prop in element.properties:
-        if prop.count_dtype is None:
-            sizes.append(None)
-            offset += prop.dtype.itemsize
-        else:
-            size = _size(element, prop.count_dtype, body, offset) if element.count else 0
-            sizes.append(size)
-            offset += prop.count_dtype.itemsize + size * prop.dtype.itemsize
-    return sizes
-
-
 def _read_ragged(element: _Element, body: bytes, offset: int) -> tuple[dict, int]:
-    """Row by row; only lists are kept, for nobody needs the scalars beside them."""
+    """Row by row; only lists are kept: the scalars next to them are not needed."""
     starts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_dtype}
     sizes: dict[str, list[int]] = {name: [] for name in starts}
     for _ in range(element.count):

@@ -146,31 +146,41 @@ class _Layer:
         return dgamma, first, self.h, q, -self.h * first / rows - q * self.mean
 
 
-class _Moments:
-    """Mean and biased variance of rows that come in parts; sums in float64 about a first guess."""
+class _Rows:
+    """Sums over rows [..., C] that come in parts, in float64 about a first guess of their mean.
 
-    def __init__(self) -> None:
-        self.rows = 0
+    Args:
+        products: sum y'y too, instead of the squares alone.
+    """
+
+    def __init__(self, *, products: bool = False) -> None:
+        self.count, self.products = 0, products
         self.shift: Tensor | None = None
 
     def add(self, z: Tensor) -> None:
-        """Some more rows: [..., C]."""
+        """Some more rows."""
         z = z.flatten(0, -2)
         if self.shift is None:
             self.shift = z.mean(0)
             self.first = torch.zeros_like(self.shift, dtype=torch.float64)
-            self.second = torch.zeros_like(self.first)
+            self.second = torch.diag(self.first) if self.products else self.first.clone()
         z = z - self.shift
-        self.rows += len(z)
+        self.count += len(z)
         self.first += z.sum(0)
-        self.second += z.square_().sum(0)
+        self.second += z.T @ z if self.products else z.square_().sum(0)
 
-    def result(self) -> tuple[Tensor, Tensor]:
-        """[C] each, in the dtype of the rows."""
+    def moments(self) -> tuple[Tensor, Tensor]:
+        """Mean and biased variance [C], in the dtype of the rows."""
         assert self.shift is not None
-        mean = self.first / self.rows
-        var = (self.second / self.rows - mean.square()).clamp_min(0)
+        mean = self.first / self.count
+        var = (self.second / self.count - mean.square()).clamp_min(0)
         return (mean + self.shift).to(self.shift.dtype), var.to(self.shift.dtype)
+
+    def covariance(self) -> tuple[Tensor, Tensor]:
+        """Mean [C] and covariance [C, C] in float64, if `products`."""
+        assert self.shift is not None
+        mean = self.first / self.count
+        return mean + self.shift, self.second / self.count - torch.outer(mean, mean)
 
 
 class _GroupedMaximum(torch.autograd.Function):
@@ -201,38 +211,38 @@ class _GroupedMaximum(torch.autograd.Function):
         parts = _parts(groups, members * max(len(weight) for weight in weights))
         z: list[Tensor] = []  # of the layers between, part by part
 
-        def norm(moments: _Moments) -> None:
+        def norm(rows: _Rows) -> None:
             i = len(layers)
-            mean, var = running[i] or moments.result()
+            mean, var = running[i] or rows.moments()
             layers.append(_Layer(gammas[i], betas[i], mean, var, eps))
 
-        moments = _Moments()
+        rows = _Rows()
         for part in parts if training[0] else []:
-            moments.add(source(part))
-        norm(moments)
+            rows.add(source(part))
+        norm(rows)
         for level, weight in enumerate(weights[1:-1], 1):
-            moments, make = _Moments(), _maker(source, layers, z, parts)
+            rows, make = _Rows(), _maker(source, layers, z, parts)
             after = []
             for i in range(len(parts)):
                 after.append(matmul_t(make(i), weight))
                 if training[level]:
-                    moments.add(after[i])
+                    rows.add(after[i])
             z += after
-            norm(moments)
+            norm(rows)
 
         weight, sign = weights[-1], torch.where(gammas[-1] < 0, -1.0, 1.0).to(xyz.dtype)
         signed = weight * sign[:, None]
         best = xyz.new_empty(groups, len(weight))
         where = torch.empty(groups, len(weight), dtype=torch.int64, device=xyz.device)
-        covariance, make = _Covariance(), _maker(source, layers, z, parts)
+        rows, make = _Rows(products=True), _maker(source, layers, z, parts)
         for i, part in enumerate(parts):
             y = make(i)
             best[part], where[part] = max_over_rows(matmul_t(y, signed))
             if training[-1]:
-                covariance.add(y)
+                rows.add(y)
         best *= sign
         if running[-1] is None:
-            mean, cov = covariance.result()
+            mean, cov = rows.covariance()
             wide = weight.double()
             z_var = ((wide @ cov) * wide).sum(1).clamp_min(0).to(xyz.dtype)
             z_mean = (wide @ mean).to(xyz.dtype)
@@ -339,33 +349,6 @@ class _Sums:
         assert isinstance(self.first, Tensor)
         assert isinstance(self.second, Tensor)
         return self.first, self.second
-
-
-class _Covariance:
-    """Mean and covariance of rows that come in parts, in float64."""
-
-    def __init__(self) -> None:
-        self.rows = 0
-        self.shift: Tensor | None = None
-
-    def add(self, y: Tensor) -> None:
-        """Some more rows: [..., C]."""
-        y = y.flatten(0, -2)
-        if self.shift is None:
-            self.shift = y.mean(0)
-            c = len(self.shift)
-            self.first = torch.zeros(c, dtype=torch.float64, device=y.device)
-            self.second = torch.zeros(c, c, dtype=torch.float64, device=y.device)
-        y = y - self.shift
-        self.rows += len(y)
-        self.first += y.sum(0)
-        self.second += y.T @ y
-
-    def result(self) -> tuple[Tensor, Tensor]:
-        """[C], [C, C]."""
-        assert self.shift is not None
-        mean = self.first / self.rows
-        return mean + self.shift, self.second / self.rows - torch.outer(mean, mean)
 
 
 def _parts(groups: int, values: int) -> list[slice]:

@@ -21,7 +21,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.geometry.matmul import matmul_t
-from qs3.models.norms import active, track, uses_batch
+from qs3.models.norms import active, statistics, uses_batch
 
 _AT_ONCE = 1 << 20  # values of z worked on at once: 4 MB in float32
 
@@ -35,6 +35,11 @@ def max_over_rows(x: Float[Tensor, "b n c"]) -> tuple[Float[Tensor, "b c"], Int[
     image = x[:, :, None].permute(0, 3, 1, 2)  # [b, c, n, 1]
     best, where = F.max_pool2d(image, (x.shape[1], 1), return_indices=True)
     return best.flatten(1), where.flatten(1)
+
+
+def relu_gradient(grad: Tensor, out: Tensor) -> Tensor:
+    """Gradient through relu, in the place of that of its output `out`."""
+    return torch.ops.aten.threshold_backward.grad_input(grad, out, 0, grad_input=grad)
 
 
 class _Largest(torch.autograd.Function):
@@ -101,12 +106,7 @@ def normed_maximum(
     best, mean = best * sign, mean * sign
     if layer.bias is not None:
         best, mean = best + layer.bias, mean + layer.bias
-    if uses_batch(plain):
-        track(plain, mean.detach(), var.detach(), y.shape[0] * y.shape[1])
-    else:
-        assert plain.running_mean is not None
-        assert plain.running_var is not None
-        mean, var = plain.running_mean, plain.running_var
+    mean, var = statistics(plain, mean, var, y.shape[0] * y.shape[1])
     return (best - mean) * (gamma * torch.rsqrt(var + plain.eps)) + plain.bias
 
 

@@ -29,6 +29,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.models.fast.active_windows import Layout, cut, reach, recut, recut_back, whole, windows
+from qs3.models.fast.pointwise_max import relu_gradient
 from qs3.models.norms import active, track
 
 _AT_ONCE = 1 << 19  # values of a map worked on at once: 2 MB in float32
@@ -188,7 +189,7 @@ class _Block:
         """Gradient of the output, written over, to that of the input."""
         first, second, shortcut = self.first, self.second, self.shortcut
         for part in self.parts:
-            dz = _mask(g[part], self.out[part])
+            dz = relu_gradient(g[part], self.out[part])
             second.count(dz, part)
             if shortcut:
                 shortcut.count(dz, part)
@@ -197,7 +198,7 @@ class _Block:
         for part in reversed(self.parts):
             x = first.relu(part)
             inner[part] = second.back(g[part], x, part)
-            first.count(_mask(inner[part], x), part)
+            first.count(relu_gradient(inner[part], x), part)
         first.counted()
         if shortcut:
             shortcut.counted()
@@ -245,7 +246,7 @@ class _Step(torch.autograd.Function):
             if k:
                 g = recut_back(g, layouts[k - 1], _wider(layouts, k))
         for part in layouts[0].parts:
-            stem.count(_mask(g[part], stem.relu(part)), part)
+            stem.count(relu_gradient(g[part], stem.relu(part)), part)
         stem.counted()
         for part in reversed(layouts[0].parts):
             stem.back(g[part], ctx.maps[part], part, need_x=False)
@@ -321,11 +322,6 @@ def _rows(maps: Tensor) -> Tensor:
 def _wide(values: Tensor, rows: Tensor) -> Tensor:
     """One value a channel, for each pixel of a row."""
     return values.repeat(rows.shape[1] // len(values))
-
-
-def _mask(g: Tensor, out: Tensor) -> Tensor:
-    """Gradient through relu, in place."""
-    return torch.ops.aten.threshold_backward.grad_input(g, out, 0, grad_input=g)
 
 
 def _layers(block: Any) -> tuple[Any, Any, Any]:

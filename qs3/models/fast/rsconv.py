@@ -25,8 +25,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from qs3.models.fast.pointwise_max import max_over_rows
-from qs3.models.norms import active, track, uses_batch
+from qs3.models.fast.pointwise_max import max_over_rows, relu_gradient
+from qs3.models.norms import active, statistics, uses_batch
 
 _AT_ONCE = 1 << 18  # values of p worked on at once: 1 MB in float32
 _STEP = 4  # sizes of balls are rounded up to multiples of it
@@ -157,13 +157,13 @@ class _LargestProduct(torch.autograd.Function):
             dp = dp.flatten(0, 1)
             dx = w.mul_(dp)
             if draising is not None:
-                draising.addmm_(_masked(dx, x).T, u)
+                draising.addmm_(relu_gradient(dx, x).T, u)
             elif dfeatures is not None:
                 dfeatures.index_add_(0, part.index.flatten(), dx[:, 3:].contiguous())
             dw = dp.mul_(x)
             dweight.addmm_(dw.T, a)
             dbias += dw.sum(0)
-            dmapping.addmm_(_masked(dw @ weight, a).T, u)
+            dmapping.addmm_(relu_gradient(dw @ weight, a).T, u)
         return None, dfeatures, dmapping, draising, dweight, dbias, None
 
 
@@ -185,11 +185,6 @@ def _products(
         assert features is not None
         x = torch.cat([u[:, 4:7], features.index_select(0, part.index.flatten())], dim=1)
     return a, w, x, (w * x).view(*part.index.shape, -1)
-
-
-def _masked(g: Tensor, out: Tensor) -> Tensor:
-    """Gradient through relu, in place."""
-    return torch.ops.aten.threshold_backward.grad_input(g, out, 0, grad_input=g)
 
 
 def _parts(relations: Relations, channels: int) -> Iterator[Balls]:
@@ -282,11 +277,6 @@ def _fold(layer: Tensor, norm: nn.Module, moments: tuple[Tensor, Tensor], slots:
 def _affine(norm: nn.Module, mean: Tensor, var: Tensor, slots: int) -> tuple[Tensor, Tensor]:
     """Scale and shift of a norm, of these statistics or of the running ones, which it updates."""
     plain = active(norm)
-    if uses_batch(plain):
-        track(plain, mean.detach(), var.detach(), slots)
-    else:
-        assert plain.running_mean is not None
-        assert plain.running_var is not None
-        mean, var = plain.running_mean, plain.running_var
+    mean, var = statistics(plain, mean, var, slots)
     h = plain.weight * torch.rsqrt(var + plain.eps)
     return h.to(plain.weight.dtype), (plain.bias - h * mean).to(plain.weight.dtype)

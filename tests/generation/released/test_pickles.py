@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -54,11 +54,13 @@ ARRAYS = hnp.arrays(
 )
 
 
+@settings(deadline=None)
 @given(st.dictionaries(st.text(max_size=4), PLAIN, max_size=4), st.integers(3, 4))
 def test_plain_values_come_back(value, protocol):
     assert load_npy_object(npy(value, protocol), "x") == value
 
 
+@settings(deadline=None)
 @given(ARRAYS, st.integers(3, 4), st.booleans())
 def test_arrays_come_back_as_numpy_itself_reads_them(array, protocol, transposed):
     data = npy({"a": array.T if transposed else array}, protocol)
@@ -190,6 +192,7 @@ def test_files_of_another_format_are_refused(data, why):
     refused(data, why)
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=60), st.integers(0, 300))
 def test_damage_anywhere_is_an_error_for_people_or_harmless(noise, at):
     data = npy({"a": np.arange(3.0), "b": [1, "x"]})

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.command import generate
@@ -16,14 +15,15 @@ from qs3.generation.plan import settings
 from qs3.generation.recipes import Mesh2Point
 from qs3.generation.released.placement import PoseFile, ReleasedPlacing, ReleasedViews, pose_file
 from qs3.generation.released.poses import read_poses
-from qs3.generation.released.views import GrowingJitterViews
+from qs3.generation.released.views import GrowingJitterViews, euler_xyz
 from qs3.geometry.cameras import Camera, Intrinsics, project, rotation_xyz
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.renderers.base import Body, Scene
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.generation.generating import composed as config
+from tests.generation.released.test_pickles import Run
 
-CONF = str(Path(__file__).parents[3] / "conf")
 RELEASED = Path(__file__).parents[4] / "shared/data/qs3_release/pose_params.tar.gz"
 needs_release = pytest.mark.skipif(
     not RELEASED.is_file(), reason="the authors' pose_params.tar.gz is not in ../shared/data"
@@ -48,25 +48,13 @@ def released(mesh, seed=0, views=5):
     low, high = mesh.bounds
     scale, yaw = 1 / (high - low).max(), rng.uniform(0, 2 * np.pi)
     middle = rotation_xyz(np.array([0, 0, yaw])) @ ((low + high) / 2 * scale)
-    angles, eyes = [], []
-    for pose in GrowingJitterViews(views).poses(rng, np.array([[-0.5] * 3, [0.5] * 3])):
-        turn = pose[:3, :3] @ np.diag([1, -1, -1])
-        eyes.append(pose[:3, 3].copy())
-        angles.append(
-            np.array(
-                [
-                    np.arctan2(turn[2, 1], turn[2, 2]),
-                    -np.arcsin(turn[2, 0]),
-                    np.arctan2(turn[1, 0], turn[0, 0]),
-                ]
-            )
-        )
+    poses = GrowingJitterViews(views).poses(rng, np.array([[-0.5] * 3, [0.5] * 3]))
     return {
         "obj_scale": np.full(3, scale),
         "obj_rotation": np.array([0.0, -0.0, yaw]),
         "obj_location": -middle,
-        "camera_location": eyes,
-        "camera_rotation": angles,
+        "camera_location": [pose[:3, 3].copy() for pose in poses],
+        "camera_rotation": [euler_xyz(pose[:3, :3] @ np.diag([1, -1, -1])) for pose in poses],
         "camera_lens": 50.0,
         "camera_sensor_fit": "AUTO",
         "camera_sensor_width": 36.0,
@@ -178,9 +166,8 @@ def test_the_rendered_object_is_where_the_pose_projects_it(poses, view):
     (image,) = renderer.render(Scene((Body(placed),), None, 1.0), [camera], seed=0, geometry=[True])
     rows, cols = np.nonzero(image.label)
     # World to Blender's camera to its sensor: 36 mm over 1080 px, 50 mm away, y up.
-    local = (placed.vertices - value["camera_location"][view]) @ rotation_xyz(
-        value["camera_rotation"][view]
-    )
+    turn = rotation_xyz(value["camera_rotation"][view])
+    local = (placed.vertices - value["camera_location"][view]) @ turn
     u = 540 + local[:, 0] / -local[:, 2] * 50 * 30 - 0.5
     v = 540 - local[:, 1] / -local[:, 2] * 50 * 30 - 0.5
     box = [cols.min(), cols.max(), rows.min(), rows.max()]
@@ -198,14 +185,6 @@ def test_another_mesh_or_unit_or_axis_is_refused(poses):
     with pytest.raises(DataError, match=r"the middle of its box is at .*another origin or axis"):
         placing.place(y_up, RNG, ID)
     ReleasedPlacing(read_poses(poses), max_error=0.5).place(larger, RNG, ID)
-
-
-class Run:
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return os.mkdir, (self.path,)
 
 
 def info(name, **attributes):
@@ -264,7 +243,7 @@ def test_odd_values_are_refused_with_the_file_and_the_key(tmp_path, change, why)
 
 def test_a_file_that_would_run_code_is_refused(tmp_path):
     victim = tmp_path / "gone"
-    value = {**released(sofa()), "obj_location": Run(str(victim))}
+    value = {**released(sofa()), "obj_location": Run(os.mkdir, str(victim))}
     path = archive(tmp_path / "poses.tar.gz", {NAME: npy(value)})
     with pytest.raises(
         DataError, match=r"sofa_0763\.npy .* its pickle asks for more .* is run: posix\.mkdir"
@@ -301,31 +280,14 @@ def test_generate_follows_the_poses_and_records_what_has_none(poses, tmp_path):
     meshes = tmp_path / "meshes/sofa/test"
     meshes.mkdir(parents=True)
     (tmp_path / "meshes/sofa/train").mkdir()
-    for path in (
-        meshes / "sofa_0763.off",
-        meshes / "sofa_0001.off",
-        meshes.parent / "train/sofa_0002.off",
-    ):
-        mesh = sofa()
-        lines = ["OFF", f"{len(mesh.vertices)} {len(mesh.faces)} 0"]
-        lines += [" ".join(map(str, vertex)) for vertex in mesh.vertices]
-        lines += [" ".join(map(str, [3, *face])) for face in mesh.faces]
-        path.write_text("\n".join(lines))
+    for name in ("test/sofa_0763", "test/sofa_0001", "train/sofa_0002"):
+        sofa().to_trimesh().export(meshes.parent / f"{name}.off", digits=9)
     overrides = [
-        "domain=specklenet10",
-        f"meshes={tmp_path / 'meshes'}",
-        "classes=[sofa]",
-        f"poses={poses}",
-        "renderer=mitsuba",
-        "renderer.samples=1",
-        "views=1",
-        "workers=0",
-        "recipe.points=256",
-        f"paths.data_dir={tmp_path / 'data'}",
+        *("domain=specklenet10", f"meshes={tmp_path / 'meshes'}", "classes=[sofa]"),
+        *(f"poses={poses}", "renderer=mitsuba", "renderer.samples=1", "views=1", "workers=0"),
+        *("recipe.points=256", f"paths.data_dir={tmp_path / 'data'}"),
     ]
-    with initialize_config_dir(CONF, version_base="1.3"):
-        cfg = compose("generate", overrides)
-        without = compose("generate", overrides[:3] + overrides[4:])
+    cfg, without = config(*overrides), config(*overrides[:3], *overrides[4:])
     pointset = generate(cfg)
     assert list(pointset.ids) == [ID]
     folder = tmp_path / "data/specklenet10"
