@@ -16,7 +16,7 @@ from qs3.config.checks import check_choice, check_float, check_int
 from qs3.config.hydra import build, in_multirun
 from qs3.data.ensure_source import check_or_make
 from qs3.data.store import is_finished
-from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
@@ -39,7 +39,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     Everything that can be wrong with the settings or the data is found before torch is imported.
     """
     _check_settings(cfg)
-    scheme: Scheme = build(cfg.selftraining)
+    scheme: SelfTrainingConfig = build(cfg.selftraining)
     run = Run(
         cfg=cfg,
         seed=check_int("seed", cfg.seed, 0),

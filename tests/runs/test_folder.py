@@ -34,7 +34,11 @@ BASE = {
         },
         "target": {"published": None},
     },
-    "selftraining": {"_target_": "qs3.datamodules.phases.Scheme", "rounds": 2, "theta": 0.8},
+    "selftraining": {
+        "_target_": "qs3.datamodules.phases.SelfTrainingConfig",
+        "rounds": 2,
+        "theta": 0.8,
+    },
     "logger": {"csv": None},
     "callbacks": {"progress": {"enabled": True}},
 }

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
-from qs3.datamodules.phases import Scheme
+from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.selectors import Qbst, Spst
 from tests.selftraining.test_selectors_balanced import select
@@ -22,7 +22,7 @@ from tests.training.toy import CONF
 NAMES = sorted(p.stem for p in (CONF / "selftraining").glob("*.yaml") if p.stem != "none")
 
 
-def scheme_of(name: str) -> Scheme:
+def scheme_of(name: str) -> SelfTrainingConfig:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return build(compose("train", [f"selftraining={name}"]).selftraining)
 
