@@ -97,16 +97,6 @@ def test_one_domain_as_source_and_target(toy, caplog):
     assert metrics.source == "kinectsim10"
 
 
-def test_turned_figures_stand_beside_the_plain_ones(toy, finished):
-    metrics = train(toy("evaluation.rotations=12"))
-    assert metrics.final == read_metrics(finished).final
-    evaluation = metrics.evaluation
-    assert evaluation.rotations == 12
-    for turned in (evaluation.final_over_rotations, evaluation.warmup_over_rotations):
-        assert turned.n == metrics.final.n
-        assert turned.calibration_error != metrics.final.calibration_error
-
-
 @pytest.mark.parametrize(
     ("more", "where", "value"),
     [
