@@ -18,7 +18,7 @@ from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.domain import DomainData
-from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.errors import ConfigError
 
@@ -56,7 +56,7 @@ class AdaptationData(LightningDataModule):
         target: Domain,
         *,
         phases: Phases,
-        scheme: Scheme,
+        scheme: SelfTrainingConfig,
         augment: Augment,
         batch_size: int,
         seed: int,

@@ -61,7 +61,7 @@ class Phases:
 
 
 @dataclass(frozen=True)
-class Scheme:
+class SelfTrainingConfig:
     """The settings of config group `selftraining`.
 
     Attributes:
@@ -132,6 +132,6 @@ class Scheme:
         return float(Decimal(repr(self.theta)) + round_ * Decimal(repr(self.epsilon)))
 
 
-def no_rounds(**ignored: Any) -> Scheme:
+def no_rounds(**ignored: Any) -> SelfTrainingConfig:
     """No self-training, whatever an experiment file has set for the rounds it would have had."""
-    return Scheme(rounds=0)
+    return SelfTrainingConfig(rounds=0)

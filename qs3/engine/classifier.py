@@ -96,7 +96,7 @@ class Classifier(LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": cosine(optimizer, self.phases)}
 
     def learning_rate(self) -> float:
-        """Of the epoch that is ending, before the hook below."""
+        """The rate of the epoch that is ending, before the hook below."""
         optimizer = self.optimizers()
         assert isinstance(optimizer, torch.optim.Optimizer)
         if self._plateau is not None:

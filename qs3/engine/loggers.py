@@ -61,7 +61,7 @@ class CsvHistory(Logger):
 
     @property
     def name(self) -> str:
-        """Of the logger."""
+        """The logger's name."""
         return "csv"
 
     @property

@@ -15,11 +15,7 @@ from qs3.errors import ConfigError
 
 
 def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
-    """Lightning's trainer by config group `trainer`.
-
-    Args:
-        cfg: the composed config.
-        **more: arguments that follow from the run.
+    """Lightning's trainer by config group `trainer`; `more`: arguments that follow from the run.
 
     Raises:
         ConfigError: Lightning does not take the settings.

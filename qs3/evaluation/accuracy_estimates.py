@@ -14,16 +14,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
-from torch import Tensor, nn
+from torch import nn
 
-from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.splits import Labelled, Unlabelled
-from qs3.evaluation.metrics import predict
+from qs3.evaluation.metrics import predict, predict_rotated
 from qs3.evaluation.ood import limits, ood_reasons_of_all, relax_min_points
+from qs3.evaluation.validators import entropies
 from qs3.runs.metrics import AccuracyEstimates, Estimates
 
 TURNS = 3
@@ -95,11 +94,11 @@ def thresholded_confidence(
         labels: theirs.
         target: probabilities of clouds without labels.
     """
-    scores = np.sort(_certainty(source))
+    scores = np.sort(-entropies(source))
     wrong = int((source.argmax(axis=1) != labels).sum())
     if wrong == len(scores):
         return 0.0
-    return float((_certainty(target) >= scores[wrong]).mean())
+    return float((-entropies(target) >= scores[wrong]).mean())
 
 
 def difference_of_confidences(
@@ -169,9 +168,10 @@ def estimate_accuracy(
     unadapted: tuple[nn.Module, nn.Module | None] | None = None,
     upright: bool = True,
 ) -> AccuracyEstimates:
-    """What `metrics.json` has under `quality`, in words in `qs3.evaluation.estimates_text`.
+    """What `metrics.json` has under `quality`; `qs3.evaluation.estimates_text` says it as text.
 
-    Looks at no label of the target.
+    Looks at no label of the target. None where a figure does not exist (no teacher, no gravity), or
+    is not finite because the net has diverged.
 
     Args:
         net: the reported one.
@@ -180,15 +180,10 @@ def estimate_accuracy(
         source: all labelled clouds.
         owner: of their labels, "source" or "target_train".
         classes: names in label order.
-        batch_size, device: of the predictions.
         teacher: the net before self-training; None if there was none.
         unadapted: net and teacher with the norms that they were trained with, for the labelled
             clouds of the source, where `net` and `teacher` have the target's (AdaBN).
         upright: z points up in the target's clouds.
-
-    Returns:
-        Plain values. None where a figure does not exist (no teacher, no gravity), or is not finite
-        because the net has diverged.
     """
     points, labels = target.points, validation.labels.numpy()
     domain = "source" if owner == "source" else "target"
@@ -208,9 +203,9 @@ def estimate_accuracy(
         return AccuracyEstimates(**about)
     about |= estimates(known, labels, judged)
     if upright:
-        about["rotation_agreement"] = rotation_agreement(
-            judged, _rotated(net, points, batch_size, device)
-        )
+        turns = [2 * math.pi * i / (TURNS + 1) for i in range(1, TURNS + 1)]
+        rotated = [predict_rotated(net, points, turn, batch_size, device) for turn in turns]
+        about["rotation_agreement"] = rotation_agreement(judged, rotated)
     if teacher is not None:
         assert taught is not None
         theirs = predict(teacher, points, batch_size, device)
@@ -221,14 +216,6 @@ def estimate_accuracy(
             found = estimates(known, labels, theirs)
             about["teacher"] = Estimates(validation_accuracy=accuracy, **found)
     return AccuracyEstimates(**about)
-
-
-def _rotated(net: nn.Module, points: Tensor, batch_size: int, device: Any) -> list[np.ndarray]:
-    tables = []
-    for i in range(1, TURNS + 1):
-        angle = torch.full((len(points),), 2 * math.pi * i / (TURNS + 1), dtype=points.dtype)
-        tables.append(predict(net, rotate_z(points, angle), batch_size, device))
-    return tables
 
 
 def ood_fraction(clouds: Clouds, source: Clouds) -> float:
@@ -244,8 +231,3 @@ def source_ranges(source: Clouds, most: int = 1000) -> dict[str, list[float]]:
     """Of each measure the range in at most `most` clouds; of points no more than the net sees."""
     seen = source.stored.shape[1] if source.order is None else source.order.shape[2]
     return relax_min_points(limits(source, most=most), seen)
-
-
-def _certainty(probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, " n"]:
-    logs = np.log(np.where(probabilities > 0, probabilities, 1.0))
-    return (probabilities * logs).sum(axis=1)

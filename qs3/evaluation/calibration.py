@@ -10,23 +10,6 @@ from jaxtyping import Float, Int
 CALIBRATION_BINS = 15
 
 
-def calibration_error(
-    probabilities: Float[np.ndarray, "n c"],
-    labels: Int[np.ndarray, " n"],
-    bins: int = CALIBRATION_BINS,
-) -> float:
-    """Expected calibration error in [0, 1]: how far confidence is from accuracy on average.
-
-    ECE = Σ_b n_b / n |accuracy_b - confidence_b| over bins of equal width, ((b-1)/B, b/B], of the
-    largest probability (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, eq. 3).
-    """
-    confidence = probabilities.max(axis=1)
-    right = probabilities.argmax(axis=1) == labels
-    place = _places(confidence, bins)
-    gap = np.bincount(place, weights=right - confidence, minlength=bins)  # n_b (accuracy - conf.)
-    return float(np.abs(gap).sum() / len(labels))
-
-
 @dataclass(frozen=True, eq=False)
 class Reliability:
     """Confidence against accuracy in bins ((b-1)/B, b/B] of the largest probability.
@@ -57,15 +40,27 @@ def reliability(
         return None
     probabilities, labels = probabilities[known], labels[known]
     confidence, right = probabilities.max(axis=1), probabilities.argmax(axis=1) == labels
-    place = _places(confidence, bins)
+    place = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
     count = np.bincount(place, minlength=bins)
     some = np.where(count, count, 1)
     means = [
         np.where(count, np.bincount(place, weights=w, minlength=bins) / some, np.nan)
         for w in (confidence, right)
     ]
-    return Reliability(count, means[0], means[1], calibration_error(probabilities, labels, bins))
+    gap = np.bincount(place, weights=right - confidence, minlength=bins)  # n_b (accuracy - conf.)
+    return Reliability(count, means[0], means[1], float(np.abs(gap).sum() / len(labels)))
 
 
-def _places(confidence: np.ndarray, bins: int) -> np.ndarray:
-    return np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+def calibration_error(
+    probabilities: Float[np.ndarray, "n c"],
+    labels: Int[np.ndarray, " n"],
+    bins: int = CALIBRATION_BINS,
+) -> float:
+    """Expected calibration error in [0, 1]: how far confidence is from accuracy on average.
+
+    ECE = Σ_b n_b / n |accuracy_b - confidence_b| over bins of equal width, ((b-1)/B, b/B], of the
+    largest probability (Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, eq. 3).
+    """
+    found = reliability(probabilities, labels, bins)
+    assert found is not None
+    return found.error

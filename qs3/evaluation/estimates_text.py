@@ -1,4 +1,4 @@
-"""`quality` of `metrics.json` in words; `qs3.evaluation.accuracy_estimates` computes it."""
+"""`quality` of `metrics.json` as text; `qs3.evaluation.accuracy_estimates` computes it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MEANINGS: Mapping[str, str] = {
 
 
 def in_words(quality: AccuracyEstimates) -> str:
-    """The estimates in a few words, for the end of a headline; "" without any."""
+    """The estimates in short, for the end of a headline; "" without any."""
     if quality.calibrated is None:
         return ""
     before = f" (before self-training {_range(quality.teacher)})" if quality.teacher else ""

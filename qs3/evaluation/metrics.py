@@ -58,22 +58,27 @@ def adapt_norms(
     seed: int,
     device: Any = "cpu",
 ) -> None:
-    """AdaBN: give the net's batch norms the statistics of the target's training clouds.
+    """AdaBN: give the net's batch norms the statistics of the target's training clouds (n >= 2).
 
     One pass in random order (a dataset is sorted by class, and a batch should look like the
-    whole), in batches of equal size as far as they can be.
-
-    Args:
-        net: changed in place; its weights stay.
-        points: at least two clouds.
-        batch_size: about how many at once.
-        seed: of the order.
-        device: of the net.
+    whole), in batches of about `batch_size`, as equal as they can be. The weights stay.
     """
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
     batches = torch.tensor_split(order, max(1, round(len(points) / batch_size)))
     with use_domain(net, norms_for(net, "target")):
         adapt_batchnorm(net, (points[index].to(device) for index in batches))
+
+
+def predict_rotated(
+    net: nn.Module,
+    points: Float[Tensor, "n p 3"],
+    turn: float,
+    batch_size: int,
+    device: Any = "cpu",
+) -> Float[np.ndarray, "n c"]:
+    """`predict` for clouds rotated about the up axis, by `turn` in radians."""
+    angle = torch.full((len(points),), turn, dtype=points.dtype)
+    return predict(net, rotate_z(points, angle), batch_size, device)
 
 
 def predict_rotation_averaged(
@@ -84,10 +89,8 @@ def predict_rotation_averaged(
     device: Any = "cpu",
 ) -> Float[np.ndarray, "n c"]:
     """Mean of the probabilities over `rotations` turns about the up axis: by 0, 2π/n, 4π/n, ..."""
-    total: Any = 0.0
-    for i in range(rotations):
-        angle = torch.full((len(points),), 2 * math.pi * i / rotations, dtype=points.dtype)
-        total = total + predict(net, rotate_z(points, angle), batch_size, device)
+    turns = (2 * math.pi * i / rotations for i in range(rotations))
+    total: Any = sum(predict_rotated(net, points, turn, batch_size, device) for turn in turns)
     return total / rotations
 
 

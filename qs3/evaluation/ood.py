@@ -87,15 +87,15 @@ def relax_min_points(usual: Mapping[str, list[float]], seen: int) -> dict[str, l
 
 
 def ood_reasons(measured: Mapping[str, float], usual: Mapping[str, list[float]]) -> list[str]:
-    """In words, which measures lie outside the usual ranges; [] if none does."""
-    told = []
+    """Which measures lie outside the usual ranges, as text; [] if none does."""
+    reasons = []
     for name, (low, high) in usual.items():
         value = measured[name]
         if low <= value <= high:
             continue
         limit = f"under {low:.4g}" if value < low else f"over {high:.4g}"
-        told.append(f"{name} {value:.4g} is {limit}")
-    return told
+        reasons.append(f"{name} {value:.4g} is {limit}")
+    return reasons
 
 
 def ood_reasons_of_all(
@@ -107,7 +107,7 @@ def ood_reasons_of_all(
 
 
 def _measured(clouds: Clouds, most: int) -> list[dict[str, float]]:
-    """Of at most `most` clouds, evenly spaced."""
+    """The measures of at most `most` clouds, evenly spaced."""
     chosen = np.unique(np.linspace(0, len(clouds) - 1, min(len(clouds), most)).astype(int))
     found = []
     for i in chosen:

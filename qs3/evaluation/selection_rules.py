@@ -24,10 +24,7 @@ OBJECTIVES = ("entropy", "infomax", "snd")
 
 
 def check_objective(objective: Any) -> None:
-    """Refuse what a search must not or cannot look at.
-
-    Args:
-        objective: of the search; None: there is none.
+    """Refuse what a search must not or cannot look at; None: there is no search.
 
     Raises:
         ConfigError: it is not a label-free score, or one that differs between trials for no merit.

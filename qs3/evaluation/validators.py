@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 TEMPERATURE = 0.05
-"""Of the soft neighbourhood density, as in its paper and code."""
+"""Temperature of the soft neighbourhood density, as in its paper and code."""
 
 _HELD_OUT = 5  # one of so many: the 20 % of QS3's released code
 _BLOCK = 512  # rows of similarities at once: 33 MB for 8,000 clouds
@@ -30,7 +30,7 @@ def entropy(probabilities: Float[np.ndarray, "n k"]) -> float:
     Morerio et al., "Minimal-Entropy Correlation Alignment for Unsupervised Deep Domain
     Adaptation", ICLR 2018, chooses a hyper-parameter by it.
     """
-    return float(_entropies(probabilities).mean())
+    return float(entropies(probabilities).mean())
 
 
 def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
@@ -44,7 +44,7 @@ def infomax(probabilities: Float[np.ndarray, "n k"]) -> float:
     it is called IM.
     """
     mean = probabilities.mean(axis=0, keepdims=True)
-    value = _entropies(mean)[0] - entropy(probabilities)  # < 0 by rounding alone
+    value = entropies(mean)[0] - entropy(probabilities)  # < 0 by rounding alone
     return float(np.maximum(0.0, value))  # max() of Python's would make 0 of NaN
 
 
@@ -136,6 +136,7 @@ def hold_out(
     return held
 
 
-def _entropies(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
-    logs = np.log(np.where(probabilities > 0, probabilities, 1.0))  # 0 ln 0 = 0
+def entropies(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+    """H(p_i) = -Σ_k p_k ln p_k of each row, in nats; 0 ln 0 = 0."""
+    logs = np.log(np.where(probabilities > 0, probabilities, 1.0))
     return -(probabilities * logs).sum(axis=1)

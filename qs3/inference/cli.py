@@ -19,10 +19,10 @@ def _predict(threads: int | None, **given: Any) -> int:
     return 1 if failed else 0
 
 
-def _export(ckpt: str, out: str, check: str | None, threads: int | None) -> None:
+def _export(ckpt: str, out: str, threads: int | None) -> None:
     from qs3.inference.export import export_command
 
-    print(export_command(ckpt, out, check, threads or _processors()))
+    print(export_command(ckpt, out, threads or _processors()))
 
 
 def _processors() -> int:
@@ -72,17 +72,16 @@ EXPORT = Command(
     (
         _CKPT,
         Option("out", text("FILE"), ".onnx, or .pt2 for torch.export.load", "model.onnx"),
-        Option("check", text("PATH"), "clouds, z up, to compare the written net with the net on"),
         _THREADS,
     ),
     (
-        "qs3 export ckpt=logs/own_scans/seed0-5f0c2a71 out=model.onnx check=scans",
+        "qs3 export ckpt=logs/own_scans/seed0-5f0c2a71 out=model.onnx",
         "qs3 export ckpt=result.pt out=model.pt2",
     ),
     about="""
 It takes prepared clouds [clouds, points, 3] and gives logits; how a cloud is prepared, and the
-names of the classes, stand in the .onnx file's metadata. The written net is run and its logits
-compared with the net's, on made-up clouds or on those of check=; damaged ones are left out.
+names of the classes, stand in the .onnx file's metadata. The written net is run on made-up clouds
+and its logits compared with the net's.
 """,
     interrupted="nothing was saved",
 )

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,17 +16,21 @@ import numpy as np
 import torch
 
 from qs3.clouds.files import SUFFIXES, measured, parse_clouds, printable
-from qs3.config.checks import check_choice, check_int
+from qs3.config.checks import check_choice
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.inference.model_file import PACKAGES
 from qs3.inference.predictor import Predictor, Prepared, load
 from qs3.models.norms import norms_for, use_domain
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.progress import progress_bar
+from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
 
 _SHOWN = 10  # failures in the text for the terminal
+_COLUMNS = (
+    *("file", "status", "class", "confidence", "points", "dropped"),
+    *("out_of_range", "reason"),
+)
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,6 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_choice("up", self.up, UP_AXES)
-        check_int("batch_size", self.batch_size, 1)
-        check_int("threads", self.threads, 1)
         if Path(self.out).suffix.lower() not in (".csv", ".json"):
             raise ConfigError(f"out={self.out} must end in .csv or .json")
 
@@ -79,30 +79,29 @@ class Row(NamedTuple):
     probabilities: np.ndarray | None
 
 
-def predict_command(
-    settings: Settings, packages: Sequence[str] = PACKAGES
-) -> tuple[str, list[Row]]:
+def predict_command(settings: Settings) -> tuple[str, int]:
     """Predict and save.
 
     Returns:
-        The text for the terminal, and the rows that failed.
+        The text for the terminal, and how many clouds failed.
 
     Raises:
         ConfigError, MissingDataError, DataError: nothing could be done at all.
     """
     files, root, others = find_files(settings.input)
-    predictor = load(settings.ckpt, device=settings.device, packages=packages)
+    predictor = load(settings.ckpt, device=settings.device)
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
     replaces = out.exists()
     began = time.monotonic()
     with progress_bar("files read", total=len(files)) as advance:
         rows = list(predict_files(predictor, files, root, settings, advance))
-    seconds = time.monotonic() - began
-    written = _json if out.suffix.lower() == ".json" else _csv
-    write_text(out, written(rows, predictor))
-    failed = [row for row in rows if row.probabilities is None]
-    lines = _told(rows, failed, len(files), others, predictor, seconds)
+    seconds, classes = time.monotonic() - began, predictor.classes
+    records = [_record(row, classes) for row in rows]
+    as_json = out.suffix.lower() == ".json"
+    write_text(out, _json(records, predictor) if as_json else _csv(records, classes))
+    lines = _told(records, len(files), others, predictor.result.gravity, seconds)
+    failed = sum(row.probabilities is None for row in rows)
     return "\n".join([*lines, saved(out, replaces)]), failed
 
 
@@ -111,15 +110,11 @@ def saved(out: str | Path, replaces: bool) -> str:
     return f"saved {out}" + " (replaced what was there)" * replaces
 
 
-def find_files(place: str | Path, key: str = "input") -> tuple[list[Path], Path, int]:
+def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
     """The files to read, what their names are relative to, and how many files are passed over.
 
     In a folder: all files of known formats at any depth, in order of their names; hidden ones and
     links to folders are left out.
-
-    Args:
-        place: a file or folder.
-        key: of the command line that names it, for messages.
 
     Raises:
         MissingDataError: nothing there.
@@ -128,10 +123,10 @@ def find_files(place: str | Path, key: str = "input") -> tuple[list[Path], Path,
     place = Path(place).expanduser()
     if place.is_file():
         if place.suffix.lower() not in SUFFIXES:
-            raise DataError(f"{key}={place}: unknown format; known are {', '.join(SUFFIXES)}")
+            raise DataError(f"input={place}: unknown format; known are {', '.join(SUFFIXES)}")
         return [place], place.parent, 0
     if not place.is_dir():
-        raise MissingDataError(f"{key}={place} is not there")
+        raise MissingDataError(f"input={place} is not there")
     found, others = [], 0
     for folder, folders, names in os.walk(place):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
@@ -143,7 +138,7 @@ def find_files(place: str | Path, key: str = "input") -> tuple[list[Path], Path,
             else:
                 others += 1
     if not found:
-        raise MissingDataError(f"{key}={place} holds no file of {' '.join(SUFFIXES)}")
+        raise MissingDataError(f"input={place} holds no file of {' '.join(SUFFIXES)}")
     return sorted(found), place, others
 
 
@@ -154,17 +149,10 @@ def predict_files(
     settings: Settings,
     advance: Callable[[], None] = lambda: None,
 ) -> Iterator[Row]:
-    """A row for each cloud, in order.
+    """A row for each cloud, in order, named relative to `root`; `advance` is called after a file.
 
     Each of `settings.threads` threads has a batch of its own: the work between products of
     matrices does not gain from several threads in one batch. A few batches are in memory.
-
-    Args:
-        predictor: the classifier.
-        files: to read.
-        root: folder that names are relative to.
-        settings: up, batch_size and threads.
-        advance: called after each file.
     """
     threads_before = torch.get_num_threads()
     pool = ThreadPoolExecutor(settings.threads, initializer=torch.set_num_threads, initargs=(1,))
@@ -252,89 +240,74 @@ def _judged(predictor: Predictor, batch: Sequence[Row | _Raw], up: str) -> list[
     return [rows[i] for i in range(len(batch))]
 
 
-def _csv(rows: list[Row], predictor: Predictor) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    first = ("file", "status", "class", "confidence", "points", "dropped")
-    writer.writerow(
-        [*first, "out_of_range", "reason", *(f"p_{name}" for name in predictor.classes)]
-    )
-    for row in rows:
-        values = _record(row, predictor)
-        each = values.pop("probabilities") or dict.fromkeys(predictor.classes)
-        flag = {True: "yes", False: "no", None: None}[values["out_of_range"]]
-        cells = {**values, "out_of_range": flag}.values()
-        writer.writerow(["" if cell is None else cell for cell in (*cells, *each.values())])
-    return text.getvalue()
+def _record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
+    """What both formats say of a cloud; None where there is nothing to say."""
+    record: dict[str, Any] = {
+        **dict.fromkeys(_COLUMNS),
+        "file": row.file,
+        "status": "failed",
+        "points": row.points,
+        "dropped": row.dropped,
+        "reason": row.reason,
+        "probabilities": None,
+    }
+    if row.probabilities is not None:
+        best, each = int(row.probabilities.argmax()), row.probabilities.tolist()
+        record |= {
+            "status": "ok",
+            "class": classes[best],
+            "confidence": each[best],
+            "out_of_range": bool(row.reason),
+            "probabilities": dict(zip(classes, each, strict=True)),
+        }
+    return record
 
 
-def _json(rows: list[Row], predictor: Predictor) -> str:
-    record = {
+def _csv(records: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> str:
+    lines: list[list[Any]] = [[*_COLUMNS, *(f"p_{name}" for name in classes)]]
+    for record in records:
+        flag = {True: "yes", False: "no", None: None}[record["out_of_range"]]
+        cells = {**record, "out_of_range": flag}
+        each = record["probabilities"] or dict.fromkeys(classes)
+        lines.append([*(cells[key] for key in _COLUMNS), *each.values()])
+    return csv_text(lines)
+
+
+def _json(records: Sequence[Mapping[str, Any]], predictor: Predictor) -> str:
+    document = {
         "qs3": VERSION,
         "target": predictor.result.target,
         "classes": list(predictor.classes),
-        "clouds": [_record(row, predictor) for row in rows],
+        "clouds": records,
     }
-    return json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _record(row: Row, predictor: Predictor) -> dict[str, Any]:
-    if row.probabilities is None:
-        nothing = dict.fromkeys(("class", "confidence"))
-        return {
-            **{"file": row.file, "status": "failed", **nothing},
-            **{"points": row.points, "dropped": row.dropped},
-            **{"out_of_range": None, "reason": row.reason, "probabilities": None},
-        }
-    each = row.probabilities.tolist()
-    best = int(row.probabilities.argmax())
-    return {
-        "file": row.file,
-        "status": "ok",
-        "class": predictor.classes[best],
-        "confidence": each[best],
-        "points": row.points,
-        "dropped": row.dropped,
-        "out_of_range": bool(row.reason),
-        "reason": row.reason,
-        "probabilities": dict(zip(predictor.classes, each, strict=True)),
-    }
+    return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def _told(
-    rows: list[Row],
-    failed: list[Row],
-    files: int,
-    others: int,
-    predictor: Predictor,
-    seconds: float,
+    records: Sequence[Mapping[str, Any]], files: int, others: int, gravity: str, seconds: float
 ) -> list[str]:
     """What was done, for the terminal."""
-    good = [row for row in rows if row.probabilities is not None]
-    strange = sum(bool(row.reason) for row in good)
-    counts = Counter(
-        predictor.classes[int(row.probabilities.argmax())]
-        for row in good
-        if row.probabilities is not None
-    )
+    good = [record for record in records if record["status"] == "ok"]
+    failed = [record for record in records if record["status"] == "failed"]
+    counts = Counter(record["class"] for record in good)
     rate = len(good) / max(seconds, 1e-9)
     lines = [f"{len(good)} clouds, {rate:.1f} clouds a second, from {files} files"]
     if good:
         lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
+        strange = sum(record["out_of_range"] for record in good)
         lines.append(f"{strange} of them out of range (column out_of_range)")
-    if holed := [row for row in good if row.dropped]:
-        dropped = sum(row.dropped or 0 for row in holed)
+    if holed := [record["dropped"] for record in good if record["dropped"]]:
         lines.append(
-            f"{dropped} points of {len(holed)} clouds are NaN or infinite and were left out "
+            f"{sum(holed)} points of {len(holed)} clouds are NaN or infinite and were left out "
             "(column dropped)"
         )
-    if predictor.result.gravity == "none":
+    if gravity == "none":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
     if others:
         lines.append(f"{others} files of other kinds passed over")
     if failed:
         lines.append(f"{len(failed)} failed:")
-        lines += [f"  {row.file}: {row.reason}" for row in failed[:_SHOWN]]
+        lines += [f"  {record['file']}: {record['reason']}" for record in failed[:_SHOWN]]
         lines += [f"  and {len(failed) - _SHOWN} more, see the table"] * (len(failed) > _SHOWN)
     return lines
 

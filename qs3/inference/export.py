@@ -18,16 +18,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.clouds.files import measured, parse_clouds
 from qs3.config.checks import check_int
-from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.errors import ConfigError, Qs3Error
 from qs3.inference.predictor import Predictor, load
 from qs3.models.base import PointClassifier
 from qs3.models.norms import norms_for, use_domain
 from qs3.utils.files import atomic_path, make_folder
 from qs3.utils.version import VERSION
-
-log = logging.getLogger(__name__)
 
 ALLOWED = 1e-4  # difference of logits
 ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
@@ -36,12 +33,11 @@ INPUT, OUTPUT = "points", "logits"
 _CHECKED = 32  # clouds to compare on
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
 _PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-_LOGGERS = ("torch", "torch.onnx", "torch._dynamo", "torch.export", "onnxscript", "onnx_ir")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The exported net's logits beside the net's own.
+    """The exported net's logits and the net's own.
 
     Sums in another order differ in their last digits. Where two neighbours or farthest points are
     equally far but for these, a net may take the other one, and a cloud's logits differ by more;
@@ -52,28 +48,19 @@ class Comparison:
         typical: the median over the clouds of the largest difference of a cloud's logits.
         largest: the largest of all.
         odd: clouds that differ by more than `ALLOWED`.
-        other_class: clouds whose most probable class differs.
     """
 
     clouds: int
     typical: float
     largest: float
     odd: int
-    other_class: int
 
     @classmethod
     def of(cls, theirs: Float[np.ndarray, "n c"], ours: Float[np.ndarray, "n c"]) -> Comparison:
         """Of two nets on the same n clouds."""
         difference = np.abs(theirs - ours).max(axis=1)
-        odd = ~(difference <= ALLOWED)  # NaN is odd
-        other = theirs.argmax(axis=1) != ours.argmax(axis=1)
-        return cls(
-            len(ours),
-            float(np.median(difference)),
-            float(difference.max()),
-            int(odd.sum()),
-            int(other.sum()),
-        )
+        odd = int((~(difference <= ALLOWED)).sum())  # NaN is odd
+        return cls(len(ours), float(np.median(difference)), float(difference.max()), odd)
 
     @property
     def agrees(self) -> bool:
@@ -88,29 +75,19 @@ class Comparison:
         if self.odd:
             text += (
                 f"; {self.odd} differ by more than {ALLOWED:g}, as where two neighbours are "
-                f"equally far; {self.other_class} get another class"
+                "equally far"
             )
         return text
 
 
-def export_command(
-    ckpt: str | Path, out: str | Path, check: str | Path | None = None, threads: int = 1
-) -> str:
-    """Export a run's classifier and compare; text for the terminal.
-
-    Args:
-        ckpt: a run's folder or result.pt.
-        out: .onnx or .pt2.
-        check: a file or folder of clouds, z up, to compare on; clouds made up if None.
-        threads: of torch.
-    """
+def export_command(ckpt: str | Path, out: str | Path, threads: int = 1) -> str:
+    """Export the classifier of a run (or its result.pt) and compare; text for the terminal."""
     from qs3.inference.command import saved
 
     torch.set_num_threads(check_int("threads", threads, 1))
     predictor = load(ckpt)
-    clouds = None if check is None else clouds_of(predictor, check)
     replaces = Path(out).expanduser().exists()
-    compared = export(predictor, out, clouds)
+    compared = export(predictor, out)
     how = f"onnxruntime.InferenceSession({str(out)!r})"
     if Path(out).suffix == ".pt2":
         how = f"torch.export.load({str(out)!r}).module()"
@@ -130,10 +107,7 @@ def export(
 ) -> Comparison:
     """Write the net to `out`, read it back, and compare it with the net, one cloud and many.
 
-    Args:
-        predictor: the classifier.
-        out: .onnx or .pt2.
-        clouds: prepared ones to compare on; None makes some up.
+    `clouds`: prepared ones to compare on; None makes some up.
 
     Raises:
         ConfigError: another kind of file, or a package for it is missing.
@@ -174,35 +148,6 @@ def any_points(predictor: Predictor) -> bool:
     return isinstance(net, PointClassifier) and predictor.points >= net.backbone.least_points
 
 
-def clouds_of(predictor: Predictor, place: str | Path) -> Float[Tensor, "n m 3"]:
-    """The first clouds of a file or folder, prepared; z up. Damaged ones are left out and told.
-
-    Raises:
-        MissingDataError: there are no files.
-        DataError: all are damaged.
-    """
-    from qs3.inference.command import find_files
-
-    found: list[Tensor] = []
-    for path in find_files(place, "check")[0]:
-        try:
-            clouds = parse_clouds(path).clouds
-        except DataError as error:
-            log.warning("left out: %s", error)
-            continue
-        for i, given in enumerate(clouds):
-            where = f"{path}, cloud {i}"
-            try:
-                found.append(predictor.prepare(measured(given, where)[0], where).points)
-            except DataError as error:
-                log.warning("left out: %s", error)
-            if len(found) == 8 * _CHECKED:
-                return torch.stack(found)
-    if not found:
-        raise DataError(f"check={place} holds no cloud that can be read; see the lines above")
-    return torch.stack(found)
-
-
 def made_up(points: int, count: int = _CHECKED) -> Float[Tensor, "n m 3"]:
     """Noisy ellipsoids and boxes in the unit ball; every fourth one repeats some of its points."""
     rng = np.random.default_rng(0)
@@ -218,7 +163,7 @@ def made_up(points: int, count: int = _CHECKED) -> Float[Tensor, "n m 3"]:
 
 
 def metadata(predictor: Predictor) -> dict[str, str]:
-    """What using the net takes, beside its weights; stands in the ONNX file's metadata_props."""
+    """What using the net takes besides its weights; stands in the ONNX file's metadata_props."""
     result = predictor.result
     upright = result.gravity == "z"
     return {
@@ -296,9 +241,8 @@ def _write_onnx(
 
 
 def _cannot(predictor: Predictor, error: Exception) -> Qs3Error:
-    lines = [line for line in str(error).splitlines() if line.strip()]
     cause = error.__cause__ or error
-    first = next(iter(str(cause).splitlines()), "") or (lines or [""])[0]
+    first = next((line for line in f"{cause}\n{error}".splitlines() if line.strip()), "")
     return Qs3Error(
         f"torch {torch.__version__} cannot export {predictor.result.model['_target_']}: its layers "
         "do what depends on values or on the number of clouds, which a graph cannot hold; use it "
@@ -309,10 +253,8 @@ def _cannot(predictor: Predictor, error: Exception) -> Qs3Error:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Without reports for those who write nets; what matters comes as an exception."""
-    loggers = [logging.getLogger(name) for name in _LOGGERS]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             # Of tensors that share memory; the logits are compared after reading back.
@@ -321,5 +263,4 @@ def _quiet() -> Iterator[None]:
             warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import importlib
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
@@ -27,17 +28,50 @@ PACKAGES = ("qs3.models",)
 """Packages that a file may take its net from."""
 
 _TARGET = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
-_MOST_POINTS = 1 << 20  # of a cloud; more is a damaged number
+
+
+def _plain(value: Any) -> bool:
+    """Numbers, words, None, and lists of them: what a net's arguments are."""
+    if isinstance(value, list):
+        return all(_plain(each) for each in value)
+    return value is None or isinstance(value, bool | int | float | str)
+
+
+def _model(value: dict[str, Any]) -> dict[str, Any]:
+    """A `_target_` and arguments that are plain values; no other key of Hydra's."""
+    target, odd = str(value.get("_target_")), [key for key in value if key.startswith("_")]
+    plain = all(_plain(one) for one in value.values())
+    if odd != ["_target_"] or not plain or not _TARGET.fullmatch(target):
+        raise ValueError("should be a dict with a `_target_` and plain arguments")
+    return value
+
+
+def _different(value: tuple[str, ...]) -> tuple[str, ...]:
+    if len(set(value)) < max(len(value), 2):
+        raise ValueError("should be at least two names, all different")
+    return value
+
+
+def _ranges(value: dict[str, list[float]]) -> dict[str, list[float]]:
+    if not set(value) <= set(MEASURES) or any(
+        math.isnan(x) for ends in value.values() for x in ends
+    ):
+        raise ValueError(f"should be [low, high] of {', '.join(MEASURES)}")
+    return value
+
+
+_Points = Annotated[int, Field(strict=True, ge=1, le=1 << 20)]  # more is a damaged number
+_Ends = Annotated[list[Annotated[float, Field(strict=True)]], Field(min_length=2, max_length=2)]
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A trained classifier, not yet built.
+    """A trained classifier, not yet built. What is read from a file is checked by these types.
 
     Attributes:
         model: the config it is built from, resolved: `_target_` and plain arguments.
         classes: names in label order.
-        points: of a cloud as the net sees it.
+        points: of a cloud as the net sees it; at most stored_points.
         stored_points: of a cloud of the target as it is stored, before sampling.
         target: name of the domain it was adapted to.
         gravity: the axis that points up in the clouds, "z"; "none": camera frame.
@@ -45,14 +79,16 @@ class Result:
         weights: of the net.
     """
 
-    model: Mapping[str, Any]
-    classes: tuple[str, ...]
-    points: int
-    stored_points: int
+    model: Annotated[dict[str, Any], AfterValidator(_model)]
+    classes: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], AfterValidator(_different)]
+    points: _Points
+    stored_points: _Points
     target: str
-    gravity: str
-    usual: Mapping[str, list[float]]
-    weights: Mapping[str, Tensor]
+    gravity: Annotated[str, Field(pattern="^(z|none)$")]
+    usual: Annotated[dict[str, _Ends], AfterValidator(_ranges)]
+    weights: Annotated[dict[str, Tensor], Field(min_length=1)]
+
+    __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
 
 
 def write_result(path: Path, result: Result) -> None:
@@ -85,10 +121,7 @@ def find_result(path: str | Path) -> Path:
 
 
 def read_result(path: str | Path) -> Result:
-    """Read and check what `write_result` wrote; nothing in the file is run.
-
-    Args:
-        path: a run's folder, or the file.
+    """Read and check what `write_result` wrote, in a run's folder or file; nothing in it is run.
 
     Raises:
         MissingDataError: no such file.
@@ -106,11 +139,9 @@ def read_result(path: str | Path) -> Result:
 
 
 def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
-    """The net in eval mode, with its weights, on the CPU.
+    """The net in eval mode, with its weights, on the CPU; the file need not be trusted.
 
-    Args:
-        result: as read from a file that need not be trusted.
-        packages: where the net may be defined. Your own net: `("qs3.models", "my_package")`.
+    `packages`: where the net may be defined. Your own net: `("qs3.models", "my_package")`.
 
     Raises:
         DataError: a net from elsewhere, or weights that are not this net's.
@@ -151,76 +182,19 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
     return make
 
 
-def _names(value: Any) -> bool:
-    named = isinstance(value, list) and all(isinstance(name, str) and name for name in value)
-    return named and len(value) >= 2 and len(set(value)) == len(value)
-
-
-def _is_model(value: Any) -> bool:
-    """A `_target_` and arguments that are plain values; no other key of Hydra's."""
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        return False
-    arguments = {key: one for key, one in value.items() if key != "_target_"}
-    target = value.get("_target_")
-    plain = all(not key.startswith("_") and _plain(one) for key, one in arguments.items())
-    return plain and isinstance(target, str) and bool(_TARGET.fullmatch(target))
-
-
-def _number_of_points(value: Any) -> bool:
-    return type(value) is int and 1 <= value <= _MOST_POINTS
-
-
-def _ranges(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        name in MEASURES
-        and isinstance(ends, list)
-        and len(ends) == 2
-        and all(isinstance(end, float) and not math.isnan(end) for end in ends)
-        for name, ends in value.items()
-    )
-
-
-def _are_weights(found: Any) -> bool:
-    return (
-        isinstance(found, dict)
-        and len(found) > 0
-        and all(isinstance(k, str) and isinstance(v, Tensor) for k, v in found.items())
-    )
-
-
-def _plain(value: Any) -> bool:
-    """Numbers, words, None, and lists of them: what a net's arguments are."""
-    if isinstance(value, list):
-        return all(_plain(each) for each in value)
-    return value is None or isinstance(value, bool | int | float | str)
-
-
-_EXPECTED: Mapping[str, tuple[Callable[[Any], bool], str]] = {
-    "model": (_is_model, "a dict with a `_target_` and plain arguments"),
-    "classes": (_names, "a list of names, all different"),
-    "points": (_number_of_points, f"from 1 to {_MOST_POINTS}"),
-    "stored_points": (_number_of_points, f"from 1 to {_MOST_POINTS}"),
-    "target": (lambda value: isinstance(value, str), "a name"),
-    "gravity": (lambda value: value in ("z", "none"), "'z' or 'none'"),
-    "usual": (_ranges, f"[low, high] of {', '.join(MEASURES)}"),
-    "weights": (_are_weights, "names and tensors"),
-}
-"""Of each value of a file what it must be, and that in words."""
-
-
 def _checked(file: Path, found: Any) -> Result:
     """The file's values as a `Result`.
 
     Raises:
         DataError: names the first one that is not as it should be.
     """
-    found = found if isinstance(found, dict) else {}
-    values = {key: found.get(key) for key in _EXPECTED}
-    wrong = {key: words for key, (fits, words) in _EXPECTED.items() if not fits(values[key])}
-    if not wrong and values["points"] > values["stored_points"]:
-        wrong = {"points": "at most stored_points"}
-    for key, words in wrong.items():
-        raise DataError(
-            f"{file} is not a result that qs3 wrote, or damaged: {key!r} should be {words}"
-        )
-    return Result(**{**values, "classes": tuple(values["classes"])})
+    try:
+        result = TypeAdapter(Result).validate_python(found)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place, why = ".".join(map(str, first["loc"])) or "the file", first["msg"]
+    else:
+        if result.points <= result.stored_points:
+            return result
+        place, why = "points", "should be at most stored_points"
+    raise DataError(f"{file} is not a result that qs3 wrote, or damaged: {place}: {why}")

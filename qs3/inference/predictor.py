@@ -40,7 +40,7 @@ class Prepared(NamedTuple):
     Attributes:
         points: [m, 3] in the unit ball.
         given: how many points there were.
-        strange: in what it is unlike the clouds of training, in words; see `qs3.evaluation.ood`.
+        strange: how it differs from the clouds of training, as text; see `qs3.evaluation.ood`.
     """
 
     points: Float[Tensor, "m 3"]
@@ -69,7 +69,7 @@ class Predictor:
 
     @property
     def points(self) -> int:
-        """Of a cloud as the net sees it."""
+        """Points of a cloud as the net sees it."""
         return self.result.points
 
     def prepare(self, cloud: np.ndarray, name: str = "the cloud", up: str = "z") -> Prepared:
@@ -149,7 +149,7 @@ def load(
     """The classifier that a finished run reports; also as `qs3.load`.
 
     Args:
-        run: its folder, or the file result.pt of it, which needs nothing beside it.
+        run: its folder, or the file result.pt of it, which needs nothing else.
         device: where to run it: "cpu", "cuda", "cuda:1".
         packages: where the net of the file may be defined. For a net of your own add your
             package, if you trust it to be built with any arguments.

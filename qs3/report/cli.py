@@ -13,7 +13,7 @@ from qs3.errors import ConfigError
 from qs3.utils.cli import Command, Group, Option, several, text, whole
 
 if TYPE_CHECKING:
-    from qs3.report.tables.table import Table
+    from qs3.report.tables.cells import Table
 
 _LAUNCHER = "hydra.launcher."
 
@@ -48,11 +48,11 @@ def _table(out: str | None, **given: Any) -> None:
     from qs3.utils.files import write_text
 
     table = _built(**given)
-    said, at = markdown(table), _saved_at(table, out, given)
-    write_text(f"{at}.md", said)
+    shown, at = markdown(table), _saved_at(table, out, given)
+    write_text(f"{at}.md", shown)
     for suffix, write in ((".csv", csv_text), (".tex", latex)):
         write_text(f"{at}{suffix}", write(table))
-    print(said)
+    print(shown)
     print(f"saved {at}.md, .csv, .tex")
 
 
@@ -253,8 +253,7 @@ PAGE = Command(
     ("qs3 report page run=logs/qs3_s2d/seed0-5f0c2a71 data_dir=data",),
     about="""
 Curves, confusion, pseudo-labels, classes, calibration; if its data are there, features and clouds
-of both domains, their class balance and the most confident errors; if they kept their views, the
-pipeline; and a page of all, index.html.
+of both domains, their class balance and the most confident errors; and a page of all, index.html.
 """,
 )
 

@@ -1,4 +1,4 @@
-"""Checkpoints that survive a kill at any moment: written beside, flushed, then renamed.
+"""Checkpoints that survive a kill at any moment: written to another file, flushed, renamed.
 
 They hold weights and plain values only and are read with `weights_only=True`.
 """

@@ -38,7 +38,15 @@ _KEPT_WHEN_CLEARED = (".hydra", ".lock")
 
 def read_started(folder: str | Path) -> dict[str, Any] | None:
     """What `write_started` saved; None if the run never got that far."""
-    return _read_json(Path(folder) / STARTED)
+    path = Path(folder) / STARTED
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be read ({error}); delete it or run with force=true") from (
+            error
+        )
 
 
 def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:
@@ -86,14 +94,3 @@ def clear(folder: str | Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink()
-
-
-def _read_json(path: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read ({error}); delete it or run with force=true") from (
-            error
-        )

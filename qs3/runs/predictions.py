@@ -63,14 +63,8 @@ def write_predictions_of_files(
 ) -> None:
     """A table for whoever owns the files: one row each, in the order of their names.
 
-    Columns: file; class; confidence; unlike_source (yes or no), reason (in what); and a probability
-    per class, to four digits.
-
-    Args:
-        path: to write.
-        files: name of each cloud's file.
-        reasons: in what a cloud is unlike the source's; "" if in nothing.
-        predictions: of the clouds.
+    Columns: file; class; confidence; unlike_source (yes or no), reason (in what it is unlike the
+    source's; "" if in nothing); and a probability per class, to four digits.
     """
     p = predictions
     first = ("file", "class", "confidence", "unlike_source", "reason")

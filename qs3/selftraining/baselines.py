@@ -1,4 +1,4 @@
-"""Controls: what a selection is worth beside one of the same size that does not choose."""
+"""Baselines: what a selection is worth against a random one of the same size."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from qs3.datamodules.adaptation import AdaptationData
-from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import copy_weights, load, save
@@ -98,7 +98,7 @@ class SelfTraining(Callback):
     """
 
     def __init__(
-        self, folder: Path, phases: Phases, scheme: Scheme, classes: Sequence[str]
+        self, folder: Path, phases: Phases, scheme: SelfTrainingConfig, classes: Sequence[str]
     ) -> None:
         self.folder, self.phases, self.scheme = folder, phases, scheme
         self.classes = tuple(classes)

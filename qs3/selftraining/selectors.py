@@ -2,7 +2,7 @@
 
 A selector sees one row a target sample: its id and the probabilities that the teacher gives it. It
 never sees a label. The result does not depend on the order of the rows: ties are broken by id.
-Here: QBST and SPST; CBST and CRST in `cbst`, controls in `controls`.
+Here: QBST and SPST; CBST and CRST in `cbst`, baselines in `baselines`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     ask Optuna for settings -> launch runs -> read the objective that each returns -> tell Optuna
 
 The objective is a validator of `qs3.evaluation.validators`: accuracy is refused, and so is to vary
-what says how runs are judged (`qs3.sweeps.summary` checks both). The study lies in a file beside
+what says how runs are judged (`qs3.sweeps.summary` checks both). The study lies in a file next to
 the runs, so that the same command goes on with it: trials that have finished are not repeated,
 those that failed or were interrupted are tried again. One that diverged is a bad trial, not a
 failed one. What Optuna draws for a trial follows from (seed, number of the trial): an interrupted
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig
 
@@ -27,7 +28,7 @@ from qs3.config import hashing
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
-from qs3.sweeps.launching import OverLauncher
+from qs3.sweeps.listed_jobs import ListedJobs, OverLauncher
 from qs3.sweeps.search_report import FAILED, Tried, report
 from qs3.sweeps.search_space import distribution, overrides, split, words
 
@@ -173,3 +174,14 @@ def _count(study: Study) -> int:
 
 def _any(study: Study, state: str) -> bool:
     return any(trial.state.name == state for trial in study.trials)
+
+
+def register() -> None:
+    """Put our sweepers into Hydra's list of plugins, before it looks for one.
+
+    Their names must begin with `hydra_plugins`. Hydra's own way, a namespace package of that name,
+    would be a second top-level package next to qs3.
+    """
+    known: dict[str, Any] = Plugins.instance().class_name_to_class
+    for sweeper in (ListedJobs, LabelFreeSearch):
+        known[f"hydra_plugins.qs3.{sweeper.__name__}"] = sweeper

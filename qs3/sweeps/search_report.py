@@ -42,14 +42,7 @@ class Tried:
 
 
 def report(headline: str, objective: str, tried: Sequence[Tried], fixed: Sequence[str]) -> str:
-    """A table of all trials, without a look at any accuracy.
-
-    Args:
-        headline: first line.
-        objective: one of `LABEL_FREE`.
-        tried: in the order of their numbers.
-        fixed: overrides that all of them share.
-    """
+    """A table of all trials, in order, without any accuracy; `fixed`: overrides that all share."""
     keys = list(dict.fromkeys(key for one in tried for key in one.params))
     rows = [("trial", objective, *keys, "run")]
     for one in tried:

@@ -30,10 +30,8 @@ def split(
 ) -> tuple[list[str], dict[str, Override]]:
     """Overrides that all runs share, and what is varied, by key.
 
-    Args:
-        arguments: of the command line; they replace `params` of the same key.
-        params: by key a value, or what to vary in Hydra's grammar for sweeps.
-        parser: Hydra's.
+    `params`: by key a value, or what to vary in Hydra's grammar for sweeps; `arguments` of the
+    command line replace those of the same key.
     """
     parser = parser or OverridesParser.create()
     by_key = {one.get_key_element(): one for one in parser.parse_overrides(list(arguments))}
@@ -128,7 +126,7 @@ def words(params: Mapping[str, Any]) -> dict[str, str]:
 
 
 def overrides(words: Mapping[str, str]) -> list[str]:
-    """Of the command line."""
+    """The words of a command line."""
     return [f"{key}={word}" for key, word in words.items()]
 
 

@@ -24,7 +24,7 @@ from omegaconf import DictConfig
 from qs3.errors import ConfigError
 from qs3.evaluation.selection_rules import check_objective
 from qs3.runs.metrics import METRICS
-from qs3.sweeps.plugins import register
+from qs3.sweeps.search import register
 from qs3.sweeps.search_space import check_varied, split
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ class SummaryOfSeeds(Callback):
     """After a multirun: mean and SEM over the seeds of each config, or objectives; what failed.
 
     Jobs may run in other processes and on other machines (joblib, submitit), so what becomes of
-    them is noted in a file beside the runs; its name travels to the jobs inside this object.
+    them is noted in a file next to the runs; its name travels to the jobs inside this object.
 
     Args:
         table: whether finished runs are summarised; a search has a table of its own.
@@ -67,13 +67,13 @@ class SummaryOfSeeds(Callback):
     def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
         """Note how the job has ended (and say what went wrong: Hydra shows the first error only).
 
-        What all jobs lack, say the data, is said once.
+        What all jobs lack, such as the data, is logged once.
         """
         if self.journal is None:
             return
         returned = getattr(job_return, "_return_value", None)
         text = in_words(returned) if isinstance(returned, Exception) else ""
-        if text and text not in (entry.get("error") for entry in self._read()[0]):
+        if text and text not in (entry.get("error") for entry in self._read()):
             log.error("%s failed: %s", " ".join(job_return.overrides), text)
         value = returned if isinstance(returned, float) else None
         self._note(config, overrides=list(job_return.overrides), error=text, value=value)
@@ -97,25 +97,21 @@ class SummaryOfSeeds(Callback):
     def _summarise(self) -> None:
         if self.journal is None or os.getpid() != self._main:
             return
-        entries, unreadable = self._read()
-        jobs = last_words(entries)
+        jobs = last_words(self._read())
         self.journal.unlink(missing_ok=True)
         self.journal = None
         folders = sorted({Path(job["folder"]) for job in jobs})
         if self.table and self.objective is not None:
             sys.stdout.write(objectives(jobs, self.objective) + "\n")
         elif self.table and any((folder / METRICS).is_file() for folder in folders):
+            from qs3.report.tables.aggregate import summarise
+
             sys.stdout.write(summarise(folders, differences(jobs)) + "\n")
         sys.stdout.write(failures(jobs))
-        if unreadable:
-            sys.stdout.write(
-                f"{unreadable} of the notes of the jobs could not be read: the list may lack some, "
-                "or say of a job that went well that it did not end\n"
-            )
         sys.stdout.flush()
 
-    def _read(self) -> tuple[list[dict[str, Any]], int]:
-        """What was noted, and how many lines are damaged: two machines may write at one place."""
+    def _read(self) -> list[dict[str, Any]]:
+        """What was noted, but for damaged lines: two machines may write at one place."""
         assert self.journal is not None
         try:
             lines = self.journal.read_bytes().splitlines()
@@ -127,7 +123,7 @@ class SummaryOfSeeds(Callback):
                 entry = json.loads(line)
                 if isinstance(entry, dict) and {"folder", "overrides"} <= set(entry):
                     entries.append(entry)
-        return entries, len(lines) - len(entries)
+        return entries
 
 
 def in_words(error: BaseException) -> str:
@@ -149,9 +145,7 @@ def last_words(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 def failures(jobs: Sequence[Mapping[str, Any]]) -> str:
     """The jobs that failed, by error; "" if there are none.
 
-    Args:
-        jobs: with "folder", "overrides" and "error", which is "" for a job that went well and
-            missing for one that never ended.
+    A job's "error" is "" if it went well, and missing if it never ended.
     """
     failed = [job for job in jobs if job.get("error") != ""]
     if not failed:
@@ -167,11 +161,7 @@ def failures(jobs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
-    """By folder the overrides in which jobs differ, without the seed; "" if they do not.
-
-    Args:
-        jobs: with "folder" and "overrides".
-    """
+    """By folder the overrides in which jobs differ, without the seed; "" if they do not."""
     words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
     keys = dict.fromkeys(key for one in words for key in one if key != "seed")
     several = [key for key in keys if len({one.get(key) for one in words}) > 1]
@@ -182,12 +172,7 @@ def differences(jobs: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
 
 
 def objectives(jobs: Sequence[Mapping[str, Any]], name: str) -> str:
-    """A table of the runs' objectives and the best of them, without a look at any accuracy.
-
-    Args:
-        jobs: with "folder", "job" (its number), "overrides", and "value" if it ended.
-        name: of the objective.
-    """
+    """A table of the runs' objectives (each job's "value") and the best of them; no accuracy."""
     from qs3.sweeps.search_report import Tried, report
 
     jobs = sorted(jobs, key=lambda job: job["job"])
@@ -210,13 +195,6 @@ def _check_fair(config: DictConfig) -> None:
         check_varied(split(config.hydra.overrides.task, params)[1].values())
     except ConfigError as error:  # Hydra makes a warning of a callback's exception
         raise SystemExit(f"{type(error).__name__}: {error}") from error
-
-
-def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:
-    """A small table of the runs in `folders`; `settings`: in what they differ."""
-    from qs3.report.tables.aggregate import summarise as table
-
-    return table(folders, settings)
 
 
 def _new_file(folder: Path) -> Path:

@@ -9,11 +9,10 @@ from lightning.pytorch import Callback, Trainer
 from omegaconf import OmegaConf
 
 from qs3.config.hydra import build
-from qs3.engine.checkpointing import AtomicCheckpointIO, SaveLast
+from qs3.engine.checkpointing import AtomicCheckpointIO, Clock, SaveLast
 from qs3.engine.classifier import Classifier
 from qs3.engine.loggers import CsvHistory, EpochRows
 from qs3.engine.trainer import build_each, make_trainer
-from qs3.engine.wall_time import Clock
 from qs3.methods.base import Method
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.student_loss import Student
@@ -39,11 +38,8 @@ class Built:
 def build_training(run: Run, method: Method, loaded: Loaded, began: float) -> Built:
     """Everything that `Trainer.fit` needs but the data.
 
-    Args:
-        run: its settings.
-        method: loss of the warm-up.
-        loaded: for class names, and the hash of what the warm-up depends on.
-        began: `time.time()` when the run started.
+    `loaded`: for class names, and the hash of what the warm-up depends on; `began`: `time.time()`
+    when the run started.
     """
     cfg, folder, phases = run.cfg, run.folder, run.phases
     classifier = _classifier(run, method)

@@ -12,11 +12,11 @@ from collections.abc import Iterator
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config import hashing
-from qs3.config.checks import check_choice, check_float, check_int
+from qs3.config.checks import check_bool, check_choice, check_float, check_int
 from qs3.config.hydra import build, in_multirun
 from qs3.data.ensure_source import check_or_make
 from qs3.data.store import is_finished
-from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
@@ -39,7 +39,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     Everything that can be wrong with the settings or the data is found before torch is imported.
     """
     _check_settings(cfg)
-    scheme: Scheme = build(cfg.selftraining)
+    scheme: SelfTrainingConfig = build(cfg.selftraining)
     run = Run(
         cfg=cfg,
         seed=check_int("seed", cfg.seed, 0),
@@ -49,8 +49,7 @@ def train(cfg: DictConfig) -> RunMetrics:
         source=build(cfg.data.source),
         target=build(cfg.data.target),
     )
-    _refuse_rounds_of_upper_bound(run)
-    _refuse_choice_without_rounds(run)
+    _check_rounds(run)
     check_objective(cfg.objective)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
@@ -155,52 +154,48 @@ def _check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
     check_choice("selection.teacher", cfg.selection.teacher, TEACHERS)
     check_choice("selection.student", cfg.selection.student, STUDENT_RULES)
-    check_int("data.points", cfg.data.points, 1)
-    check_int("data.fps_starts", cfg.data.fps_starts, 1)
-    for key in ("clouds_a_class", "clouds_a_split"):
-        if cfg.data[key] is not None:
-            check_int(f"data.{key}", cfg.data[key], 1)
+    for key, least in (
+        ("data.points", 1),
+        ("data.fps_starts", 1),
+        ("data.eval_batch_size", 1),
+        ("evaluation.rotations", 0),
+        ("protocol.batch_size", 2),  # batch norm needs two clouds
+    ):
+        check_int(key, OmegaConf.select(cfg, key), least)
+    for key in ("data.clouds_a_class", "data.clouds_a_split", "trainer.threads"):
+        if (value := OmegaConf.select(cfg, key)) is not None:
+            check_int(key, value, 1)
+    check_bool("data.make_source", cfg.data.make_source)
+    check_bool("report.pictures", cfg.report.pictures)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
         raise ConfigError(f"ckpt_path must be last or a path, got {cfg.ckpt_path!r}")
     if cfg.ckpt_path is not None and cfg.force:
         raise ConfigError(
             "force=true begins the run anew and ckpt_path goes on with one; give one of them"
         )
-    check_int("data.eval_batch_size", cfg.data.eval_batch_size, 1)
     check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
-    check_int("evaluation.rotations", cfg.evaluation.rotations, 0)
-    check_int("protocol.batch_size", cfg.protocol.batch_size, 2)  # batch norm needs two clouds
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
     if not 0 <= check_float("protocol.smoothing", cfg.protocol.smoothing) <= highest:
         raise ConfigError(
             f"protocol.smoothing must lie in [0, {highest:g}], got {cfg.protocol.smoothing}"
         )
-    if check_float("protocol.regulariser", cfg.protocol.regulariser) < 0:
-        raise ConfigError(f"protocol.regulariser must be >= 0, got {cfg.protocol.regulariser}")
+    check_float("protocol.regulariser", cfg.protocol.regulariser, ">= 0")
     if "lr" in cfg.protocol.optimizer:
         check_float("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
-    if not isinstance(cfg.data.make_source, bool):
-        raise ConfigError(f"data.make_source must be true or false, got {cfg.data.make_source!r}")
-    if not isinstance(cfg.report.pictures, bool):
-        raise ConfigError(f"report.pictures must be true or false, got {cfg.report.pictures!r}")
-    if cfg.trainer.threads is not None:
-        check_int("trainer.threads", cfg.trainer.threads, 1)
 
 
 def _is_upper_bound(cfg: DictConfig) -> bool:
     return cfg.method.get("_target_") == _SUPERVISED
 
 
-def _refuse_rounds_of_upper_bound(run: Run) -> None:
+def _check_rounds(run: Run) -> None:
+    """Refuse rounds for the upper bound, and a choice among epochs of rounds there are not."""
     if _is_upper_bound(run.cfg) and run.scheme.rounds:
         raise ConfigError(
             "method=supervised trains on the target's labels and has no use for pseudo-labels; "
             "set selftraining=none"
         )
-
-
-def _refuse_choice_without_rounds(run: Run) -> None:
     rule = run.cfg.selection.student
     if rule != LAST and not run.scheme.rounds:
         raise ConfigError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,19 +11,22 @@ from typing import Any
 
 from torch import nn
 
+from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.evaluation.accuracy_estimates import estimate_accuracy
-from qs3.evaluation.metrics import adapt_norms
-from qs3.evaluation.selection_rules import LAST
+from qs3.evaluation.metrics import adapt_norms, predict
+from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
+from qs3.evaluation.validators import LABEL_FREE
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
 from qs3.selftraining.student_selection import Choice
 from qs3.training.build import Built
-from qs3.training.final_scores import training_accuracy, without_labels
 from qs3.training.load import Loaded
 from qs3.training.run import STUDENT, Run
 from qs3.utils.seeding import derive
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,3 +143,36 @@ def _quality(
         upright=run.target.gravity == "z",
         **more,
     )
+
+
+def without_labels(
+    net: nn.Module, target: Unlabelled, choice: Choice | None, batch_size: int, device: Any
+) -> dict[str, float | None]:
+    """The reported net's scores by `qs3.evaluation.validators`, on the target's training clouds.
+
+    Scores by name; None for one that is not a number, of a net that has diverged. SND needs two
+    clouds. If the student was chosen by `pseudo_val`, its score is here.
+    """
+    table = predict(net, target.points, batch_size, device)
+    scores = {
+        name: one.score(table)
+        for name, one in LABEL_FREE.items()
+        if name != "snd" or len(table) > 1
+    }
+    if choice is not None and choice.rule == PSEUDO_VAL:
+        scores[PSEUDO_VAL] = choice.score
+    return {name: score if math.isfinite(score) else None for name, score in scores.items()}
+
+
+def training_accuracy(
+    net: nn.Module, labelled: Labelled, owner: str, batch_size: int, device: Any
+) -> TrainingAccuracy:
+    """How many clouds the reported net was trained on, and the share that is right.
+
+    `owner`: of their labels, "source" or "target_train": whose norms the net takes for them.
+    """
+    domain = "source" if owner == "source" else "target"
+    table = predict(net, labelled.clouds.all(), batch_size, device, domain=domain)
+    right = float((table.argmax(axis=1) == labelled.labels.numpy()).mean())
+    log.info("%.1f %% of the %d training clouds are right", 100 * right, len(table))
+    return TrainingAccuracy(n=len(table), accuracy=right)

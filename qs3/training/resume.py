@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from qs3.runs.checkpoints import LAST
 from qs3.runs.metrics import METRICS
 from qs3.training.provenance import warn_of_versions
 from qs3.training.run import Run
-from qs3.utils.files import atomic_path, make_folder
+from qs3.utils.files import copy_file
 from qs3.utils.locks import check_idle
 
 log = logging.getLogger(__name__)
@@ -76,11 +75,5 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
     for file in sorted(file for file in other.rglob("*") if file.is_file()):
         part = file.relative_to(other)
         if part.parts[0] not in _STAYS and file.suffix != ".log" and part.name != LAST:
-            _copy(file, run.folder / part)
-    _copy(path, run.folder / LAST)  # the checkpoint last: with it a run counts as begun
-
-
-def _copy(source: Path, target: Path) -> None:
-    make_folder(target.parent)
-    with atomic_path(target) as temporary:
-        shutil.copyfile(source, temporary)
+            copy_file(file, run.folder / part)
+    copy_file(path, run.folder / LAST)  # the checkpoint last: with it a run counts as begun

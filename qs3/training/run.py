@@ -8,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from qs3.data.domain import Domain
-from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.phases import Phases, SelfTrainingConfig
 
 STUDENT = "student.pt"
 """Weights at the end of the last round."""
@@ -22,6 +22,6 @@ class Run:
     folder: Path
     seed: int
     phases: Phases
-    scheme: Scheme
+    scheme: SelfTrainingConfig
     source: Domain
     target: Domain

@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from qs3.config import hashing
 from qs3.errors import DataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
-from qs3.utils.files import atomic_path, make_folder, write_json
+from qs3.utils.files import copy_file, write_json
 
 log = logging.getLogger(__name__)
 
@@ -37,12 +36,7 @@ _AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_na
 
 
 def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
-    """64 hex digits over what a warm-up depends on, except its seed.
-
-    Args:
-        cfg: of the run.
-        started: hashes of the datasets and versions, as in `started.json`.
-    """
+    """64 hex digits over what a warm-up depends on (also `started.json`), except its seed."""
     before: Any = OmegaConf.to_container(cfg, resolve=False)
     before = OmegaConf.create(before)
     for key in _AFTERWARDS:
@@ -76,7 +70,7 @@ class SharedWarmup(Checkpoint):
             return False
         log.info("the warm-up was trained before: going on from %s", self.shared)
         for name in (HISTORY, LAST):  # the checkpoint last: with it a run counts as begun
-            _copy(self.shared / name, self.folder / name)
+            copy_file(self.shared / name, self.folder / name)
         return True
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -86,9 +80,8 @@ class SharedWarmup(Checkpoint):
         if self.shared is None or self._is_there():
             return
         try:
-            make_folder(self.shared)
             for name in (HISTORY, LAST):
-                _copy(self.folder / name, self.shared / name)
+                copy_file(self.folder / name, self.shared / name)
             write_json(self.shared / runs.STARTED, {"warmup_sha256": self.sha256})
         except Exception as error:  # a full disk, say: sharing is a convenience
             log.warning("the warm-up cannot be shared (%s); training goes on", error)
@@ -101,8 +94,3 @@ class SharedWarmup(Checkpoint):
         except DataError:  # damaged: as good as not there
             return False
         return mark is not None and mark.get("warmup_sha256") == self.sha256
-
-
-def _copy(source: Path, target: Path) -> None:
-    with atomic_path(target) as temporary:
-        shutil.copyfile(source, temporary)

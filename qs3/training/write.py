@@ -101,7 +101,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
 
 
 def _selection(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> Selection:
-    """In words, which weights labelled the target first and which are reported."""
+    """Which weights labelled the target first and which are reported, as text."""
     rule = built.warmup.rule
     if rule == "source_val":
         rule = f"{loaded.data.owner}_val"

@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,3 +118,10 @@ def _umask() -> int:
     mask = os.umask(0o022)
     os.umask(mask)
     return mask
+
+
+def copy_file(source: Path, target: Path) -> None:
+    """Copy a file, atomically; its folder is made."""
+    make_folder(target.parent)
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)

@@ -21,7 +21,7 @@ from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
-from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled
 
 CLOUDS, STORED, POINTS, BATCH = 4183, 2048, 1024, 16  # PointDA-10's ModelNet, QS3's warm-up
@@ -57,7 +57,7 @@ def our_data(clouds: Clouds) -> AdaptationData:
         domain,
         domain,
         phases=Phases(200),
-        scheme=Scheme(),
+        scheme=SelfTrainingConfig(),
         augment=Augment(),
         batch_size=BATCH,
         seed=0,

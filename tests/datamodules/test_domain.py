@@ -16,7 +16,7 @@ from qs3.data.store import PointSet, open_pointset
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
-from qs3.datamodules.phases import Phases, Scheme
+from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import unit_ball
@@ -347,8 +347,8 @@ def test_wrong_settings_are_errors_for_people(data_dir, settings, message):
 def adaptation(data_dir: Path, **settings: Any) -> AdaptationData:
     domains = (Domain(name, "X", name, data_dir / name) for name in ("specklenet10", "kinectsim10"))
     data = AdaptationData(
-        *domains, phases=Phases(2), scheme=Scheme(), augment=Augment(), batch_size=8, seed=0,
-        points=32, **settings,
+        *domains, phases=Phases(2), scheme=SelfTrainingConfig(), augment=Augment(), batch_size=8,
+        seed=0, points=32, **settings,
     )  # fmt: skip
     data.prepare_data()
     data.setup("fit")

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from qs3.datamodules.phases import Phases, Scheme, no_rounds
+from qs3.datamodules.phases import Phases, SelfTrainingConfig, no_rounds
 from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Qbst
 
@@ -26,7 +26,7 @@ def test_without_rounds_all_is_warmup():
 
 
 def test_theta_grows_without_rounding_error():
-    scheme = Scheme(Qbst(), rounds=10, theta=0.8, epsilon=0.005)
+    scheme = SelfTrainingConfig(Qbst(), rounds=10, theta=0.8, epsilon=0.005)
     assert [scheme.theta_of(j) for j in (0, 3, 9)] == [0.8, 0.815, 0.845]
 
 
@@ -49,7 +49,7 @@ def test_theta_grows_without_rounding_error():
 )
 def test_wrong_settings_name_the_key(settings, message):
     with pytest.raises(ConfigError, match=message):
-        Scheme(**{"selector": Qbst(), "rounds": 2, **settings})
+        SelfTrainingConfig(**{"selector": Qbst(), "rounds": 2, **settings})
 
 
 def test_none_ignores_what_an_experiment_set_for_rounds():

@@ -15,7 +15,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from qs3.config.compose import composing
-from qs3.report.tables.table import CONF
+from qs3.config.location import CONF
 
 SOURCES = {
     "M → D": "modelnet10",
@@ -176,11 +176,3 @@ def test_columns_differ_in_their_source_alone(configs):
             found = differing(config, configs[table, other, row])
             outside = {key for key in found if not _within(key, {"data.source"})}
             assert outside == set(), f"{table}, {row}: {column} and {other}"
-
-
-def test_differences_are_seen():
-    one = _flat({"a": {"b": 1, "c": None}, "experiment_name": "x", "d": {}})
-    other = _flat({"a": {"b": 1}, "experiment_name": "y", "d": {"e": 2}})
-    assert differing(one, other) == {"a.c", "d", "d.e"}
-    assert _within("model.norm", {"model"})
-    assert not _within("models", {"model"})

@@ -10,7 +10,7 @@ from torch import nn
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.splits import Unlabelled
-from qs3.evaluation.calibration import calibration_error
+from qs3.evaluation.calibration import calibration_error, reliability
 from qs3.evaluation.metrics import (
     Evaluation,
     predict,
@@ -51,12 +51,23 @@ def test_calibration_worked_by_hand():
     labels = np.array([0, 1, 0, 1, 1])
     expected = 2 / 5 * abs(1 / 2 - 0.5) + 3 / 5 * abs(2 / 3 - 0.8)
     assert calibration_error(probabilities, labels, bins=2) == pytest.approx(expected)
-
-
-def test_calibration_of_the_sure():
     sure = np.array([[1.0, 0.0], [1.0, 0.0]])
     assert calibration_error(sure, np.array([0, 0])) == 0
     assert calibration_error(sure, np.array([1, 1])) == 1
+
+
+def test_reliability_of_known_bins():
+    """Edges belong to the bin below; clouds without a label do not count."""
+    top = np.array([0.6, 0.6, 0.61, 1.0, 0.9])
+    table, labels = np.stack([top, 1 - top], axis=1), np.array([0, 1, 0, 0, -1])
+    found = reliability(table, labels, bins=5)
+    assert found.count.tolist() == [0, 0, 2, 1, 1]
+    np.testing.assert_allclose(found.accuracy[2:], [0.5, 1, 1])
+    np.testing.assert_allclose(found.confidence[2:], [0.6, 0.61, 1])
+    assert np.isnan(found.accuracy[:2]).all()
+    assert found.error == pytest.approx((2 * 0.1 + 0.39 + 0) / 4)
+    assert found.error == calibration_error(table[:4], labels[:4], bins=5)
+    assert reliability(table, np.full(5, -1)) is None
 
 
 @given(st.integers(0, 1000), st.integers(1, 30), st.integers(2, 5), st.integers(1, 20))

@@ -15,7 +15,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import nn
 
 import qs3
 from qs3.data.store import open_pointset
@@ -45,21 +44,21 @@ def changed(run: Path, folder: Path, **values: Any) -> Path:
     return folder / "result.pt"
 
 
-def test_predictions_of_the_run_to_the_last_digit(run, predictor, test_clouds):
+def test_predictions_of_the_run_to_the_last_digit(run, predictor, test_clouds, tmp_path):
     expected = read_predictions(run / "predictions.csv")
     assert not (run / ".hydra").exists()  # called from Python: nothing but the run's own files
     assert predictor.classes == expected.classes
+    assert not any(module.training for module in predictor.net.modules())
     np.testing.assert_array_equal(predictor(test_clouds, batch_size=64), expected.probabilities)
     # sums in batches of another size may be added otherwise
     np.testing.assert_allclose(
         predictor(test_clouds, batch_size=5), expected.probabilities, atol=1e-6
     )
-
-
-def test_the_file_alone_is_enough(run, tmp_path, test_clouds, predictor):
-    alone = tmp_path / "sent_by_mail.pt"
+    alone = tmp_path / "sent_by_mail.pt"  # the file alone is enough
     alone.write_bytes((run / "result.pt").read_bytes())
+    state = torch.get_rng_state()
     np.testing.assert_array_equal(qs3.load(alone)(test_clouds[:3]), predictor(test_clouds[:3]))
+    assert torch.equal(torch.get_rng_state(), state)  # the caller's random numbers stay
 
 
 def test_any_number_of_points_any_size_any_place(predictor, test_clouds):
@@ -159,14 +158,6 @@ def test_the_front_door_says_what_it_takes():
         assert f"{name}:" in qs3.load.__doc__
 
 
-def test_random_numbers_of_the_caller_are_left_alone(run):
-    torch.manual_seed(5)
-    expected = torch.rand(1)
-    torch.manual_seed(5)
-    qs3.load(run)
-    assert torch.rand(1) == expected
-
-
 def test_missing_runs_are_told_apart(run, tmp_path):
     with pytest.raises(MissingDataError, match="is not there"):
         qs3.load(tmp_path / "nothing")
@@ -205,7 +196,6 @@ def test_pickles_are_refused_unopened(run, tmp_path):
 @pytest.mark.parametrize(
     "model",
     [
-        {"_target_": "os.system", "command": "mkdir {mark}"},
         {"_target_": "os.mkdir", "path": "{mark}"},
         {"_target_": "qs3.models.os.mkdir", "path": "{mark}"},
         {"_target_": "qs3.models.base.nn.Linear", "in_features": 1, "out_features": 1},
@@ -334,8 +324,3 @@ def test_written_is_read(tmp_path_factory, run, points, gravity, classes, low):
 def test_importing_qs3_imports_nothing_heavy():
     code = "import qs3, sys; qs3.load; assert not {'torch', 'numpy', 'hydra'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_nets_are_in_eval_mode(predictor):
-    assert isinstance(predictor.net, nn.Module)
-    assert not any(module.training for module in predictor.net.modules())

@@ -5,7 +5,8 @@ import torch
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
-from qs3.methods.pointdan import PointDan, discrepancy
+from qs3.methods.mmd import mmd2
+from qs3.methods.pointdan import SIGMAS, PointDan, discrepancy
 from qs3.models.pointdan import pointdan
 from tests.methods.shapes import tiny_net
 
@@ -78,3 +79,44 @@ def test_classifiers_learn_at_their_own_rate() -> None:
     ((module, factor),) = PointDan().learning_rates(net)
     assert module is net.head
     assert factor == 2.0
+
+
+def brute_force(x, y, sigmas):
+    def kernel(a, b):
+        return sum(math.exp(-float((a - b).square().sum()) / (2 * s * s)) for s in sigmas)
+
+    def mean(u, v):
+        return sum(kernel(a, b) for a in u for b in v) / (len(u) * len(v))
+
+    return mean(x, x) + mean(y, y) - 2 * mean(x, y)
+
+
+@pytest.mark.parametrize("sizes", [(5, 5), (3, 8), (1, 1)])
+def test_mmd_against_brute_force(sizes: tuple[int, int]) -> None:
+    torch.manual_seed(0)
+    x = torch.randn(sizes[0], 7, dtype=torch.float64)
+    y = torch.randn(sizes[1], 7, dtype=torch.float64) + 1
+    assert mmd2(x, y, SIGMAS).item() == pytest.approx(brute_force(x, y, SIGMAS), abs=1e-10)
+
+
+def test_mmd_known_answers() -> None:
+    x = torch.tensor([[0.0, 0.0]])
+    y = torch.tensor([[3.0, 4.0]])  # at distance 5
+    assert mmd2(x, y, [5.0]).item() == pytest.approx(2 - 2 * math.exp(-0.5))
+    assert mmd2(x, x, SIGMAS).item() == 0
+    far = torch.full((1, 2), 1e6)
+    assert mmd2(x, far, SIGMAS).item() == pytest.approx(2 * len(SIGMAS))
+
+
+def test_many_features_lose_no_kernel_to_rounding() -> None:
+    torch.manual_seed(0)
+    x, y = torch.randn(6, 4096), torch.randn(6, 4096)
+    expected = brute_force(x.double(), y.double(), SIGMAS)
+    assert mmd2(x, y, SIGMAS).item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_mmd_gradient() -> None:
+    torch.manual_seed(0)
+    x = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    y = torch.randn(5, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda a, b: mmd2(a, b, (0.5, 2.0)), (x, y))

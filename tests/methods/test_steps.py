@@ -10,6 +10,7 @@ Nets are tiny ones, for the same reason: what a backbone does is tested with it.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from torch.utils._pytree import tree_leaves
 
 from qs3.datamodules.augment import Augment
 from qs3.methods.base import Method
-from tests.methods.cases import CASES, batch_of, total
+from qs3.methods.source_only import SourceOnly
+from tests.methods.cases import CASES, Case, batch_of, total
 from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -168,46 +170,27 @@ def test_augmentation_is_part_of_a_step() -> None:
     assert not any("_local_scalar_dense" in name or "nonzero" in name for name in counts[0])
 
 
-class _Wrong(Method):
-    """A loss with a fault of its own."""
-
-    def __init__(self, fault: str) -> None:
-        super().__init__()
-        self.fault = fault
-
-    def loss(
-        self, net: nn.Module, batch: dict[str, Any], generator: torch.Generator
-    ) -> dict[str, Tensor]:
-        points, y = batch["source"]["points"], batch["source"]["y_source"]
-        logits = net(points)
-        if self.fault == "item":
-            logits = logits * (1 + 0 * logits.detach().sum().item())
-        elif self.fault == "mask":
-            logits = logits[y >= 0]
-        elif self.fault == "cpu":
-            y = y.cpu().to(points.device)
-        elif self.fault == "if" and (y > 0).any():
-            logits = 2 * logits
-        elif self.fault == "constant":
-            logits = logits + torch.tensor([0.0] * CLASSES, device=points.device)
-        elif self.fault == "loop":
-            logits = torch.stack([row * 1.0 for row in logits])
-        return {"ce": nn.functional.cross_entropy(logits, y)}
+FAULTS: dict[str, Callable[[Tensor], Tensor]] = {
+    "item": lambda x: x * (1 + 0 * x.detach().sum().item()),
+    "mask": lambda x: x[x[:, 0] > -1e9],
+    "cpu": lambda x: x + x.detach().cpu().to(x.device),
+    "constant": lambda x: x + torch.tensor([0.0] * CLASSES, device=x.device),
+    "loop": lambda x: torch.stack([row * 1.0 for row in x]),
+}
 
 
-@pytest.mark.parametrize("fault", ["item", "mask", "cpu", "if", "constant"])
-def test_the_watch_sees_waiting(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(CASES, fault, type(CASES["pcm"])(lambda: _Wrong(fault), 1))
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_watch_sees_a_fault(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Wrong(SourceOnly):
+        def loss(self, net: Any, batch: Any, generator: Any) -> dict[str, Tensor]:
+            return super().loss(lambda points: FAULTS[fault](net(points)), batch, generator)
+
+    monkeypatch.setitem(CASES, fault, Case(Wrong, 1))
     try:
         watch = _watched(fault, b=4)
     except (RuntimeError, NotImplementedError):
         return
-    assert watch.carried
-
-
-def test_the_watch_sees_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(CASES, "loop", type(CASES["pcm"])(lambda: _Wrong("loop"), 1))
-    assert _watched("loop", b=4).counts != _watched("loop", b=8).counts
+    assert watch.carried or watch.counts != _watched(fault, b=8).counts
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

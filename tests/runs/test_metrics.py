@@ -6,18 +6,17 @@ import copy
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
 from qs3.config import hashing
 from qs3.errors import DataError
 from qs3.report.runs.data import read_run
 from qs3.report.tables.aggregate import load_run, summarise
-from qs3.report.tables.table import build_table, markdown
+from qs3.report.tables.formats import markdown
+from qs3.report.tables.table import build_table
 from qs3.runs.metrics import (
     METRICS,
     AccuracyEstimates,
@@ -27,7 +26,6 @@ from qs3.runs.metrics import (
     PseudoLabelScores,
     RoundRecord,
     RunMetrics,
-    Scores,
     StudentChoice,
     TrainingAccuracy,
     Warmup,
@@ -137,17 +135,6 @@ def test_the_file_has_the_names_of_the_schema(document):
     assert document["status"] == "finished"
 
 
-def test_a_result_cannot_be_changed():
-    made = metrics()
-    with pytest.raises(FrozenInstanceError):
-        made.seed = 1  # type: ignore[misc]
-    assert replace(made, seed=1).seed == 1
-    with pytest.raises(ValidationError, match="seed"):
-        replace(made, seed="1")
-    with pytest.raises(ValidationError, match="accuracy"):
-        Scores(n=1, predicted={"a": 1}, accuracy=float("nan"))
-
-
 def test_an_unknown_key_is_named_wherever_it_is(document, tmp_path):
     objects = [(), *(p for p in places(document) if isinstance(at(document, p), dict))]
     assert len(objects) > 25
@@ -164,64 +151,29 @@ def test_an_unknown_key_is_named_wherever_it_is(document, tmp_path):
         assert said.startswith(".".join(map(str, (*place, "speed"))) + ": "), said
 
 
-def test_a_missing_key_is_named_or_has_a_default_that_claims_nothing(document, tmp_path):
-    left_out = set()
-    for *parents, key in places(document):
-        if isinstance(key, int) or not isinstance(at(document, tuple(parents)), dict):
-            continue
-        changed = copy.deepcopy(document)
-        del at(changed, tuple(parents))[key]
-        (tmp_path / METRICS).write_text(json.dumps(changed))
-        try:
-            found = read_metrics(tmp_path)
-        except DataError:
-            said = refusal(tmp_path, json.dumps(changed))
-            assert said.startswith(".".join(map(str, (*parents, key))) + ": "), said
-            continue
-        write_metrics(tmp_path, found)
-        again = json.loads((tmp_path / METRICS).read_text())
-        value = at(again, tuple(parents)).get(key)
-        assert value in (None, []) or (key, value) == ("status", "finished")
-        left_out.add(key)
-    assert left_out > {"student", "rounds", "accuracy", "teacher"}
-    needed = {"experiment", "hash", "seed", "final", "n", "data", "target", "theta", "epoch"}
-    assert not needed & left_out
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("seed",), "1"),
+        (("seed",), 1.5),
+        (("simulated",), 0),
+        (("status",), "failed"),
+        (("rounds", 0, "theta"), float("nan")),
+        (("quality", "teacher", "calibrated"), float("inf")),
+        (("final", "confusion", 0, 1), "text"),
+    ],
+)
+def test_a_value_that_does_not_fit_is_named(document, tmp_path, place, value):
+    at(document, place[:-1])[place[-1]] = value
+    said = refusal(tmp_path, json.dumps(document))
+    assert said.startswith(".".join(map(str, place)) + ": "), said
 
 
-def test_a_value_of_another_type_is_named(document, tmp_path):
-    for place in places(document):
-        value = at(document, place)
-        others: list[Any] = [{"x": [1]}] if isinstance(value, str) else ["text"]
-        if isinstance(value, bool):
-            others += [0, "true"]
-        elif isinstance(value, int):
-            others += ["1", 1.5, True]
-        elif isinstance(value, float):
-            others += ["0.5", True]
-        elif isinstance(value, str):
-            others += [1, None]
-        for other in others:
-            changed = copy.deepcopy(document)
-            at(changed, place[:-1])[place[-1]] = other
-            said = refusal(tmp_path, json.dumps(changed))
-            assert said.startswith(".".join(map(str, place)) + ": "), (place, other, said)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_a_figure_that_is_no_number_is_named(document, tmp_path, value):
-    floats = [place for place in places(document) if isinstance(at(document, place), float)]
-    assert len(floats) > 40
-    for place in floats:
-        changed = copy.deepcopy(document)
-        at(changed, place[:-1])[place[-1]] = value
-        said = refusal(tmp_path, json.dumps(changed))
-        assert said.startswith(".".join(map(str, place)) + ": "), said
-        assert "finite" in said
-
-
-def test_another_status_is_no_result(document, tmp_path):
-    said = refusal(tmp_path, json.dumps({**document, "status": "failed"}))
-    assert said.startswith("status: ")
+@pytest.mark.parametrize("place", [("hash",), ("final", "n"), ("rounds", 0, "theta")])
+def test_a_missing_key_is_named(document, tmp_path, place):
+    del at(document, place[:-1])[place[-1]]
+    said = refusal(tmp_path, json.dumps(document))
+    assert said.startswith(".".join(map(str, place)) + ": "), said
 
 
 DAMAGED = {
@@ -236,14 +188,18 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("how", DAMAGED)
-def test_every_reader_names_a_damaged_file(how, toy, tmp_path, capsys):  # noqa: F811
+def test_a_damaged_file_is_named(how, tmp_path):
+    (tmp_path / METRICS).write_bytes(DAMAGED[how])
+    with pytest.raises(DataError, match=r"metrics\.json is damaged: .*; delete it and repeat"):
+        read_metrics(tmp_path)
+
+
+def test_every_reader_names_a_damaged_file(toy, tmp_path, capsys):  # noqa: F811
     cell = build_table("quickstart", tmp_path / "logs").cells[0]
     run_cell(tmp_path / "logs", cell, seeds=(0,))
     (file,) = (tmp_path / "logs").rglob(METRICS)
-    file.write_bytes(DAMAGED[how])
+    file.write_bytes(DAMAGED["cut"])
     said = rf"{re.escape(str(file))} is damaged: .*; delete it and repeat"
-    with pytest.raises(DataError, match=said):
-        read_metrics(file.parent)
     with pytest.raises(DataError, match=said):
         read_run(file.parent)
     assert main(["report", "page", f"run={file.parent}"]) == 1
@@ -259,10 +215,10 @@ def test_every_reader_names_a_damaged_file(how, toy, tmp_path, capsys):  # noqa:
     cfg = toy("selftraining=none")
     own = hashing.run_folder(cfg)
     own.mkdir(parents=True)
-    (own / METRICS).write_bytes(DAMAGED[how])
+    (own / METRICS).write_bytes(DAMAGED["cut"])
     with pytest.raises(DataError, match=rf"{re.escape(str(own / METRICS))} is damaged: "):
         train(cfg)
-    assert (own / METRICS).read_bytes() == DAMAGED[how]
+    assert (own / METRICS).read_bytes() == DAMAGED["cut"]
 
 
 def test_a_file_that_cannot_be_read(tmp_path):

@@ -5,8 +5,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from qs3.errors import ConfigError, SelectionError
 from qs3.selftraining.selectors import Qbst, TeacherPredictions, check_selection
@@ -100,50 +98,3 @@ def test_wrong_setting_names_the_key(settings):
     (key,) = settings
     with pytest.raises(ConfigError, match=f"selftraining.selector.{key}"):
         Qbst(**settings)
-
-
-tables = st.lists(
-    st.tuples(st.integers(0, 3), st.sampled_from([0.1, 0.5, 0.8, 0.801, 0.9, 0.95, 1.0])),
-    max_size=60,
-).map(lambda rows: [(f"{i:02d}", k, p) for i, (k, p) in enumerate(rows)])
-settings = st.fixed_dictionaries(
-    {
-        "mu": st.sampled_from(["balanced", "one"]),
-        "order": st.sampled_from(["descending", "ascending"]),
-        "counts": st.sampled_from(["confident", "all"]),
-    }
-)
-
-
-@given(tables.filter(bool), settings, st.randoms(use_true_random=False))
-def test_the_order_of_samples_does_not_matter(table, chosen, rng):
-    shuffled = rng.sample(table, len(table))
-    assert select(table, classes=4, **chosen)[1] == select(shuffled, classes=4, **chosen)[1]
-
-
-@given(tables.filter(bool), settings)
-def test_never_below_theta_never_above_the_quota(table, chosen):
-    selection, _ = select(table, classes=4, **chosen)
-    confidence = np.array([p for _, _, p in table])
-    assert (confidence[selection.selected] > 0.8).all()
-    quota = np.ceil(selection.mu * selection.confident + 1e-9)
-    assert (selection.kept <= quota).all()
-    assert selection.kept.sum() == selection.selected.sum()
-
-
-@given(tables.filter(bool))
-def test_mu_falls_as_a_class_grows(table):
-    selection, _ = select(table, classes=4)
-    if selection.confident.sum():
-        order = np.argsort(selection.confident, kind="stable")
-        assert (np.diff(selection.mu[order]) <= 0).all()
-
-
-@given(tables.filter(bool))
-def test_kept_are_the_most_confident(table):
-    selection, _ = select(table, classes=4)
-    p, k = np.array([r[2] for r in table]), np.array([r[1] for r in table])
-    for cls in range(4):
-        kept = p[selection.selected & (k == cls)]
-        left = p[~selection.selected & (k == cls)]
-        assert not len(kept) or not len(left) or kept.min() >= left.max()

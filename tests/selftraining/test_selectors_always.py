@@ -1,4 +1,4 @@
-"""What holds for every selector of `conf/selftraining`, whatever the table; and naive twins."""
+"""What holds for every selector, whatever the table; and naive twins."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
-from qs3.datamodules.phases import Scheme
+from qs3.datamodules.phases import SelfTrainingConfig
+from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.selectors import Qbst, Spst
 from tests.selftraining.test_selectors_balanced import select
@@ -22,27 +23,30 @@ from tests.training.toy import CONF
 NAMES = sorted(p.stem for p in (CONF / "selftraining").glob("*.yaml") if p.stem != "none")
 
 
-def scheme_of(name: str) -> Scheme:
+def scheme_of(name: str) -> SelfTrainingConfig:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return build(compose("train", [f"selftraining={name}"]).selftraining)
 
 
 SCHEMES = {name: scheme_of(name) for name in NAMES}
-schemes = st.sampled_from(sorted(SCHEMES))
+SELECTORS = {name: scheme.selector for name, scheme in SCHEMES.items()} | {
+    "qbst ascending": Qbst(order="ascending"),
+    "qbst of all": Qbst(counts="all", order="ascending"),
+    "cbst half": Cbst(portion=0.5),
+    "lrent half": Cbst(portion=0.5, labels="lrent"),
+    "random of all": Random(Qbst(), seed=3, pool="all"),
+    "random cbst": Random(Cbst(portion=0.5), seed=1),
+}
+every_selector = pytest.mark.parametrize("name", SELECTORS)
 # Whole numbers from a small range: many ties, within a row and between rows.
 tables = st.lists(st.lists(st.integers(1, 9), min_size=3, max_size=3), min_size=1, max_size=40).map(
     lambda rows: np.array([[x / sum(row) for x in row] for row in rows])
 )
-thetas = st.sampled_from([0.4, 0.5, 0.6, 0.8])
+thetas = st.sampled_from([0.0, 0.4, 0.5, 0.6, 0.8])
 
 
 def ids_of(p: np.ndarray) -> list[str]:
     return [f"{i:02d}" for i in range(len(p))]
-
-
-def theta_for(name: str, theta: float) -> float:
-    """A threshold of the round; a scheme with thresholds of its own has none."""
-    return 0.0 if SCHEMES[name].theta == 0 else theta
 
 
 def test_all_are_here() -> None:
@@ -50,10 +54,12 @@ def test_all_are_here() -> None:
     assert SCHEMES["crst_mrkld"].mrkld > 0
 
 
-@given(schemes, tables, thetas, st.integers(0, 9), st.randoms(use_true_random=False))
+@every_selector
+@settings(max_examples=40)
+@given(p=tables, theta=thetas, round_=st.integers(0, 9), rng=st.randoms(use_true_random=False))
 def test_the_order_of_samples_does_not_matter(name, p, theta, round_, rng) -> None:
     """The same ids with the same labels, hard or soft, and the same figures."""
-    selector, theta = SCHEMES[name].selector, theta_for(name, theta)
+    selector = SELECTORS[name]
     ids, order = ids_of(p), rng.sample(range(len(p)), len(p))
     here, kept = select(selector, p, theta, ids, round_)
     there, kept_there = select(selector, p[order], theta, [ids[i] for i in order], round_)
@@ -65,52 +71,50 @@ def test_the_order_of_samples_does_not_matter(name, p, theta, round_, rng) -> No
         np.testing.assert_array_equal(here.soft[order], there.soft)
 
 
-@given(schemes, tables, thetas)
-def test_no_pseudo_label_at_or_below_theta(name, p, theta) -> None:
-    theta = theta_for(name, theta)
-    selection, _ = select(SCHEMES[name].selector, p, theta, ids_of(p))
+@every_selector
+@settings(max_examples=40)
+@given(p=tables, theta=thetas)
+def test_no_pseudo_label_at_or_below_theta_and_figures_agree(name, p, theta) -> None:
+    selection, _ = select(SELECTORS[name], p, theta, ids_of(p))
     labels = p.argmax(axis=1) if selection.labels is None else selection.labels
-    assert (p[np.arange(len(p)), labels][selection.selected] > theta).all()
-    assert selection.kept.sum() == selection.selected.sum()
+    if name != "random of all":
+        assert (p[np.arange(len(p)), labels][selection.selected] > theta).all()
+    kept = np.bincount(labels[selection.selected], minlength=3)
+    assert kept.tolist() == selection.kept.tolist()
+    confident = np.bincount(p.argmax(axis=1)[p.max(axis=1) > theta], minlength=3)
+    assert confident.tolist() == selection.confident.tolist()
 
 
 # --- QBST ------------------------------------------------------------------------------------
 
 
-def qbst_by_hand(p: np.ndarray, theta: float, ids: list[str]) -> list[str]:
-    """One sample after the other, in fractions."""
+def qbst_by_hand(p: np.ndarray, theta: float, ids: list[str], sign: int) -> list[str]:
+    """One sample after the other, in fractions; the least confident first with sign = 1."""
     above = [(i, int(row.argmax()), row.max()) for i, row in zip(ids, p, strict=True)]
     above = [row for row in above if row[2] > theta]
     kept = []
     for k in range(p.shape[1]):
-        of_class = sorted((-c, i) for i, label, c in above if label == k)
+        of_class = sorted((sign * c, i) for i, label, c in above if label == k)
         mu = 1 - Fraction(len(of_class), len(above)) if above else Fraction(0)
         kept += [f"{i}{k}" for _, i in of_class[: math.ceil(mu * len(of_class))]]
     return sorted(kept)
 
 
-@given(tables, thetas)
-def test_qbst_is_its_naive_twin(p, theta) -> None:
-    assert select(Qbst(), p, theta, ids_of(p))[1] == " ".join(qbst_by_hand(p, theta, ids_of(p)))
-
-
-@given(tables, thetas, st.sampled_from(["descending", "ascending"]))
-def test_qbst_keeps_just_its_quota(p, theta, order) -> None:
-    """ceil(mu_k n_k), never more, and never fewer; counted in fractions."""
-    selection, _ = select(Qbst(order=order), p, theta, ids_of(p))
-    n_k = [int(n) for n in selection.confident]
-    quotas = [math.ceil((1 - Fraction(n, sum(n_k))) * n) if n else 0 for n in n_k]
-    assert selection.kept.tolist() == quotas
+@pytest.mark.parametrize(("order", "sign"), [("descending", -1), ("ascending", 1)])
+@given(p=tables, theta=thetas)
+def test_qbst_is_its_naive_twin(order, sign, p, theta) -> None:
+    kept = select(Qbst(order=order), p, theta, ids_of(p))[1]
+    assert kept == " ".join(qbst_by_hand(p, theta, ids_of(p), sign))
 
 
 @given(tables, thetas)
-def test_qbst_of_all_counts_never_exceeds_its_quota(p, theta) -> None:
+def test_qbst_of_all_counts_keeps_just_its_quota(p, theta) -> None:
     selection, _ = select(Qbst(counts="all"), p, theta, ids_of(p))
     counts, n = np.bincount(p.argmax(axis=1), minlength=3), int(selection.confident.sum())
     for k in range(3):
         mu = max(1 - Fraction(int(counts[k]), n), Fraction(0)) if n else Fraction(0)
         assert float(mu) == pytest.approx(selection.mu[k], abs=1e-12)
-        assert selection.kept[k] <= math.ceil(mu * int(selection.confident[k]))
+        assert selection.kept[k] == math.ceil(mu * int(selection.confident[k]))
 
 
 @given(tables, thetas, st.integers(0, 2), st.integers(1, 5))

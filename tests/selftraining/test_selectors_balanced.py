@@ -84,42 +84,9 @@ def test_lrent_worked_by_hand() -> None:
 probabilities = st.lists(
     st.lists(st.integers(1, 12), min_size=4, max_size=4), min_size=1, max_size=40
 ).map(lambda rows: np.array([[x / sum(row) for x in row] for row in rows]))
-selectors = st.sampled_from(
-    [
-        Spst(),
-        Qbst(),
-        Cbst(),
-        Cbst(portion=0.5),
-        Cbst(portion=0.5, labels="lrent"),
-        Random(Qbst(), seed=3),
-        Random(Qbst(), seed=3, pool="all"),
-        Random(Cbst(portion=0.5), seed=1),
-    ]
-)
+
+
 thetas = st.sampled_from([0.3, 0.5, 0.8])
-
-
-@given(probabilities, selectors, thetas, st.integers(0, 9), st.randoms(use_true_random=False))
-def test_the_order_of_samples_does_not_matter(p, selector, theta, round_, rng) -> None:
-    ids = [f"{i:02d}/" for i in range(len(p))]
-    order = rng.sample(range(len(p)), len(p))
-    here = select(selector, p, theta, ids, round_)
-    there = select(selector, p[order], theta, [ids[i] for i in order], round_)
-    assert here[1] == there[1]
-    for name in ("mu", "confident", "kept", "thresholds"):
-        np.testing.assert_array_equal(getattr(here[0], name), getattr(there[0], name))
-    if here[0].soft is not None:
-        np.testing.assert_array_equal(here[0].soft[order], there[0].soft)
-
-
-@given(probabilities, selectors, thetas)
-def test_never_below_theta_and_figures_agree(p, selector, theta) -> None:
-    selection, _ = select(selector, p, theta, [f"{i:02d}" for i in range(len(p))])
-    labels = p.argmax(axis=1) if selection.labels is None else selection.labels
-    if getattr(selector, "pool", "confident") != "all":
-        assert (p[np.arange(len(p)), labels][selection.selected] > theta).all()
-    kept = np.bincount(labels[selection.selected], minlength=4)
-    assert kept.tolist() == selection.kept.tolist()
 
 
 @given(probabilities, thetas)

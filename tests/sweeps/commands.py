@@ -1,25 +1,12 @@
-"""Runs the two commands of the tests: train.py on tiny data, and its light twin."""
+"""Multiruns of train.py's light twin."""
 
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-
-
-def command(folder: Path, *arguments: str, script: str = "train.py") -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, str(ROOT / script), *arguments],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+from tests.commands import command
 
 
 def light(folder: Path, *arguments: str) -> subprocess.CompletedProcess:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 
 from qs3.config import hashing
 from qs3.data.store import open_pointset
 from qs3.datamodules.splits import load_clouds
-from qs3.evaluation.metrics import adapt_norms, predict
+from qs3.evaluation.metrics import adapt_norms
 from qs3.runs.checkpoints import load
-from qs3.runs.predictions import read_predictions
 from qs3.training.command import train
 from tests.training.toy import TinyNet
 
@@ -47,16 +45,3 @@ def test_order_of_clouds_is_mixed_and_batches_are_even():
     flat = [value for batch in seen for value in batch]
     assert sorted(flat) == list(range(65))
     assert flat != sorted(flat)
-
-
-def test_predictions_are_those_of_the_result(toy, toy_data):
-    cfg = toy()
-    metrics = train(cfg)
-    found = read_predictions(hashing.run_folder(cfg) / "predictions.csv")
-    net = TinyNet(3)
-    net.load_state_dict(load(hashing.run_folder(cfg) / "result.pt")["weights"])
-    test = load_clouds(open_pointset(toy_data / "kinectsim10"), "test", 32)
-    np.testing.assert_array_equal(found.probabilities, predict(net, test.points, 64))
-    assert found.ids == found.meshes == test.ids  # no meshes are known here
-    accuracy = float((found.predicted == found.labels).mean())
-    assert accuracy == metrics.final.accuracy

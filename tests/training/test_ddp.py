@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 import signal
 import subprocess
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,12 +23,11 @@ from qs3.runs.checkpoints import load
 from qs3.runs.pseudo_labels import write_pseudo_labels
 from qs3.selftraining.selectors import Qbst, TeacherPredictions
 from qs3.training.command import train
+from tests.commands import command
 from tests.training.conftest import result_of
-from tests.training.test_resume import interrupt
 from tests.training.toy import CLASSES, overrides, toy_config, write_domain
-from tests.training.watching import seen_by
+from tests.training.watching import interrupt, seen_by
 
-ROOT = Path(__file__).parents[2]
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
 WARMUP, EPOCHS = 6, 3
 # The same clouds whoever draws them, so that a process's clouds can be told by their coordinates.
@@ -50,17 +47,6 @@ class Both:
     two: Path
     watched: Path
     ids: tuple[str, ...]
-
-
-def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), *arguments],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 def watch(folder: Path) -> str:
@@ -128,14 +114,11 @@ def test_the_table_of_a_later_round_is_what_one_process_makes_of_the_weights(
 
 
 @pytest.mark.parametrize("round_", [0, 1])
-def test_no_cloud_is_missing_and_none_comes_twice(both: Both, round_: int) -> None:
-    assert [row["id"] for row in rows(both.two, round_)] == list(both.ids)
-    assert len(set(both.ids)) == 75
-
-
-@pytest.mark.parametrize("round_", [0, 1])
 def test_both_train_on_the_selected_and_on_nothing_else(both: Both, round_: int) -> None:
+    """75 clouds in the table, each once; the selected ones shared out."""
     table = rows(both.two, round_)
+    assert [row["id"] for row in table] == list(both.ids)
+    assert len(set(both.ids)) == 75
     selected = [i for i, row in enumerate(table) if row["selected"] == "1"]
     labels = [CLASSES.index(table[i]["label"]) for i in selected]
     for epoch in range(WARMUP + EPOCHS * round_, WARMUP + EPOCHS * (round_ + 1)):

@@ -13,10 +13,10 @@ from qs3.config import hashing
 from qs3.errors import ConfigError
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
-from tests.training.toy import _SHAPES, CLASSES, CONF, overrides
+from tests.training.toy import _SHAPES, CONF, overrides
 
 
-def write_clouds(folder: Path, layout: str, count: int, noise: float) -> None:
+def write_clouds(folder: Path, count: int, noise: float, labels: bool) -> None:
     """Text files of 40 to 80 points: class/name.xyz, or name.txt without labels."""
     rng = np.random.default_rng(count)
     for cls, shape in _SHAPES.items():
@@ -24,7 +24,7 @@ def write_clouds(folder: Path, layout: str, count: int, noise: float) -> None:
             points = rng.normal(size=(int(rng.integers(40, 80)), 3)) * shape
             points += noise * rng.normal(size=points.shape)
             path = folder / f"{cls}_{i:02d}.txt"
-            if layout == "class":
+            if labels:
                 path = folder / cls.capitalize() / f"{i:02d}.xyz"
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savetxt(path, points, fmt="%.5f")
@@ -45,22 +45,9 @@ def config(root: Path, *more: str) -> DictConfig:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write_clouds(tmp_path / "labelled", "class", 20, 0.05)
-    write_clouds(tmp_path / "scans", "none", 12, 0.15)
+    write_clouds(tmp_path / "labelled", 20, 0.05, labels=True)
+    write_clouds(tmp_path / "scans", 12, 0.15, labels=False)
     return tmp_path
-
-
-def test_pseudo_labels_for_own_scans(root: Path) -> None:
-    cfg = config(root)
-    train(cfg)
-    folder = hashing.run_folder(cfg)
-    metrics = read_metrics(folder)
-    assert metrics.status == "finished"
-    assert metrics.final.accuracy is None
-    assert sum(metrics.final.predicted.values()) == 36
-    assert metrics.evaluation.labels is False
-    assert len(metrics.rounds) == 2
-    assert all(record.mu.keys() == set(CLASSES) for record in metrics.rounds)
 
 
 def test_own_labels_are_an_upper_bound_or_refused(root: Path) -> None:

@@ -20,10 +20,14 @@ from qs3.runs.metrics import RunMetrics
 from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
 from qs3.training.command import train
+from qs3.utils.seeding import derive
+from tests.training.conftest import result_of
 from tests.training.toy import CLASSES, toy_config
+from tests.training.watching import interrupt
 
 # 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1
 STARTS, ENDS = (0, 4, 7), (3, 6, 9)
+PERSISTENT = ("selftraining.init=persistent", "selftraining.theta=0.35")
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,11 @@ def continued(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
     return kept_run(root, toy_data, "selftraining=spst", "selftraining.theta=0.35")
 
 
+@pytest.fixture(scope="module")
+def persistent(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
+    return kept_run(tmp_path_factory.mktemp("persistent"), toy_data, *PERSISTENT)
+
+
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     assert a.keys() == b.keys()
     return all(torch.equal(a[name], b[name]) for name in a)
@@ -94,6 +103,32 @@ def test_the_optimiser_begins_anew(name: str, request: pytest.FixtureRequest) ->
         assert run.before(start)["moments"] == 0
         assert run.before(start, 1)["moments"] > 0
         assert run.before(start + 1)["moments"] > 0  # in a phase's other epochs they are kept
+
+
+def test_continued_students_begin_with_their_teacher(continued: Kept) -> None:
+    """Round 0 with the selected weights of the warm-up, not its last; round 1 with the student."""
+    selected = load(continued.folder / "warmup_selected.pt")
+    assert same(continued.before(4)["weights"], selected)
+    assert same(continued.before(7)["weights"], continued.net(6))
+    assert not same(selected, continued.net(3))
+
+
+def test_a_persistent_student_is_new_in_round_0_and_kept_afterwards(persistent: Kept) -> None:
+    """The released code's: the same weights and moments in all rounds."""
+    torch.manual_seed(derive(0, "init", 1))
+    assert same(persistent.before(4)["weights"], build(persistent.cfg.model).state_dict())
+    assert persistent.before(4)["moments"] == 0
+    assert same(persistent.before(7)["weights"], persistent.net(6))
+    assert persistent.before(7)["moments"] > 0
+    steps = {e: persistent.checkpoint(e)["optimizer_states"][0]["state"][0]["step"] for e in (6, 7)}
+    assert steps[7] > steps[6] > 0
+
+
+def test_a_persistent_run_that_was_interrupted_ends_the_same(persistent: Kept, toy) -> None:
+    cut = toy(*PERSISTENT)
+    interrupt(cut, epoch=7)
+    train(cut)
+    assert result_of(hashing.run_folder(cut)) == result_of(persistent.folder)
 
 
 @pytest.mark.parametrize("name", ["scratch", "continued"])

@@ -6,7 +6,6 @@ import csv
 import math
 
 import numpy as np
-import pytest
 import torch
 from torch import nn
 from torch.nn import functional as F
@@ -15,14 +14,13 @@ from qs3.config import hashing
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.engine.schedules import Plateau
-from qs3.errors import ConfigError
 from qs3.methods.base import class_loss
 from qs3.methods.source_only import SourceOnly
 from qs3.models.pointnet import pointnet, transform_regulariser
 from qs3.selftraining.student_loss import Student
 from qs3.training.command import train
 from tests.training.conftest import result_of
-from tests.training.test_resume import interrupt
+from tests.training.watching import interrupt
 
 
 def test_smoothing_spreads_over_the_other_classes():
@@ -55,15 +53,15 @@ def test_plateau_halves_after_eleven_epochs_without_a_lower_loss():
 SIMPLEVIEW = ("protocol=simpleview", "protocol.epochs=40", "protocol.optimizer.lr=4.0")
 
 
-def lrs(folder) -> list[float]:
+def column(folder, name) -> list[float]:
     with open(folder / "history.csv", newline="") as file:
-        return [float(row["lr"]) for row in csv.DictReader(file)]
+        return [float(row[name]) for row in csv.DictReader(file)]
 
 
 def test_a_run_with_a_plateau_resumes_exactly(toy):
     cfg = toy(*SIMPLEVIEW)
     train(cfg)
-    rates, expected = lrs(hashing.run_folder(cfg)), result_of(hashing.run_folder(cfg))
+    rates, expected = column(hashing.run_folder(cfg), "lr"), result_of(hashing.run_folder(cfg))
     assert rates[0] == 4.0
     assert rates[39] < 4.0  # it came to a plateau
     assert rates[40:] == [4.0] * 6  # each round begins anew
@@ -74,15 +72,13 @@ def test_a_run_with_a_plateau_resumes_exactly(toy):
 
 
 def test_smoothing_reaches_warmup_and_students(toy):
-    plain, smooth = toy("seed=3"), toy("seed=3", "protocol.smoothing=0.3")
-    with open_history(plain) as a, open_history(smooth) as b:
-        for row_a, row_b in zip(csv.DictReader(a), csv.DictReader(b), strict=True):
-            assert row_a["train/loss"] != row_b["train/loss"]
-
-
-def open_history(cfg):
-    train(cfg)
-    return open(hashing.run_folder(cfg) / "history.csv", newline="")
+    short = ("protocol.epochs=1", "selftraining.rounds=1", "selftraining.epochs=1")
+    losses = []
+    for smoothing in (0.0, 0.3):
+        cfg = toy(*short, "selftraining.theta=0.3", f"protocol.smoothing={smoothing}")
+        train(cfg)
+        losses.append(column(hashing.run_folder(cfg), "train/loss"))
+    assert all(plain != smooth for plain, smooth in zip(*losses, strict=True))
 
 
 def test_the_nets_regulariser_is_added():
@@ -107,21 +103,6 @@ def test_the_nets_regulariser_is_added():
     assert features.regulariser > 0
     assert plain > 0
     assert transform_regulariser(torch.eye(3)[None]) == 0
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("protocol.smoothing=0.7", r"protocol\.smoothing must lie in \[0, 0\.666667\], got 0\.7"),
-        ("protocol.smoothing=-0.1", r"protocol\.smoothing must lie in"),
-        ("protocol.schedule=step", r"protocol\.schedule must be one of"),
-        ("protocol.regulariser=-1", r"protocol\.regulariser must be >= 0"),
-        ("evaluation.norms=ada", r"evaluation\.norms must be one of"),
-    ],
-)
-def test_wrong_settings(toy, change, message):
-    with pytest.raises(ConfigError, match=message):
-        train(toy(change))
 
 
 def test_smoothing_keeps_the_optimum_where_it_should_be():

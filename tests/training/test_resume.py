@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from lightning.pytorch import Callback
-from omegaconf import open_dict
 
 import qs3.runs.checkpoints
 import qs3.selftraining.callback
@@ -23,45 +21,7 @@ from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.toy import overrides
-
-
-class Stop(Exception):
-    """Stands for a kill."""
-
-
-class StopAt(Callback):
-    """Raises in one hook, the n-th time."""
-
-    def __init__(self, hook: str, count: int) -> None:
-        self.left = count
-
-        def stop(*args: object, **kwargs: object) -> None:
-            self.left -= 1
-            if self.left == 0:
-                raise Stop
-
-        setattr(self, hook, stop)
-
-    # Lightning looks hooks up by name; these are replaced on the instance.
-    def on_train_batch_end(self, *args, **kwargs): ...
-    def on_train_epoch_start(self, *args, **kwargs): ...
-    def on_train_epoch_end(self, *args, **kwargs): ...
-    def on_validation_batch_end(self, *args, **kwargs): ...
-    def on_train_start(self, *args, **kwargs): ...
-    def on_train_end(self, *args, **kwargs): ...
-
-
-def interrupt(cfg, hook: str, count: int) -> None:
-    stopping = cfg.copy()
-    with open_dict(stopping):
-        stopping.callbacks.progress = {
-            "_target_": "tests.training.test_resume.StopAt",
-            "hook": hook,
-            "count": count,
-        }
-    assert hashing.config_hash(stopping) == hashing.config_hash(cfg)
-    with pytest.raises(Stop):
-        train(stopping)
+from tests.training.watching import Stop, interrupt
 
 
 # 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1; 4 batches an epoch of the warm-up

@@ -10,14 +10,13 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import open_dict
 
 from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.toy import CONF
-from tests.training.watching import Stop
+from tests.training.watching import interrupt
 
 # 7 epochs: 0-2 warm-up, 3-4 round 0, 5-6 round 1
 SHORT = ("protocol.epochs=3", "selftraining.epochs=2")
@@ -50,14 +49,7 @@ def check(toy: Any, tmp_path: Path, settings: tuple[str, ...], *epochs: int) -> 
     whole, broken = (toy(*settings, f"paths.log_dir={tmp_path / x}") for x in ("whole", "broken"))
     train(whole)
     for epoch in epochs:
-        stopping = broken.copy()
-        with open_dict(stopping):
-            stopping.callbacks.progress = {
-                "_target_": "tests.training.watching.StopIn",
-                "epoch": epoch,
-            }
-        with pytest.raises(Stop):
-            train(stopping)
+        interrupt(broken, epoch=epoch)
         assert load(hashing.run_folder(broken) / "last.ckpt")["epoch"] == epoch - 1
     train(broken)
     ours, theirs = hashing.run_folder(broken), hashing.run_folder(whole)

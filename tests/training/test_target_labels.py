@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.datamodules.validation_split import RULES
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import Evaluation
+from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.training.command import train
 from tests.training.search import Truth, search
 from tests.training.toy import _SHAPES, CLASSES, write_domain
@@ -109,31 +109,35 @@ def watch(monkeypatch):
 _LOOK: list[Any] = [None]  # a global, so that the search does not find what it searches for
 
 
+CASES = [
+    (("method=source_only", "selftraining=none"), False),
+    (("selftraining=none",), True),
+    (("selftraining.use_source=true",), True),
+    *(((f"selection.student={rule}",), False) for rule in STUDENT_RULES),
+]
+SLOW = ("last", "entropy", "infomax")  # rules; like the others
+
+
 @pytest.mark.parametrize(
-    ("method", "selftraining"),
-    [("source_only", "none"), ("pcm", "none"), ("pcm", "qbst")],
+    ("settings", "class_in_id"),
+    [
+        pytest.param(*case, marks=pytest.mark.slow if case[0][0].endswith(SLOW) else [])
+        for case in CASES
+    ],
 )
-@pytest.mark.parametrize("class_in_id", [False, True])
-def test_no_target_label_within_reach(toy, tmp_path, watch, method, selftraining, class_in_id):
+def test_no_target_label_within_reach(toy, tmp_path, watch, settings, class_in_id):
     write_domain(tmp_path / "data", "specklenet10", noise=0.05)
     write_shuffled_target(tmp_path / "data", class_in_id)
     watch.truth = truth_of(tmp_path / "data")
-    more = ["selftraining.use_source=true"] if selftraining == "qbst" else []
-    metrics = train(
-        toy(
-            f"paths.data_dir={tmp_path / 'data'}",
-            f"method={method}",
-            f"selftraining={selftraining}",
-            *more,
-        )
-    )
+    metrics = train(toy(f"paths.data_dir={tmp_path / 'data'}", *settings))
     assert metrics.final.accuracy < 1  # else pseudo-labels would be the labels
     assert watch.planted == [True]
     # What a cloud is called may tell its class. No batch and no loss holds a name.
     names = {path for path in watch.found if path.endswith("ids: train labels")}
     assert watch.found == names
     assert bool(names) == class_in_id
-    assert watch.keys == {"points", "y_source"} | ({"y_pseudo"} if more else set())
+    rounds = "selftraining=none" not in settings
+    assert watch.keys == {"points", "y_source"} | ({"y_pseudo"} if rounds else set())
 
 
 def test_the_upper_bound_does_hold_them(toy, tmp_path, watch):
@@ -152,21 +156,9 @@ def test_the_upper_bound_does_hold_them(toy, tmp_path, watch):
 LABELS = np.random.default_rng(0).integers(3, size=50)
 
 
-def closure() -> Callable[[], np.ndarray]:
-    hidden = LABELS.copy()
-    return lambda: hidden
-
-
 def generator() -> Any:
     hidden = LABELS.tolist()
-    yield 0
-    yield hidden
-
-
-def started() -> Any:
-    iterator = generator()
-    next(iterator)
-    return iterator
+    yield lambda: hidden
 
 
 class Slotted:
@@ -177,22 +169,16 @@ class Slotted:
 
 
 HIDDEN = {
-    "array": lambda: LABELS.copy(),
     "float tensor": lambda: torch.tensor(LABELS).float(),
     "one-hot": lambda: torch.nn.functional.one_hot(torch.tensor(LABELS)),
-    "other names": lambda: [("c", "a", "b")[y] for y in LABELS],
     "by id": lambda: {f"id{i}": int(y) for i, y in enumerate(LABELS)},
     "as folders": lambda: tuple(f"{'abc'[y]}/train/{i}" for i, y in enumerate(LABELS)),
     "view": lambda: torch.tensor(LABELS)[:4],
     "array's view": lambda: LABELS.copy()[3:5],
     "part of more": lambda: np.concatenate([np.zeros(9, int), LABELS, np.ones(3, int)]),
-    "closure": closure,
-    "partial": lambda: functools.partial(print, LABELS.copy()),
-    "generator": started,
+    "closure": lambda: next(generator()),
     "slot": Slotted,
-    "buffer": lambda: torch.utils.data.TensorDataset(torch.tensor(LABELS)),
     "iterator": lambda: iter([LABELS.copy()]),
-    "method": lambda: SimpleNamespace(hidden=LABELS.copy()).__repr__,
 }
 
 

@@ -8,10 +8,14 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from lightning.pytorch import Callback
+from omegaconf import open_dict
 
+from qs3.config import hashing
 from qs3.runs.checkpoints import copy_weights, save
+from qs3.training.command import train
 
 
 class Watch(Callback):
@@ -102,26 +106,51 @@ class KillAt(Callback):
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-class Stop(Exception):
-    """Stands for a kill."""
-
-
-class StopIn(Callback):
-    """Raises `Stop` in the middle of an epoch: after its first batch, of several."""
-
-    def __init__(self, epoch: int) -> None:
-        self.epoch = epoch
-
-    def on_train_batch_end(
-        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        if trainer.current_epoch == self.epoch:
-            assert trainer.num_training_batches > 1
-            raise Stop
-
-
 def seen_by(folder: Path, epoch: int, processes: int = 2) -> list[dict[str, Any]]:
     """What `Watch` wrote of an epoch, by process."""
     return [
         torch.load(folder / f"{epoch}-{rank}.pt", weights_only=True) for rank in range(processes)
     ]
+
+
+class Stop(Exception):
+    """Stands for a kill."""
+
+
+class StopAt(Callback):
+    """Raises in one hook, the n-th time; or the n-th time in an epoch."""
+
+    def __init__(self, hook: str, count: int = 1, epoch: int | None = None) -> None:
+        self.left = count
+
+        def stop(trainer: Any, *args: Any, **kwargs: Any) -> None:
+            self.left -= epoch in (None, trainer.current_epoch)
+            if self.left == 0:
+                raise Stop
+
+        setattr(self, hook, stop)
+
+    # Lightning looks hooks up by name; these are replaced on the instance.
+    def on_train_batch_end(self, *args: Any, **kwargs: Any) -> None: ...
+    def on_train_epoch_start(self, *args: Any, **kwargs: Any) -> None: ...
+    def on_train_epoch_end(self, *args: Any, **kwargs: Any) -> None: ...
+    def on_validation_batch_end(self, *args: Any, **kwargs: Any) -> None: ...
+    def on_train_start(self, *args: Any, **kwargs: Any) -> None: ...
+    def on_train_end(self, *args: Any, **kwargs: Any) -> None: ...
+
+
+def interrupt(
+    cfg: Any, hook: str = "on_train_batch_end", count: int = 1, epoch: int | None = None
+) -> None:
+    """Train until `StopAt` raises; without a hook in the middle of an epoch."""
+    stopping = cfg.copy()
+    with open_dict(stopping):
+        stopping.callbacks.progress = {
+            "_target_": "tests.training.watching.StopAt",
+            "hook": hook,
+            "count": count,
+            "epoch": epoch,
+        }
+    assert hashing.config_hash(stopping) == hashing.config_hash(cfg)
+    with pytest.raises(Stop):
+        train(stopping)

@@ -5,7 +5,7 @@ Nothing is global: no screen is needed, and no figure stays open.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -74,3 +74,22 @@ def say(ax: Any, words: str) -> None:
     """Write instead of drawing."""
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=SOFT)
     ax.set(xticks=[], yticks=[])
+
+
+def grouped_bars(
+    ax: Any, names: Sequence[str], groups: Mapping[str, np.ndarray], colours: Sequence[str]
+) -> None:
+    """How many clouds each name has: a bar of each of `groups`, with its count if there is room."""
+    place, wide = np.arange(len(names)), 0.8 / len(groups)
+    for i, (label, counts) in enumerate(groups.items()):
+        at = place + (i - (len(groups) - 1) / 2) * wide
+        bars = ax.bar(at, counts, wide, label=label, color=colours[i])
+        if len(names) <= 20:
+            ax.bar_label(bars, fmt="{:,.0f}", fontsize=7, color=SOFT, padding=1)
+    turn = 0 if len(names) <= 6 else 30 if len(names) <= 20 else 60
+    ax.set_xticks(place, names, fontsize=9, rotation=turn, ha="right" if turn else "center")
+    ax.set_ylabel("clouds", fontsize=9, color=SOFT)
+    ax.margins(x=0.01, y=0.14)
+    ax.grid(axis="y", color=GRID, linewidth=0.7)
+    ax.legend(fontsize=8.5, frameon=False, ncols=len(groups), loc="lower right",
+              bbox_to_anchor=(1.0, 0.99))  # fmt: skip

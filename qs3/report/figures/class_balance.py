@@ -9,49 +9,27 @@ import numpy as np
 
 from qs3.data.store import PointSet
 from qs3.errors import DataError
-from qs3.report.figures.canvas import new_figure
-from qs3.utils.plotting import BLUE, GRID, INK, PALE_BLUE, SOFT, save_png
+from qs3.report.figures.canvas import grouped_bars, new_figure, say
+from qs3.utils.plotting import BLUE, INK, PALE_BLUE, save_png
 
 _COLOURS = {"train": BLUE, "test": PALE_BLUE}
 
 
 def class_picture(domains: Mapping[str, PointSet], path: str | Path) -> Path:
-    """Save a row of bars for each domain, one bar a class and split, with its count.
-
-    Args:
-        domains: by title.
-        path: of the PNG.
-
-    Raises:
-        DataError: no domains.
-    """
+    """Save a row of bars for each domain (by title): a bar a class and split, with its count."""
     if not domains:
         raise DataError("a picture of no domains")
     figure, axes = new_figure(10, 0.4 + 2.3 * len(domains), len(domains), 1)
     for ax, (title, data) in zip(axes, domains.items(), strict=True):
         ax.set_title(f"{title}: {_summary(data)}", fontsize=10, color=INK, loc="left")
         if not data.labelled:
-            ax.text(0.5, 0.5, "no labels", transform=ax.transAxes, ha="center", color=SOFT)
-            ax.set(xticks=[], yticks=[])
+            say(ax, "no labels")
             continue
-        counts, place = data.counts(), np.arange(len(data.classes))
-        width = 0.8 / len(counts)
-        small = 7.5 if len(data.classes) * len(counts) <= 30 else 5.5
-        for i, (split, of_class) in enumerate(counts.items()):
-            numbers = np.array([of_class.get(name, 0) for name in data.classes])
-            at = place + (i - (len(counts) - 1) / 2) * width
-            ax.bar(at, numbers, width, color=_COLOURS[split], label=split)
-            for x, number in zip(at, numbers, strict=True):
-                ax.text(x, number, f"{number:,}", ha="center", va="bottom", fontsize=small,
-                        color=SOFT)  # fmt: skip
-        turned = len(data.classes) > 12
-        ax.set_xticks(place, data.classes, fontsize=9, rotation=60 if turned else 0,
-                      ha="right" if turned else "center")  # fmt: skip
-        ax.set_ylabel("clouds", fontsize=9, color=SOFT)
-        ax.margins(x=0.01, y=0.12)
-        ax.grid(axis="y", color=GRID, linewidth=0.7)
-        ax.legend(fontsize=8.5, frameon=False, ncols=2, loc="lower right",
-                  bbox_to_anchor=(1.0, 0.99))  # fmt: skip
+        counts = {
+            split: np.array([of_class.get(name, 0) for name in data.classes])
+            for split, of_class in data.counts().items()
+        }
+        grouped_bars(ax, data.classes, counts, [_COLOURS[split] for split in counts])
     save_png(figure, Path(path))
     return Path(path)
 

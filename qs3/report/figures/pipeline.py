@@ -145,8 +145,8 @@ def scan_object(
         keep = Keep(views=Path(folder)) if looks else Keep()
         made = scanner.cloud(loaded, item.id, keep)
         views = load_views(Path(folder), item.id)
-    told = ("domain=", "renderer=", "paths.", "workers=")
-    changed = [word for word in overrides if not word.startswith(told)]
+    shown = ("domain=", "renderer=", "paths.", "workers=")
+    changed = [word for word in overrides if not word.startswith(shown)]
     return ScannedObject(
         name=item.id,
         domain=domain.label + (f" with {' '.join(changed)}" if changed else ""),
@@ -163,14 +163,10 @@ def scan_object(
 def kept_object(
     folder: str | Path, object_id: str | None = None, meshes: str | Path | None = None
 ) -> ScannedObject:
-    """Read one object of a dataset that was generated with keep_views=true.
+    """Read one object (None: the first) of a dataset that was generated with keep_views=true.
 
-    Nothing is scanned or instantiated from what the dataset's files say.
-
-    Args:
-        folder: of the dataset.
-        object_id: which object; None: the first.
-        meshes: the folder of meshes that it was made from, if it was.
+    Nothing is scanned or instantiated from what the dataset's files say. `meshes`: the folder of
+    meshes that it was made from, if it was.
 
     Raises:
         MissingDataError, DataError: it is not a dataset, or damaged.

@@ -6,6 +6,8 @@ and to one scale. A stage that a sensor does not have says so in its place.
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,7 @@ from qs3.generation.view_files import REASON_COLOURS, KeptView
 from qs3.geometry.orthographic import axes_of, unit
 from qs3.report.figures.pipeline import ScannedObject
 from qs3.sensors.pixel_status import Reason
-from qs3.utils.plotting import DARK, GRID, INK, PALE, PANEL, SOFT, blank, save_png
+from qs3.utils.plotting import DARK, GRID, INK, PANEL, SOFT, blank, cloud_colours, save_png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,17 +26,14 @@ if TYPE_CHECKING:
 _DPI = 150
 _ROW = 3.9  # inches
 _UPRIGHT = 1.06  # a panel's height by its width: room for the bar of length below a cloud
-_ASIDE_DEG = 40.0  # the clouds are seen from so far beside the camera, to show errors of depth
-_STEPS = (1, 1.5, 2, 3, 4, 5, 6, 8, 10)
+_ASIDE_DEG = (
+    40.0  # the clouds are seen from so far to the side of the camera, to show errors of depth
+)
 _BEFORE_BEHIND = ("#1f5fbf", "#b4bac3", "#c8321f")
 
 
 def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
-    """Draw one object's pipeline.
-
-    Args:
-        one: the object.
-        view: which of its views the images show.
+    """Draw one object's pipeline; its images are those of a view.
 
     Raises:
         ConfigError: it has no such view.
@@ -92,7 +91,7 @@ def draw_images(axes: Any, view: KeptView) -> None:
     elif "reference" in images:
         _picture(axes[1], "stored picture of the pattern", images["reference"])
     else:
-        why = "one camera beside a projector" if disparity is not None else "one camera"
+        why = "one camera and a projector" if disparity is not None else "one camera"
         _say(axes[1], "second image", f"none: this sensor has\n{why}")
     if disparity is None:
         _say(axes[2], "disparity", "none: this sensor\ndoes not triangulate")
@@ -131,18 +130,16 @@ def draw_clouds(axes: Any, one: ScannedObject) -> None:
         corners = np.concatenate([corners, one.mesh.bounds])
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius = 1.04 * float(np.abs((corners - middle) @ turn[:2].T).max())
-    bar = _round_down(0.6 * radius)
+    bar = _round(0.6 * radius, (1, 2, 5), up=False)
     views = f"{len(one.views)} views fused" if one.views else "surface samples"
     kinds = ((f"cloud: {views}", one.cloud), ("clean twin: true depth, same views", one.clean))
     for ax, (title, cloud) in zip(axes, kinds, strict=False):
         if cloud is None:
             _say(ax, "clean twin", "none: it is made from\nthe true depth of views")
             continue
-        seen, near, order = _turned(cloud, middle, turn)
-        colour = _viridis(0.02 + 0.86 * unit(cloud[:, 2].astype(np.float64))[order])
-        ax.scatter(
-            *seen.T, s=_size(cloud), c=near * colour + (1 - near) * np.array(PALE), linewidths=0
-        )
+        local, order = _turned(cloud, middle, turn)
+        colours = cloud_colours(unit(cloud[:, 2].astype(np.float64))[order], unit(local[:, 2]))
+        ax.scatter(*local[:, :2].T, s=_size(cloud), c=colours, linewidths=0)
         _room(ax, radius, bar)
         _frame(ax, f"{title}\n{len(cloud):,} points, colour is height")
     _draw_residuals(axes[2], one, middle, turn, radius, bar)
@@ -154,15 +151,16 @@ def _draw_residuals(
     from matplotlib.colors import LinearSegmentedColormap
 
     if one.residual_m is None:
-        _say(ax, "residuals", "none: the true surface is not\nknown:\n" + _wrapped(one.why_no_mesh))
+        why = textwrap.fill(one.why_no_mesh, 32)
+        _say(ax, "residuals", f"none: the true surface is not\nknown:\n{why}")
         return
     residual = 1000 * one.residual_m  # mm
     size = np.abs(residual)
     median, most = np.percentile(size, [50, 95])
-    limit = _round_up(max(float(most), 0.1))
-    seen, _, order = _turned(one.cloud, middle, turn)
+    limit = _round(max(float(most), 0.1), (1, 1.5, 2, 3, 4, 5, 6, 8, 10), up=True)
+    local, order = _turned(one.cloud, middle, turn)
     colours = LinearSegmentedColormap.from_list("before and behind", _BEFORE_BEHIND)
-    dots = ax.scatter(*seen.T, s=_size(one.cloud), c=residual[order], cmap=colours,
+    dots = ax.scatter(*local[:, :2].T, s=_size(one.cloud), c=residual[order], cmap=colours,
                       vmin=-limit, vmax=limit, linewidths=0)  # fmt: skip
     _room(ax, radius, bar)
     figures = f"half within {median:.1f} mm, 95 % within {most:.1f} mm"
@@ -173,12 +171,6 @@ def _draw_residuals(
     _bar(ax, dots, words, extend="both")
 
 
-def _wrapped(words: str) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(words, 32))
-
-
 def _side(one: ScannedObject) -> tuple[float, float]:
     """Azimuth and elevation of whoever looks at the clouds, degrees."""
     if not one.views:
@@ -187,20 +179,11 @@ def _side(one: ScannedObject) -> tuple[float, float]:
     return float(np.rad2deg(np.arctan2(away[1], away[0]))) + _ASIDE_DEG, 18.0
 
 
-def _turned(
-    cloud: np.ndarray, middle: np.ndarray, turn: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """[P, 2] metres right and up, farthest first; [P, 1] nearness from 0.35 to 1; their order."""
+def _turned(cloud: np.ndarray, middle: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, ...]:
+    """[P, 3] metres right, up and towards us, farthest first; and their order."""
     local = (cloud.astype(np.float64) - middle) @ turn.T
     order = np.argsort(local[:, 2], kind="stable")
-    near = 0.35 + 0.65 * unit(local[:, 2])[order]
-    return local[order, :2], near[:, None], order
-
-
-def _viridis(values: np.ndarray) -> np.ndarray:
-    from matplotlib import colormaps
-
-    return colormaps["viridis"](values)[:, :3]
+    return local[order], order
 
 
 def _size(cloud: np.ndarray) -> float:
@@ -266,13 +249,10 @@ def _say(ax: Any, title: str, words: str) -> None:
     ax.text(0.5, 0.5, words, ha="center", va="center", fontsize=9, color=SOFT)
 
 
-def _round_up(value: float) -> float:
-    """The next number that reads well on a scale."""
+def _round(value: float, steps: Sequence[float], up: bool) -> float:
+    """The next step times a power of ten from `value` on, or the last one up to it."""
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(k * power for k in _STEPS if k * power >= value * (1 - 1e-9)))
-
-
-def _round_down(value: float) -> float:
-    """The last of 1, 2, 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(max(k * power for k in (1, 2, 5) if k * power <= value * (1 + 1e-9)))
+    numbers = [float(step * power) for step in steps]
+    if up:
+        return min(number for number in numbers if number >= value * (1 - 1e-9))
+    return max(number for number in numbers if number <= value * (1 + 1e-9))

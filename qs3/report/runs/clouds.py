@@ -27,9 +27,7 @@ def cloud_pictures(
 ) -> dict[str, Callable[[Path], object]]:
     """What draws each of them into a PNG; it raises NothingToDrawError, which says why not.
 
-    Args:
-        run: as read.
-        data_dir: where the datasets lie; None: where the run's config says.
+    `data_dir`: where the datasets lie; None: where the run's config says.
     """
     domains = _Domains(run, data_dir)
     makers: dict[str, Callable[[Path], object]] = {
@@ -43,7 +41,6 @@ def cloud_pictures(
         makers["mistakes"] = domains.mistakes
     else:
         makers["named"] = domains.named
-    makers["pipeline"] = domains.pipeline
     return {name: partial(_or_say_why, make) for name, make in makers.items()}
 
 
@@ -138,26 +135,6 @@ class _Domains:
             heading=f"{self.label('target')}: {words}",
             rows=rows,
         )
-
-    def pipeline(self, path: Path) -> None:
-        """The first object of whichever dataset kept its views."""
-        from qs3.data.dataset_folder import VIEWS
-        from qs3.report.figures.pipeline import kept_object
-        from qs3.report.figures.pipeline_figure import save_pipeline
-
-        scanned = []
-        for role in ROLES:
-            data = self.data(role)  # that it is the run's is checked here
-            domain = domain_of(self.run, role, self.data_dir)
-            if (domain.folder / VIEWS).is_dir():
-                save_pipeline(kept_object(domain.folder), path)
-                return
-            if "sensor" in ((data.meta.get("settings") or {}).get("recipe") or {}):
-                scanned.append(domain.name)
-        why = "no views of its clouds were kept (generate.py keep_views=true)"
-        if scanned:
-            why += f"; qs3 report pipeline domain={scanned[0]} scans an object again"
-        raise NothingToDrawError(why)
 
 
 def _surest(said: Predictions, which: np.ndarray) -> list[int]:

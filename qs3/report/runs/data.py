@@ -7,7 +7,6 @@ run does not have is None, and what is damaged is refused by the name of its fil
 from __future__ import annotations
 
 import csv
-import json
 import math
 import re
 import shlex
@@ -104,7 +103,7 @@ class RunFiles:
         classes: names in label order.
         config: as composed, not resolved; None if Hydra did not write it.
         command: that started the run; None likewise.
-        notes: what is missing, in words.
+        notes: what is missing, as text.
     """
 
     folder: Path
@@ -157,6 +156,7 @@ def read_run(folder: str | Path) -> RunFiles:
     elif metrics is not None:
         notes.append(f"{PREDICTIONS} is gone")
     rounds = _rounds(folder, metrics, notes)
+    typed = _yaml(folder / ".hydra" / "overrides.yaml", list)
     return RunFiles(
         folder=folder,
         metrics=metrics,
@@ -164,8 +164,8 @@ def read_run(folder: str | Path) -> RunFiles:
         rounds=rounds,
         predictions=predictions,
         classes=_classes(metrics, predictions, rounds),
-        config=_yaml(folder / ".hydra" / "config.yaml"),
-        command=_command(folder),
+        config=_yaml(folder / ".hydra" / "config.yaml", dict),
+        command=None if typed is None else shlex.join(["python", "train.py", *map(str, typed)]),
         notes=tuple(notes),
     )
 
@@ -229,7 +229,8 @@ def _classes(
     return tuple(sorted({row.label for round_ in rounds for row in round_.labels or []}))
 
 
-def _yaml(path: Path) -> dict[str, Any] | None:
+def _yaml(path: Path, kind: type) -> Any:
+    """What a file of Hydra's holds, not resolved; None if it is not there, or not of that kind."""
     from omegaconf import OmegaConf
 
     if not path.is_file():
@@ -238,15 +239,7 @@ def _yaml(path: Path) -> dict[str, Any] | None:
         found: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
     except Exception as error:  # yaml's and omegaconf's kinds have nothing else in common
         raise _damaged(path, error) from error
-    return found if isinstance(found, dict) else None
-
-
-def _command(folder: Path) -> str | None:
-    path = folder / ".hydra" / "overrides.yaml"
-    if not path.is_file():
-        return None
-    words = [line[2:] for line in path.read_text("utf-8").splitlines() if line.startswith("- ")]
-    return shlex.join(["python", "train.py", *(word.strip("'") for word in words)])
+    return found if isinstance(found, kind) else None
 
 
 def _count(names: list[str], classes: tuple[str, ...]) -> np.ndarray:
@@ -261,13 +254,7 @@ def _damaged(path: Path, error: Exception) -> DataError:
 
 
 def settings_of(run: RunFiles) -> str | None:
-    """The composed config as one line a key, sorted; None if it is not there."""
-    if run.config is None:
-        return None
-    return "\n".join(f"{key}: {value}" for key, value in sorted(_flat(run.config)))
+    """The composed config as YAML, sorted; None if it is not there."""
+    from omegaconf import OmegaConf
 
-
-def _flat(node: Any, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(node, dict) and node:
-        return [pair for key, value in node.items() for pair in _flat(value, f"{prefix}{key}.")]
-    return [(prefix[:-1], json.dumps(node, ensure_ascii=False))]
+    return None if run.config is None else OmegaConf.to_yaml(dict(run.config), sort_keys=True)

@@ -16,12 +16,7 @@ _KEYS = tuple(field.name for field in dataclasses.fields(Domain))
 
 
 def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> Domain:
-    """A domain as the run's config describes it; nothing is opened.
-
-    Args:
-        run: as read.
-        role: "source" or "target".
-        data_dir: where the datasets lie; None: where the run's config says.
+    """A domain ("source" or "target") as the run's config describes it; nothing is opened.
 
     Raises:
         NothingToDrawError: there is no config, or it describes no domain.
@@ -49,11 +44,6 @@ def domain_of(run: RunFiles, role: str, data_dir: str | Path | None = None) -> D
 
 def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) -> PointSet:
     """A domain's dataset, if it is the one that the run used. Nothing is imported or made.
-
-    Args:
-        run: as read.
-        role: "source" or "target".
-        data_dir: where the datasets lie; None: where the run's config says.
 
     Raises:
         NothingToDrawError: the dataset is not there, or is another; says what to do.

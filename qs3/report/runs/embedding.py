@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLOUDS = 600
-"""Of a domain, at most."""
+"""At most, of each domain."""
 
 _WARMUP = "warmup_selected.pt"  # of qs3.selftraining.callback, which imports Lightning
 _BATCH = 32
@@ -40,12 +40,7 @@ def draw_embedding(
     """t-SNE of the global features of test clouds of source and target, before and after.
 
     "Before" are the weights that the warm-up selected, "after" those of the result: without rounds
-    they are the same, and there is one panel. Which clouds follows from the run's seed.
-
-    Args:
-        run: a finished one.
-        data_dir: where the datasets lie; None: where the run's config says.
-        clouds: of a domain, at most.
+    they are the same, and there is one panel. Which `clouds` follows from the run's seed.
 
     Raises:
         NothingToDrawError: data or weights are not there; says which.

@@ -1,4 +1,4 @@
-"""The figures of one run. Each returns matplotlib's figure, or says in words why there is none.
+"""The figures of one run. Each returns matplotlib's figure, or raises the reason why there is none.
 
 Labels of the target that appear here judge a finished run; nothing is chosen by them.
 """
@@ -16,6 +16,7 @@ from qs3.report.figures.canvas import (
     cell_text,
     cells,
     curve,
+    grouped_bars,
     new_figure,
     say,
 )
@@ -208,10 +209,7 @@ def _worth(run: RunFiles) -> list[tuple[list[float], str, str, str]]:
 def classes(run: RunFiles, train_labels: np.ndarray | None = None) -> Figure:
     """How many clouds of each class the target's splits have, and how many were predicted.
 
-    Args:
-        run: as read.
-        train_labels: [n] classes of the target's training clouds, where they are known: they are
-            shown and nothing else.
+    `train_labels`: [n] classes of its training clouds, if known; they are shown and nothing else.
     """
     panels = class_counts(run, train_labels)
     if not panels:
@@ -220,17 +218,8 @@ def classes(run: RunFiles, train_labels: np.ndarray | None = None) -> Figure:
     width = max(6.5, 0.55 * len(names) + 1.5)
     figure, axes = new_figure(width, 3.1 * len(panels) + 0.7, len(panels), 1)
     for ax, (title, bars) in zip(axes, panels.items(), strict=True):
-        x, wide = np.arange(len(names)), 0.8 / len(bars)
-        for i, (label, counts) in enumerate(bars.items()):
-            place = x + (i - (len(bars) - 1) / 2) * wide
-            drawn = ax.bar(place, counts, wide, label=label, color=(INK, BLUE, PALE_BLUE)[i])
-            if len(names) <= 12:
-                ax.bar_label(drawn, fontsize=7, color=SOFT, padding=1)
-        ax.set_xticks(x, names, rotation=30 if len(names) <= 20 else 90, ha="right")
-        ax.set_ylabel("clouds")
+        grouped_bars(ax, names, bars, (INK, BLUE, PALE_BLUE))
         ax.set_title(title, fontsize=10, loc="left")
-        ax.margins(y=0.14)
-        ax.legend(fontsize=8, frameon=False)
     figure.suptitle(f"{run.title}: classes of {run.target}", fontsize=12)
     return figure
 
@@ -303,15 +292,12 @@ def embedding(
     names: Sequence[str],
     domains: Sequence[str],
 ) -> Figure:
-    """Both domains' clouds on a plane, a panel for each net.
+    """Both domains' clouds on a plane: a panel for each of `places` (by its title, [n, 2]).
 
     Args:
-        title: above all.
-        places: by panel title, [n, 2].
         labels: [n] class; -1 unknown, drawn grey.
         domain: [n] 0 source, 1 target.
-        names: of the classes.
-        domains: of the two.
+        names, domains: of the classes and of the two domains.
     """
     from matplotlib import colormaps
     from matplotlib.lines import Line2D

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -24,7 +24,6 @@ _TITLES = {
     "class_balance": "Classes of both domains",
     "mistakes": "Most confident errors",
     "named": "Most confident of each class",
-    "pipeline": "From mesh to cloud",
 }
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; margin: 2rem auto; padding: 0 1rem;
@@ -41,18 +40,13 @@ pre { background: #f7f8fa; padding: .8rem; overflow-x: auto; font-size: 13px; }
 
 
 def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]) -> str:
-    """The page as HTML, with its images inside.
-
-    Args:
-        run: as read.
-        pictures: PNG by name.
-        skipped: why one is not there, by name.
-    """
+    """The page as HTML, with its PNGs inside; `skipped`: why a picture is not there, by name."""
     parts = [
         *(f'<p class="note">Note: {escape(note)}.</p>' for note in run.notes),
-        _table(key_figures(run)),
+        _table(key_figures(run).items()),
     ]
-    parts += _quality(run)
+    if run.metrics is not None:
+        parts += ["<h2>Quality without labels</h2>", _table(quality_table(run.metrics.quality))]
     if run.command:
         parts += ["<h2>Command</h2>", f"<pre>{escape(run.command)}</pre>"]
     for name, path in pictures.items():
@@ -86,18 +80,6 @@ def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]
             "",
         ]
     )
-
-
-def _quality(run: RunFiles) -> list[str]:
-    """What can be said without the target's labels."""
-    if run.metrics is None:
-        return []
-    rows = quality_table(run.metrics.quality)
-    cells = (
-        f"<tr><th>{escape(name)}</th><td>{escape(value)}</td><td>{escape(meaning)}</td></tr>"
-        for name, value, meaning in rows
-    )
-    return ["<h2>Quality without labels</h2>", f"<table>{''.join(cells)}</table>"]
 
 
 def key_figures(run: RunFiles) -> dict[str, str]:
@@ -134,8 +116,9 @@ def key_figures(run: RunFiles) -> dict[str, str]:
     return found
 
 
-def _table(rows: Mapping[str, str]) -> str:
-    cells = (
-        f"<tr><th>{escape(key)}</th><td>{escape(value)}</td></tr>" for key, value in rows.items()
+def _table(rows: Iterable[Sequence[str]]) -> str:
+    lines = (
+        f"<tr><th>{escape(head)}</th>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
+        for head, *cells in rows
     )
-    return f"<table>{''.join(cells)}</table>"
+    return f"<table>{''.join(lines)}</table>"

@@ -41,7 +41,7 @@ class Drawn:
     Attributes:
         pictures: PNG by name, such as "curves".
         skipped: why a picture is not there, by name.
-        notes: what the run's folder lacks, in words.
+        notes: what the run's folder lacks, as text.
         page: the HTML page.
     """
 
@@ -62,7 +62,6 @@ def draw(
     """Draw a run's pictures; those of an earlier call are replaced.
 
     Args:
-        folder: of the run.
         out: folder for the files; None: `pictures` in the run's.
         data_dir: where the datasets lie; None: where the run's config says.
         embed: also lay out the features of both domains; takes a minute.

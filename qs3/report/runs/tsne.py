@@ -60,7 +60,7 @@ def affinities(squared: Float[np.ndarray, "n n"], perplexity: float) -> Float[np
 def gradient(
     p: Float[np.ndarray, "n n"], y: Float[np.ndarray, "n 2"]
 ) -> tuple[Float[np.ndarray, "n 2"], float]:
-    """Of the Kullback-Leibler divergence by the places y (eq. 5), and the divergence (eq. 2)."""
+    """The gradient of the Kullback-Leibler divergence by the places y (eq. 5), and it (eq. 2)."""
     norms = (y * y).sum(axis=1)
     kernel = 1 / (1 + np.maximum(norms[:, None] + norms[None] - 2 * y @ y.T, 0))  # Student's t
     np.fill_diagonal(kernel, 0)

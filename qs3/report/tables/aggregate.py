@@ -108,7 +108,7 @@ class Group:
 
     @property
     def seeds(self) -> list[int]:
-        """Of the finished runs."""
+        """Seeds of the finished runs."""
         return [run.seed for run in self.finished if run.seed is not None]
 
     @property
@@ -117,11 +117,9 @@ class Group:
         return self.first is not None and self.first.final.accuracy is None
 
     def stat(self, score: str, take: str = "final") -> Stat | None:
-        """Mean of a score over seeds; None if there is nothing that may be averaged.
+        """Mean of a score of `Scores` over seeds; None if there is nothing that may be averaged.
 
-        Args:
-            score: of `qs3.runs.metrics.Scores`, such as "accuracy".
-            take: "final", or "warmup" for the teacher of round 0.
+        `take`: "final", or "warmup" for the teacher of round 0.
         """
         if not self.results or not self.comparable:
             return None
@@ -208,11 +206,8 @@ def task(metrics: RunMetrics) -> str:
 def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:
     """An aligned text table of the runs in `folders`, a line a config; percentages.
 
-    What could not be averaged follows below the table, with its reason.
-
-    Args:
-        folders: of the runs.
-        settings: by folder in what a config differs from the others of the table.
+    What could not be averaged follows below the table, with its reason. `settings`: by folder how
+    a config differs from the others of the table.
     """
     settings = settings or {}
     runs = [load_run(folder) for folder in folders]
@@ -226,18 +221,15 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
     )  # fmt: skip
     lines, notes = [header], []
     for g in groups:
-        accuracy, balanced = g.stat("accuracy"), g.stat("balanced_accuracy")
-        majority = g.stat("majority_rate")
-        few = 0 < len(g.finished) < FEW_SEEDS
+        first, stats = g.first, [g.stat(name) for name in ("accuracy", "balanced_accuracy")]
+        majority, few = g.stat("majority_rate"), 0 < len(g.finished) < FEW_SEEDS
+        about = (task(first), first.method, first.selftraining) if first else ("?", "?", "?")
         lines.append(
             (
                 g.experiment,
                 *([differs[g.experiment, g.hash] or "-"] if several else []),
-                task(g.first) if g.first else "?",
-                g.first.method if g.first else "?",
-                g.first.selftraining if g.first else "?",
-                accuracy.percent() if accuracy else "-",
-                balanced.percent() if balanced else "-",
+                *about,
+                *(stat.percent() if stat else "-" for stat in stats),
                 f"{len(g.finished)}{' (!)' if few else ''}",
                 f"{100 * majority.mean:.1f}" if majority else "-",  # of the data: no SEM
             )

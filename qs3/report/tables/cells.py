@@ -13,7 +13,7 @@ from qs3.report.tables.aggregate import FEW_SEEDS, Group, Stat, scores_of
 SEEDS = "0,1,2"
 METRICS = {"accuracy": "accuracy %", "balanced_accuracy": "balanced accuracy %"}
 INCOMPLETE = "†"
-"""Marks a number beside which a seed failed or is not finished."""
+"""Marks a number that lacks a seed which failed or is not finished."""
 
 
 @dataclass(frozen=True)

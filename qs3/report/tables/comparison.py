@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from qs3.errors import ConfigError, DataError
+from qs3.report.tables.cells import Cell, Table
 from qs3.report.tables.formats import SIMULATED, marks
 from qs3.report.tables.paired import LEVEL, Difference, compare_on_average
-from qs3.report.tables.table import Cell, Table
 from qs3.runs.predictions import FILE, read_predictions
 from qs3.utils import text_table
 
@@ -130,20 +130,14 @@ def text(
     """A line a row: differences in percentage points, and how many seeds would tell them apart.
 
     Args:
-        found: of `against` or `effects`.
-        base: the row that all are compared with, if it is one.
+        found: of `against` (with its `base`) or `effects`.
         markdown: instead of columns for the terminal.
         table: that they are of: its title and what must not be overlooked come first.
     """
-    header = [
-        f"minus {base}" if base else "difference",
-        "accuracy",
-        "balanced accuracy",
-        "seeds",
-        "to tell apart",
-    ]
-    lines = [header]
+    lines = [[f"minus {base}" if base else "difference", "accuracy", "balanced accuracy", "seeds",
+              "to tell apart"]]  # fmt: skip
     reasons: dict[str, list[str]] = {}
+    judged = {one.name: one.differences[0] for one in found if one.differences}
     for one in found:
         if one.differences is None:
             reasons.setdefault(one.why, []).append(one.name)
@@ -152,24 +146,22 @@ def text(
         lines.append(
             [one.name, _shown(accuracy), _shown(balanced), str(accuracy.seeds), _needed(accuracy)]
         )
-    notes = [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
-    meshes = {one.differences[0].meshes for one in found if one.differences}
-    notes.insert(
-        0,
+    meshes = ", ".join(map(str, sorted({one.meshes for one in judged.values()})))
+    notes = [
         f"differences in percentage points with {LEVEL:.0%} intervals over seeds and test meshes"
-        + (f" ({', '.join(map(str, sorted(meshes)))} meshes)" if meshes else "")
+        + (f" ({meshes} meshes)" if meshes else "")
         + "; * marks those whose interval does not reach 0, each line by itself: of twenty rows "
-        "that are no better than the other one gets a star",
-    )
-    if any(_needed(one.differences[0]) == _MORE_MESHES for one in found if one.differences):
+        "that are no better than the other one gets a star"
+    ]
+    if any(not one.objects_known for one in found):
+        notes.append(
+            "which clouds show the same object is not known, so each counts as one of its own: "
+            "where several do, the intervals are too narrow"
+        )
+    notes += [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
+    if any(_needed(one) == _MORE_MESHES for one in judged.values()):
         notes.append(
             f"{_MORE_MESHES}: no number of seeds would tell them apart, the test split has too few"
-        )
-    if any(one.differences and not one.objects_known for one in found):
-        notes.insert(
-            1,
-            "which clouds show the same object is not known, so each counts as one of its own: "
-            "where several do, the intervals are too narrow",
         )
     head = []
     if table:
@@ -182,12 +174,7 @@ def text(
 
 
 def csv_text(found: Sequence[Compared], table: Table) -> str:
-    """A line a difference and metric, in percentage points.
-
-    Args:
-        found: of `against` or `effects`.
-        table: that they are of.
-    """
+    """A line a difference and metric, in percentage points."""
     rows: list[list[Any]] = [
         ["name", "metric", "difference", "low", "high", "seeds", "meshes", "seeds_needed",
          "simulated", "why"]

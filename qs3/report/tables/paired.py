@@ -57,11 +57,7 @@ class Difference:
 def compare(
     a: Sequence[Predictions], b: Sequence[Predictions], *, balanced: bool = False
 ) -> Difference:
-    """The difference in accuracy between two rows.
-
-    Args:
-        a, b: predictions of the same seeds, in the same order, at least two.
-        balanced: compare balanced accuracy instead.
+    """The difference in accuracy (or balanced accuracy) between the predictions of two rows.
 
     Raises:
         DataError: the clouds differ, have no labels, or there are fewer than two seeds or meshes.
@@ -79,7 +75,7 @@ def compare_on_average(
     The rows themselves are taken as given: the interval is over seeds and meshes, as for one.
 
     Args:
-        pairs: of one or several rows, each as in `compare`, all of the same seeds.
+        pairs: rows A and B; of each the predictions by seed, the same seeds in the same order.
         balanced: compare balanced accuracy instead.
 
     Raises:
@@ -152,6 +148,6 @@ _T2_OF_SEEDS = _t2(_SEEDS)
 
 
 def _variance(clusters: Float[np.ndarray, " c"]) -> float:
-    """Of a sum of c independent clusters whose mean is 0, with the small-sample factor."""
+    """The variance of a sum of c independent clusters of mean 0, with the small-sample factor."""
     c = len(clusters)
     return float((clusters**2).sum()) * c / (c - 1)

@@ -17,7 +17,7 @@ from pathlib import Path
 from qs3.config.location import python_command, typed
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
-from qs3.report.tables.table import Table
+from qs3.report.tables.cells import Table
 
 LAUNCHERS: Mapping[str, str | None] = {
     "basic": None,
@@ -53,11 +53,9 @@ def missing(
     """What is to be run: row by row, in each row seed by seed; what cells share, once.
 
     Args:
-        table: with the runs that there are.
         seeds: that each cell should have.
-        rows: only rows with one of these names, or, where no row has that name, whose name
+        rows, columns: only those of one of these names, or, where none has that name, whose name
             contains the word; all if empty.
-        columns: likewise.
 
     Raises:
         ConfigError: `rows` fit no row, `columns` no column, or both together no cell.
@@ -103,16 +101,14 @@ def launch(
     log_dir: str,
     settings: Sequence[str] = (),
 ) -> int:
-    """Run jobs as one multirun of `train.py`; returns its exit status.
+    """Run jobs, in order, as one multirun of `train.py`; returns its exit status.
 
     What becomes of them is written to the terminal by the multirun itself, with the failures last;
     with submitit, what a job says lies in `<log_dir>/.submitit`.
 
     Args:
-        jobs: in the order of their numbers.
         launcher: one of `LAUNCHERS`.
         at_once: how many run at the same time; None: what the launcher does by itself.
-        log_dir: of the runs.
         settings: further overrides of the launcher, such as "hydra.launcher.partition=gpu".
     """
     if not jobs:

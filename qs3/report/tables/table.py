@@ -1,4 +1,4 @@
-"""The paper's tables and the field's benchmarks, with our numbers beside theirs.
+"""The paper's tables and the field's benchmarks, with our numbers next to theirs.
 
 A table is a file of conf/table/. Each cell names a run by its command line; composing it gives the
 config hash by which the runs of its seeds are found under the log folder. This module reads the
@@ -10,37 +10,35 @@ from __future__ import annotations
 import difflib
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from qs3.config.compose import composing, first_line
 from qs3.config.location import CONF
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
 from qs3.report.tables.aggregate import Group, group, load_runs
-from qs3.report.tables.cells import METRICS, Cell, Published, Table
-from qs3.report.tables.formats import csv_text, grid, latex, markdown, remarks, to_run
+from qs3.report.tables.cells import Cell, Published, Table
 
-__all__ = [
-    "CONF",
-    "Cell",
-    "Table",
-    "build_table",
-    "composing",
-    "csv_text",
-    "grid",
-    "latex",
-    "markdown",
-    "remarks",
-    "table_names",
-    "to_run",
-]
-BENCHMARK = "benchmark"
 _SUPERVISED = "qs3.methods.supervised.Supervised"
-_KEYS = ("title", "layout", "notes", "metrics", "columns", "rows", "sources")
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
+class _Spec:
+    """A table's file; a row's entries are `_cell`'s business."""
+
+    title: str
+    metrics: list[Literal["accuracy", "balanced_accuracy"]]
+    columns: list[str] | dict[str, str]
+    rows: list[dict[str, Any]]
+    layout: Literal["", "benchmark"] = ""
+    notes: list[str] = field(default_factory=list)
+    sources: dict[str, str] = field(default_factory=dict)
 
 
 def table_names() -> list[str]:
@@ -73,57 +71,52 @@ def build_table(
             f"there is no table {name!r}; there are {', '.join(table_names())}; or give a "
             "file of your own, NAME.yaml"
         )
-    name = path.stem
-    try:
-        spec = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {error}") from error
+    name, spec = path.stem, _read(path)
     if target is not None:
         check_domain("target=", target)
-    groups = {(g.experiment, g.hash): g for g in group(load_runs(log_dir))}
+        if spec.layout:
+            raise ConfigError(
+                f"target={target}: the columns of table {name} have several targets; leave it out"
+            )
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
     if str(log_dir) != "logs":
         more.append(override("paths.log_dir", log_dir))
     try:
-        benchmark = _is_benchmark(spec, path)
-        if benchmark and target:
-            raise ConfigError(
-                f"target={target}: the columns of table {name} have several targets; leave it out"
-            )
         cells = [
             replace(cell, column=_column(column, target))
-            for row in spec["rows"]
-            for i, column in enumerate(spec["columns"])
+            for row in spec.rows
+            for i, column in enumerate(spec.columns)
             if (cell := _cell(spec, row, i, column, more, published=not target))
         ]
-        filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
-        metrics = tuple(spec["metrics"])
-        columns = tuple(_column(column, target) for column in spec["columns"])
-        rows = {
-            row["name"]: tuple(filled.get((row["name"], column)) for column in columns)
-            for row in spec["rows"]
-        }
-        title, notes = spec["title"], spec.get("notes", [])
-        averages = {r["name"]: float(r["average"]) for r in spec["rows"] if "average" in r}
+        averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
     except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
-    if odd := [note for note in notes if not isinstance(note, str)]:
-        raise ConfigError(f"{path}: notes: {odd[0]} is not a line of text; put quotes around it")
-    if unknown := sorted(set(metrics) - set(METRICS)):
-        raise ConfigError(f"{path}: unknown metrics {unknown}; known are {', '.join(METRICS)}")
+    groups = {(g.experiment, g.hash): g for g in group(load_runs(log_dir))}
+    filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
+    columns = tuple(_column(column, target) for column in spec.columns)
+    rows = {
+        row["name"]: tuple(filled.get((row["name"], column)) for column in columns)
+        for row in spec.rows
+    }
+    title, notes = spec.title, spec.notes
     if target:
         title = f"{title}, on another target: {target}"
         notes = [*notes, f"all cells on the target {target}, which is not the paper's"]
-    return Table(name, title, tuple(notes), metrics, columns, rows, benchmark, averages)
+    metrics = tuple(spec.metrics)
+    return Table(name, title, tuple(notes), metrics, columns, rows, bool(spec.layout), averages)
 
 
-def _is_benchmark(spec: Mapping[str, Any], path: Path) -> bool:
-    if unknown := sorted(set(spec) - set(_KEYS)):
-        raise ConfigError(f"{path}: unknown keys {unknown}; known are {', '.join(_KEYS)}")
-    layout = spec.get("layout", "")
-    if layout not in ("", BENCHMARK):
-        raise ConfigError(f"{path}: layout: {layout!r} is not known; leave it out or {BENCHMARK}")
-    return bool(layout)
+def _read(path: Path) -> _Spec:
+    try:
+        spec = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return TypeAdapter(_Spec).validate_python(spec)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        text = "; put quotes around it" * (first["type"] == "string_type")
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise ConfigError(f"{path}: {place}: {first['msg']}{text}") from error
 
 
 def _column(name: str, target: str | None) -> str:
@@ -133,26 +126,26 @@ def _column(name: str, target: str | None) -> str:
 
 
 def _cell(
-    spec: Mapping[str, Any],
+    spec: _Spec,
     row: Mapping[str, Any],
     i: int,
     column: str,
     more: Sequence[str],
     published: bool,
 ) -> Cell | None:
-    """Of an entry `<column>: {run:, paper:, ...}`, or of what the row says for all columns.
+    """The cell of an entry `<column>: {run:, paper:, ...}`, or of what the row has for all columns.
 
     A row's `run` is followed by the overrides of its columns; its `paper` has a number a column.
     """
     own = row.get(column, {})
     line = own.get("run")
     if line is None and "run" in row:
-        line = f"{row['run']} {spec['columns'][column]}"
+        line = f"{row['run']} {spec.columns[column]}"  # type: ignore[call-overload]
     numbers = row.get("paper")
-    if numbers is not None and len(numbers) != len(spec["columns"]):
+    if numbers is not None and len(numbers) != len(spec.columns):
         raise ConfigError(
             f"table row {row['name']!r}: paper: has {len(numbers)} numbers, one for each of the "
-            f"{len(spec['columns'])} columns is needed"
+            f"{len(spec.columns)} columns is needed"
         )
     number = own.get("paper", numbers[i] if numbers else None)
     if line is None and number is None:
@@ -165,7 +158,7 @@ def _cell(
             float(mean),
             None if sem is None else float(sem),
             own.get("selected", row.get("selected", "")),
-            spec.get("sources", {}).get(source, source),
+            spec.sources.get(source, source),
         )
     overrides = () if line is None else (*shlex.split(line), *more)
     take = own.get("take", row.get("take", "final"))
@@ -212,14 +205,7 @@ def _fill(
                 raise ConfigError(
                     f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}"
                 ) from error
-            key = (str(cfg.experiment_name), config_hash(cfg))
-            domain = cfg.data.target
-            filled.append(
-                replace(
-                    cell,
-                    group=groups.get(key),
-                    target=str(domain.name),
-                    simulated=bool(domain.simulated),
-                )
-            )
+            found = groups.get((str(cfg.experiment_name), config_hash(cfg)))
+            domain, simulated = str(cfg.data.target.name), bool(cfg.data.target.simulated)
+            filled.append(replace(cell, group=found, target=domain, simulated=simulated))
     return filled

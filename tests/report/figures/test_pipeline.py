@@ -58,12 +58,9 @@ def test_residuals_of_a_scan_are_distances_that_trimesh_finds(speckle):
     assert (speckle.residual_m < 0).any()
 
 
-def test_the_clean_twin_has_no_residual(speckle):
+def test_the_clean_twin_has_no_residual_and_every_point_was_measured(speckle):
     eyes = np.repeat(speckle.views[0].world_from_camera[None, :3, 3], len(speckle.clean), axis=0)
     assert np.abs(signed_distance_m(speckle.clean, eyes, speckle.mesh)).max() < 1e-5
-
-
-def test_every_point_of_the_cloud_was_measured(speckle):
     fused = speckle.fused().astype(np.float32)
     assert {point.tobytes() for point in speckle.cloud} <= {point.tobytes() for point in fused}
 

@@ -7,8 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from qs3.data import contact_sheets as pictures
-from qs3.data.store import ManifestRow, open_pointset, read_meta, write_pointset
-from qs3.generation.command import generate
+from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import clouds as run_clouds
 from qs3.report.runs.clouds import cloud_pictures
@@ -16,7 +15,6 @@ from qs3.report.runs.data import read_run
 from qs3.report.runs.pictures import draw as draw_run
 from qs3.runs.metrics import DataHashes
 from qs3.runs.predictions import Predictions, read_predictions
-from tests.generation.generating import config
 from tests.report.made_runs import change, not_blank, table
 from tests.training.toy import CLASSES, write_domain
 
@@ -133,7 +131,7 @@ def test_unlabelled_domain(run, tmp_path, sheets):
 
 def test_other_data_damaged_data_no_data(run, toy_data, tmp_path):
     out = tmp_path / "x.png"
-    for name in ("domains", "source_clouds", "class_balance", "pipeline"):
+    for name in ("domains", "source_clouds", "class_balance"):
         assert "specklenet10, is not at" in why_not(run, name, out, tmp_path / "nowhere")
     data_dir = tmp_path / "copy"
     shutil.copytree(toy_data, data_dir)
@@ -185,18 +183,3 @@ def test_domains_stand_side_by_side_under_their_names(run, toy_data, tmp_path, m
     seen.clear()
     draw(run, "domains", tmp_path / "d.png")
     assert list(seen) == ["S: SpeckleNet10, source", "S: SpeckleNet10, target"]
-
-
-def test_pipeline_of_a_dataset_that_kept_its_views(run, toy_data, tmp_path):
-    out = tmp_path / "p.png"
-    assert "keep_views=true" in why_not(run, "pipeline", out)
-    chosen = ["classes=[chair]", "catalogue.train=1", "catalogue.test=0", "keep_views=true"]
-    generate(config(tmp_path / "made", None, "workers=0", *chosen))
-    data_dir = tmp_path / "made"
-    shutil.copytree(toy_data / "kinectsim10", data_dir / "kinectsim10")
-    saw(run, data_dir)
-    assert not_blank(draw(run, "pipeline", out, data_dir))
-    shutil.rmtree(data_dir / "specklenet10" / "views")
-    assert read_meta(data_dir / "specklenet10")["settings"]["recipe"]["sensor"]
-    why = why_not(run, "pipeline", tmp_path / "q.png", data_dir)
-    assert "qs3 report pipeline domain=specklenet10" in why

@@ -37,15 +37,10 @@ def test_affinities_have_the_perplexity():
     found = affinities(squared, perplexity)
     np.testing.assert_allclose(found, (p + p.T) / 80, atol=1e-9)
     assert found.sum() == pytest.approx(1)
-
-
-def test_affinities_of_points_far_away_and_of_copies():
-    x = points(20)
+    x = points(20)  # far away, and copies
     x[0] += 1e4
     x[1:4] = x[4]
-    p = affinities(squared_distances(x), 3.0)
-    assert np.isfinite(p).all()
-    assert p.sum() == pytest.approx(1)
+    assert affinities(squared_distances(x), 3.0).sum() == pytest.approx(1)
     with pytest.raises(ConfigError, match="perplexity"):
         affinities(squared_distances(x), 20.0)
 

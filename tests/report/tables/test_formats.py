@@ -13,7 +13,6 @@ from qs3.config.compose import composing
 from qs3.config.hashing import config_hash
 from qs3.errors import ConfigError
 from qs3.report.tables import table as tables
-from qs3.report.tables.aggregate import load_run
 from qs3.report.tables.cells import Cell, Published, Table
 from qs3.report.tables.formats import csv_text, details, grid, latex, markdown, to_run
 from qs3.report.tables.running import missing
@@ -124,18 +123,22 @@ def test_an_average_of_few_or_failed_seeds_says_so(pointda):
     assert shown((*of(3, ())[:5], *of(3, ("seed 9: unfinished",))[5:])) == "51.0 ± 0.6 †"
 
 
-def test_a_published_accuracy_stands_in_no_other_column(empty):
-    """Papers give accuracy, not balanced accuracy."""
-    for name in ("uda", "pointda10"):
-        only = replace(empty[name], metrics=("balanced_accuracy",))
-        cells = [cell.paper.text() for cell in only.cells if cell.paper]
-        for column in zip(*grid(only), strict=True):
-            if set(column[1:]) & set(cells):
-                assert column[0] == "paper, accuracy %"
-        turned = replace(empty[name], metrics=("balanced_accuracy", "accuracy"))
-        for column in zip(*grid(turned), strict=True):
-            if "balanced" in column[0]:
-                assert not set(column[1:]) & set(cells), column[0]
+@pytest.mark.parametrize("name", ["uda", "pointda10"])
+def test_a_published_accuracy_stands_in_no_other_column(empty, name):
+    """Papers give accuracy, not balanced accuracy; each column has a name of its own."""
+    only = replace(empty[name], metrics=("balanced_accuracy",))
+    cells = [cell.paper.text() for cell in only.cells if cell.paper]
+    for column in zip(*grid(only), strict=True):
+        if set(column[1:]) & set(cells):
+            assert column[0] == "paper, accuracy %"
+    both = replace(empty[name], metrics=("balanced_accuracy", "accuracy"))
+    lines = grid(both)
+    for column in zip(*lines, strict=True):
+        if "balanced" in column[0]:
+            assert not set(column[1:]) & set(cells), column[0]
+    names = [head for head in lines[0] if head != "paper"]
+    assert len(set(names)) == len(names)
+    assert len(parse_latex(latex(both))) == len(lines)
 
 
 def test_published_averages_agree(empty):
@@ -185,8 +188,13 @@ def test_failed_seeds_are_in_every_format(tmp_path):
     begun = tmp_path / cfg.experiment_name / f"seed3-{config_hash(cfg)}"
     begun.mkdir()
     (begun / "started.json").write_text("{}")
-    assert load_run(begun).status == "unfinished"
+    other = build_table("quickstart", tmp_path).cells[1]
+    with composing() as compose:
+        cfg = compose("train", [*other.overrides, "seed=0"])
+    (tmp_path / cfg.experiment_name / f"seed0-{config_hash(cfg)}").mkdir(parents=True)
     table = build_table("quickstart", tmp_path)
+    assert grid(table)[2][1:3] == ["not finished †"] * 2
+    assert other.command in to_run(table)
     for name, write in FORMATS.items():
         text = write(table)
         assert re.search(r"seed 2: .*metrics\.json is damaged", text), name
@@ -198,18 +206,6 @@ def test_failed_seeds_are_in_every_format(tmp_path):
     assert (row["row"], row["n"], row["seeds"]) == (cell.row, "2", "0 1")
     assert row["problems"].count("; seed 3: ") == 1
     assert "dagger" in parse_latex(latex(table))[-1][0]  # in the tabular, not only in a comment
-
-
-def test_only_unfinished_seeds(tmp_path):
-    cell = build_table("quickstart", tmp_path).cells[0]
-    with composing() as compose:
-        cfg = compose("train", [*cell.overrides, "seed=0"])
-    begun = tmp_path / cfg.experiment_name / f"seed0-{config_hash(cfg)}"
-    begun.mkdir(parents=True)
-    (begun / "last.ckpt").write_bytes(b"")
-    table = build_table("quickstart", tmp_path)
-    assert grid(table)[1][1:3] == ["not finished †"] * 2
-    assert cell.command in to_run(table)
 
 
 def test_simulated_targets_are_marked_in_every_format(empty, tmp_path):
@@ -229,12 +225,9 @@ def test_simulated_targets_are_marked_in_every_format(empty, tmp_path):
         assert (row["target"], row["simulated"]) == ("kinectsim10", "true")
     real = empty["uda"]
     assert {r["simulated"] for r in csv.DictReader(io.StringIO(csv_text(real)))} == {"false"}
-    assert all("SIMULATED" not in write(real) for write in FORMATS.values())
-
-
-def test_a_benchmark_keeps_its_targets(tmp_path):
     with pytest.raises(ConfigError, match="pointda10 have several targets; leave it out"):
         build_table("pointda10", tmp_path, target="kinectsim10")
+    assert all("SIMULATED" not in write(real) for write in FORMATS.values())
 
 
 def test_what_stands_behind_each_number(tmp_path):
@@ -256,20 +249,12 @@ def test_what_stands_behind_each_number(tmp_path):
     assert row["seconds"] == "90 120.04"
 
 
-def test_accuracy_and_balanced_in_several_columns(empty):
-    for name in ("uda", "pointda10"):
-        table = replace(empty[name], metrics=("accuracy", "balanced_accuracy"))
-        lines = grid(table)
-        assert {len(line) for line in lines} == {len(lines[0])}
-        assert len({*lines[0]} - {"paper"}) == len([h for h in lines[0] if h != "paper"])
-        assert len(parse_latex(latex(table))) == len(lines)
-
-
 words = st.text(st.characters(exclude_categories=["C", "Z"], max_codepoint=127), max_size=12)
 
 
 @given(row=words.filter(bool), column=words.filter(bool), selected=words)
 def test_any_names_are_escaped(row, column, selected):
+    assert latex_text("a_b & 5 % → {x}") == r"a\_b \& 5 \% $\rightarrow$ \{x\}"
     cell = Cell(row, column, (), Published(50.0, None, selected))
     for layout in (False, True):
         rows = {row: (cell,)}
@@ -280,35 +265,3 @@ def test_any_names_are_escaped(row, column, selected):
             len({line.replace(r"\|", "").count("|") for line in markdown(table).splitlines()[2:5]})
             == 1
         )
-
-
-def test_the_latex_parser_sees_mistakes(empty):
-    good = latex(empty["uda"])
-    parse_latex(good)
-    for old, new in (
-        (r"\end{tabular}", ""),
-        (" & 90.4", " 90.4"),
-        (r"\%", "%"),
-        ("$\\pm$", "$\\pm"),
-    ):
-        assert old in good
-        with pytest.raises((AssertionError, ValueError)):
-            parse_latex(good.replace(old, new, 1))
-    assert latex_text("a_b & 5 % → {x}") == r"a\_b \& 5 \% $\rightarrow$ \{x\}"
-
-
-def test_wrong_published_entries(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "CONF", tmp_path)
-    (tmp_path / "table").mkdir()
-    path = tmp_path / "table" / "x.yaml"
-    head = "title: x\nmetrics: [accuracy]\ncolumns: [a, b]\n"
-    for text, message in (
-        (head + "rows:\n- {name: r, paper: [1]}", "row 'r': paper: has 1 numbers.*2 columns"),
-        (head + "rows:\n- {name: r, a: {paper: 101}}", "paper: 101.0.*from 0 to 100"),
-        (head + "layout: wide\nrows: []", "layout: 'wide' is not known"),
-        (head + "tilte: y\nrows: []", r"unknown keys \['tilte'\]"),
-        (head + "rows:\n- {name: r, a: {paper: [1, 2, 3]}}", "x.yaml: missing or wrong entry"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ConfigError, match=message):
-            build_table("x")

@@ -20,12 +20,16 @@ def predictions(labels, predicted, meshes, ids=None) -> Predictions:
     )
 
 
-def test_by_hand():
-    """Two seeds, four clouds of two meshes: A is right where B is not on (0, 0), (0, 1), (1, 0)."""
+def two_rows():
     labels, meshes = [0, 0, 0, 0], ["m", "m", "n", "n"]
     b = [predictions(labels, [1, 1, 0, 0], meshes)] * 2
     a = [predictions(labels, [0, 0, 0, 0], meshes), predictions(labels, [0, 1, 0, 0], meshes)]
-    found = compare(a, b)
+    return a, b
+
+
+def test_by_hand():
+    """Two seeds, four clouds of two meshes: A is right where B is not on (0, 0), (0, 1), (1, 0)."""
+    found = compare(*two_rows())
     assert found.mean == 3 / 8
     assert (found.seeds, found.meshes) == (2, 2)
     # deviations from 3/8 by seed and mesh, of weight 1/4 and 1/2: (1.25, -.75), (.25, -.75) / 8
@@ -48,10 +52,8 @@ def test_balanced_weighs_classes_alike():
 
 
 def test_several_differences_on_average():
-    """Those of one row and their opposite cancel; beside an equal pair a difference halves."""
-    labels, meshes = [0, 0, 0, 0], ["m", "m", "n", "n"]
-    b = [predictions(labels, [1, 1, 0, 0], meshes)] * 2
-    a = [predictions(labels, [0, 0, 0, 0], meshes), predictions(labels, [0, 1, 0, 0], meshes)]
+    """Those of one row and their opposite cancel; with an equal pair a difference halves."""
+    a, b = two_rows()
     one, half = compare(a, b), compare_on_average([(a, b), (b, b)])
     np.testing.assert_allclose(
         [half.mean, half.low, half.high], [one.mean / 2, one.low / 2, one.high / 2]

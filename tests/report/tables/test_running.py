@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from qs3.errors import ConfigError
+from qs3.report.tables.cells import Table
 from qs3.report.tables.comparison import against, csv_text, effects, text
 from qs3.report.tables.running import Job, _chosen, launch, missing
-from qs3.report.tables.table import Table, build_table
+from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
 from tests.commands import main
@@ -50,11 +51,6 @@ def test_runs_that_cells_share_are_run_once(tmp_path):
     assert len({job.overrides for job in jobs}) == len(jobs)
 
 
-def test_unknown_row(tmp_path):
-    with pytest.raises(ConfigError, match="no row of table cad10 has 'danm' in its name"):
-        jobs_of(tmp_path, "danm")
-
-
 def test_one_cell(tmp_path):
     table = build_table("factorial", tmp_path)
     every = missing(table, [0])
@@ -85,10 +81,6 @@ def test_one_cell(tmp_path):
 def test_what_is_refused(words, message, tmp_path, capsys):
     assert main(["report", "train", "table=cad10", f"log_dir={tmp_path}", *words]) == 1
     assert message in capsys.readouterr().err
-
-
-def test_nothing_to_launch():
-    assert launch([], "joblib", 2, "logs") == 0
 
 
 def test_a_failure_is_the_exit_status(tmp_path, capfd):

@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 
 from qs3.config.compose import composing
 from qs3.config.hashing import config_hash, run_folder
+from qs3.config.location import CONF
 from qs3.errors import ConfigError
-from qs3.report.tables import table as tables
 from qs3.report.tables.cells import Published
 from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
 from qs3.report.tables.table import build_table
@@ -131,6 +131,17 @@ def test_another_target(tmp_path):
         build_table("uda", tmp_path, target="kinectsim1")
 
 
+def test_composing_inside_an_application():
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        outer = GlobalHydra.instance().hydra
+        with composing() as compose:
+            assert OmegaConf.is_config(compose("train", []))
+        assert GlobalHydra.instance().hydra is outer
+
+
 def test_extra_overrides_are_part_of_the_command(tmp_path):
     table = build_table("quickstart", tmp_path, extra=["data.points=64"])
     assert f"data.points=64 paths.log_dir={tmp_path} seed=0,1,2 -m" in table.cells[0].command
@@ -138,27 +149,29 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
         build_table("quickstart", tmp_path, extra=["no_such_key=1"])
 
 
-def test_wrong_tables(tmp_path, monkeypatch):
-    with pytest.raises(ConfigError, match="there is no table 'x'; there are ablation, cad10, "):
-        build_table("x")
-    monkeypatch.setattr(tables, "CONF", tmp_path)
-    (tmp_path / "table").mkdir()
-    path = tmp_path / "table" / "x.yaml"
-    for text in ("title: [", "title: x\nrows: []", "[]", "a"):
-        path.write_text(text)
-        with pytest.raises(ConfigError, match=str(path)):
-            build_table("x")
-
-
-def test_composing_inside_an_application():
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-
-    with initialize_config_dir(str(tables.CONF), version_base="1.3"):
-        outer = GlobalHydra.instance().hydra
-        with composing() as compose:
-            assert OmegaConf.is_config(compose("train", []))
-        assert GlobalHydra.instance().hydra is outer
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title: [", "x.yaml: while parsing"),
+        ("[]", "x.yaml: the file: "),
+        ("title: x\nrows: []", "x.yaml: metrics: Field required"),
+        ("HEAD\ntilte: y\nrows: []", "x.yaml: tilte: Unexpected"),
+        ("HEAD\nlayout: wide\nrows: []", "x.yaml: layout: Input should be '' or 'benchmark'"),
+        ("HEAD\nnotes: [a: b]\nrows: []", r"x.yaml: notes\.0: .*put quotes around it"),
+        ("HEAD\nrows:\n- {name: r, paper: [1]}", "row 'r': paper: has 1 numbers.*2 columns"),
+        ("HEAD\nrows:\n- {name: r, a: {paper: 101}}", "paper: 101.0.*from 0 to 100"),
+        ("HEAD\nrows:\n- {name: r, a: {paper: [1, 2, 3]}}", "x.yaml: missing or wrong entry"),
+        ("HEAD\nrows:\n- {a: {paper: 1}}", "x.yaml: missing or wrong entry 'name'"),
+        ("HEAD\nrows:\n- {name: r, a: {run: nonsense}}", "table cell 'r', 'a': .*nonsense"),
+    ],
+)
+def test_wrong_tables(tmp_path, text, message):
+    path = tmp_path / "x.yaml"
+    with pytest.raises(ConfigError, match=r"no table .*x\.yaml'; there are ablation, .*NAME\.yaml"):
+        build_table(str(path))
+    path.write_text(text.replace("HEAD", "title: x\nmetrics: [accuracy]\ncolumns: [a, b]"))
+    with pytest.raises(ConfigError, match=message):
+        build_table(str(path))
 
 
 def test_command_line(tmp_path, capsys):

@@ -8,7 +8,7 @@ from qs3.config import hashing
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
-from tests.training.test_resume import interrupt
+from tests.training.watching import interrupt
 
 LONG = 1e6  # seconds; no test takes as long
 
