@@ -35,8 +35,6 @@ _UNHASHED = (
     ),
 )
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
-# By today's name of a class the one under which runs were hashed before: they are still found.
-_HASHED_AS = {"qs3.datamodules.phases.SelfTrainingConfig": "qs3.datamodules.phases.Scheme"}
 
 
 def config_sha256(cfg: DictConfig) -> str:
@@ -55,8 +53,6 @@ def config_sha256(cfg: DictConfig) -> str:
             node.pop(leaf, None)
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None
-    elif (name := plain["selftraining"].get("_target_")) in _HASHED_AS:
-        plain["selftraining"]["_target_"] = _HASHED_AS[name]
     trainer = plain.get("trainer")
     devices = trainer.get("devices") if isinstance(trainer, dict) else None
     if isinstance(devices, list) and len(devices) == 1:
