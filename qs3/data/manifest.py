@@ -6,8 +6,8 @@ import csv
 import dataclasses
 import hashlib
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,8 @@ class ManifestRow:
         status: "ok", or a word for what went wrong ("failed", "skipped").
         reason: why it is not ok; of one that is, what was left out of its file, if anything.
         index: row of the arrays; set by `write_pointset`, None if not ok.
+        more: further columns of this dataset alone, by header: sensor, tier, frame. A manifest
+            has them only if a row does, so others keep their bytes.
     """
 
     id: str
@@ -54,6 +56,7 @@ class ManifestRow:
     status: str = OK
     reason: str = ""
     index: int | None = None
+    more: Mapping[str, str] = field(default_factory=dict, hash=False)
 
 
 _COLUMNS: tuple[tuple[str, str], ...] = (  # of manifest.csv: (header, field)
@@ -137,9 +140,11 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
 
 def to_csv(rows: Sequence[ManifestRow]) -> str:
     """The text of manifest.csv; line breaks inside a value become spaces."""
-    lines = [[header for header, _ in _COLUMNS]]
+    more = list(dict.fromkeys(header for row in rows for header in row.more))
+    lines = [[*(header for header, _ in _COLUMNS), *more]]
     for row in rows:
-        values = [getattr(row, field) for _, field in _COLUMNS]
+        values = [getattr(row, name) for _, name in _COLUMNS]
+        values += [row.more.get(header) for header in more]
         lines.append(["" if v is None else " ".join(str(v).splitlines()) for v in values])
     return csv_text(lines)
 
@@ -149,19 +154,21 @@ def _from_csv(text: str, path: Path) -> list[ManifestRow]:
         header, *lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     except (csv.Error, ValueError) as error:
         raise DataError(f"{path} is empty or damaged ({error}); {AGAIN}") from error
-    if header != [name for name, _ in _COLUMNS]:
+    more = header[len(_COLUMNS) :]
+    if header[: len(_COLUMNS)] != [name for name, _ in _COLUMNS] or len({*header}) < len(header):
         raise DataError(f"{path}, line 1: the columns are not {[n for n, _ in _COLUMNS]}")
     rows = []
     for number, values in enumerate(lines, start=2):
-        if len(values) != len(_COLUMNS):
-            raise DataError(f"{path}, line {number}: {len(values)} columns, not {len(_COLUMNS)}")
+        if len(values) != len(header):
+            raise DataError(f"{path}, line {number}: {len(values)} columns, not {len(header)}")
         fields: dict[str, Any] = {}
-        for (name, field), value in zip(_COLUMNS, values, strict=True):
+        for (name, key), value in zip(_COLUMNS, values, strict=False):
             try:
-                fields[field] = (int(value) if value else None) if name in _INTEGERS else value
+                fields[key] = (int(value) if value else None) if name in _INTEGERS else value
             except ValueError as error:
                 raise DataError(
                     f"{path}, line {number}: {name} is {value!r}, not a number"
                 ) from error
-        rows.append(ManifestRow(**fields))
+        further = zip(more, values[len(_COLUMNS) :], strict=True)
+        rows.append(ManifestRow(**fields, more={key: value for key, value in further if value}))
     return rows

@@ -57,6 +57,9 @@ class Importer(abc.ABC):
     complete: ClassVar[bool] = True
     """Whether a class without clouds in a split means that something is wrong."""
 
+    made_of: ClassVar[str] = ""
+    """What its clouds are, where a name does not tell it; goes into the store's meta.yaml."""
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
         if self.points < 1:
@@ -101,11 +104,15 @@ class Importer(abc.ABC):
         """[n, 3] as read to at most P points, for formats that allow more."""
         return cloud
 
-    def read(self, classes: Sequence[str]) -> tuple[list[np.ndarray], list[ManifestRow]]:
+    def read(
+        self, classes: Sequence[str], work: Path | None = None
+    ) -> tuple[list[np.ndarray], list[ManifestRow]]:
         """Read everything.
 
         Args:
             classes: the names in label order; each must occur in each split that there is.
+            work: a folder in which an importer that takes minutes may keep what it has done, to
+                continue after an interruption; it is deleted when the store is finished.
 
         Returns:
             [P, 3] float32 clouds with z up, and their rows (plus rows of what was skipped).
@@ -165,8 +172,9 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
                 "to import the published files"
             )
         shutil.rmtree(building, ignore_errors=True)
+        work = folder.with_name(f".{folder.name}.parts")
         settings = importer.settings()
-        clouds, rows = importer.read(classes)
+        clouds, rows = importer.read(classes, work)
         if importer.settings() != settings:
             raise DataError(
                 f"files in {importer.root} were added, removed or changed while they were "
@@ -178,11 +186,13 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
             classes=classes,
             arrays={"points": clouds},
             rows=rows,
-            meta={"imported": settings},
+            meta={"imported": settings}
+            | ({"made_of": importer.made_of} if importer.made_of else {}),
         )
         if folder.is_dir():  # holds a lock at most
             shutil.rmtree(folder)
         os.rename(building, folder)
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def class_of(name: str, classes: Sequence[str], where: str) -> str:
