@@ -144,7 +144,7 @@ def cut(
         return _refused(piece, f"{piece.rim:.0%} of its outline cut off by the picture")
     if piece.occ > rules.most_occ:
         return _refused(piece, f"{piece.occ:.0%} of its outline covered")
-    flat = thickness_m(points[inlier]) < rules.flat_m
+    flat = not limits.thin and thickness_m(points[inlier]) < rules.flat_m
     reasons = [
         word
         for word, found in (

@@ -21,14 +21,17 @@ class Limits:
     Attributes:
         pixels: an object has at least so many with depth.
         least_m, most_m: its largest extent along x, y or z is between these.
+        thin: its things are thin by nature, so that being flat makes none of them hard.
     """
 
     pixels: int = 700
     least_m: float = 0.1
     most_m: float = 3.5
+    thin: bool = False
 
     def __post_init__(self) -> None:
         check_int("pixels", self.pixels, 1)
+        check_bool("thin", self.thin)
         least, most = check_float("least_m", self.least_m), check_float("most_m", self.most_m)
         if not 0 < least < most:
             raise ConfigError(f"least_m={least} and most_m={most}: 0 < least_m < most_m must hold")

@@ -1,0 +1,272 @@
+"""Runs, objects, predictions, figures: what `qs3 report judge` finds out.
+
+The archive is read by `qs3.data.importers.object_archive`; its clouds go to each run as those of
+`qs3 predict` do, thinned to the points that the run was trained with. Nothing is trained, chosen or
+tuned by what comes out.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from qs3.classes import known_as
+from qs3.data.importers.object_archive import TIERS, Archive, read_archive
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.inference.model_file import FILE, find_result
+from qs3.inference.predictor import load
+from qs3.report.judge.intervals import Share, share
+from qs3.runs.metrics import read_metrics
+from qs3.utils.files import sha256_file
+from qs3.utils.progress import progress_bar
+
+BLOCK = 30
+"""Frames in a row that make a cluster."""
+
+JUDGE = "judge"
+"""The part of an archive's `dev` that judges, if it has parts."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one family of runs on one tier of objects.
+
+    Attributes:
+        tier: "all", "clean" or "hard".
+        n, blocks: objects, and blocks of frames they come from.
+        accuracy, balanced: with their intervals; balanced over the classes that are there.
+        majority: what always naming the commonest class would reach.
+        counts: objects of each class that is there.
+        recall: of each of them, the mean over seeds.
+        predicted: objects called each class, the mean over seeds.
+    """
+
+    tier: str
+    n: int
+    blocks: int
+    accuracy: Share
+    balanced: Share
+    majority: float
+    counts: dict[str, int]
+    recall: dict[str, float]
+    predicted: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Family:
+    """Runs of one config, one a seed.
+
+    Attributes:
+        name: of the experiment with the config's hash, or the run's path.
+        runs: their result files.
+        seeds: theirs; empty where not known.
+        points: of a cloud as the nets see it.
+        target: what they were adapted to.
+        figures: by tier.
+    """
+
+    name: str
+    runs: tuple[Path, ...]
+    seeds: tuple[int, ...]
+    points: int
+    target: str
+    figures: tuple[Figures, ...]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """All of it.
+
+    Attributes:
+        data, sha256: the archive.
+        part: of its `dev` that was judged on; "" for all.
+        classes: that were judged.
+        left_out: objects of other classes.
+        inliers_only: whether stray points were left out.
+        families: in the order of the runs given.
+    """
+
+    data: Path
+    sha256: str
+    part: str
+    classes: tuple[str, ...]
+    left_out: int
+    inliers_only: bool
+    families: tuple[Family, ...]
+
+
+def judge(
+    runs: Sequence[str],
+    data: Path,
+    *,
+    classes: Sequence[str] = (),
+    part: str = "",
+    inliers_only: bool = True,
+    device: str = "cpu",
+) -> Verdict:
+    """Judge saved runs on an archive of objects.
+
+    Args:
+        runs: folders of runs, folders of such folders, patterns, or result files.
+        data: the .npz.
+        classes: only objects of these; none: of all that every run knows.
+        part: of its `dev`; none: "judge", where it has one, else all.
+        inliers_only: leave points out that the archive marks as stray.
+        device: of the nets.
+
+    Raises:
+        MissingDataError: a run or the archive is not there.
+        DataError: one is damaged.
+        ConfigError: nothing is left to judge on, or runs that cannot be judged so.
+    """
+    files = find_runs(runs)
+    archive = read_archive(data)
+    chosen, part = _chosen(archive, part)
+    predictors = {file: load(file, device=device) for file in files}
+    for file, one in predictors.items():
+        if one.result.gravity != "z":
+            raise ConfigError(
+                f"{file} was trained on clouds in the frame of their camera; the archive's have z "
+                "up, so it cannot be judged on them"
+            )
+    common = _common([one.classes for one in predictors.values()], classes)
+    names = [known_as(str(name), common) for name in archive.cls]
+    kept = [i for i in chosen if names[i] is not None]
+    if not kept:
+        raise ConfigError(f"{data}: no object of {', '.join(common)} in what was asked for")
+    truth = np.array([common.index(str(names[i])) for i in kept])
+    clouds = [archive.cloud(i, inliers_only) for i in kept]
+    said = [f"{data.name}[{i}]" for i in kept]
+    guesses: dict[Path, np.ndarray] = {}
+    with progress_bar("judging runs", total=len(files)) as advance:
+        for file, one in predictors.items():
+            wanted = [one.classes.index(name) for name in common]
+            every = list(range(len(one.classes)))
+            found = one(clouds, names=said).argmax(axis=1)
+            place = {label: wanted.index(label) if label in wanted else -1 for label in every}
+            guesses[file] = np.array([place[label] for label in found.tolist()])
+            advance()
+    blocks = archive.frame[kept] // BLOCK
+    tiers = archive.tier[kept]
+    families = []
+    for name, members, seeds in _families(files):
+        picked = np.stack([guesses[file] for file in members])
+        first = predictors[members[0]]
+        figures = tuple(
+            _figures(tier, picked[:, of], truth[of], blocks[of], common)
+            for tier, of in [("all", np.ones(len(kept), bool))]
+            + [(tier, tiers == tier) for tier in TIERS]
+            if of.any()
+        )
+        families.append(Family(name, members, seeds, first.points, first.result.target, figures))
+    return Verdict(
+        data,
+        sha256_file(data),
+        part,
+        common,
+        len(chosen) - len(kept),
+        inliers_only,
+        tuple(families),
+    )
+
+
+def find_runs(runs: Sequence[str]) -> list[Path]:
+    """The result files that are meant, each once, in order.
+
+    Raises:
+        MissingDataError: one is not there, or a folder holds none.
+    """
+    found: dict[Path, None] = {}
+    for words in runs:
+        places = [Path(words).expanduser()]
+        if not places[0].exists() and glob.has_magic(words):
+            places = sorted(map(Path, glob.glob(str(places[0]))))
+            if not places:
+                raise MissingDataError(f"runs={words} matches nothing")
+        for place in places:
+            below = sorted(place.rglob(FILE)) if place.is_dir() else []
+            for file in below or [find_result(place)]:
+                found.setdefault(file)
+    if not found:
+        raise ConfigError("runs= names no run; give folders of finished runs")
+    return list(found)
+
+
+def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[int, ...]]]:
+    """Name, files and seeds of the runs of each config that saw the same data.
+
+    Raises:
+        ConfigError: a seed is there twice.
+    """
+    members: dict[tuple[str, ...], dict[int, Path]] = {}
+    for file in files:
+        metrics = read_metrics(file.parent)
+        if metrics is None:
+            members[(str(file),)] = {-1: file}
+            continue
+        key = (metrics.experiment, metrics.hash, metrics.data.source, metrics.data.target)
+        of = members.setdefault(key, {})
+        if metrics.seed in of:
+            raise ConfigError(
+                f"{file.parent} and {of[metrics.seed].parent} are the same run twice; give one"
+            )
+        of[metrics.seed] = file
+    found = []
+    for key, of in members.items():
+        seeds = tuple(sorted(seed for seed in of if seed >= 0))
+        name = f"{key[0]} {key[1]}" if len(key) > 1 else key[0]
+        found.append((name, tuple(of[seed] for seed in sorted(of)), seeds))
+    return found
+
+
+def _chosen(archive: Archive, part: str) -> tuple[list[int], str]:
+    """Positions of the objects of a part, and the part."""
+    parts = sorted({*archive.dev.tolist()} - {""})
+    if not part and JUDGE in parts:
+        part = JUDGE
+    if not part:
+        return list(range(len(archive))), ""
+    if part not in parts:
+        has = f"its parts are {', '.join(parts)}" if parts else "it has no parts"
+        raise ConfigError(f"part={part}: {archive.path} has none of that name; {has}")
+    return np.flatnonzero(archive.dev == part).tolist(), part
+
+
+def _common(of_runs: Sequence[tuple[str, ...]], wanted: Sequence[str]) -> tuple[str, ...]:
+    """The classes that every run knows, in the order of the first; those wanted alone."""
+    common = tuple(name for name in of_runs[0] if all(name in one for one in of_runs))
+    if unknown := [name for name in wanted if name not in common]:
+        raise ConfigError(
+            f"classes={','.join(unknown)}: not known to every run; those are {', '.join(common)}"
+        )
+    if not common:
+        raise DataError("the runs have no class in common")
+    return tuple(name for name in common if not wanted or name in wanted)
+
+
+def _figures(
+    tier: str,
+    guesses: Int[np.ndarray, "s n"],
+    truth: Int[np.ndarray, " n"],
+    blocks: Int[np.ndarray, " n"],
+    names: Sequence[str],
+) -> Figures:
+    right: Bool[np.ndarray, "s n"] = guesses == truth
+    counts = np.bincount(truth, minlength=len(names))
+    there = [k for k, count in enumerate(counts) if count]
+    return Figures(
+        tier,
+        len(truth),
+        len(np.unique(blocks)),
+        share(right, truth, blocks),
+        share(right, truth, blocks, balanced=True),
+        float(counts.max() / len(truth)),
+        {names[k]: int(counts[k]) for k in there},
+        {names[k]: float(right[:, truth == k].mean()) for k in there},
+        {names[k]: float((guesses == k).sum(axis=1).mean()) for k in range(len(names))},
+    )
