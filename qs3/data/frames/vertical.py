@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -28,7 +29,8 @@ _ROUNDS = 6  # of fit and trimming
 _TRIM = 3.0  # median absolute deviations
 _LEAST_SHARE = 0.5  # of the floor's pixels that must lie in the plane
 _LEAST_FRAMES = 10  # with readings and a floor, for the mounting
-_STEP_PX, _REACH_PX = 4, 3  # every how many pixels a normal, and from how far
+_STEP_PX, _REACH_PX = 4, 8  # every how many pixels a normal, and from how far
+_SPAN_SHARE = 0.15  # of the depth, that a window's depths may span
 _WITHIN_DEG = (45.0, 45.0, 45.0, 15.0, 15.0, 15.0)  # a plane counts as level or upright, by round
 
 
@@ -117,25 +119,27 @@ def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:
 
 
 def _normals(depth_m: np.ndarray, camera: Pinhole) -> np.ndarray:
-    """[n, 3] unit normals of a grid of pixels, where the surface is smooth."""
-    points = camera.rays(*depth_m.shape) * depth_m[..., None]
+    """[n, 3] unit normals of a grid of pixels, where a window around them is measured and smooth.
+
+    1/z is linear in a plane's pixels, so a normal is the slopes of 1/z over the window.
+    """
     r = _REACH_PX
-    centre = (slice(r, -r, _STEP_PX), slice(r, -r, _STEP_PX))
-
-    def moved(rows: int, columns: int) -> np.ndarray:
-        height, width = depth_m.shape
-        picked: np.ndarray = points[
-            r + rows : height - r + rows : _STEP_PX, r + columns : width - r + columns : _STEP_PX
-        ]
-        return picked
-
-    left, right, above, below = moved(0, -r), moved(0, r), moved(-r, 0), moved(r, 0)
-    z = depth_m[centre]
-    smooth = z > 0
-    for side in (left, right, above, below):
-        smooth &= (side[..., 2] > 0) & (np.abs(side[..., 2] - z) < 0.03 * z + 0.02)
-    normal = np.cross(right - left, below - above)[smooth]
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    good = length[:, 0] > 1e-12
-    unit: np.ndarray = normal[good] / length[good]
+    width = 2 * r + 1
+    window = np.ones((width, width), np.uint8)
+    holes = cv2.dilate((depth_m <= 0).astype(np.uint8), window, borderValue=1) > 0
+    span = cv2.dilate(depth_m, window) - cv2.erode(depth_m, window)
+    smooth = ~holes & (span < _SPAN_SHARE * depth_m)
+    smooth[:r], smooth[-r:], smooth[:, :r], smooth[:, -r:] = False, False, False, False
+    inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
+    steps = np.arange(-r, r + 1, dtype=np.float64)
+    slope, mean = steps / (steps**2).sum(), np.full(width, 1 / width)
+    along_u = cv2.sepFilter2D(inverse, cv2.CV_64F, slope, mean)
+    along_v = cv2.sepFilter2D(inverse, cv2.CV_64F, mean, slope)
+    level = cv2.sepFilter2D(inverse, cv2.CV_64F, mean, mean)
+    v, u = np.nonzero(smooth[::_STEP_PX, ::_STEP_PX])
+    at = (v * _STEP_PX, u * _STEP_PX)
+    x, y = (at[1] - camera.cx_px) / camera.fx_px, (at[0] - camera.cy_px) / camera.fy_px
+    nx, ny = along_u[at] * camera.fx_px, along_v[at] * camera.fy_px
+    normal = np.stack([nx, ny, level[at] - nx * x - ny * y], axis=1)
+    unit: np.ndarray = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     return unit
