@@ -20,8 +20,8 @@ import functools
 import logging
 import zipfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -93,10 +93,10 @@ class ObjectArchive(Importer):
 
     Attributes:
         file: the .npz, in the folder or by its whole path.
-        parts: value of `dev` -> split; other values are left out. An archive without `dev` is all
-            of the split "test".
-        fold, folds: instead, the part that is `parts`' "train" alone, cut into `folds` runs of
-            blocks, of which number `fold` (from 0) is for test and the others for training.
+        train_parts, test_parts: values of `dev` that are for training and for test; others are
+            left out. An archive without `dev` is all for test.
+        fold, folds: instead, `train_parts` alone, cut into `folds` runs of blocks, of which number
+            `fold` (from 0) is for test and the others for training.
         gap: frames next to a fold's test blocks that are left out of its training part.
         block: so many frames in a row make a cluster.
         inliers_only: leave stray points out.
@@ -104,7 +104,8 @@ class ObjectArchive(Importer):
     """
 
     file: str = "objects.npz"
-    parts: Mapping[str, str] = field(default_factory=lambda: {"adapt": "train", "judge": "test"})
+    train_parts: Sequence[str] = ("adapt",)
+    test_parts: Sequence[str] = ("judge",)
     fold: int | None = None
     folds: int = 5
     gap: int = 15
@@ -117,15 +118,15 @@ class ObjectArchive(Importer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "parts", dict(self.parts))
-        object.__setattr__(self, "tiers", list(self.tiers))
+        for key in ("train_parts", "test_parts", "tiers"):
+            object.__setattr__(self, key, [str(word) for word in getattr(self, key)])
         check_bool("published.inliers_only", self.inliers_only)
         for key, least in (("folds", 2), ("gap", 0), ("block", 1)):
             check_int(f"published.{key}", getattr(self, key), least)
         if self.fold is not None and check_int("published.fold", self.fold, 0) >= self.folds:
             raise ConfigError(f"published.fold={self.fold} of {self.folds} folds counted from 0")
-        if wrong := sorted({*self.parts.values()} - {*SPLITS}):
-            raise ConfigError(f"published.parts: unknown splits {wrong}; known are {SPLITS}")
+        if both := sorted({*self.train_parts} & {*self.test_parts}):
+            raise ConfigError(f"published.train_parts and test_parts both name {', '.join(both)}")
         if not self.tiers or not {*self.tiers} <= {*TIERS}:
             raise ConfigError(f"published.tiers={self.tiers} must be some of {', '.join(TIERS)}")
 
@@ -206,8 +207,11 @@ class ObjectArchive(Importer):
         if self.fold is None:
             if not (archive.dev != "").any():
                 return ["test"] * len(archive)
-            return [self.parts.get(str(part), "") for part in archive.dev]
-        ours = [self.parts.get(str(part)) == "train" for part in archive.dev]
+            split = dict.fromkeys(self.train_parts, "train") | dict.fromkeys(
+                self.test_parts, "test"
+            )
+            return [split.get(str(part), "") for part in archive.dev]
+        ours = np.isin(archive.dev, self.train_parts)
         frames = archive.frame
         blocks = np.unique(frames[ours] // self.block)
         if len(blocks) < self.folds:
@@ -221,7 +225,7 @@ class ObjectArchive(Importer):
         near = np.abs(frames[:, None] - of_test[None]).min(axis=1) <= self.gap
         return [
             "" if not mine else "test" if is_test else "" if close else "train"
-            for mine, is_test, close in zip(ours, test.tolist(), near.tolist(), strict=True)
+            for mine, is_test, close in zip(ours, test, near, strict=True)
         ]
 
 

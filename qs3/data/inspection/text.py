@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from qs3.data.inspection import columns
 from qs3.utils import text_table
 
 Numbers = dict[str, Any]
@@ -37,6 +38,7 @@ def of_domain(facts: Numbers) -> str:
                 f"{split}: {of['largest_class']} is {of['largest_share']:.1%}, "
                 f"{of['largest_over_smallest']:.1f} times the smallest class"
             )
+    parts += columns.text(facts["columns"])
     parts += _measured(facts["valid_points"])
     unit = "unit ball" if extents["in_unit_ball"] else "as stored"
     parts += [
