@@ -130,7 +130,7 @@ def cut(
         kept=pixels / int(measured.sum()),
         rim=rim(mask, image.inside, rules),
         occ=occlusion(mask, own, depth, rules),
-        extent_m=tuple(float(side) for side in extent),
+        extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
         depth_m=float(np.median(depth[own])),
     )
     if holes > rules.most_holes:

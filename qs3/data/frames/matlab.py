@@ -94,7 +94,7 @@ def words(file: Any, name: str, path: Path) -> list[str]:
         raise DataError(f"{path}: {name} is {cells.dtype} {cells.shape}, not a list of text")
     found = []
     for i, reference in enumerate(cells[...].ravel()):
-        text = file[reference] if reference else None
+        text: Any = file[reference] if reference else None
         plain = isinstance(text, h5py.Dataset) and text.dtype.kind == "u"
         if not plain or text.size > _MOST_LETTERS or text.external or text.is_virtual:
             raise DataError(f"{path}: {name}, number {i + 1}, is no text")

@@ -40,6 +40,7 @@ AREA = (44, 471, 40, 601)
 
 _SIZE = (480, 640)
 _MOST_FRAMES = 100_000
+_FARTHEST_M = 9.99
 _KINDS = {"rawDepths": "f", "labels": "u", "instances": "u"}
 
 
@@ -105,8 +106,9 @@ class LabelledFrames:
         return AREA if self._images["rawDepths"].shape[:0:-1] == _SIZE else None
 
     def depth_m(self, frame: int) -> np.ndarray:
-        """[h, w] float64, 0 where nothing was measured."""
-        return self._read("rawDepths", frame).astype(np.float64)
+        """[h, w] float64, 0 where nothing was measured (the toolbox cuts depths off at 10 m)."""
+        depth = self._read("rawDepths", frame).astype(np.float64)
+        return np.where(depth < _FARTHEST_M, depth, 0)
 
     def labels(self, frame: int) -> np.ndarray:
         """[h, w] number of each pixel's name from 1; 0 for none.

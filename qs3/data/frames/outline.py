@@ -17,7 +17,9 @@ def eroded(mask: Bool[np.ndarray, "h w"], by_px: int) -> Bool[np.ndarray, "h w"]
     if by_px == 0:
         return mask
     window = np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8)
-    found = cv2.erode(mask.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    found = cv2.erode(
+        mask.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=(1,)
+    )
     return found.astype(bool)
 
 
@@ -71,7 +73,10 @@ def occlusion(
     outside = np.where(~mask & (depth_m > 0), depth_m, _FAR)
     width = 2 * rules.reach_px + 1
     nearest = cv2.erode(
-        outside, np.ones((width, width), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=_FAR
+        outside,
+        np.ones((width, width), np.uint8),
+        borderType=cv2.BORDER_CONSTANT,
+        borderValue=(_FAR,),
     )[edge]
     jump = np.maximum(rules.jump_m, rules.jump_share * object_depth)
     return float((nearest < object_depth - jump).mean())

@@ -126,7 +126,7 @@ def _normals(depth_m: np.ndarray, camera: Pinhole) -> np.ndarray:
     r = _REACH_PX
     width = 2 * r + 1
     window = np.ones((width, width), np.uint8)
-    holes = cv2.dilate((depth_m <= 0).astype(np.uint8), window, borderValue=1) > 0
+    holes = cv2.dilate((depth_m <= 0).astype(np.uint8), window, borderValue=(1,)) > 0
     span = cv2.dilate(depth_m, window) - cv2.erode(depth_m, window)
     smooth = ~holes & (span < _SPAN_SHARE * depth_m)
     smooth[:r], smooth[-r:], smooth[:, :r], smooth[:, -r:] = False, False, False, False

@@ -154,7 +154,7 @@ class NYUv2(FrameImporter):
             return others
         hull = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.int32))
         inside = np.zeros(mask.shape, np.uint8)
-        cv2.fillConvexPoly(inside, hull, 1)
+        cv2.fillConvexPoly(inside, hull, (1,))
         return others & (inside == 1)
 
     def _verticals(

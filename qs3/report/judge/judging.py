@@ -217,9 +217,9 @@ def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[
             )
         of[metrics.seed] = file
     found = []
-    for key, of in members.items():
+    for words, of in members.items():
         seeds = tuple(sorted(seed for seed in of if seed >= 0))
-        name = f"{key[0]} {key[1]}" if len(key) > 1 else key[0]
+        name = " ".join(words[:2])
         found.append((name, tuple(of[seed] for seed in sorted(of)), seeds))
     return found
 

@@ -60,6 +60,20 @@ def test_what_is_cut_is_what_was_placed(opened, shots):
     assert "cut off by the picture" in refused.reason or "pixels" in refused.reason
 
 
+def test_without_noise_every_point_is_exact(tmp_path, shots):
+    """A camera that is a pixel off would move edges by 5 mm, a vertical by half a degree 2 cm."""
+    some = [shots[0], shots[3]]
+    write_nyuv2(tmp_path / "published" / "nyuv2", some, noisy=False)
+    domain = compose_domain("nyuv2", {"paths.data_dir": str(tmp_path)})
+    data = domain.open()
+    assert len(data) == 4
+    for row, cloud in zip(read_manifest(domain.folder, data.classes), data.points, strict=True):
+        shot = some[int(row.more["frame"]) - 1]
+        where = shot.to_world(np.asarray(cloud, dtype=float))
+        off = np.min([thing.distance(where) for thing in shot.things], axis=0)
+        assert off.max() < 1e-3, row.id
+
+
 def test_books_belong_to_their_shelf(opened, shots):
     _, data, rows = opened
     cloud = data.points[next(row.index for row in rows if row.cls == "bookshelf")]

@@ -11,6 +11,7 @@ from qs3.data.frames.sunrgbd import millimetres, read_frames
 from qs3.data.inspection.open_dataset import compose_domain
 from qs3.data.store import is_finished, read_manifest
 from qs3.errors import DataError, Qs3Error
+from tests.fixtures.frame_files import write_sunrgbd
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,19 @@ def test_what_is_cut_is_what_was_placed(opened, shots):
         off = np.min([thing.distance(where) for thing in shot.things], axis=0)
         assert off.max() < 0.06, row.id
         assert np.median(off) < 0.01, row.id
+
+
+def test_without_noise_every_point_is_exact(tmp_path, shots):
+    """A camera that is a pixel off would move edges by 5 mm; a depth is a whole millimetre."""
+    write_sunrgbd(tmp_path / "published" / "sunrgbd", [shots[0], shots[3]], noisy=False)
+    domain = compose_domain("sunrgbd", {"paths.data_dir": str(tmp_path)})
+    data = domain.open()
+    assert len(data) == 4
+    for row, cloud in zip(read_manifest(domain.folder, data.classes), data.points, strict=True):
+        shot = (shots[0], shots[3])[int(row.more["frame"]) - 1]
+        where = shot.to_world(np.asarray(cloud, dtype=float))
+        off = np.min([thing.distance(where) for thing in shot.things], axis=0)
+        assert off.max() < 1.5e-3, row.id
 
 
 def test_sensors_and_splits(opened, sunrgbd, tmp_path, shots):
