@@ -15,7 +15,7 @@ from qs3.utils.text_table import csv_text as csv_of
 def text(verdict: Verdict) -> str:
     """Two tables: a row a family and tier, and a row a class."""
     v = verdict
-    rows = [["run", "seeds", "tier", "objects", "rooms", "accuracy %", "balanced %", "majority %"]]
+    rows = [["run", "seeds", "tier", "objects", "blocks", "accuracy %", "balanced %", "majority %"]]
     for family in v.families:
         for f in family.figures:
             rows.append(
@@ -53,7 +53,7 @@ def csv_text(verdict: Verdict) -> str:
     """A row a family and tier, with a recall and a count for each class; shares in [0, 1]."""
     names = verdict.classes
     header = [
-        "run", "seeds", "tier", "objects", "rooms", "accuracy", "accuracy_sem", "accuracy_low",
+        "run", "seeds", "tier", "objects", "blocks", "accuracy", "accuracy_sem", "accuracy_low",
         "accuracy_high", "balanced", "balanced_sem", "balanced_low", "balanced_high", "majority",
         *(f"recall_{name}" for name in names), *(f"objects_{name}" for name in names),
     ]  # fmt: skip
