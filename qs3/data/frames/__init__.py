@@ -2,7 +2,7 @@
 
     images.py      a depth image with its camera and its vertical, and the points of its pixels
     rules.py       what counts as an object that can be used, and which are clean; with reasons
-    parts_of.py    pixels that hang together in depth
+    pieces.py      pixels that hang together in depth
     outline.py     how much of an object the picture cuts off, and what stands before it
     cutting.py     one object by its mask, or by an oriented box less the floor
     vertical.py    which way is up: a fitted floor, an accelerometer, or the planes of a room

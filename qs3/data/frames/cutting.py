@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from qs3.data.frames.images import DepthImage
 from qs3.data.frames.outline import eroded, occlusion, rim
-from qs3.data.frames.parts_of import body, pieces
+from qs3.data.frames.pieces import body, pieces
 from qs3.data.frames.rules import Rules
 
 CLEAN, HARD = "clean", "hard"
@@ -111,19 +111,18 @@ def cut(
         The object; or one that is `refused`, with the reason.
     """
     mask = mask & image.inside
-    depth, limits = image.depth_m, rules.limits_of(cls)
+    depth = image.depth_m
     core = eroded(mask, rules.erode_px if edge_px is None else edge_px)
     measured = core & (depth >= rules.near_m) & (depth <= rules.far_m)
-    holes = 1 - measured.sum() / max(int(core.sum()), 1)
     own = body(pieces(measured, depth, rules), image.points_m, rules)
     points = image.points_m[own]
-    inlier = inliers(points, rules)
-    pixels = len(points)
+    inlier, pixels = inliers(points, rules), len(points)
     if rules.drop_outliers:
         points, inlier = points[inlier], inlier[inlier]
-    piece = Piece(points.astype(np.float32), inlier, pixels, float(holes))
-    if pixels < limits.pixels:
-        return _refused(piece, f"{pixels} pixels with depth, fewer than {limits.pixels}")
+    holes = 1 - float(measured.sum()) / max(int(core.sum()), 1)
+    piece = Piece(points.astype(np.float32), inlier, pixels, holes)
+    if pixels < (least := rules.limits_of(cls).pixels):
+        return replace(piece, refused=True, why=f"{pixels} pixels with depth, fewer than {least}")
     extent = np.ptp(points[inlier], axis=0)
     piece = replace(
         piece,
@@ -133,28 +132,31 @@ def cut(
         extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
         depth_m=float(np.median(depth[own])),
     )
-    if holes > rules.most_holes:
-        return _refused(piece, f"{holes:.0%} of it without depth")
-    if not limits.least_m <= extent.max() <= limits.most_m:
-        return _refused(
-            piece,
-            f"{extent.max():.2f} m, not {limits.least_m:g} to {limits.most_m:g} m",
-        )
-    if piece.rim > rules.most_rim:
-        return _refused(piece, f"{piece.rim:.0%} of its outline cut off by the picture")
-    if piece.occ > rules.most_occ:
-        return _refused(piece, f"{piece.occ:.0%} of its outline covered")
-    flat = not limits.thin and thickness_m(points[inlier]) < rules.flat_m
-    reasons = [
-        word
-        for word, found in (
-            ("cut off", piece.rim > rules.clean_rim),
-            ("covered", piece.occ > rules.clean_occ),
-            ("torn", piece.kept < rules.least_kept),
-            ("flat", flat),
-        )
-        if found
-    ]
+    return _judged(piece, cls, rules)
+
+
+def _judged(piece: Piece, cls: str, rules: Rules) -> Piece:
+    """The piece with its tier, or refused."""
+    limits, longest = rules.limits_of(cls), max(piece.extent_m)
+    wrong = (
+        (piece.holes > rules.most_holes, f"{piece.holes:.0%} of it without depth"),
+        (
+            not limits.least_m <= longest <= limits.most_m,
+            f"{longest:.2f} m, not {limits.least_m:g} to {limits.most_m:g} m",
+        ),
+        (piece.rim > rules.most_rim, f"{piece.rim:.0%} of its outline cut off by the picture"),
+        (piece.occ > rules.most_occ, f"{piece.occ:.0%} of its outline covered"),
+    )
+    if reasons := [words for found, words in wrong if found]:
+        return replace(piece, refused=True, why=", ".join(reasons))
+    flat = not limits.thin and thickness_m(piece.points_m[piece.inlier]) < rules.flat_m
+    lesser = (
+        (piece.rim > rules.clean_rim, "cut off"),
+        (piece.occ > rules.clean_occ, "covered"),
+        (piece.kept < rules.least_kept, "torn"),
+        (flat, "flat"),
+    )
+    reasons = [word for found, word in lesser if found]
     return replace(piece, tier=HARD if reasons else CLEAN, why=", ".join(reasons))
 
 
@@ -191,7 +193,3 @@ def thickness_m(points_m: Float[np.ndarray, "n 3"]) -> float:
     _, _, axes = np.linalg.svd(centred.T @ centred)
     low, high = np.quantile(centred @ axes[2], [(1 - _PLATE) / 2, (1 + _PLATE) / 2])
     return float(high - low)
-
-
-def _refused(piece: Piece, why: str) -> Piece:
-    return replace(piece, refused=True, why=why)

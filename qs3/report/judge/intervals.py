@@ -8,9 +8,9 @@ errors clustered by block and by seed (Cameron, Gelbach, Miller, J. Business & E
 about the mean, for balanced accuracy about the recall of its class.
 
 A half width is t(S - 1)² V_seeds + t(M - 1)² max(0, V_blocks - V_both) under the root, with
-Student's quantiles; of one seed V_blocks alone. It is no wider than [0, 1]. A class that was seen in
-one block alone adds nothing to the variance of balanced accuracy, although nobody knows how it varies
-from room to room: where a table shows such classes, that interval is too narrow.
+Student's quantiles; of one seed V_blocks alone. It is no wider than [0, 1]. A class that was seen
+in one block alone adds nothing to the variance of balanced accuracy, although nobody knows how it
+varies from room to room: with such classes that interval is too narrow.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ tuned by what comes out.
 from __future__ import annotations
 
 import glob
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from qs3.classes import known_as
 from qs3.data.importers.object_archive import TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.model_file import FILE, find_result
-from qs3.inference.predictor import load
+from qs3.inference.predictor import Predictor, load
 from qs3.report.judge.intervals import Share, share
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import sha256_file
@@ -124,55 +124,61 @@ def judge(
         DataError: one is damaged.
         ConfigError: nothing is left to judge on, or runs that cannot be judged so.
     """
-    files = find_runs(runs)
+    predictors = _loaded(find_runs(runs), device)
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
-    predictors = {file: load(file, device=device) for file in files}
-    for file, one in predictors.items():
-        if one.result.gravity != "z":
-            raise ConfigError(
-                f"{file} was trained on clouds in the frame of their camera; the archive's have z "
-                "up, so it cannot be judged on them"
-            )
     common = _common([one.classes for one in predictors.values()], classes)
     names = [known_as(str(name), common) for name in archive.cls]
     kept = [i for i in chosen if names[i] is not None]
     if not kept:
         raise ConfigError(f"{data}: no object of {', '.join(common)} in what was asked for")
     truth = np.array([common.index(str(names[i])) for i in kept])
-    clouds = [archive.cloud(i, inliers_only) for i in kept]
-    said = [f"{data.name}[{i}]" for i in kept]
-    guesses: dict[Path, np.ndarray] = {}
-    with progress_bar("judging runs", total=len(files)) as advance:
-        for file, one in predictors.items():
-            wanted = [one.classes.index(name) for name in common]
-            every = list(range(len(one.classes)))
-            found = one(clouds, names=said).argmax(axis=1)
-            place = {label: wanted.index(label) if label in wanted else -1 for label in every}
-            guesses[file] = np.array([place[label] for label in found.tolist()])
-            advance()
-    blocks = archive.frame[kept] // BLOCK
-    tiers = archive.tier[kept]
+    blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
+    guesses = _guesses(predictors, archive, kept, inliers_only, common)
+    every = np.ones(len(kept), dtype=bool)
     families = []
-    for name, members, seeds in _families(files):
+    for name, members, seeds in _families(list(predictors)):
         picked = np.stack([guesses[file] for file in members])
         first = predictors[members[0]]
         figures = tuple(
             _figures(tier, picked[:, of], truth[of], blocks[of], common)
-            for tier, of in [("all", np.ones(len(kept), bool))]
-            + [(tier, tiers == tier) for tier in TIERS]
+            for tier, of in (("all", every), *((tier, tiers == tier) for tier in TIERS))
             if of.any()
         )
         families.append(Family(name, members, seeds, first.points, first.result.target, figures))
-    return Verdict(
-        data,
-        sha256_file(data),
-        part,
-        common,
-        len(chosen) - len(kept),
-        inliers_only,
-        tuple(families),
-    )
+    left_out = len(chosen) - len(kept)
+    return Verdict(data, sha256_file(data), part, common, left_out, inliers_only, tuple(families))
+
+
+def _loaded(files: Sequence[Path], device: str) -> dict[Path, Predictor]:
+    """The classifiers, all for clouds with z up."""
+    found = {file: load(file, device=device) for file in files}
+    for file, one in found.items():
+        if one.result.gravity != "z":
+            raise ConfigError(
+                f"{file} was trained on clouds in the frame of their camera; the archive's have z "
+                "up, so it cannot be judged on them"
+            )
+    return found
+
+
+def _guesses(
+    predictors: Mapping[Path, Predictor],
+    archive: Archive,
+    kept: Sequence[int],
+    inliers_only: bool,
+    common: Sequence[str],
+) -> dict[Path, np.ndarray]:
+    """What each run calls each object: a position in `common`, or -1 for another class."""
+    clouds = [archive.cloud(i, inliers_only) for i in kept]
+    said = [f"{archive.path.name}[{i}]" for i in kept]
+    found = {}
+    with progress_bar("judging runs", total=len(predictors)) as advance:
+        for file, one in predictors.items():
+            place = np.array([common.index(c) if c in common else -1 for c in one.classes])
+            found[file] = place[one(clouds, names=said).argmax(axis=1)]
+            advance()
+    return found
 
 
 def find_runs(runs: Sequence[str]) -> list[Path]:

@@ -9,7 +9,7 @@ from qs3.data.frames.cutting import Box, box_mask, cut
 from qs3.data.frames.images import DepthImage, Pinhole, upright
 from qs3.data.frames.nyuv2 import AREA
 from qs3.data.frames.outline import occlusion, rim
-from qs3.data.frames.parts_of import body, pieces
+from qs3.data.frames.pieces import body, pieces
 from qs3.data.frames.rules import Limits, Rules
 from qs3.errors import ConfigError, DataError
 from tests.fixtures.frame_files import Shot, Thing, kinect
