@@ -15,7 +15,7 @@ import numpy as np
 
 from qs3.errors import DataError, MissingDataError
 
-_MOST_V5_BYTES = 1 << 30
+_MOST_V5_BYTES = 1 << 28
 _MOST_WORDS = 1 << 17
 _MOST_LETTERS = 1 << 12
 AGAIN = "download it again"

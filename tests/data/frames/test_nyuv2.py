@@ -131,6 +131,27 @@ def test_an_interrupted_import_goes_on(nyuv2, tmp_path, monkeypatch):
     assert data.sha256 == other.sha256
 
 
+def test_other_settings_begin_anew(nyuv2, tmp_path, monkeypatch, caplog):
+    keys = {"paths.data_dir": str(nyuv2), "path": str(tmp_path / "store")}
+    labels = reader.LabelledFrames.labels
+
+    def stops(self, frame):
+        if frame == 6 and list(work.glob("*.npz")):
+            raise KeyboardInterrupt
+        return labels(self, frame)
+
+    work = tmp_path / ".store.parts" / "parts"
+    monkeypatch.setattr(reader.LabelledFrames, "labels", stops)
+    with pytest.raises(KeyboardInterrupt):
+        compose_domain("nyuv2", keys).open()
+    monkeypatch.undo()
+    other = {**keys, "published.tiers": "[clean]"}
+    with caplog.at_level("INFO"):
+        data = compose_domain("nyuv2", other).open()
+    assert "are cut anew" in caplog.text
+    assert len(data) == 8
+
+
 def test_other_processes_cut_the_same(opened, nyuv2, tmp_path):
     keys = {"paths.data_dir": str(nyuv2), "path": str(tmp_path / "two"), "published.workers": "1"}
     assert compose_domain("nyuv2", keys).open().sha256 == opened[1].sha256
