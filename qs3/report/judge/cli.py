@@ -51,7 +51,8 @@ JUDGE = Command(
     about="""
 Accuracy, balanced accuracy over the classes that are there, and the majority rate, for all objects
 and for the clean and the hard ones apart; and the recall of each class. Runs of one config that saw
-the same data are one row, averaged over their seeds.
+the same data are one row, averaged over their seeds. The other rows are compared with the first,
+paired object by object and seed by seed.
 
 Objects of one room are not independent: intervals take blocks of 30 frames in a row as clusters.
 Each cloud is thinned to the points that its run was trained with. The archive's arrays are in the

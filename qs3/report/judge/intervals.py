@@ -27,7 +27,7 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Share:
-    """A share of right predictions, in [0, 1].
+    """A share of right predictions, in [0, 1], or a difference of two, in [-1, 1].
 
     Attributes:
         mean: over seeds.
@@ -56,17 +56,49 @@ def share(
         blocks: cluster of each object, any numbers.
         balanced: mean of the recalls.
     """
-    hits = right.astype(float)
-    seeds, n = hits.shape
+    return _over(right.astype(float), labels, blocks, balanced, (0.0, 1.0))
+
+
+def difference(
+    a: Bool[np.ndarray, "s n"],
+    b: Bool[np.ndarray, "t n"],
+    labels: Int[np.ndarray, " n"],
+    blocks: Int[np.ndarray, " n"],
+    *,
+    balanced: bool = False,
+) -> Share:
+    """Share of a less that of b, paired: object by object, and seed by seed.
+
+    If they have not as many seeds each, their seeds are averaged first, and the interval is over
+    blocks alone: it then tells nothing of other seeds.
+
+    Args:
+        a, b: as in `share`; row k of both is of the same seed.
+        labels, blocks, balanced: as in `share`.
+    """
+    x, y = a.astype(float), b.astype(float)
+    if len(x) != len(y):
+        x, y = x.mean(axis=0, keepdims=True), y.mean(axis=0, keepdims=True)
+    return _over(x - y, labels, blocks, balanced, (-1.0, 1.0))
+
+
+def _over(
+    values: Float[np.ndarray, "s n"],
+    labels: Int[np.ndarray, " n"],
+    blocks: Int[np.ndarray, " n"],
+    balanced: bool,
+    ends: tuple[float, float],
+) -> Share:
+    """The weighted mean of each seed's and object's value, with its interval within `ends`."""
+    seeds, n = values.shape
     _, kind, counts = np.unique(labels, return_inverse=True, return_counts=True)
     if balanced:
         weights = 1 / (len(counts) * counts[kind])
-        recall = np.bincount(kind, hits.mean(axis=0)) / counts
-        expected = recall[kind]
+        expected = (np.bincount(kind, values.mean(axis=0)) / counts)[kind]
     else:
         weights = np.full(n, 1 / n)
-        expected = np.full(n, hits.mean())
-    each = hits @ weights
+        expected = np.full(n, values.mean())
+    each = values @ weights
     mean = float(each.mean())
     sem = float(each.std(ddof=1) / math.sqrt(seeds)) if seeds > 1 else None
     _, block = np.unique(blocks, return_inverse=True)
@@ -74,14 +106,14 @@ def share(
     if m < 2:
         return Share(mean, sem, None, None)
     cells = np.zeros((seeds, m))  # what each seed and block adds to the mean beyond its share
-    np.add.at(cells.T, block, ((hits - expected) * weights).T)
+    np.add.at(cells.T, block, ((values - expected) * weights).T)
     cells /= seeds
     half2 = _t2(m) * _variance(cells.sum(axis=0))
     if seeds > 1:
         of_blocks = max(0.0, _variance(cells.sum(axis=0)) - float((cells**2).sum()))
         half2 = _t2(seeds) * _variance(cells.sum(axis=1)) + _t2(m) * of_blocks
     half = math.sqrt(half2)
-    return Share(mean, sem, max(0.0, mean - half), min(1.0, mean + half))
+    return Share(mean, sem, max(ends[0], mean - half), min(ends[1], mean + half))
 
 
 def _t2(clusters: int) -> float:

@@ -20,7 +20,7 @@ from qs3.data.importers.object_archive import TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.model_file import FILE, find_result
 from qs3.inference.predictor import Predictor, load
-from qs3.report.judge.intervals import Share, share
+from qs3.report.judge.intervals import Share, difference, share
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import sha256_file
 from qs3.utils.progress import progress_bar
@@ -79,6 +79,25 @@ class Family:
 
 
 @dataclass(frozen=True)
+class Difference:
+    """One family less the first, on one tier.
+
+    Attributes:
+        name, base: of the two.
+        tier: of the objects.
+        seeds: that both have; below two the interval is over blocks alone.
+        accuracy, balanced: in [-1, 1].
+    """
+
+    name: str
+    base: str
+    tier: str
+    seeds: int
+    accuracy: Share
+    balanced: Share
+
+
+@dataclass(frozen=True)
 class Verdict:
     """All of it.
 
@@ -89,6 +108,7 @@ class Verdict:
         left_out: objects of other classes.
         inliers_only: whether stray points were left out.
         families: in the order of the runs given.
+        differences: of the others to the first of them.
     """
 
     data: Path
@@ -98,6 +118,7 @@ class Verdict:
     left_out: int
     inliers_only: bool
     families: tuple[Family, ...]
+    differences: tuple[Difference, ...]
 
 
 def judge(
@@ -136,18 +157,63 @@ def judge(
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
     guesses = _guesses(predictors, archive, kept, inliers_only, common)
     every = np.ones(len(kept), dtype=bool)
-    families = []
+    subsets = {"all": every, **{tier: tiers == tier for tier in TIERS if (tiers == tier).any()}}
+    families, differences = [], []
+    base: tuple[Family, np.ndarray] | None = None
     for name, members, seeds in _families(list(predictors)):
         picked = np.stack([guesses[file] for file in members])
         first = predictors[members[0]]
         figures = tuple(
             _figures(tier, picked[:, of], truth[of], blocks[of], common)
-            for tier, of in (("all", every), *((tier, tiers == tier) for tier in TIERS))
-            if of.any()
+            for tier, of in subsets.items()
         )
         families.append(Family(name, members, seeds, first.points, first.result.target, figures))
+        right = picked == truth
+        base = base or (families[0], right)
+        if len(families) > 1:
+            differences += _differences(families[-1], right, *base, truth, blocks, subsets)
     left_out = len(chosen) - len(kept)
-    return Verdict(data, sha256_file(data), part, common, left_out, inliers_only, tuple(families))
+    return Verdict(
+        data,
+        sha256_file(data),
+        part,
+        common,
+        left_out,
+        inliers_only,
+        tuple(families),
+        tuple(differences),
+    )
+
+
+def _differences(
+    family: Family,
+    right: np.ndarray,
+    base: Family,
+    base_right: np.ndarray,
+    truth: np.ndarray,
+    blocks: np.ndarray,
+    subsets: Mapping[str, np.ndarray],
+) -> list[Difference]:
+    """A family less the base on each tier, over the seeds that both have where there are any."""
+    common = sorted({*family.seeds} & {*base.seeds})
+    if common:
+        right = right[[family.seeds.index(seed) for seed in common]]
+        base_right = base_right[[base.seeds.index(seed) for seed in common]]
+    return [
+        Difference(
+            family.name,
+            base.name,
+            tier,
+            len(common),
+            *(
+                difference(
+                    right[:, of], base_right[:, of], truth[of], blocks[of], balanced=balanced
+                )
+                for balanced in (False, True)
+            ),
+        )
+        for tier, of in subsets.items()
+    ]
 
 
 def _loaded(files: Sequence[Path], device: str) -> dict[Path, Predictor]:

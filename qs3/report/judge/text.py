@@ -13,7 +13,7 @@ from qs3.utils.text_table import csv_text as csv_of
 
 
 def text(verdict: Verdict) -> str:
-    """Two tables: a row a family and tier, and a row a class."""
+    """Tables: a row a family and tier; differences to the first family; a row a class."""
     v = verdict
     rows = [["run", "seeds", "tier", "objects", "blocks", "accuracy %", "balanced %", "majority %"]]
     for family in v.families:
@@ -32,9 +32,24 @@ def text(verdict: Verdict) -> str:
         "Mean ± SEM over seeds; in brackets the interval at 95 %, with blocks of frames as clusters"
         " and, of several runs, seeds.",
     ]
+    if v.differences:
+        lines += ["", f"less {v.families[0].name}, paired object by object", *aligned(_less(v))]
+        if any(d.seeds < 2 for d in v.differences):
+            lines.append(
+                "(!) fewer than two common seeds: the interval is over blocks alone"
+            )
     if v.left_out:
         lines.append(f"{v.left_out} objects of other classes are left out.")
     return "\n".join([*lines, "", "recall %", *aligned(_classes(verdict), numbers=True)])
+
+
+def _less(verdict: Verdict) -> list[list[str]]:
+    """A row a difference."""
+    rows = [["run", "tier", "accuracy", "balanced"]]
+    for d in verdict.differences:
+        name = d.name + " (!)" * (d.seeds < 2)
+        rows.append([name, d.tier, _percent(d.accuracy, "+"), _percent(d.balanced, "+")])
+    return rows
 
 
 def _classes(verdict: Verdict) -> list[list[str]]:
@@ -78,7 +93,9 @@ def json_text(verdict: Verdict) -> str:
     return json.dumps(values, indent=1, allow_nan=False, ensure_ascii=False, default=str) + "\n"
 
 
-def _percent(share: Share) -> str:
+def _percent(share: Share, sign: str = "") -> str:
     sem = "" if share.sem is None else f" ± {100 * share.sem:.1f}"
-    ends = "" if share.low is None else f" [{100 * share.low:.1f}, {100 * (share.high or 0):.1f}]"
-    return f"{100 * share.mean:.1f}{sem}{ends}"
+    ends = ""
+    if share.low is not None and share.high is not None:
+        ends = f" [{100 * share.low:{sign}.1f}, {100 * share.high:{sign}.1f}]"
+    return f"{100 * share.mean:{sign}.1f}{sem}{ends}"

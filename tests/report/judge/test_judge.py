@@ -15,7 +15,7 @@ from qs3.errors import ConfigError, MissingDataError
 from qs3.inference.model_file import Result, write_result
 from qs3.inference.predictor import load
 from qs3.models.pointnet import pointnet
-from qs3.report.judge.intervals import share
+from qs3.report.judge.intervals import difference, share
 from qs3.report.judge.judging import find_runs, judge
 from tests.fixtures.frame_files import write_archive
 from tests.report.made_runs import write_run
@@ -150,6 +150,32 @@ def test_intervals_by_hand():
     assert found.low == pytest.approx(max(0, 5 / 8 - half))
     assert found.high == pytest.approx(min(1, 5 / 8 + half))
     assert share(right, labels, np.zeros(8)).low is None
+
+
+def test_differences_are_paired():
+    """Two rows that are right about other objects of the same rooms; and a row less itself."""
+    rng = np.random.default_rng(1)
+    labels, blocks = rng.integers(0, 3, 60), np.repeat(np.arange(12), 5)
+    a, b = rng.random((2, 60)) < 0.7, rng.random((2, 60)) < 0.5
+    for balanced in (False, True):
+        found = difference(a, b, labels, blocks, balanced=balanced)
+        alone = [share(x, labels, blocks, balanced=balanced).mean for x in (a, b)]
+        assert found.mean == pytest.approx(alone[0] - alone[1])
+        assert found.low < found.mean < found.high
+    same = difference(a, a, labels, blocks)
+    assert (same.mean, same.low, same.high) == (0, 0, 0)
+    assert difference(a, b[:1], labels, blocks).sem is None  # other numbers of seeds
+
+
+def test_the_others_are_compared_with_the_first(archive, logs):
+    verdict = judge([str(logs / "exp"), str(logs / "other")], archive)
+    first, other = (family.figures for family in verdict.families)
+    assert [d.tier for d in verdict.differences] == ["all", "clean", "hard"]
+    seed0 = judge([str(logs / "exp" / "seed0-0123abcd")], archive).families[0].figures
+    for d, theirs, ours in zip(verdict.differences, other, seed0, strict=True):
+        assert d.seeds == 1
+        assert d.accuracy.mean == pytest.approx(theirs.accuracy.mean - ours.accuracy.mean)
+    assert first[0].accuracy.sem is not None
 
 
 def test_balanced_takes_each_class_alike():
