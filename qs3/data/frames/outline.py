@@ -65,9 +65,11 @@ def occlusion(
         depth_m: of all; 0 is a hole.
         rules: reach and jump.
     """
-    edge = outline(mask)
-    if not edge.any() or not own.any():
+    if not mask.any() or not own.any():
         return 0.0
+    at = _around(mask, rules.reach_px + 1)
+    mask, own, depth_m = mask[at], own[at], depth_m[at]
+    edge = outline(mask)
     row, column = distance_transform_edt(~own, return_distances=False, return_indices=True)
     object_depth = depth_m[row, column][edge]
     outside = np.where(~mask & (depth_m > 0), depth_m, _FAR)
@@ -80,3 +82,12 @@ def occlusion(
     )[edge]
     jump = np.maximum(rules.jump_m, rules.jump_share * object_depth)
     return float((nearest < object_depth - jump).mean())
+
+
+def _around(mask: Bool[np.ndarray, "h w"], margin_px: int) -> tuple[slice, slice]:
+    """Rows and columns of the mask and so many more: most objects are a small part of a picture."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(int(rows[0]) - margin_px, 0), int(rows[-1]) + margin_px + 1),
+        slice(max(int(columns[0]) - margin_px, 0), int(columns[-1]) + margin_px + 1),
+    )

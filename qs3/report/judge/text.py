@@ -35,9 +35,7 @@ def text(verdict: Verdict) -> str:
     if v.differences:
         lines += ["", f"less {v.families[0].name}, paired object by object", *aligned(_less(v))]
         if any(d.seeds < 2 for d in v.differences):
-            lines.append(
-                "(!) fewer than two common seeds: the interval is over blocks alone"
-            )
+            lines.append("(!) fewer than two common seeds: the interval is over blocks alone")
     if v.left_out:
         lines.append(f"{v.left_out} objects of other classes are left out.")
     return "\n".join([*lines, "", "recall %", *aligned(_classes(verdict), numbers=True)])
