@@ -1,6 +1,7 @@
 """What counts as an object that can be used, and which of those are clean.
 
-The values and their reasons are in conf/cutting; the defaults here are the same.
+The values and their reasons are in conf/cutting; the defaults here are the same, without the limits
+of the ten classes.
 """
 
 from __future__ import annotations

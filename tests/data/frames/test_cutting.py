@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from qs3.classes import CLASSES
 from qs3.data.frames.cutting import Box, box_mask, cut
 from qs3.data.frames.images import DepthImage, Pinhole, upright
 from qs3.data.frames.nyuv2 import AREA
@@ -180,6 +181,12 @@ def test_outliers_are_flagged_or_dropped(rules):
     assert 0.9 < kept.inlier.mean() < 1
     np.testing.assert_array_equal(dropped.points_m, kept.points_m[kept.inlier])
     assert dropped.pixels == kept.pixels
+
+
+def test_the_defaults_are_those_of_the_config(rules):
+    assert dataclasses.replace(rules, limits={}) == Rules()
+    assert rules.limits_of("anything") == Limits()
+    assert set(rules.limits) == {"default", *CLASSES}
 
 
 def test_wrong_rules_and_images():
