@@ -6,8 +6,8 @@ import csv
 import dataclasses
 import hashlib
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,8 @@ class ManifestRow:
         status: "ok", or a word for what went wrong ("failed", "skipped").
         reason: why it is not ok; of one that is, what was left out of its file, if anything.
         index: row of the arrays; set by `write_pointset`, None if not ok.
+        more: further columns of this dataset alone, by header: sensor, tier, frame. A manifest
+            has them only if a row does, so others keep their bytes.
     """
 
     id: str
@@ -54,6 +56,7 @@ class ManifestRow:
     status: str = OK
     reason: str = ""
     index: int | None = None
+    more: Mapping[str, str] = field(default_factory=dict, hash=False)
 
 
 _COLUMNS = (
@@ -124,9 +127,11 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
 
 def to_csv(rows: Sequence[ManifestRow]) -> str:
     """The text of manifest.csv; line breaks inside a value become spaces."""
-    lines: list[Sequence[str]] = [_COLUMNS]
+    more = list(dict.fromkeys(header for row in rows for header in row.more))
+    lines: list[Sequence[str]] = [[*_COLUMNS, *more]]
     for row in rows:
-        values = [getattr(row, field) for field in _FIELDS]
+        values = [getattr(row, name) for name in _FIELDS]
+        values += [row.more.get(header) for header in more]
         lines.append(["" if v is None else " ".join(str(v).splitlines()) for v in values])
     return csv_text(lines)
 
@@ -136,18 +141,20 @@ def _from_csv(text: str, path: Path) -> list[ManifestRow]:
         header, *lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     except (csv.Error, ValueError) as error:
         raise DataError(f"{path} is empty or damaged ({error}); {AGAIN}") from error
-    if tuple(header) != _COLUMNS:
+    more = header[len(_COLUMNS) :]
+    if tuple(header[: len(_COLUMNS)]) != _COLUMNS or len({*header}) < len(header):
         raise DataError(f"{path}, line 1: the columns are not {', '.join(_COLUMNS)}")
     rows = []
     for number, values in enumerate(lines, start=2):
-        if len(values) != len(_COLUMNS):
-            raise DataError(f"{path}, line {number}: {len(values)} columns, not {len(_COLUMNS)}")
+        if len(values) != len(header):
+            raise DataError(f"{path}, line {number}: {len(values)} columns, not {len(header)}")
         fields: dict[str, Any] = {}
-        for field, value in zip(_FIELDS, values, strict=True):
+        for name, value in zip(_FIELDS, values, strict=False):
             try:
-                fields[field] = (int(value) if value else None) if field in _INTEGERS else value
+                fields[name] = (int(value) if value else None) if name in _INTEGERS else value
             except ValueError as error:
                 where = f"{path}, line {number}"
-                raise DataError(f"{where}: {field} is {value!r}, not a number") from error
-        rows.append(ManifestRow(**fields))
+                raise DataError(f"{where}: {name} is {value!r}, not a number") from error
+        further = zip(more, values[len(_COLUMNS) :], strict=True)
+        rows.append(ManifestRow(**fields, more={key: value for key, value in further if value}))
     return rows

@@ -299,6 +299,7 @@ REPORT = Group(
         "train": TRAIN,
         "compare": COMPARE,
         "effects": EFFECTS,
+        "judge": "qs3.report.judge.cli:JUDGE",
         "page": PAGE,
         "pictures": PICTURES,
         "pipeline": PIPELINE,

@@ -70,6 +70,9 @@ class Importer(abc.ABC):
     complete: ClassVar[bool] = True
     """Whether a class without clouds in a split means that something is wrong."""
 
+    made_of: ClassVar[str] = ""
+    """What its clouds are, where a name does not tell it; goes into the store's meta.yaml."""
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
         check_int("published.points", self.points, 1)
@@ -112,8 +115,15 @@ class Importer(abc.ABC):
         """[n, 3] as read to at most P points, for formats that allow more."""
         return cloud
 
-    def read(self, classes: Sequence[str]) -> tuple[list[np.ndarray], list[ManifestRow]]:
+    def read(
+        self, classes: Sequence[str], work: Path | None = None
+    ) -> tuple[list[np.ndarray], list[ManifestRow]]:
         """Read everything: [P, 3] float32 clouds with z up, and their rows and those skipped.
+
+        Args:
+            classes: the names in label order.
+            work: a folder in which an importer that takes minutes may keep what it has done, to
+                continue after an interruption; it is deleted when the store is finished.
 
         Raises:
             DataError: names the file, the line or item, and what is wrong; or one of the classes
@@ -167,8 +177,9 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
                 "to import the published files"
             )
         shutil.rmtree(building, ignore_errors=True)
+        work = folder.with_name(f".{folder.name}.parts")
         settings = importer.settings()
-        clouds, rows = importer.read(classes)
+        clouds, rows = importer.read(classes, work)
         if importer.settings() != settings:
             raise DataError(
                 f"files in {importer.root} were added, removed or changed while they were "
@@ -180,11 +191,13 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
             classes=classes,
             arrays={"points": clouds},
             rows=rows,
-            meta={"imported": settings},
+            meta={"imported": settings}
+            | ({"made_of": importer.made_of} if importer.made_of else {}),
         )
         if folder.is_dir():  # holds a lock at most
             shutil.rmtree(folder)
         os.rename(building, folder)
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def cloud_id(cls: str, split: str, name: str) -> str:

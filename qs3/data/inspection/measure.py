@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from qs3.data.inspection import gap, measures
+from qs3.data.inspection.columns import columns
 from qs3.data.inspection.gravity import judge_set
 from qs3.data.inspection.open_dataset import Opened
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
@@ -72,6 +73,7 @@ def inspect(opened: Opened, bounds: Bounds, advance: Advance = lambda: None) -> 
         },
         "spacing": measures.summary(values, measures.groups(data, chosen)),
         "copies": measures.copies(data, opened.rows),
+        "columns": columns(opened.rows, data.meta),
     }
 
 

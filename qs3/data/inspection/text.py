@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from qs3.data.inspection import columns
 from qs3.utils import text_table
 
 Numbers = dict[str, Any]
@@ -31,6 +32,7 @@ def of_domain(facts: Numbers) -> str:
                 f"{split}: {cls} is {most / sum(some.values()):.1%}, "
                 f"{most / min(some.values()):.1f} times the smallest class"
             )
+    parts += columns.text(facts["columns"])
     unit = "unit ball" if extents["in_unit_ball"] else "as stored"
     parts += [
         *_valid(facts["valid_points"]),

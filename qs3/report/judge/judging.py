@@ -1,0 +1,344 @@
+"""Runs, objects, predictions, figures: what `qs3 report judge` finds out.
+
+The archive is read by `qs3.data.importers.object_archive`; its clouds go to each run as those of
+`qs3 predict` do, thinned to the points that the run was trained with. Nothing is trained, chosen or
+tuned by what comes out.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from qs3.classes import known_as
+from qs3.data.importers.object_archive import TIERS, Archive, read_archive
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.inference.model_file import FILE, find_result
+from qs3.inference.predictor import Predictor, load
+from qs3.report.judge.intervals import Share, difference, share
+from qs3.runs.metrics import read_metrics
+from qs3.utils.files import sha256_file
+from qs3.utils.progress import progress_bar
+
+BLOCK = 30
+"""Frames in a row that make a cluster."""
+
+JUDGE = "judge"
+"""The part of an archive's `dev` that judges, if it has parts."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one family of runs on one tier of objects.
+
+    Attributes:
+        tier: "all", "clean" or "hard".
+        n, blocks: objects, and blocks of frames they come from.
+        accuracy, balanced: with their intervals; balanced over the classes that are there.
+        majority: what always naming the commonest class would reach.
+        counts: objects of each class that is there.
+        recall: of each of them, the mean over seeds.
+        predicted: objects called each class, the mean over seeds.
+    """
+
+    tier: str
+    n: int
+    blocks: int
+    accuracy: Share
+    balanced: Share
+    majority: float
+    counts: dict[str, int]
+    recall: dict[str, float]
+    predicted: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Family:
+    """Runs of one config, one a seed.
+
+    Attributes:
+        name: of the experiment with the config's hash, or the run's path.
+        runs: their result files.
+        seeds: theirs; empty where not known.
+        points: of a cloud as the nets see it.
+        target: what they were adapted to.
+        figures: by tier.
+    """
+
+    name: str
+    runs: tuple[Path, ...]
+    seeds: tuple[int, ...]
+    points: int
+    target: str
+    figures: tuple[Figures, ...]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One family less the first, on one tier.
+
+    Attributes:
+        name, base: of the two.
+        tier: of the objects.
+        seeds: that both have; below two the interval is over blocks alone.
+        accuracy, balanced: in [-1, 1].
+    """
+
+    name: str
+    base: str
+    tier: str
+    seeds: int
+    accuracy: Share
+    balanced: Share
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """All of it.
+
+    Attributes:
+        data, sha256: the archive.
+        part: of its `dev` that was judged on; "" for all.
+        classes: that were judged.
+        left_out: objects of other classes.
+        inliers_only: whether stray points were left out.
+        families: in the order of the runs given.
+        differences: of the others to the first of them.
+    """
+
+    data: Path
+    sha256: str
+    part: str
+    classes: tuple[str, ...]
+    left_out: int
+    inliers_only: bool
+    families: tuple[Family, ...]
+    differences: tuple[Difference, ...]
+
+
+def judge(
+    runs: Sequence[str],
+    data: Path,
+    *,
+    classes: Sequence[str] = (),
+    part: str = "",
+    inliers_only: bool = True,
+    device: str = "cpu",
+) -> Verdict:
+    """Judge saved runs on an archive of objects.
+
+    Args:
+        runs: folders of runs, folders of such folders, patterns, or result files.
+        data: the .npz.
+        classes: only objects of these; none: of all that every run knows.
+        part: of its `dev`; none: "judge", where it has one, else all.
+        inliers_only: leave points out that the archive marks as stray.
+        device: of the nets.
+
+    Raises:
+        MissingDataError: a run or the archive is not there.
+        DataError: one is damaged.
+        ConfigError: nothing is left to judge on, or runs that cannot be judged so.
+    """
+    predictors = _loaded(find_runs(runs), device)
+    archive = read_archive(data)
+    chosen, part = _chosen(archive, part)
+    common = _common([one.classes for one in predictors.values()], classes)
+    names = [known_as(str(name), common) for name in archive.cls]
+    kept = [i for i in chosen if names[i] is not None]
+    if not kept:
+        raise ConfigError(f"{data}: no object of {', '.join(common)} in what was asked for")
+    truth = np.array([common.index(str(names[i])) for i in kept])
+    blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
+    guesses = _guesses(predictors, archive, kept, inliers_only, common)
+    every = np.ones(len(kept), dtype=bool)
+    subsets = {"all": every, **{tier: tiers == tier for tier in TIERS if (tiers == tier).any()}}
+    families, differences = [], []
+    base: tuple[Family, np.ndarray] | None = None
+    for name, members, seeds in _families(list(predictors)):
+        picked = np.stack([guesses[file] for file in members])
+        first = predictors[members[0]]
+        figures = tuple(
+            _figures(tier, picked[:, of], truth[of], blocks[of], common)
+            for tier, of in subsets.items()
+        )
+        families.append(Family(name, members, seeds, first.points, first.result.target, figures))
+        right = picked == truth
+        base = base or (families[0], right)
+        if len(families) > 1:
+            differences += _differences(families[-1], right, *base, truth, blocks, subsets)
+    left_out = len(chosen) - len(kept)
+    return Verdict(
+        data,
+        sha256_file(data),
+        part,
+        common,
+        left_out,
+        inliers_only,
+        tuple(families),
+        tuple(differences),
+    )
+
+
+def _differences(
+    family: Family,
+    right: np.ndarray,
+    base: Family,
+    base_right: np.ndarray,
+    truth: np.ndarray,
+    blocks: np.ndarray,
+    subsets: Mapping[str, np.ndarray],
+) -> list[Difference]:
+    """A family less the base on each tier, over the seeds that both have where there are any."""
+    common = sorted({*family.seeds} & {*base.seeds})
+    if common:
+        right = right[[family.seeds.index(seed) for seed in common]]
+        base_right = base_right[[base.seeds.index(seed) for seed in common]]
+    return [
+        Difference(
+            family.name,
+            base.name,
+            tier,
+            len(common),
+            *(
+                difference(
+                    right[:, of], base_right[:, of], truth[of], blocks[of], balanced=balanced
+                )
+                for balanced in (False, True)
+            ),
+        )
+        for tier, of in subsets.items()
+    ]
+
+
+def _loaded(files: Sequence[Path], device: str) -> dict[Path, Predictor]:
+    """The classifiers, all for clouds with z up."""
+    found = {file: load(file, device=device) for file in files}
+    for file, one in found.items():
+        if one.result.gravity != "z":
+            raise ConfigError(
+                f"{file} was trained on clouds in the frame of their camera; the archive's have z "
+                "up, so it cannot be judged on them"
+            )
+    return found
+
+
+def _guesses(
+    predictors: Mapping[Path, Predictor],
+    archive: Archive,
+    kept: Sequence[int],
+    inliers_only: bool,
+    common: Sequence[str],
+) -> dict[Path, np.ndarray]:
+    """What each run calls each object: a position in `common`, or -1 for another class."""
+    clouds = [archive.cloud(i, inliers_only) for i in kept]
+    said = [f"{archive.path.name}[{i}]" for i in kept]
+    found = {}
+    with progress_bar("judging runs", total=len(predictors)) as advance:
+        for file, one in predictors.items():
+            place = np.array([common.index(c) if c in common else -1 for c in one.classes])
+            found[file] = place[one(clouds, names=said).argmax(axis=1)]
+            advance()
+    return found
+
+
+def find_runs(runs: Sequence[str]) -> list[Path]:
+    """The result files that are meant, each once, in order.
+
+    Raises:
+        MissingDataError: one is not there, or a folder holds none.
+    """
+    found: dict[Path, None] = {}
+    for words in runs:
+        places = [Path(words).expanduser()]
+        if not places[0].exists() and glob.has_magic(words):
+            places = sorted(map(Path, glob.glob(str(places[0]))))
+            if not places:
+                raise MissingDataError(f"runs={words} matches nothing")
+        for place in places:
+            below = sorted(place.rglob(FILE)) if place.is_dir() else []
+            for file in below or [find_result(place)]:
+                found.setdefault(file)
+    if not found:
+        raise ConfigError("runs= names no run; give folders of finished runs")
+    return list(found)
+
+
+def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[int, ...]]]:
+    """Name, files and seeds of the runs of each config that saw the same data.
+
+    Raises:
+        ConfigError: a seed is there twice.
+    """
+    members: dict[tuple[str, ...], dict[int, Path]] = {}
+    for file in files:
+        metrics = read_metrics(file.parent)
+        if metrics is None:
+            members[(str(file),)] = {-1: file}
+            continue
+        key = (metrics.experiment, metrics.hash, metrics.data.source, metrics.data.target)
+        of = members.setdefault(key, {})
+        if metrics.seed in of:
+            raise ConfigError(
+                f"{file.parent} and {of[metrics.seed].parent} are the same run twice; give one"
+            )
+        of[metrics.seed] = file
+    found = []
+    for words, of in members.items():
+        seeds = tuple(sorted(seed for seed in of if seed >= 0))
+        name = " ".join(words[:2])
+        found.append((name, tuple(of[seed] for seed in sorted(of)), seeds))
+    return found
+
+
+def _chosen(archive: Archive, part: str) -> tuple[list[int], str]:
+    """Positions of the objects of a part, and the part."""
+    parts = sorted({*archive.dev.tolist()} - {""})
+    if not part and JUDGE in parts:
+        part = JUDGE
+    if not part:
+        return list(range(len(archive))), ""
+    if part not in parts:
+        has = f"its parts are {', '.join(parts)}" if parts else "it has no parts"
+        raise ConfigError(f"part={part}: {archive.path} has none of that name; {has}")
+    return np.flatnonzero(archive.dev == part).tolist(), part
+
+
+def _common(of_runs: Sequence[tuple[str, ...]], wanted: Sequence[str]) -> tuple[str, ...]:
+    """The classes that every run knows, in the order of the first; those wanted alone."""
+    common = tuple(name for name in of_runs[0] if all(name in one for one in of_runs))
+    if unknown := [name for name in wanted if name not in common]:
+        raise ConfigError(
+            f"classes={','.join(unknown)}: not known to every run; those are {', '.join(common)}"
+        )
+    if not common:
+        raise DataError("the runs have no class in common")
+    return tuple(name for name in common if not wanted or name in wanted)
+
+
+def _figures(
+    tier: str,
+    guesses: Int[np.ndarray, "s n"],
+    truth: Int[np.ndarray, " n"],
+    blocks: Int[np.ndarray, " n"],
+    names: Sequence[str],
+) -> Figures:
+    right: Bool[np.ndarray, "s n"] = guesses == truth
+    counts = np.bincount(truth, minlength=len(names))
+    there = [k for k, count in enumerate(counts) if count]
+    return Figures(
+        tier,
+        len(truth),
+        len(np.unique(blocks)),
+        share(right, truth, blocks),
+        share(right, truth, blocks, balanced=True),
+        float(counts.max() / len(truth)),
+        {names[k]: int(counts[k]) for k in there},
+        {names[k]: float(right[:, truth == k].mean()) for k in there},
+        {names[k]: float((guesses == k).sum(axis=1).mean()) for k in range(len(names))},
+    )

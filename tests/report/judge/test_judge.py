@@ -1,0 +1,204 @@
+"""Runs judged on an archive: by hand, by family, by tier; intervals that take rooms together."""
+
+import csv
+import json
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.__main__ import QS3
+from qs3.classes import CLASSES
+from qs3.data.importers.object_archive import read_archive
+from qs3.errors import ConfigError, MissingDataError
+from qs3.inference.model_file import Result, write_result
+from qs3.inference.predictor import load
+from qs3.models.pointnet import pointnet
+from qs3.report.judge.intervals import difference, share
+from qs3.report.judge.judging import find_runs, judge
+from tests.fixtures.frame_files import write_archive
+from tests.report.made_runs import write_run
+
+MODEL = {"_target_": "qs3.models.pointnet.pointnet"}
+
+
+def add_net(folder, seed, *, classes=CLASSES, **changes):
+    """A run's result.pt of an untrained net; its last bias makes it name several classes."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        net = pointnet(num_classes=len(classes))
+    values = {
+        "model": {**MODEL, "num_classes": len(classes)}, "classes": tuple(classes),
+        "points": 64, "stored_points": 128, "target": "kinectsim10", "gravity": "z", "usual": {},
+        "weights": net.state_dict(),
+    }  # fmt: skip
+    write_result(folder / "result.pt", Result(**{**values, **changes}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("judge") / "held_back.npz"
+    write_archive(path, {"train": 1, "test": 5}, points=150)
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Two seeds of one config, and one of another."""
+    root = tmp_path_factory.mktemp("logs")
+    for seed in (0, 1):
+        add_net(write_run(root, seed=seed), seed)
+    add_net(write_run(root, experiment="other", hash="ffff0000"), 5)
+    return root
+
+
+def test_by_hand(archive, logs):
+    verdict = judge([str(logs / "exp")], archive)
+    (family,) = verdict.families
+    assert (family.name, family.seeds) == ("exp 0123abcd", (0, 1))
+    assert verdict.part == "judge"
+    held = read_archive(archive)
+    kept = np.flatnonzero(held.dev == "judge")
+    truth = np.array([CLASSES.index(name) for name in held.cls[kept]])
+    right = []
+    for file in family.runs:
+        found = load(file)([held.cloud(i, True) for i in kept]).argmax(1)
+        right.append(found == truth)
+    right = np.stack(right)
+    everything, *tiers = family.figures
+    assert (everything.n, everything.majority) == (50, 0.1)
+    assert everything.accuracy.mean == pytest.approx(right.mean())
+    per_seed = right.mean(axis=1)
+    assert everything.accuracy.sem == pytest.approx(per_seed.std(ddof=1) / np.sqrt(2))
+    for tier in tiers:
+        mine = held.tier[kept] == tier.tier
+        assert tier.n == mine.sum()
+        assert tier.accuracy.mean == pytest.approx(right[:, mine].mean())
+        recalls = [right[:, mine & (truth == k)].mean() for k in np.unique(truth[mine])]
+        assert tier.balanced.mean == pytest.approx(np.mean(recalls))
+    assert sum(tier.n for tier in tiers) == everything.n
+    assert sum(everything.predicted.values()) == pytest.approx(everything.n)
+
+
+def test_families_parts_and_classes(archive, logs):
+    verdict = judge([str(logs)], archive, part="adapt", classes=["chair", "sofa"])
+    assert [family.name for family in verdict.families] == ["exp 0123abcd", "other ffff0000"]
+    assert verdict.families[1].figures[0].accuracy.sem is None
+    assert verdict.families[0].figures[0].counts == {"chair": 1, "sofa": 1}
+    assert verdict.left_out == 8
+    with pytest.raises(ConfigError, match=r"part=x.*adapt, gap, judge"):
+        judge([str(logs)], archive, part="x")
+    with pytest.raises(ConfigError, match="throne"):
+        judge([str(logs)], archive, classes=["throne"])
+
+
+def test_runs_of_other_classes_are_judged_on_what_all_know(archive, logs, tmp_path):
+    few = add_net(tmp_path, 3, classes=("sofa", "chair", "bed"))
+    verdict = judge([str(logs / "other"), str(few)], archive)
+    assert verdict.classes == ("bed", "chair", "sofa")
+    assert {family.figures[0].n for family in verdict.families} == {15}
+    assert verdict.families[1].name == str(few / "result.pt")
+    camera = add_net(tmp_path, 3, gravity="none")
+    with pytest.raises(ConfigError, match="frame of their camera"):
+        judge([str(camera)], archive)
+
+
+def test_runs_are_found(logs, tmp_path):
+    assert len(find_runs([str(logs)])) == 3
+    assert len(find_runs([f"{logs}/exp/seed*", str(logs / "exp")])) == 2
+    for words in (str(tmp_path / "nothing"), f"{logs}/no*", str(tmp_path)):
+        with pytest.raises(MissingDataError):
+            find_runs([words])
+
+
+def test_the_same_run_twice(archive, logs, tmp_path):
+    import shutil
+
+    (run,) = (logs / "other").iterdir()
+    shutil.copytree(run, tmp_path / run.name)
+    with pytest.raises(ConfigError, match="the same run twice"):
+        judge([str(run), str(tmp_path)], archive)
+
+
+def test_command(archive, logs, tmp_path, capsys):
+    words = ["report", "judge", f"runs={logs}", f"data={archive}"]
+    assert QS3([*words, f"out={tmp_path}/judged.csv"]) == 0
+    said = capsys.readouterr().out
+    assert "real objects" in said
+    assert "exp 0123abcd" in said
+    assert "hard" in said
+    rows = list(csv.DictReader((tmp_path / "judged.csv").read_text().splitlines()))
+    assert [row["tier"] for row in rows] == ["all", "clean", "hard"] * 2
+    assert rows[0]["objects_chair"] == "5"
+    assert QS3([*words, f"out={tmp_path}/judged.json"]) == 0
+    found = json.loads((tmp_path / "judged.json").read_text())
+    assert found["families"][0]["figures"][0]["accuracy"]["mean"] == float(rows[0]["accuracy"])
+    with pytest.raises(ConfigError, match=r"\.csv or \.json"):
+        QS3([*words, "out=x.txt"])
+
+
+def test_intervals_by_hand():
+    """One seed, two objects a block: the variance of four sums, by Student with 3 degrees."""
+    right = np.array([[1, 1, 1, 0, 0, 0, 1, 1]], dtype=bool)
+    labels, blocks = np.zeros(8, int), np.repeat(np.arange(4), 2)
+    found = share(right, labels, blocks)
+    sums = np.array([3 / 4, -1 / 4, -5 / 4, 3 / 4]) / 8  # about the mean 5/8
+    half = 3.182446 * np.sqrt((sums**2).sum() * 4 / 3)
+    assert found.mean == 5 / 8
+    assert found.low == pytest.approx(max(0, 5 / 8 - half))
+    assert found.high == pytest.approx(min(1, 5 / 8 + half))
+    assert share(right, labels, np.zeros(8)).low is None
+
+
+def test_differences_are_paired():
+    """Two rows that are right about other objects of the same rooms; and a row less itself."""
+    rng = np.random.default_rng(1)
+    labels, blocks = rng.integers(0, 3, 60), np.repeat(np.arange(12), 5)
+    a, b = rng.random((2, 60)) < 0.7, rng.random((2, 60)) < 0.5
+    for balanced in (False, True):
+        found = difference(a, b, labels, blocks, balanced=balanced)
+        alone = [share(x, labels, blocks, balanced=balanced).mean for x in (a, b)]
+        assert found.mean == pytest.approx(alone[0] - alone[1])
+        assert found.low < found.mean < found.high
+    same = difference(a, a, labels, blocks)
+    assert (same.mean, same.low, same.high) == (0, 0, 0)
+    assert difference(a, b[:1], labels, blocks).sem is None  # other numbers of seeds
+
+
+def test_the_others_are_compared_with_the_first(archive, logs):
+    verdict = judge([str(logs / "exp"), str(logs / "other")], archive)
+    first, other = (family.figures for family in verdict.families)
+    assert [d.tier for d in verdict.differences] == ["all", "clean", "hard"]
+    seed0 = judge([str(logs / "exp" / "seed0-0123abcd")], archive).families[0].figures
+    for d, theirs, ours in zip(verdict.differences, other, seed0, strict=True):
+        assert d.seeds == 1
+        assert d.accuracy.mean == pytest.approx(theirs.accuracy.mean - ours.accuracy.mean)
+    assert first[0].accuracy.sem is not None
+
+
+def test_balanced_takes_each_class_alike():
+    right = np.array([[1, 1, 1, 1, 1, 1, 0, 0]], dtype=bool)
+    labels = np.array([0, 0, 0, 0, 0, 0, 3, 3])
+    exact = share(right, labels, np.arange(8), balanced=True)
+    # every recall is 0 or 1 in every room
+    assert (exact.mean, exact.low, exact.high) == pytest.approx((0.5, 0.5, 0.5))
+
+
+def test_intervals_cover_and_rooms_widen_them():
+    """Rooms are easy or hard as a whole; about 95 % of the intervals hold the truth."""
+    rng = np.random.default_rng(0)
+    inside, wider = 0, 0
+    blocks = np.repeat(np.arange(30), 6)
+    for _ in range(400):
+        easy = rng.random(30) < 0.5
+        p = np.where(easy[blocks], 0.9, 0.3)
+        right = rng.random((1, 180)) < p
+        labels = rng.integers(0, 3, 180)
+        judged = partial(share, right, labels)
+        found, alone = judged(blocks), judged(np.arange(180))
+        inside += found.low <= 0.6 <= found.high
+        wider += found.high - found.low > alone.high - alone.low
+    assert 0.9 < inside / 400 < 0.98
+    assert wider > 380
