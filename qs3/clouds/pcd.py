@@ -35,8 +35,8 @@ class PcdCloud:
     """Positions as the file has them.
 
     Attributes:
-        fields: "x", "y" and "z", as far as the file has them: [N] in its type and unit, N = width
-            * height, row-major. No measurement is NaN.
+        fields: "x", "y", "z" and "label", as far as the file has them: [N] in its type and unit,
+            N = width * height, row-major. No measurement is NaN.
         width, height: of the depth image in an organised cloud; height is 1 in any other.
     """
 
@@ -56,7 +56,7 @@ class PcdCloud:
         return np.stack([self.fields[axis] for axis in _AXES], axis=1).astype(np.float64)
 
     def image(self, name: str) -> np.ndarray:
-        """[height, width] x, y or z of an organised cloud.
+        """[height, width] one field of an organised cloud.
 
         Raises:
             DataError: the cloud is not an image, or has no such field.
@@ -80,7 +80,7 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Header:
-    """`fields` are x, y and z; a point has `numbers` numbers in `point_bytes` bytes."""
+    """`fields` are those that are read; a point has `numbers` numbers in `point_bytes` bytes."""
 
     fields: tuple[_Field, ...]
     numbers: int
@@ -169,7 +169,7 @@ def _parse_header(data: bytes) -> tuple[_Header, int]:
 
 
 def _fields(entries: dict[str, list[str]]) -> tuple[tuple[_Field, ...], int, int]:
-    """x, y and z; numbers and bytes of a point."""
+    """The fields that are read; numbers and bytes of a point."""
     names, kinds = entries.get("FIELDS", []), entries.get("TYPE", [])
     if not names:
         raise DataError("has no fields")
@@ -186,7 +186,7 @@ def _fields(entries: dict[str, list[str]]) -> tuple[tuple[_Field, ...], int, int
             raise DataError(f"has a field {name!r} with a COUNT of {count}")
         if name in fields:
             raise DataError(f"has two fields called {name!r}")
-        if name in _AXES:
+        if name in _AXES or (name == "label" and count == 1):
             fields[name] = _Field(name, np.dtype(f"<{_KINDS[kind]}{size}"), numbers, offset)
         numbers, offset = numbers + count, offset + count * size
     return tuple(fields.values()), numbers, offset
