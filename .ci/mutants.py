@@ -1,7 +1,8 @@
 """How strong the tests are: faults put into the code one at a time, and whether a test fails.
 
-    python .ci/mutants.py .ci/mutants.toml out/mutants.csv          # all that the file names
-    python .ci/mutants.py .ci/mutants.toml out/mutants.csv store    # only targets named so
+    python .ci/mutants.py .ci/mutants.toml TABLE.csv          # all that the file names
+    python .ci/mutants.py .ci/mutants.toml TABLE.csv store    # only targets named so
+    python .ci/mutants.py .ci/mutants.toml TABLE.csv again    # survivors, too: tests were added
 
 The faults ("mutants") are those of cosmic-ray's operators: other comparisons, arithmetic, numbers
 and booleans, `and` for `or`, a removed `not`, decorator or loop, other exceptions. Those in type
@@ -10,13 +11,16 @@ alone, so a mutant that only a distant test would notice counts as alive.
 
 cosmic-ray's own runner starts Python and imports torch anew for every mutant. Here a worker has
 the large libraries loaded, works on a copy of the tracked files, and forks a child for each
-mutant. Results are appended as they come: a second call goes on where the first one stopped.
+mutant. Results are appended as they come: a second call goes on where the first one stopped, and
+those of a module that was changed since are taken out.
 """
 
 from __future__ import annotations
 
 import ast
 import csv
+import gc
+import hashlib
 import importlib
 import os
 import random
@@ -44,13 +48,16 @@ WORKERS = int(os.environ.get("WORKERS", "2"))
 LIBRARIES = [
     *("numpy", "scipy.spatial", "torch", "torch.utils.data", "torch._dynamo", "lightning", "hydra"),
     *("omegaconf", "pydantic", "rich.progress", "h5py", "cv2", "pytest", "trimesh", "filelock"),
-    *("matplotlib.pyplot", "torchmetrics", "fpsample"),
+    *("matplotlib.pyplot", "torchmetrics", "fpsample", "hypothesis.strategies", "jaxtyping"),
 ]
 OPTIONS = [
     *("-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"),
+    "--hypothesis-profile=mutants",
     *("-W", "ignore::pytest.PytestAssertRewriteWarning"),  # of plugins that are loaded already
 ]
-FIELDS = ["target", "module", "operator", "occurrence", "line", "outcome", "seconds", "change"]
+ALIVE = "survived"
+KEY = ("module", "version", "operator", "occurrence")
+FIELDS = ["target", "module", "version", "operator", "occurrence", "line", "outcome", "change"]
 
 
 @dataclass(frozen=True)
@@ -59,14 +66,15 @@ class Mutant:
 
     target: str
     module: str
+    version: str  # of the module: how its SHA-256 begins
     operator: str
     occurrence: int
     line: int
 
     @property
-    def key(self) -> tuple[str, str, int]:
+    def key(self) -> tuple[str, ...]:
         """What tells it from the others."""
-        return self.module, self.operator, self.occurrence
+        return tuple(str(getattr(self, name)) for name in KEY)
 
 
 def annotated_spans(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -84,7 +92,7 @@ def mutants(root: Path, target: str, module: str) -> Iterator[Mutant]:
     """All mutants of a module, those in annotations left out."""
     source = (root / module).read_text()
     spans = annotated_spans(source)
-    tree = get_ast(source)
+    tree, version = get_ast(source), hashlib.sha256(source.encode()).hexdigest()[:12]
     for name in sorted(operator_names()):
         kind = get_operator(name)
         if kind.arguments():
@@ -93,7 +101,7 @@ def mutants(root: Path, target: str, module: str) -> Iterator[Mutant]:
         places = [place for node in ast_nodes(tree) for place in operator.mutation_positions(node)]
         for occurrence, (start, _) in enumerate(places):
             if not any(first <= tuple(start) < last for first, last in spans):
-                yield Mutant(target, module, name, occurrence, start[0])
+                yield Mutant(target, module, version, name, occurrence, start[0])
 
 
 def chosen(root: Path, targets: dict[str, Any], names: list[str]) -> list[tuple[Mutant, list[str]]]:
@@ -144,7 +152,7 @@ def run_tests(copy: Path, tests: list[str], limit: float, log: Path) -> tuple[st
         if pid:
             code = os.waitstatus_to_exitcode(status)
             kill_group(child)
-            return "survived" if code == 0 else "killed", time.monotonic() - start
+            return ALIVE if code == 0 else "killed", time.monotonic() - start
         time.sleep(0.02)
     kill_group(child)
     os.waitpid(child, 0)
@@ -172,6 +180,14 @@ def work(root: Path, number: int, jobs: Any, results: Any) -> None:
     sys.path.insert(0, str(copy))
     for name in LIBRARIES:
         importlib.import_module(name)
+    from hypothesis import Phase, settings
+
+    phases = (Phase.explicit, Phase.generate)  # a counterexample is enough, it need not be small
+    settings.register_profile(
+        "mutants", deadline=None, derandomize=True, database=None, phases=phases
+    )
+    gc.collect()
+    gc.freeze()  # a collection in a child would touch, and so copy, all of it: twice the time
     limits: dict[tuple[str, ...], float] = {}
     log = copy.parent / "log.txt"
     while (job := jobs.get()) is not None:
@@ -181,7 +197,7 @@ def work(root: Path, number: int, jobs: Any, results: Any) -> None:
         if tuple(tests) not in limits:
             sys.dont_write_bytecode = False
             outcome, seconds = run_tests(copy, tests, 3600, log)
-            if outcome != "survived":
+            if outcome != ALIVE:
                 raise SystemExit(
                     f"The tests fail without a mutant: {tests}\n{log.read_text()[-3000:]}"
                 )
@@ -191,17 +207,17 @@ def work(root: Path, number: int, jobs: Any, results: Any) -> None:
         for cached in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
             cached.unlink()
         if changed is None or changed == source:
-            results.put((mutant, "none", 0.0, ""))
+            results.put((mutant, "none", ""))
             continue
         path.write_text(changed)
         try:
-            outcome, seconds = run_tests(copy, tests, limits[tuple(tests)], log)
+            outcome, _ = run_tests(copy, tests, limits[tuple(tests)], log)
         finally:
             path.write_text(source)
         before, after = source.splitlines(), changed.splitlines()
         same = next((i for i, (a, b) in enumerate(zip(before, after, strict=False)) if a != b), 0)
         line = f"{before[same].strip()}  ->  {after[same].strip() if same < len(after) else ''}"
-        results.put((mutant, outcome, seconds, line))
+        results.put((mutant, outcome, line))
         for left in copy.parent.glob("pytest-of-*"):
             shutil.rmtree(left, ignore_errors=True)
     shutil.rmtree(copy.parent, ignore_errors=True)
@@ -222,40 +238,54 @@ def summary(rows: list[dict[str, str]]) -> str:
     return "\n".join(lines)
 
 
+def still_true(
+    there: list[dict[str, str]], mutants: list[Mutant], again: bool
+) -> list[dict[str, str]]:
+    """Earlier results, without those of changed modules (and of survivors, to try them again)."""
+    targets = {mutant.target for mutant in mutants}
+    versions = {(mutant.module, mutant.version) for mutant in mutants}
+    return [
+        row
+        for row in there
+        if row["target"] not in targets
+        or ((row["module"], row["version"]) in versions and not (again and row["outcome"] == ALIVE))
+    ]
+
+
 def main(targets_file: str, out: str, *names: str) -> None:
     """Try what has not been tried yet, and print the table."""
     root = Path(os.environ.get("MUTANTS_ROOT", Path(__file__).parents[1])).resolve()
     targets = tomllib.loads(Path(targets_file).read_text())
+    jobs = chosen(root, targets, [name for name in names if name != "again"])
     table = Path(out)
     table.parent.mkdir(parents=True, exist_ok=True)
-    begun = table.exists()
-    rows = list(csv.DictReader(table.open())) if begun else []
-    done = {(row["module"], row["operator"], int(row["occurrence"])) for row in rows}
-    wanted = [job for job in chosen(root, targets, list(names)) if job[0].key not in done]
+    there = list(csv.DictReader(table.open())) if table.exists() else []
+    rows = still_true(there, [mutant for mutant, _ in jobs], again="again" in names)
+    done = {tuple(row[name] for name in KEY) for row in rows}
+    wanted = [job for job in jobs if job[0].key not in done]
     context = get_context("fork")
-    jobs, results = context.Queue(), context.Queue()
+    queue, results = context.Queue(), context.Queue()
     for job in [*wanted, *[None] * WORKERS]:
-        jobs.put(job)
+        queue.put(job)
     workers = [
-        context.Process(target=work, args=(root, number, jobs, results))
+        context.Process(target=work, args=(root, number, queue, results))
         for number in range(WORKERS)
     ]
     for worker in workers:
         worker.start()
-    with table.open("a", newline="") as stream:
+    with table.open("w", newline="") as stream:
         writer = csv.DictWriter(stream, FIELDS, lineterminator="\n")
-        if not begun:
-            writer.writeheader()
+        writer.writeheader()
+        writer.writerows(rows)
         for number in range(1, len(wanted) + 1):
             while results.empty():
                 if any(worker.exitcode for worker in workers):
                     raise SystemExit("A worker failed; what it printed stands above.")
                 time.sleep(0.05)
-            mutant, outcome, seconds, change = results.get()
-            row = {**asdict(mutant), "outcome": outcome, "seconds": f"{seconds:.1f}"}
-            writer.writerow(row | {"change": change})
+            mutant, outcome, change = results.get()
+            rows.append({**asdict(mutant), "outcome": outcome, "change": change})
+            writer.writerow(rows[-1])
             stream.flush()
-            rows.append({k: str(v) for k, v in row.items()})
             if number % 25 == 0:
                 print(f"{number} of {len(wanted)}", file=sys.stderr, flush=True)
     print(summary(rows))

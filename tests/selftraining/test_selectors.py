@@ -1,13 +1,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import FrozenInstanceError, replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from qs3.errors import ConfigError, SelectionError
-from qs3.selftraining.selectors import Qbst, TeacherPredictions, check_selection
+from qs3.selftraining.selectors import (
+    Qbst,
+    Selection,
+    Spst,
+    TeacherPredictions,
+    check_selection,
+)
 
 # Worked by hand for theta = 0.8. Confident: class 0: a b c d e (5), class 1: g h (2),
 # class 2: j (1); n = 8, mu = 3/8, 6/8, 7/8; quotas ceil(15/8) = 2, ceil(12/8) = 2, ceil(7/8) = 1.
@@ -84,6 +91,33 @@ def test_nothing_confident_is_an_error_with_counts():
     selection, _ = select(TABLE, theta=0.995)
     with pytest.raises(SelectionError, match=r"only 0 .*theta=0\.995.*x 0/0.*lower selftraining"):
         check_selection(selection, ("x", "y", "z"), 0, "warn")
+
+
+@pytest.mark.parametrize(
+    ("confident", "advice"),
+    [([1, 0, 0], "of one class"), ([0, 9, 0], "of one class"), ([1, 1, 0], "lower selftraining")],
+)
+def test_two_pseudo_labels_are_the_least(confident, advice):
+    def chosen(kept):
+        return Selection(np.ones(1, bool), 0.8, np.zeros(3), np.array(confident), np.array(kept))
+
+    assert check_selection(chosen([1, 1, 0]), ("x", "y", "z"), 0, "warn") == ["z"]
+    with pytest.raises(SelectionError, match=f"only 1 .*{advice}"):
+        check_selection(chosen([1, 0, 0]), ("x", "y", "z"), 0, "warn")
+    with pytest.raises(ValueError, match="zip"):
+        check_selection(chosen([1, 1, 0]), ("x", "y"), 0, "warn")
+    one_short = replace(chosen([1, 1, 0]), confident=np.array([1, 1]))
+    with pytest.raises(ValueError, match="zip"):
+        check_selection(one_short, ("x", "y", "z"), 0, "warn")
+
+
+def test_predictions_selections_and_rules_cannot_be_changed():
+    selection, _ = select(TABLE)
+    teacher = TeacherPredictions(["a"], np.array([0.9]), np.array([0]), 1)
+    for made, key in ((selection, "theta"), (teacher, "classes"), (Qbst(), "mu"), (Spst(), "pace")):
+        with pytest.raises(FrozenInstanceError):
+            setattr(made, key, 1)
+    assert len({selection, teacher}) == 2  # told apart as objects: arrays have no truth
 
 
 def test_missing_class():
