@@ -15,7 +15,6 @@ from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
 
 _KEYS = ("points", "cls", "split", "name")
-_MAX_BYTES = 8 << 30
 
 
 @dataclass(frozen=True)
@@ -54,21 +53,35 @@ class NamedArrays(Importer):
         return by_class(found, classes)
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The four arrays; DataError if damaged, pickled, too large, missing or of another shape."""
+def plain_arrays(
+    path: Path, required: Sequence[str], optional: Sequence[str] = (), most_bytes: int = 8 << 30
+) -> dict[str, np.ndarray]:
+    """Some arrays of an .npz; nothing in it is unpickled.
+
+    Raises:
+        DataError: damaged, pickled, too large, an array missing, or a single value for one.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(info.file_size for info in archive.infolist())
-        if size > _MAX_BYTES:
-            raise DataError(f"{path} unpacks to {size} bytes, more than {_MAX_BYTES}")
+        if size > most_bytes:
+            raise DataError(f"{path} unpacks to {size} bytes, more than {most_bytes}")
         with np.load(path, allow_pickle=False) as file:
-            if missing := [key for key in _KEYS if key not in file.files]:
+            if missing := [key for key in required if key not in file.files]:
                 raise DataError(f"{path} has no arrays {missing}; it has {file.files}")
-            arrays = {key: file[key] for key in _KEYS}
+            arrays = {key: file[key] for key in (*required, *optional) if key in file.files}
     except DataError:
         raise
     except Exception as error:  # BadZipFile, zlib.error, pickled content, unknown compression ...
         raise DataError(f"{path}: not a readable .npz of plain arrays ({error})") from error
+    if single := [key for key, array in arrays.items() if array.ndim == 0]:
+        raise DataError(f"{path}: {', '.join(single)} is a single value, not an array")
+    return arrays
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The four arrays; DataError if damaged, pickled, too large, missing or of another shape."""
+    arrays = plain_arrays(path, _KEYS)
     points = arrays["points"]
     if points.ndim != 3 or points.shape[2] != 3 or points.dtype.kind != "f":
         raise DataError(f"{path}: points is {points.dtype} {points.shape}, not floats [N, P, 3]")

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import zipfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qs3.config.checks import check_bool, check_int
+from qs3.data.importers.arrays import plain_arrays
 from qs3.data.importers.base import Importer, Item, class_of
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError, MissingDataError
@@ -36,8 +36,8 @@ log = logging.getLogger(__name__)
 
 TIERS = ("clean", "hard")
 
-_MAX_BYTES = 4 << 30
 _METRES = 1e-4
+_MAX_BYTES = 4 << 30
 _KINDS = {
     "xyz_tenth_mm": ("i", "[P, 3] of int16"),
     "centre_m": ("f", "[N, 3] of numbers"),
@@ -50,6 +50,7 @@ _KINDS = {
     "dev": ("U", "[N] of text"),
 }
 _OPTIONAL = ("inlier", "sub", "dev")
+_REQUIRED = tuple(key for key in _KINDS if key not in _OPTIONAL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +138,7 @@ class ObjectArchive(Importer):
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""
-        needed = [key for key in _KINDS if key not in _OPTIONAL]
-        return [f"{self.path}   (arrays {', '.join(needed)}; published.file=PATH)"]
+        return [f"{self.path}   (arrays {', '.join(_REQUIRED)}; published.file=PATH)"]
 
     def is_there(self) -> bool:
         """See `Importer`."""
@@ -243,20 +243,7 @@ def read_archive(path: Path) -> Archive:
     """
     if not path.is_file():
         raise MissingDataError(f"there is no {path}")
-    try:
-        with zipfile.ZipFile(path) as zipped:
-            size = sum(info.file_size for info in zipped.infolist())
-        if size > _MAX_BYTES:
-            raise DataError(f"{path} unpacks to {size} bytes, more than {_MAX_BYTES}")
-        with np.load(path, allow_pickle=False) as file:
-            missing = [key for key in _KINDS if key not in file.files and key not in _OPTIONAL]
-            if missing:
-                raise DataError(f"{path} has no arrays {missing}; it has {file.files}")
-            found = {key: file[key] for key in _KINDS if key in file.files}
-    except DataError:
-        raise
-    except Exception as error:  # zlib.error, BadZipFile, ValueError for pickles, ...
-        raise DataError(f"{path}: not a readable .npz of plain arrays ({error})") from error
+    found = plain_arrays(path, _REQUIRED, _OPTIONAL, _MAX_BYTES)
     n, p = len(found["cls"]), len(found["xyz_tenth_mm"])
     shapes = {"xyz_tenth_mm": (p, 3), "centre_m": (n, 3), "start": (n + 1,), "inlier": (p,)}
     for key, array in found.items():
