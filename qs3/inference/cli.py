@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from qs3.utils.cli import Command, Option, text, whole
+from qs3.utils.cli import FLAG, NUMBER, Command, Option, text, whole
 
 _CKPT = Option("ckpt", text("RUN"), "a finished run's folder, or its result.pt", required=True)
 _THREADS = Option("threads", whole(), "batches at the same time (default: one a processor)")
@@ -31,35 +31,56 @@ def _processors() -> int:
 
 PREDICT = Command(
     "qs3 predict",
-    "what a trained classifier says of your clouds",
+    "what a trained classifier says of your clouds, or of objects in your depth images",
     _predict,
     (
         _CKPT,
-        Option("input", text("PATH"), "a file of clouds, or a folder of them", required=True),
+        Option("input", text("PATH"), "clouds: a file, a folder, or an archive of objects", ""),
+        Option("depth", text("PATH"), "or depth images: a .png or .npy, a folder, or a list", ""),
+        Option("mask", text("PATH"), "image of objects' numbers; a folder if depth is one", ""),
+        Option("box", text("L,T,R,B"), "or the object's left,top,right,bottom in pixels", ""),
+        Option("intrinsics", text("F,F,C,C|FILE"), "of the depth camera: fx,fy,cx,cy", ""),
+        Option("depth_scale", NUMBER, "metres a unit (default: 0.001; 1 of floats)"),
+        Option("up", text("AXIS|X,Y,Z"), "clouds: x y z -x -y or -z; depth: see below", ""),
+        Option("part", text("NAME"), "of an archive of objects: this part alone", ""),
+        Option("sample", whole(), "only so many, drawn at random, always the same ones"),
         Option("out", text("FILE"), ".csv or .json", "predictions.csv"),
-        Option("up", text("AXIS"), "which points up in your files: x y z -x -y -z", "z"),
+        Option("page", FLAG, "also a page with pictures, FILE.html", True),
         Option("batch_size", whole(), "clouds that the net sees at a time", 16),
         _THREADS,
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
     ),
     (
         "qs3 predict ckpt=logs/own_scans/seed0-5f0c2a71 input=scans",
-        "qs3 predict ckpt=result.pt input=scans out=predictions.json up=y device=cuda",
+        "qs3 predict ckpt=RUN depth=frame.png mask=mask.png intrinsics=525,525,319.5,239.5",
+        "qs3 predict ckpt=RUN depth=a.npy box=210,95,480,430 intrinsics=cam.yaml up=0,-0.97,-0.24",
+        "qs3 predict ckpt=result.pt depth=objects.csv intrinsics=camera.json out=said.json",
     ),
     about="""
-Clouds are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of points,
-any unit, any place. Other files are passed over. Which way is up is not guessed, and the wrong axis
-costs most of the accuracy.
+CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of points,
+any unit, any place. Other files are passed over. Which way is up is not guessed (default z), and
+the wrong axis costs most of the accuracy. Labels: the file's own, or a folder called as a class.
 
-A row for each cloud: file (name[3] is cloud 3 of a file that holds several), status, class,
-confidence, points, dropped, out_of_range, reason, and p_<class>, a probability for each class.
-Points that are NaN or infinite are left out: dropped counts them, points the others.
+DEPTH IMAGES are .png of 16 bits, in millimetres, or .npy; 0 is not measured. A mask has 0 where no
+object is and a number for each object. A list is .csv, .json or .yaml with a row an object or a
+picture: depth, mask, object (number in the mask), box, intrinsics, up, depth_scale, label; files
+are relative to it, and what is empty holds as given here. up=x,y,z is up in the camera's frame (x
+right, y down, z forward), at any length: what an accelerometer at rest reads, in these axes. -y is
+a level camera. Without it up is fitted to the planes of the picture, else the camera counts as
+level; the column up says which.
+
+A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status, class,
+confidence, label, points, dropped, tier, caution, up, out_of_range, reason, and p_<class>, a
+probability for each class. dropped counts points that are NaN or infinite, and pixels of an object
+without depth. tier is clean, hard, or poor (what datasets leave out), and caution says why: cut off
+by the picture, covered, few pixels.
 
 out_of_range=yes: a cloud unlike all those of training (fewer points than the net samples and than
 training had; spacing, flatness, height or stray points outside what 99.8 % of them had); the reason
 says in what. It guarantees nothing: an object of no known class also gets a class, often with high
 confidence.
 
+The page shows the objects: with labels the errors first, the most confident before the others.
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.
 """,
     interrupted="nothing was saved",

@@ -1,9 +1,7 @@
-"""Files in, a table out: read, prepare, predict in batches, save."""
+"""Clouds or depth images in, a table and a page out: read, prepare, predict in batches, save."""
 
 from __future__ import annotations
 
-import json
-import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,22 +13,30 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from qs3.clouds.files import SUFFIXES, measured, parse_clouds, printable
 from qs3.config.checks import check_choice
+from qs3.data.frames.pointed import LEVEL, PLANES
 from qs3.data.importers.folders import UP_AXES
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, DataError
+from qs3.inference.depth_list import Shown, direction, find_shown, numbers
+from qs3.inference.inputs import (
+    Sample,
+    Unit,
+    archive_units,
+    cloud_units,
+    depth_units,
+    find_files,
+    is_archive,
+    reason_of,
+)
+from qs3.inference.page import Gallery, page
 from qs3.inference.predictor import Predictor, Prepared, load
+from qs3.inference.scores import Count, scores
+from qs3.inference.table import Row, as_csv, as_json, record
 from qs3.models.norms import norms_for, use_domain
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.progress import progress_bar
-from qs3.utils.text_table import csv_text
-from qs3.utils.version import VERSION
 
 _SHOWN = 10  # failures in the text for the terminal
-_COLUMNS = (
-    *("file", "status", "class", "confidence", "points", "dropped"),
-    *("out_of_range", "reason"),
-)
 
 
 @dataclass(frozen=True)
@@ -39,44 +45,56 @@ class Settings:
 
     Attributes:
         ckpt: a run's folder or result.pt.
-        input: a file or folder.
+        input: a file or folder of clouds, or an archive of cut objects; "" if `depth` is given.
+        depth: a depth image, a folder or list of them; "" if `input` is given.
+        mask, box, intrinsics: of depth images; see `qs3.inference.depth_list`.
+        depth_scale: metres a unit; None: by the kind of numbers.
+        up: the axis that points up in clouds (z if ""), or a direction in the depth camera's frame.
+        part: of an archive; "" for all.
+        sample: so many of the files, images or objects, drawn at random; None: all.
         out: .csv or .json.
-        up: the axis that points up in the files.
+        page: also write a page beside it.
         batch_size: clouds that the net sees at a time.
         threads: batches that are worked on at the same time.
         device: of the net.
     """
 
     ckpt: str
-    input: str
+    input: str = ""
+    depth: str = ""
+    mask: str = ""
+    box: str = ""
+    intrinsics: str = ""
+    depth_scale: float | None = None
+    up: str = ""
+    part: str = ""
+    sample: int | None = None
     out: str = "predictions.csv"
-    up: str = "z"
+    page: bool = True
     batch_size: int = 16
     threads: int = 1
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        check_choice("up", self.up, UP_AXES)
+        if bool(self.input) == bool(self.depth):
+            raise ConfigError("give input=PATH for clouds, or depth=PATH for depth images")
+        of_depth = {"mask", "box", "intrinsics", "depth_scale"}
+        if odd := [key for key in sorted(of_depth) if getattr(self, key) and not self.depth]:
+            raise ConfigError(f"{odd[0]}= is for depth images; give depth=IMAGE, not input=")
+        if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
+            raise ConfigError(f"depth_scale={self.depth_scale:g}: metres a unit, in (0, 1]")
+        if self.input:
+            check_choice("up", self.up or "z", UP_AXES)
         if Path(self.out).suffix.lower() not in (".csv", ".json"):
             raise ConfigError(f"out={self.out} must end in .csv or .json")
 
 
-class Row(NamedTuple):
-    """What is said of one cloud, or why nothing can be said.
+class Inputs(NamedTuple):
+    """What there is to read, how many files are passed over, and what a unit is called."""
 
-    Attributes:
-        file: relative to the input; name[3] is cloud 3 of a file that holds several.
-        points: in the file, without those dropped; None if it could not be read.
-        dropped: points of the file that are NaN or infinite; None if it could not be read.
-        reason: in what it is out of range, or why it failed; "" otherwise.
-        probabilities: [C] float64; None if it failed.
-    """
-
-    file: str
-    points: int | None
-    dropped: int | None
-    reason: str
-    probabilities: np.ndarray | None
+    units: Sequence[Unit]
+    others: int
+    kind: str
 
 
 def predict_command(settings: Settings) -> tuple[str, int]:
@@ -88,21 +106,39 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     Raises:
         ConfigError, MissingDataError, DataError: nothing could be done at all.
     """
-    files, root, others = find_files(settings.input)
+    find = _depth_images(settings) if settings.depth else _clouds(settings)
     predictor = load(settings.ckpt, device=settings.device)
+    classes = predictor.classes
+    inputs = find(predictor)
+    if settings.sample and settings.sample < len(inputs.units):
+        drawn = np.random.default_rng(0).choice(len(inputs.units), settings.sample, replace=False)
+        inputs = inputs._replace(units=[inputs.units[i] for i in sorted(drawn)])
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
-    replaces = out.exists()
-    began = time.monotonic()
-    with progress_bar("files read", total=len(files)) as advance:
-        rows = list(predict_files(predictor, files, root, settings, advance))
-    seconds, classes = time.monotonic() - began, predictor.classes
-    records = [_record(row, classes) for row in rows]
-    as_json = out.suffix.lower() == ".json"
-    write_text(out, _json(records, predictor) if as_json else _csv(records, classes))
-    lines = _told(records, len(files), others, predictor.result.gravity, seconds)
-    failed = sum(row.probabilities is None for row in rows)
-    return "\n".join([*lines, saved(out, replaces)]), failed
+    began, gallery, rows = time.monotonic(), Gallery(classes), []
+    with progress_bar(f"{inputs.kind} read", total=len(inputs.units)) as advance:
+        for row, sample in predict_units(predictor, inputs.units, settings, advance):
+            rows.append(row)
+            if sample and settings.page:
+                gallery.add(row, sample)
+    seconds = time.monotonic() - began
+    records = [record(row, classes) for row in rows]
+    lines = _told(rows, records, inputs, predictor, seconds)
+    if out.suffix.lower() == ".json":
+        text = as_json(records, classes, predictor.result.target)
+    else:
+        text = as_csv(records, classes)
+    lines.append(_save(out, text))
+    if settings.page:
+        title = f"{Path(settings.input or settings.depth).name}, as {settings.ckpt} sees it"
+        lines.append(_save(out.with_suffix(".html"), page(title, rows, gallery, classes)))
+    return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _save(path: Path, text: str) -> str:
+    replaces = path.exists()
+    write_text(path, text)
+    return saved(path, replaces)
 
 
 def saved(out: str | Path, replaces: bool) -> str:
@@ -110,59 +146,68 @@ def saved(out: str | Path, replaces: bool) -> str:
     return f"saved {out}" + " (replaced what was there)" * replaces
 
 
-def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
-    """The files to read, what their names are relative to, and how many files are passed over.
+def _clouds(settings: Settings) -> Callable[[Predictor], Inputs]:
+    """What finds the clouds for a net; what is not there is told before the net is read."""
+    files, root, others = find_files(settings.input)
+    archive = len(files) == 1 and files[0].is_file() and is_archive(files[0])
+    if archive and settings.up not in ("", "z"):
+        raise ConfigError(f"up={settings.up}: in an archive of objects z points up")
+    if settings.part and not archive:
+        raise ConfigError(f"part={settings.part}: {settings.input} is no archive of objects")
 
-    In a folder: all files of known formats at any depth, in order of their names; hidden ones and
-    links to folders are left out.
+    def find(predictor: Predictor) -> Inputs:
+        if archive:
+            return Inputs(archive_units(files[0], settings.part, predictor.classes), 0, "objects")
+        units = cloud_units(files, root, settings.up or "z", predictor.classes)
+        return Inputs(units, others, "files")
 
-    Raises:
-        MissingDataError: nothing there.
-        DataError: one file, of an unknown format.
-    """
-    place = Path(place).expanduser()
-    if place.is_file():
-        if place.suffix.lower() not in SUFFIXES:
-            raise DataError(f"input={place}: unknown format; known are {', '.join(SUFFIXES)}")
-        return [place], place.parent, 0
-    if not place.is_dir():
-        raise MissingDataError(f"input={place} is not there")
-    found, others = [], 0
-    for folder, folders, names in os.walk(place):
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
-        for name in sorted(names):
-            if name.startswith("."):
-                continue
-            if os.path.splitext(name)[1].lower() in SUFFIXES:
-                found.append(Path(folder) / name)
-            else:
-                others += 1
-    if not found:
-        raise MissingDataError(f"input={place} holds no file of {' '.join(SUFFIXES)}")
-    return sorted(found), place, others
+    return find
 
 
-def predict_files(
+def _depth_images(settings: Settings) -> Callable[[Predictor], Inputs]:
+    """What finds the depth images for a net; likewise."""
+    common = Shown(
+        "",
+        box=numbers(settings.box, 4, "box") if settings.box else None,
+        intrinsics=settings.intrinsics,
+        up=direction(settings.up),
+        scale_m=settings.depth_scale,
+    )
+    if settings.part:
+        raise ConfigError(f"part={settings.part} is for an archive of objects, input=FILE.npz")
+    shown, others = find_shown(settings.depth, settings.mask, common)
+    if not any(one.intrinsics for one in shown):
+        raise ConfigError(
+            "intrinsics=fx,fy,cx,cy of the depth camera in pixels, or intrinsics=FILE, is missing"
+        )
+
+    def find(predictor: Predictor) -> Inputs:
+        units = depth_units(shown, predictor.result.gravity, predictor.classes)
+        return Inputs(units, others, "depth images")
+
+    return find
+
+
+def predict_units(
     predictor: Predictor,
-    files: Iterable[Path],
-    root: Path,
+    units: Iterable[Unit],
     settings: Settings,
     advance: Callable[[], None] = lambda: None,
-) -> Iterator[Row]:
-    """A row for each cloud, in order, named relative to `root`; `advance` is called after a file.
+) -> Iterator[tuple[Row, Sample | None]]:
+    """A row for each cloud, in order, and what it was made of; `advance` is called after a unit.
 
     Each of `settings.threads` threads has a batch of its own: the work between products of
     matrices does not gain from several threads in one batch. A few batches are in memory.
     """
     threads_before = torch.get_num_threads()
     pool = ThreadPoolExecutor(settings.threads, initializer=torch.set_num_threads, initargs=(1,))
-    running: deque[Future[list[Row]]] = deque()
+    running: deque[Future[list[tuple[Row, Sample | None]]]] = deque()
     net = predictor.net
     try:
         # Once for all: threads that change and restore a net's domain would do it to one another.
         with use_domain(net, norms_for(net, "target")):
-            for batch in _batches(files, root, settings.batch_size, advance):
-                running.append(pool.submit(_judged, predictor, batch, settings.up))
+            for batch in _batches(units, settings.batch_size, advance):
+                running.append(pool.submit(_judged, predictor, batch))
                 if len(running) > 2 * settings.threads:
                     yield from running.popleft().result()
             while running:
@@ -172,21 +217,13 @@ def predict_files(
         torch.set_num_threads(threads_before)  # libraries below torch keep one number for all
 
 
-class _Raw(NamedTuple):
-    """A cloud as read: its name in the table, its points, and how many were not finite."""
-
-    name: str
-    cloud: np.ndarray
-    dropped: int
-
-
 def _batches(
-    files: Iterable[Path], root: Path, size: int, advance: Callable[[], None]
-) -> Iterator[list[Row | _Raw]]:
-    """The clouds of all files, `size` at a time; what cannot be read is a row already."""
-    batch: list[Row | _Raw] = []
-    for path in files:
-        for item in _read(path, root):
+    units: Iterable[Unit], size: int, advance: Callable[[], None]
+) -> Iterator[list[Row | Sample]]:
+    """The clouds of all units, `size` at a time; what cannot be read is a row already."""
+    batch: list[Row | Sample] = []
+    for unit in units:
+        for item in unit():
             batch.append(item)
             if len(batch) == size:
                 yield batch
@@ -196,122 +233,89 @@ def _batches(
         yield batch
 
 
-def _read(path: Path, root: Path) -> Iterator[Row | _Raw]:
-    name = _printable(path.relative_to(root).as_posix())
-    try:
-        found = parse_clouds(path)
-    except DataError as error:
-        yield Row(name, None, None, _reason(error, str(path)), None)
-        return
-    for i, given in enumerate(found.clouds):
-        own = f"{name}[{i}]" if found.many else name
-        try:
-            cloud, dropped = measured(given, own)
-        except DataError as error:
-            yield Row(own, 0, len(given), _reason(error, own), None)
-            continue
-        yield _Raw(own, cloud, dropped)
-
-
-def _reason(error: DataError, name: str) -> str:
-    """What is wrong, without the name before it: that has a column of its own."""
-    return printable(str(error).removeprefix(name).lstrip(" :,"))
-
-
-def _judged(predictor: Predictor, batch: Sequence[Row | _Raw], up: str) -> list[Row]:
+def _judged(predictor: Predictor, batch: Sequence[Row | Sample]) -> list[tuple[Row, Sample | None]]:
     """The rows of a batch: each cloud prepared, and one pass of the net."""
-    prepared: dict[int, tuple[_Raw, Prepared]] = {}
-    rows: dict[int, Row] = {}
+    prepared: dict[int, tuple[Sample, Prepared]] = {}
+    rows: dict[int, tuple[Row, Sample | None]] = {}
     for i, item in enumerate(batch):
         if isinstance(item, Row):
-            rows[i] = item
+            rows[i] = item, None
             continue
         try:
-            prepared[i] = item, predictor.prepare(item.cloud, item.name, up)
+            prepared[i] = item, predictor.prepare(item.cloud, item.name, item.axis)
         except DataError as error:
-            why = _reason(error, item.name)
-            rows[i] = Row(item.name, len(item.cloud), item.dropped, why, None)
+            rows[i] = item.row(reason_of(error, item.name), None), None
     if prepared:
         points = torch.stack([each.points for _, each in prepared.values()])
         found = predictor.probabilities(points, len(points))
         for (i, (item, each)), probabilities in zip(prepared.items(), found, strict=True):
-            why = "; ".join(each.strange)
-            rows[i] = Row(item.name, each.given, item.dropped, why, probabilities)
+            rows[i] = item.row("; ".join(each.strange), probabilities), item
     return [rows[i] for i in range(len(batch))]
 
 
-def _record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
-    """What both formats say of a cloud; None where there is nothing to say."""
-    record: dict[str, Any] = {
-        **dict.fromkeys(_COLUMNS),
-        "file": row.file,
-        "status": "failed",
-        "points": row.points,
-        "dropped": row.dropped,
-        "reason": row.reason,
-        "probabilities": None,
-    }
-    if row.probabilities is not None:
-        best, each = int(row.probabilities.argmax()), row.probabilities.tolist()
-        record |= {
-            "status": "ok",
-            "class": classes[best],
-            "confidence": each[best],
-            "out_of_range": bool(row.reason),
-            "probabilities": dict(zip(classes, each, strict=True)),
-        }
-    return record
-
-
-def _csv(records: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> str:
-    lines: list[list[Any]] = [[*_COLUMNS, *(f"p_{name}" for name in classes)]]
-    for record in records:
-        flag = {True: "yes", False: "no", None: None}[record["out_of_range"]]
-        cells = {**record, "out_of_range": flag}
-        each = record["probabilities"] or dict.fromkeys(classes)
-        lines.append([*(cells[key] for key in _COLUMNS), *each.values()])
-    return csv_text(lines)
-
-
-def _json(records: Sequence[Mapping[str, Any]], predictor: Predictor) -> str:
-    document = {
-        "qs3": VERSION,
-        "target": predictor.result.target,
-        "classes": list(predictor.classes),
-        "clouds": records,
-    }
-    return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
 def _told(
-    records: Sequence[Mapping[str, Any]], files: int, others: int, gravity: str, seconds: float
+    rows: Sequence[Row],
+    records: Sequence[Mapping[str, Any]],
+    inputs: Inputs,
+    predictor: Predictor,
+    seconds: float,
 ) -> list[str]:
     """What was done, for the terminal."""
-    good = [record for record in records if record["status"] == "ok"]
-    failed = [record for record in records if record["status"] == "failed"]
-    counts = Counter(record["class"] for record in good)
+    good = [one for one in records if one["status"] == "ok"]
+    failed = [one for one in records if one["status"] == "failed"]
+    counts = Counter(one["class"] for one in good)
     rate = len(good) / max(seconds, 1e-9)
-    lines = [f"{len(good)} clouds, {rate:.1f} clouds a second, from {files} files"]
+    lines = [
+        f"{len(good)} clouds, {rate:.1f} clouds a second, from {len(inputs.units)} {inputs.kind}"
+    ]
     if good:
         lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
-        strange = sum(record["out_of_range"] for record in good)
+        lines += _scored(rows, predictor.classes)
+        strange = sum(one["out_of_range"] for one in good)
         lines.append(f"{strange} of them out of range (column out_of_range)")
-    if holed := [record["dropped"] for record in good if record["dropped"]]:
+    if cautioned := sum(one["caution"] is not None for one in good):
+        lines.append(f"{cautioned} of them with a caution (column caution)")
+    lines += _vertical(rows)
+    if holed := [one["dropped"] for one in good if one["dropped"]]:
         lines.append(
             f"{sum(holed)} points of {len(holed)} clouds are NaN or infinite and were left out "
             "(column dropped)"
+            if inputs.kind == "files"
+            else f"{sum(holed)} points of {len(holed)} objects have no depth or are stray (column "
+            "dropped)"
         )
-    if gravity == "none":
+    if predictor.result.gravity == "none" and inputs.kind != "depth images":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
-    if others:
-        lines.append(f"{others} files of other kinds passed over")
+    if inputs.others:
+        lines.append(f"{inputs.others} files of other kinds passed over")
     if failed:
         lines.append(f"{len(failed)} failed:")
-        lines += [f"  {record['file']}: {record['reason']}" for record in failed[:_SHOWN]]
+        lines += [f"  {one['file']}: {one['reason']}" for one in failed[:_SHOWN]]
         lines += [f"  and {len(failed) - _SHOWN} more, see the table"] * (len(failed) > _SHOWN)
     return lines
 
 
-def _printable(name: str) -> str:
-    """A file's name as UTF-8; bytes that are none become escapes."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
+    """Right and wrong, if somebody gave labels."""
+    found = scores(rows, classes)
+    if found is None:
+        return []
+
+    def of(count: Count) -> str:
+        return f"{count.right} of {count.of} ({count.share:.1%})"
+
+    tiers = "".join(f"; {tier} {of(count)}" for tier, count in found.tiers.items())
+    label, times = found.majority
+    return [f"right {of(found.all)}{tiers}; always {label}: {times / found.all.of:.1%}"]
+
+
+def _vertical(rows: Sequence[Row]) -> list[str]:
+    """Where up was not given."""
+    counts = Counter(row.up for row in rows)
+    words = {
+        PLANES: "fitted to the planes of the picture",
+        LEVEL: "not known, so the camera counts as level",
+    }
+    return [
+        f"up of {counts[how]}: {says}; up= tells it" for how, says in words.items() if counts[how]
+    ]

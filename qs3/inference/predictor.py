@@ -2,6 +2,7 @@
 
     predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
     probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up
+    objects = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
 
 A cloud goes the way of the target's clouds in the run: thinned to as many points as these were
 stored with (farthest points from the first one on), or filled up by repeating its points from the
@@ -22,6 +23,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.clouds.files import checked
+from qs3.data.frames.given import Intrinsics, check_intrinsics
+from qs3.data.frames.images import Pinhole
+from qs3.data.frames.pointed import Pointed, point_out
 from qs3.data.importers.base import check_cloud
 from qs3.data.importers.folders import CloudFolder
 from qs3.datamodules.clouds import Clouds
@@ -45,6 +49,33 @@ class Prepared(NamedTuple):
 
     points: Float[Tensor, "m 3"]
     given: int
+    strange: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPrediction:
+    """What a classifier says of one object of a depth image.
+
+    Attributes:
+        name: "[3]", the number in the mask; "[210,95,480,430]", the box; "" of a mask of bool.
+        cls: the likeliest class; "" if nothing of the object was measured.
+        confidence: its probability, in [0, 1].
+        probabilities: [C] float64, in the order of the predictor's classes.
+        points_m: [n, 3] float32, z up, the camera at the origin.
+        tier: "clean", "hard", or "poor": datasets leave such objects out.
+        cautions: why, in words, and what is not sure about the picture.
+        up: how the vertical is known: "given", "planes" of the picture, or "level" camera.
+        strange: how the cloud differs from all of training's; see `qs3.evaluation.ood`.
+    """
+
+    name: str
+    cls: str
+    confidence: float
+    probabilities: Float[np.ndarray, " c"]
+    points_m: Float[np.ndarray, "n 3"]
+    tier: str
+    cautions: tuple[str, ...]
+    up: str
     strange: tuple[str, ...]
 
 
@@ -141,6 +172,68 @@ class Predictor:
             return np.empty((0, len(self.classes)))
         ready = [self.prepare(c, name, up).points for c, name in zip(arrays, names, strict=True)]
         return self.probabilities(torch.stack(ready), batch_size)
+
+    def predict_depth(
+        self,
+        depth_m: Float[np.ndarray, "h w"],
+        camera: Pinhole | Sequence[float],
+        *,
+        mask: np.ndarray | None = None,
+        box: Sequence[float] | None = None,
+        up: Sequence[float] | None = None,
+    ) -> list[DepthPrediction]:
+        """The classes of the objects of a mask, one a number, or of what lies in a box.
+
+        Args:
+            depth_m: [h, w] floats, metres along the optical axis; 0 or not finite: not measured.
+            camera: fx, fy, cx, cy in pixels, the centre of the top left one at (0, 0).
+            mask: [h, w] whole numbers or bool; 0 is no object. Or:
+            box: left, top, right, bottom in pixels.
+            up: in the camera's frame (x right, y down, z forward), any length; None: by the planes
+                of the picture, and where it shows none, up in the picture.
+
+        Returns:
+            In the order of the mask's numbers.
+
+        Raises:
+            DataError: no depth image, a mask of another size, a box beside the picture, or
+                intrinsics that cannot be the picture's.
+        """
+        depth = np.asarray(depth_m)
+        if depth.ndim != 2 or depth.dtype.kind != "f":
+            raise DataError(
+                f"the depth image is {depth.dtype} {depth.shape}, expected floats [h, w] in metres"
+            )
+        if not isinstance(camera, Pinhole):
+            if len(values := [float(value) for value in camera]) != 4:
+                raise DataError(f"camera={values}: expected fx, fy, cx, cy")
+            camera = Pinhole(*values)
+        check_intrinsics(Intrinsics(camera), depth, "the depth image")
+        found = point_out(depth, camera, mask=mask, box=box, up=up)
+        return [self._of_depth(one) for one in found]
+
+    def _of_depth(self, one: Pointed) -> DepthPrediction:
+        points, cautions = one.piece.points_m, tuple(caution.words for caution in one.cautions)
+        if one.why:
+            nothing = np.full(len(self.classes), np.nan)
+            said = (*cautions, one.why)
+            return DepthPrediction(
+                one.name, "", float("nan"), nothing, points, one.tier, said, one.up, ()
+            )
+        ready = self.prepare(one.cloud(self.result.gravity), one.name)
+        (each,) = self.probabilities(ready.points[None])
+        best = int(each.argmax())
+        return DepthPrediction(
+            one.name,
+            self.classes[best],
+            float(each[best]),
+            each,
+            points,
+            one.tier,
+            cautions,
+            one.up,
+            ready.strange,
+        )
 
 
 def load(

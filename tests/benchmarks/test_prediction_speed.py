@@ -10,7 +10,8 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.inference.command import Settings, predict_files
+from qs3.inference.command import Settings, predict_units
+from qs3.inference.inputs import cloud_units
 from qs3.inference.model_file import Result
 from qs3.inference.predictor import Predictor
 from qs3.models.dgcnn import dgcnn
@@ -61,11 +62,11 @@ def test_clouds_a_second(
     result = Result({}, CLASSES, 1024, 2048, "made", "z", usual, {})
     predictor = Predictor(net, result, torch.device("cpu"))
     threads = torch.get_num_threads()
-    settings = Settings(ckpt="", input="", threads=threads)
+    settings = Settings(ckpt="", input="clouds", threads=threads)
 
     def run() -> np.ndarray:
-        rows = list(predict_files(predictor, files, tmp_path, settings))
-        return np.stack([row.probabilities for row in rows if row.probabilities is not None])
+        rows = list(predict_units(predictor, cloud_units(files, tmp_path, "z", ()), settings))
+        return np.stack([row.probabilities for row, _ in rows if row.probabilities is not None])
 
     straight = NaiveDGCNN(net).eval()
     seconds, theirs = 0.0, np.empty((0, len(CLASSES)))

@@ -28,6 +28,7 @@ def run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"paths.log_dir={tmp_path_factory.mktemp('logs')}",
         *("num_classes=3", "model.k=6", "data.points=32", "data.fps_starts=1"),
         *("protocol.epochs=3", "trainer.threads=1", "callbacks=none", "logger=csv"),
+        "report.pictures=false",
     ]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", overrides)

@@ -82,8 +82,8 @@ def test_test_clouds_get_what_the_run_said(run, data_dir, clouds, tmp_path, caps
     said = capsys.readouterr().out
     assert "24 clouds, " in said
     assert "clouds a second, from 1 files" in said
-    assert said.endswith(f"saved {out}\n")
-    assert predict(run, tmp_path / "test.npy", out) == 0
+    assert said.endswith(f"saved {out}\nsaved {out.with_suffix('.html')}\n")
+    assert predict(run, tmp_path / "test.npy", out, "page=false") == 0
     assert capsys.readouterr().out.endswith(f"saved {out} (replaced what was there)\n")
 
 
@@ -200,7 +200,7 @@ def test_up_and_flags(run, clouds, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["predict", "ckpt={run}"], "input=PATH is missing"),
+        (["predict", "ckpt={run}"], "give input=PATH for clouds, or depth=PATH"),
         (["predict", "ckpt={run}", "{clouds}"], "is not key=value; keys are ckpt, input"),
         (
             ["predict", "ckpt={run}", "input={clouds}", "gravity=z"],

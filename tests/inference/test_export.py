@@ -165,7 +165,7 @@ assert not any(name.startswith("qs3") for name in sys.modules)
 
 
 def test_the_example_of_the_document_needs_numpy_and_onnxruntime_alone(run, tmp_path, capsys):
-    """The lines of docs/predictions.md, run as they stand; the same probabilities as ours."""
+    """The lines of docs/how-to/predict.md, run as they stand; the same probabilities as ours."""
     predictor = qs3.load(run)
     cloud = np.random.default_rng(3).normal(size=(predictor.result.stored_points, 3))
     np.savetxt(tmp_path / "scan.xyz", cloud)

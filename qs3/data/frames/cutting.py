@@ -9,6 +9,7 @@ What is cut is what the camera measured, with its holes and its fringes: nothing
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +21,7 @@ from qs3.data.frames.pieces import body, pieces
 from qs3.data.frames.rules import Rules
 
 CLEAN, HARD = "clean", "hard"
+FEW = "few points"
 
 _AROUND_M = 0.5  # the floor of a box is looked for so far around it
 _FLOOR_WITHIN_M = 0.15  # and so far above or below its bottom
@@ -87,6 +89,20 @@ class Box:
         return float(self.centre_m[2] - np.abs(self.axes[:, 2]) @ self.half_m)
 
 
+class Fault(NamedTuple):
+    """One thing that is wrong with a piece.
+
+    Attributes:
+        kind: in a word or two: "few points", "holes", "size", "cut off", "covered", "torn", "flat".
+        words: with its figure.
+        refuses: it cannot be used; else it is hard.
+    """
+
+    kind: str
+    words: str
+    refuses: bool
+
+
 def cut(
     image: DepthImage,
     mask: Bool[np.ndarray, "h w"],
@@ -94,11 +110,7 @@ def cut(
     rules: Rules,
     edge_px: int | None = None,
 ) -> Piece:
-    """Cut the object of a mask.
-
-    The mask loses its edge, where labels and depth do not agree to the pixel. What is measured of
-    the rest is split where the depth jumps, and the largest piece stays with those that are near
-    it in space.
+    """Cut the object of a mask, and judge it.
 
     Args:
         image: one depth image.
@@ -110,21 +122,38 @@ def cut(
     Returns:
         The object; or one that is `refused`, with the reason.
     """
+    piece = cut_out(image, mask, rules, edge_px)
+    found = faults(piece, cls, rules)
+    if reasons := [fault.words for fault in found if fault.refuses]:
+        few = [fault.words for fault in found if fault.kind == FEW]
+        return replace(piece, refused=True, why=", ".join(few or reasons))
+    return replace(
+        piece, tier=HARD if found else CLEAN, why=", ".join(fault.kind for fault in found)
+    )
+
+
+def cut_out(
+    image: DepthImage, mask: Bool[np.ndarray, "h w"], rules: Rules, edge_px: int | None = None
+) -> Piece:
+    """What of a mask is the object, measured but not judged.
+
+    The mask loses its edge, where labels and depth do not agree to the pixel. What is measured of
+    the rest is split where the depth jumps, and the largest piece stays with those that are near
+    it in space. Arguments are those of `cut`. Without any depth the piece has no points.
+    """
     mask = mask & image.inside
     depth = image.depth_m
-    core = eroded(mask, rules.erode_px if edge_px is None else edge_px)
-    measured = core & (depth >= rules.near_m) & (depth <= rules.far_m)
-    own = body(pieces(measured, depth, rules), image.points_m, rules)
+    own, measured, core = own_pixels(image, mask, rules, edge_px)
     points = image.points_m[own]
     inlier, pixels = inliers(points, rules), len(points)
     if rules.drop_outliers:
         points, inlier = points[inlier], inlier[inlier]
     holes = 1 - float(measured.sum()) / max(int(core.sum()), 1)
     piece = Piece(points.astype(np.float32), inlier, pixels, holes)
-    if pixels < (least := rules.limits_of(cls).pixels):
-        return replace(piece, refused=True, why=f"{pixels} pixels with depth, fewer than {least}")
+    if pixels == 0:
+        return piece
     extent = np.ptp(points[inlier], axis=0)
-    piece = replace(
+    return replace(
         piece,
         kept=pixels / int(measured.sum()),
         rim=rim(mask, image.inside, rules),
@@ -132,32 +161,45 @@ def cut(
         extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
         depth_m=float(np.median(depth[own])),
     )
-    return _judged(piece, cls, rules)
 
 
-def _judged(piece: Piece, cls: str, rules: Rules) -> Piece:
-    """The piece with its tier, or refused."""
+def own_pixels(
+    image: DepthImage, mask: Bool[np.ndarray, "h w"], rules: Rules, edge_px: int | None = None
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """The pixels that `cut` takes; those of the mask's core with depth; those of its core."""
+    core = eroded(mask & image.inside, rules.erode_px if edge_px is None else edge_px)
+    measured = core & (image.depth_m >= rules.near_m) & (image.depth_m <= rules.far_m)
+    return body(pieces(measured, image.depth_m, rules), image.points_m, rules), measured, core
+
+
+def faults(piece: Piece, cls: str, rules: Rules) -> list[Fault]:
+    """All that is wrong with a piece, by the limits of its class; [] if it is clean."""
     limits, longest = rules.limits_of(cls), max(piece.extent_m)
-    wrong = (
-        (piece.holes > rules.most_holes, f"{piece.holes:.0%} of it without depth"),
+    few = piece.pixels < limits.pixels
+    size = not limits.least_m <= longest <= limits.most_m
+    thin = not limits.thin and piece.pixels > 0
+    flat = thin and thickness_m(piece.points_m[piece.inlier]) < rules.flat_m
+    kept = f"{1 - piece.kept:.0%} of what was measured hangs elsewhere"
+    found = (
+        (few, FEW, f"{piece.pixels} pixels with depth, fewer than {limits.pixels}", True),
+        (piece.holes > rules.most_holes, "holes", f"{piece.holes:.0%} of it without depth", True),
+        (size, "size", f"{longest:.2f} m, not {limits.least_m:g} to {limits.most_m:g} m", True),
         (
-            not limits.least_m <= longest <= limits.most_m,
-            f"{longest:.2f} m, not {limits.least_m:g} to {limits.most_m:g} m",
+            piece.rim > rules.clean_rim,
+            "cut off",
+            f"{piece.rim:.0%} of its outline cut off by the picture",
+            piece.rim > rules.most_rim,
         ),
-        (piece.rim > rules.most_rim, f"{piece.rim:.0%} of its outline cut off by the picture"),
-        (piece.occ > rules.most_occ, f"{piece.occ:.0%} of its outline covered"),
+        (
+            piece.occ > rules.clean_occ,
+            "covered",
+            f"{piece.occ:.0%} of its outline covered",
+            piece.occ > rules.most_occ,
+        ),
+        (piece.kept < rules.least_kept, "torn", kept, False),
+        (flat, "flat", f"it lies in a plate of {rules.flat_m * 100:g} cm", False),
     )
-    if reasons := [words for found, words in wrong if found]:
-        return replace(piece, refused=True, why=", ".join(reasons))
-    flat = not limits.thin and thickness_m(piece.points_m[piece.inlier]) < rules.flat_m
-    lesser = (
-        (piece.rim > rules.clean_rim, "cut off"),
-        (piece.occ > rules.clean_occ, "covered"),
-        (piece.kept < rules.least_kept, "torn"),
-        (flat, "flat"),
-    )
-    reasons = [word for found, word in lesser if found]
-    return replace(piece, tier=HARD if reasons else CLEAN, why=", ".join(reasons))
+    return [Fault(kind, words, refuses) for there, kind, words, refuses in found if there]
 
 
 def box_mask(image: DepthImage, box: Box, rules: Rules) -> Bool[np.ndarray, "h w"]:

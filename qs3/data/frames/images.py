@@ -94,18 +94,20 @@ class DepthImage:
 def upright(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """The rotation to z up whose y axis is where the camera looks, level; x is to the right.
 
+    Of a camera that looks straight down or up, y is up in the picture or down in it.
+
     Args:
         up: in camera coordinates, any length.
 
     Raises:
-        DataError: no direction, or the camera looks straight up or down.
+        DataError: no direction.
     """
     length = float(np.linalg.norm(up))
     if not np.isfinite(length) or length < 1e-9:
         raise DataError(f"{np.asarray(up).tolist()} points nowhere, so nobody knows what is up")
     z = np.asarray(up, dtype=np.float64) / length
     forward = np.array([0.0, 0.0, 1.0]) - z[2] * z
-    if np.linalg.norm(forward) < 1e-6:
-        raise DataError("the camera looks straight up or down")
+    if np.linalg.norm(forward) < 1e-6:  # z is along the optical axis, so this is level
+        forward = -np.sign(z[2]) * CAMERA_UP
     y = forward / np.linalg.norm(forward)
     return np.stack([np.cross(y, z), y, z])

@@ -31,6 +31,8 @@ _LEAST_SHARE = 0.5  # of the floor's pixels that must lie in the plane
 _LEAST_FRAMES = 10  # with readings and a floor, for the mounting
 _STEP_PX, _REACH_PX = 4, 8  # every how many pixels a normal, and from how far
 _SPAN_SHARE = 0.15  # of the depth, that a window's depths may span
+_STEEP_UP = np.array([0.0, -0.5, -np.sqrt(0.75)])  # of a camera that looks down by 60 degrees
+_LEAST_LEVEL = 0.05  # share of the normals that a level surface has
 _WITHIN_DEG = (45.0, 45.0, 45.0, 15.0, 15.0, 15.0)  # a plane counts as level or upright, by round
 
 
@@ -101,16 +103,52 @@ def mounting(readings: Float[np.ndarray, "n 3"], ups: Float[np.ndarray, "n 3"]) 
 
 def planes_up(depth_m: Float[np.ndarray, "h w"], camera: Pinhole) -> Float[np.ndarray, " 3"] | None:
     """Unit vector up by the planes of a room; None if there are too few normals."""
+    return _fitted(_normals(depth_m, camera), CAMERA_UP)
+
+
+def planes_up_steep(
+    depth_m: Float[np.ndarray, "h w"], camera: Pinhole
+) -> tuple[Float[np.ndarray, " 3"] | None, bool]:
+    """As `planes_up`, also for a camera that looks steeply down, and whether it is sure.
+
+    Where a camera looks down by more than 45°, the wall before it is nearer to level in the picture
+    than the floor, but then it hangs above the camera like a ceiling: a fit whose level surfaces
+    do so is made again from steeply down on. It is sure if level surfaces below the camera are
+    seen, and were found from up in the picture. A table seen from straight above looks like a wall
+    from the front: nobody can be sure of that.
+    """
     normals = _normals(depth_m, camera)
+    level = _fitted(normals, CAMERA_UP)
+    floors, ceilings = _level_shares(normals, level)
+    if level is not None and ceilings <= max(floors, _LEAST_LEVEL):
+        return level, floors >= _LEAST_LEVEL
+    steep = _fitted(normals, _STEEP_UP)
+    floors, ceilings = _level_shares(normals, steep)
+    return (steep if floors > ceilings else level), False
+
+
+def _level_shares(normals: np.ndarray, up: np.ndarray | None) -> tuple[float, float]:
+    """Shares of the normals that are of level surfaces below the camera, and above it."""
+    if up is None:
+        return 0.0, 0.0
+    along = normals @ up  # normals point away from the camera
+    least = np.cos(np.deg2rad(_WITHIN_DEG[-1]))
+    return float((along < -least).mean()), float((along > least).mean())
+
+
+def _fitted(
+    normals: Float[np.ndarray, "n 3"], start: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " 3"] | None:
+    """The direction near `start` to which most normals are parallel or perpendicular."""
     if len(normals) < 100:
         return None
-    up = CAMERA_UP
+    up = start
     for within in np.deg2rad(_WITHIN_DEG):
         along = np.abs(normals @ up)
         level, upright = normals[along > np.cos(within)], normals[along < np.sin(within)]
         _, axes = np.linalg.eigh(upright.T @ upright - level.T @ level)
         up = axes[:, 0] * np.sign(axes[:, 0] @ up or 1.0)
-    return up if angle_deg(up, CAMERA_UP) <= MOST_TILT_DEG else None
+    return up if angle_deg(up, start) <= MOST_TILT_DEG else None
 
 
 def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:

@@ -202,5 +202,13 @@ def test_wrong_rules_and_images():
         Pinhole(0, 1, 0, 0)
     with pytest.raises(DataError, match="z up"):
         DepthImage(np.ones((4, 4)), Pinhole(1, 1, 0, 0), np.eye(3) * 2)
-    with pytest.raises(DataError, match="straight"):
-        upright(np.array([0, 0, -1.0]))
+    with pytest.raises(DataError, match="points nowhere"):
+        upright(np.zeros(3))
+
+
+def test_a_camera_that_looks_straight_down_or_up_is_the_limit_of_one_that_nearly_does():
+    for z in (-1.0, 1.0):
+        exact = upright(np.array([0, 0, z]))
+        np.testing.assert_allclose(exact, upright(np.array([0, -1e-5, z])), atol=1e-4)
+        np.testing.assert_allclose(exact @ exact.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(exact) > 0

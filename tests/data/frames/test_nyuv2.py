@@ -104,7 +104,7 @@ def test_the_same_again_and_only_clean(opened, nyuv2, tmp_path):
     assert len(clean.open()) == len([t for _, t in EXPECTED.values() if t == "clean"]) + 1
     told = [r.reason for r in read_manifest(clean.folder, clean.names) if r.status != "ok"]
     assert any(reason.startswith("hard (") for reason in told)
-    assert clean.open().meta["made_of"].startswith("real objects")
+    assert clean.open().made_of.objects.startswith("real objects")
 
 
 def test_an_interrupted_import_goes_on(nyuv2, tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 from qs3.clouds.pcd import read_pcd
 from qs3.data.frames.cutting import cut
 from qs3.data.frames.images import DepthImage, Pinhole, upright
+from qs3.data.frames.pointed import point_out
 from qs3.data.frames.rules import Limits, Rules
 from qs3.data.frames.vertical import angle_deg, floor_up, planes_up
 
@@ -46,3 +47,24 @@ def test_two_ways_to_the_vertical_agree_and_objects_stand_on_the_table():
             sizes.append(max(piece.extent_m))
     assert len(sizes) > 10
     assert 0.1 < np.median(sizes) < 0.3
+
+
+@pytest.mark.skipif(not FRAMES, reason="shared/data/kinect_v1 is not at hand")
+def test_what_lies_in_a_box_is_what_was_labelled():
+    """Where two things touch, a box cannot part them; most it can."""
+    shares = []
+    for path in FRAMES[:3]:
+        cloud = read_pcd(path)
+        depth = np.nan_to_num(cloud.image("z")).astype(float)
+        label = cloud.image("label")
+        for number in np.unique(label[label > TABLE]):
+            own = label == number
+            v, u = np.nonzero(own)
+            if len(v) < 1000:
+                continue
+            (one,) = point_out(depth, CAMERA, box=(u.min(), v.min(), u.max() + 1, v.max() + 1))
+            assert one.up == "planes"
+            found, own = one.mask & (depth > 0), own & (depth > 0)
+            shares.append((found & own).sum() / (found | own).sum())
+    assert len(shares) >= 6
+    assert np.median(shares) > 0.8

@@ -1,0 +1,247 @@
+"""What `qs3 predict` is given: files of clouds, an archive of cut objects, or depth images.
+
+All of them become `Sample`s, one after the other; what cannot be read becomes a failed `Row`, and
+the others go on.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from qs3.classes import known_as
+from qs3.clouds.files import SUFFIXES, measured, parse_clouds, printable
+from qs3.data.frames.cutting import Piece, faults
+from qs3.data.frames.given import check_intrinsics, read_depth, read_intrinsics, read_mask
+from qs3.data.frames.pointed import RULES, Caution, Pointed, point_out
+from qs3.data.importers.object_archive import Archive, read_archive
+from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
+from qs3.inference.depth_list import Shown
+from qs3.inference.table import Row
+
+Z = "z"
+_KEY = "xyz_tenth_mm.npy"  # of an archive of cut objects
+
+
+class Sample(NamedTuple):
+    """A cloud as read, and what is known of it; see `Row`.
+
+    Attributes:
+        name: in the table.
+        cloud: [n, 3], `axis` up.
+        dropped: points that were left out.
+        axis: that points up in it.
+        picture: the depth image and the object's pixels in it; None if it comes from none.
+    """
+
+    name: str
+    cloud: np.ndarray
+    dropped: int
+    axis: str = Z
+    label: str = ""
+    tier: str = ""
+    cautions: tuple[Caution, ...] = ()
+    up: str = Z
+    picture: tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]] | None = None
+
+    def row(self, reason: str, probabilities: np.ndarray | None) -> Row:
+        """With what the net says of it, or why it says nothing."""
+        return Row(
+            self.name,
+            len(self.cloud),
+            self.dropped,
+            reason,
+            probabilities,
+            self.label,
+            self.tier,
+            self.cautions,
+            self.up,
+        )
+
+
+Unit = Callable[[], Iterator[Sample | Row]]
+"""Reads one file, one depth image or one object of an archive."""
+
+
+def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
+    """The files to read, what their names are relative to, and how many files are passed over.
+
+    In a folder: all files of known formats at any depth, in order of their names; hidden ones and
+    links to folders are left out.
+
+    Raises:
+        MissingDataError: nothing there.
+        DataError: one file, of an unknown format.
+    """
+    place = Path(place).expanduser()
+    if place.is_file():
+        if place.suffix.lower() not in SUFFIXES:
+            raise DataError(f"input={place}: unknown format; known are {', '.join(SUFFIXES)}")
+        return [place], place.parent, 0
+    if not place.is_dir():
+        raise MissingDataError(f"input={place} is not there")
+    found, others = [], 0
+    for folder, folders, names in os.walk(place):
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
+        for name in sorted(names):
+            if name.startswith("."):
+                continue
+            if os.path.splitext(name)[1].lower() in SUFFIXES:
+                found.append(Path(folder) / name)
+            else:
+                others += 1
+    if not found:
+        raise MissingDataError(f"input={place} holds no file of {' '.join(SUFFIXES)}")
+    return sorted(found), place, others
+
+
+def cloud_units(files: Sequence[Path], root: Path, axis: str, classes: Sequence[str]) -> list[Unit]:
+    """One a file, named relative to `root`.
+
+    A cloud's label is that of its file, where numbers count the classes from 0, else the nearest
+    folder below `root` that is called as a class.
+    """
+    return [functools.partial(_clouds, path, root, axis, classes) for path in files]
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a file is an .npz of objects cut from depth images."""
+    if path.suffix.lower() != ".npz":
+        return False
+    try:
+        with zipfile.ZipFile(path) as file:
+            return _KEY in file.namelist()
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError):
+        return False  # said when it is read as clouds
+
+
+def archive_units(path: Path, part: str, classes: Sequence[str]) -> list[Unit]:
+    """One an object of the archive, of all or of one part; stray points are left out.
+
+    Raises:
+        DataError: it is damaged.
+        ConfigError: it has no such part.
+    """
+    archive = read_archive(path)
+    parts = sorted({*archive.dev.tolist()} - {""})
+    if part and part not in parts:
+        has = f"its parts are {', '.join(parts)}" if parts else "it has no parts"
+        raise ConfigError(f"part={part}: {path} has none of that name; {has}")
+    chosen = np.flatnonzero(archive.dev == part) if part else range(len(archive))
+    return [functools.partial(_object, archive, int(i), classes) for i in chosen]
+
+
+def depth_units(shown: Sequence[Shown], gravity: str, classes: Sequence[str]) -> list[Unit]:
+    """One a row of the list; clouds stay in the camera's frame if the net's `gravity` is "none"."""
+    return [functools.partial(_pointed, one, gravity, classes) for one in shown]
+
+
+def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
+    name = _printable(path.relative_to(root).as_posix())
+    folders = [known_as(part, classes) for part in path.relative_to(root).parts[:-1]]
+    folder = next((cls for cls in reversed(folders) if cls), "")
+    try:
+        found = parse_clouds(path)
+    except DataError as error:
+        yield Row(name, None, None, reason_of(error, str(path)), None, folder)
+        return
+    for i, given in enumerate(found.clouds):
+        own = f"{name}[{i}]" if found.many else name
+        label = _label(found.labels[i], classes) if found.labels is not None else folder
+        try:
+            cloud, dropped = measured(given, own)
+        except DataError as error:
+            yield Row(own, 0, len(given), reason_of(error, own), None, label)
+            continue
+        yield Sample(own, cloud, dropped, axis, label, up=axis)
+
+
+def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sample]:
+    cloud = archive.cloud(index, inliers_only=True)
+    extent = np.ptp(cloud, axis=0).astype(float)
+    piece = Piece(
+        cloud,
+        np.ones(len(cloud), dtype=bool),
+        len(cloud) if archive.pixels is None else int(archive.pixels[index]),
+        holes=0.0,
+        rim=0.0 if archive.rim is None else float(archive.rim[index]),
+        occ=0.0 if archive.occ is None else float(archive.occ[index]),
+        extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
+    )
+    tier = str(archive.tier[index])
+    cautions = [Caution(one.kind, one.words) for one in faults(piece, "", RULES)]
+    if tier == "hard" and not cautions:
+        cautions = [Caution("otherwise hard", "the archive calls it hard")]
+    yield Sample(
+        f"{archive.path.name}[{index}]",
+        cloud,
+        archive.size(index) - len(cloud),
+        label=_label(str(archive.cls[index]), classes),
+        tier=tier,
+        cautions=tuple(cautions) if tier == "hard" else (),
+    )
+
+
+def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
+    name, label = _printable(shown.name), _label(shown.label, classes)
+    if shown.wrong:
+        yield Row(name, None, None, shown.wrong, None, label)
+        return
+    try:
+        depth, found, bent = _read_picture(shown)
+    except Qs3Error as error:
+        yield Row(name, None, None, reason_of(error, str(shown.depth)), None, label)
+        return
+    for one in found:
+        own = name + one.name
+        if one.why:
+            yield Row(own, 0, one.without_depth, one.why, None, label, one.tier, up=one.up)
+            continue
+        yield Sample(
+            own,
+            one.cloud(gravity),
+            one.without_depth,
+            label=label,
+            tier=one.tier,
+            cautions=(*one.cautions, *bent),
+            up=one.up,
+            picture=(depth, one.mask),
+        )
+
+
+def _read_picture(
+    shown: Shown,
+) -> tuple[Float[np.ndarray, "h w"], list[Pointed], tuple[Caution, ...]]:
+    """Depth, objects, and what is not sure about the camera."""
+    depth = read_depth(shown.depth, shown.scale_m)
+    given = read_intrinsics(shown.intrinsics, shown.folder)
+    camera = check_intrinsics(given, depth, str(shown.depth))
+    mask = None if shown.mask is None else read_mask(shown.mask)
+    found = point_out(depth, camera, mask=mask, box=shown.box, up=shown.up, only=shown.only)
+    bent = Caution("lens", "the camera's distortion is known and not corrected")
+    return depth, found, (bent,) * given.bent
+
+
+def reason_of(error: Qs3Error, name: str) -> str:
+    """What is wrong, without the name before it: that has a column of its own."""
+    return printable(str(error).removeprefix(name).lstrip(" :,"))
+
+
+def _label(given: object, classes: Sequence[str]) -> str:
+    """A class of the net's if it is one by its name or, of whole numbers, by its place."""
+    if isinstance(given, int) and not isinstance(given, bool):
+        return classes[given] if 0 <= given < len(classes) else str(given)
+    words = given.decode(errors="replace") if isinstance(given, bytes) else str(given)
+    return known_as(words, classes) or printable(words)
+
+
+def _printable(name: str) -> str:
+    """A file's name as UTF-8; bytes that are none become escapes."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")

@@ -1,0 +1,102 @@
+"""Right and wrong among predictions whose labels somebody gave, and what goes with it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from qs3.inference.table import Row
+
+STRANGE = "unlike training"
+"""The kind of what is out of the range of training's clouds."""
+
+
+class Count(NamedTuple):
+    """So many right of so many."""
+
+    right: int
+    of: int
+
+    @property
+    def share(self) -> float:
+        """In [0, 1]; 0 of none."""
+        return self.right / max(self.of, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Of the rows with a prediction and a label that is a class of the net's.
+
+    Attributes:
+        all: right ones.
+        majority: the commonest label, and how many have it.
+        confidence: mean over all of them, in [0, 1].
+        tiers: right ones of each tier, if there are any.
+        kinds: by what was wrong with a cloud: right ones with it, and without it.
+        confusion: [C, C] how often each label (row) was called each class (column).
+        unknown: labels that are no class of the net's, and how often.
+        unlabelled: rows with a prediction and no label.
+    """
+
+    all: Count
+    majority: tuple[str, int]
+    confidence: float
+    tiers: dict[str, Count]
+    kinds: dict[str, tuple[Count, Count]]
+    confusion: Int[np.ndarray, "c c"]
+    unknown: dict[str, int]
+    unlabelled: int
+
+
+def right(row: Row, classes: Sequence[str]) -> bool | None:
+    """Whether the net is right; None if there is no prediction, or no label of its classes."""
+    if row.probabilities is None or row.label not in classes:
+        return None
+    return classes[int(row.probabilities.argmax())] == row.label
+
+
+def kinds(row: Row) -> list[str]:
+    """What was wrong with a cloud, in a word or two each."""
+    found = [caution.kind for caution in row.cautions]
+    return found + [STRANGE] * bool(row.probabilities is not None and row.reason)
+
+
+def scores(rows: Iterable[Row], classes: Sequence[str]) -> Scores | None:
+    """The figures; None if no row has both a prediction and a label of the net's classes."""
+    said = [row for row in rows if row.probabilities is not None]
+    judged = [(row, r) for row in said if (r := right(row, classes)) is not None]
+    if not judged:
+        return None
+    confusion = np.zeros((len(classes), len(classes)), dtype=np.int64)
+    for row, _ in judged:
+        assert row.probabilities is not None
+        confusion[classes.index(row.label), int(row.probabilities.argmax())] += 1
+    (label, times), *_ = Counter(row.label for row, _ in judged).most_common(1)
+    tiers = sorted({row.tier for row, _ in judged} - {""})
+    every = Counter(kind for row, _ in judged for kind in {*kinds(row)})
+    return Scores(
+        _count(r for _, r in judged),
+        (label, times),
+        float(np.mean([np.max(row.probabilities) for row, _ in judged])),  # type: ignore[arg-type]
+        {tier: _count(r for row, r in judged if row.tier == tier) for tier in tiers},
+        {
+            kind: (
+                _count(r for row, r in judged if kind in kinds(row)),
+                _count(r for row, r in judged if kind not in kinds(row)),
+            )
+            for kind, _ in every.most_common()
+        },
+        confusion,
+        dict(Counter(row.label for row in said if row.label and row.label not in classes)),
+        sum(not row.label for row in said),
+    )
+
+
+def _count(found: Iterable[bool]) -> Count:
+    values = list(found)
+    return Count(sum(values), len(values))

@@ -1,0 +1,91 @@
+"""What `qs3 predict` says of each object: the rows of its table, as CSV and as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.data.frames.pointed import Caution
+from qs3.utils.text_table import csv_text
+from qs3.utils.version import VERSION
+
+COLUMNS = (
+    *("file", "status", "class", "confidence", "label", "points", "dropped", "tier", "caution"),
+    *("up", "out_of_range", "reason"),
+)
+
+
+class Row(NamedTuple):
+    """What is said of one cloud, or why nothing can be said.
+
+    Attributes:
+        file: relative to the input; name[3] is cloud 3 of a file that holds several, or object 3
+            of a depth image's mask.
+        points: that were used; None if it could not be read.
+        dropped: points that were left out: NaN, infinite or marked as stray; of a depth image the
+            object's pixels without depth. None if it could not be read.
+        reason: in what it is out of range, or why it failed; "" otherwise.
+        probabilities: [C] float64; None if it failed.
+        label: what it is, if somebody said so: a class of the net's, or another word; "" if not.
+        tier: of an object cut from a depth image: "clean", "hard" or "poor"; "" of other clouds.
+        cautions: what was wrong when it was cut.
+        up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
+    """
+
+    file: str
+    points: int | None
+    dropped: int | None
+    reason: str
+    probabilities: Float[np.ndarray, " c"] | None
+    label: str = ""
+    tier: str = ""
+    cautions: tuple[Caution, ...] = ()
+    up: str = ""
+
+
+def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
+    """What both formats say of a cloud, by `COLUMNS`, and "probabilities"; None if nothing."""
+    found: dict[str, Any] = {
+        **dict.fromkeys(COLUMNS),
+        "file": row.file,
+        "status": "failed",
+        "label": row.label or None,
+        "points": row.points,
+        "dropped": row.dropped,
+        "tier": row.tier or None,
+        "caution": "; ".join(caution.words for caution in row.cautions) or None,
+        "up": row.up or None,
+        "reason": row.reason,
+        "probabilities": None,
+    }
+    if row.probabilities is not None:
+        best, each = int(row.probabilities.argmax()), row.probabilities.tolist()
+        found |= {
+            "status": "ok",
+            "class": classes[best],
+            "confidence": each[best],
+            "out_of_range": bool(row.reason),
+            "probabilities": dict(zip(classes, each, strict=True)),
+        }
+    return found
+
+
+def as_csv(records: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> str:
+    """A line each, with a column for each class."""
+    lines: list[list[Any]] = [[*COLUMNS, *(f"p_{name}" for name in classes)]]
+    for one in records:
+        flag = {True: "yes", False: "no", None: None}[one["out_of_range"]]
+        cells = {**one, "out_of_range": flag}
+        each = one["probabilities"] or dict.fromkeys(classes)
+        lines.append([*(cells[key] for key in COLUMNS), *each.values()])
+    return csv_text(lines)
+
+
+def as_json(records: Sequence[Mapping[str, Any]], classes: Sequence[str], target: str) -> str:
+    """One document; `target`: the domain that the net was adapted to."""
+    document = {"qs3": VERSION, "target": target, "classes": list(classes), "clouds": records}
+    return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -1,0 +1,245 @@
+"""`qs3 predict` of depth images and of archives of objects, and the page that it makes."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+import io
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+import qs3
+from qs3.data.frames.images import Pinhole
+from qs3.data.frames.pointed import point_out
+from qs3.errors import DataError
+from tests.commands import main
+from tests.fixtures.frame_files import Shot, Thing, kinect, write_archive
+from tests.fixtures.published import CLASSES
+
+SHOT = Shot(
+    [
+        Thing("ball", -0.6, 2.4, 20, boxes=((0, 0, 0.4, 0.7, 0.7, 0.7),)),
+        Thing("rod", 0.7, 2.6, 25, boxes=((0, 0, 0.5, 0.2, 0.2, 1.0),)),
+    ],
+    pitch_deg=14,
+    roll_deg=3,
+)
+CAMERA = ",".join(map(str, SHOT.camera))
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with open(path, encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def seen() -> tuple[np.ndarray, np.ndarray]:
+    """Depth in whole millimetres, and the number of the thing that each pixel shows."""
+    depth, shown = SHOT.render()
+    return np.rint(kinect(depth, 1) * 1000).astype(np.uint16), np.maximum(shown + 1, 0)
+
+
+def save(path: Path, image: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    return path
+
+
+@pytest.fixture
+def frame(tmp_path) -> Path:
+    """A folder with depth.png and mask.png."""
+    depth, mask = seen()
+    save(tmp_path / "depth.png", depth)
+    save(tmp_path / "mask.png", mask.astype(np.uint8))
+    return tmp_path
+
+
+def predict(run: Path, out: Path, *more: str) -> int:
+    return main(["predict", f"ckpt={run}", f"out={out}", "threads=1", *more])
+
+
+def test_each_object_of_a_mask_gets_what_the_net_says_of_its_cloud(run, frame, capsys):
+    up = ",".join(map(str, SHOT.up_in_camera))
+    words = (f"depth={frame}/depth.png", f"mask={frame}/mask.png", f"intrinsics={CAMERA}")
+    assert predict(run, frame / "said.csv", *words, f"up={up}") == 0
+    rows = table(frame / "said.csv")
+    assert [row["file"] for row in rows] == ["depth.png[1]", "depth.png[2]"]
+    depth, mask = seen()
+    objects = point_out(depth / 1000, Pinhole(*SHOT.camera), mask=mask, up=SHOT.up_in_camera)
+    predictor = qs3.load(run)
+    expected = predictor([one.piece.points_m for one in objects])
+    for row, one, each in zip(rows, objects, expected, strict=True):
+        found = [float(row[f"p_{name}"]) for name in predictor.classes]
+        np.testing.assert_allclose(found, each, atol=1e-6)
+        assert (row["status"], row["tier"], row["up"]) == ("ok", "clean", "given")
+        assert int(row["points"]) == len(one.piece.points_m)
+        assert int(row["dropped"]) == one.without_depth
+    said = capsys.readouterr().out
+    assert "2 clouds, " in said
+    assert "from 1 depth images" in said
+    assert f"saved {frame}/said.html" in said
+    page = (frame / "said.html").read_text()
+    assert page.count('<img alt="cloud"') == page.count('<img alt="depth image"') == 2
+    assert "nobody knows which are right" in page
+    in_python = predictor.predict_depth(depth / 1000, SHOT.camera, mask=mask, up=SHOT.up_in_camera)
+    np.testing.assert_allclose([one.probabilities for one in in_python], expected, atol=1e-6)
+    assert [one.cls for one in in_python] == [row["class"] for row in rows]
+    with pytest.raises(DataError, match="expected floats"):
+        predictor.predict_depth(depth, SHOT.camera, mask=mask)
+
+
+def test_a_box_without_gravity_and_metres_in_npy(run, frame):
+    depth, mask = seen()
+    np.save(frame / "metres.npy", np.where(depth > 0, depth / 1000, np.nan))
+    v, u = np.nonzero(mask == 2)
+    box = f"{u.min() - 4},{v.min() - 4},{u.max() + 5},{v.max() + 5}"
+    (frame / "camera.json").write_text(
+        json.dumps({"K": [SHOT.camera[0], 0, SHOT.camera[2], 0, *SHOT.camera[1::2], 0, 0, 1]})
+    )
+    words = (f"depth={frame}/metres.npy", f"box={box}", f"intrinsics={frame}/camera.json")
+    assert predict(run, frame / "said.json", *words) == 0
+    (one,) = json.loads((frame / "said.json").read_text())["clouds"]
+    assert one["file"] == f"metres.npy[{box}]"
+    assert (one["status"], one["up"], one["tier"]) == ("ok", "planes", "clean")
+    true = int(((mask == 2) & (depth > 0)).sum())
+    assert 0.9 * true < one["points"] <= true
+
+
+def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys):
+    whole = (frame / "depth.png").read_bytes()
+    (frame / "broken.png").write_bytes(whole[: len(whole) // 2])
+    (frame / "objects.csv").write_text(
+        "depth,mask,object,box,intrinsics,label\n"
+        "depth.png,mask.png,1,,,ball\n"
+        "broken.png,mask.png,,,,rod\n"
+        'depth.png,,,"300,90,nowhere,400",,\n'
+        "depth.png,mask.png,9,,,\n"
+        "gone.png,mask.png,,,,\n"
+        'depth.png,mask.png,2,,"5,5,5,5",\n'
+        "depth.png,mask.png,2,,,Rod\n"
+    )
+    out = frame / "said.csv"
+    assert predict(run, out, f"depth={frame}/objects.csv", f"intrinsics={CAMERA}", "up=-y") == 1
+    rows = table(out)
+    assert [row["status"] for row in rows] == ["ok", *["failed"] * 5, "ok"]
+    assert [row["label"] for row in rows] == ["ball", "rod", "", "", "", "", "rod"]
+    reasons = [row["reason"] for row in rows[1:6]]
+    for reason, words in zip(
+        reasons,
+        (
+            "broken off",
+            "row 3: box=300,90,nowhere,400",
+            "no object 9",
+            "not there",
+            "field of view",
+        ),
+        strict=True,
+    ):
+        assert words in reason
+    said = capsys.readouterr().out
+    assert "5 failed:" in said
+    assert re.search(r"right [012] of 2 \(", said)
+    page = (frame / "said.html").read_text()
+    assert "Not predicted: 5" in page
+    assert "broken off" in page
+
+
+def test_two_folders_go_together_by_name(run, frame):
+    depth, mask = seen()
+    for name in ("a", "b"):
+        save(frame / "depths" / f"{name}.png", depth)
+    np.save(frame / "a.npy", mask)
+    (frame / "masks").mkdir()
+    (frame / "a.npy").rename(frame / "masks" / "a.npy")
+    words = (f"depth={frame}/depths", f"mask={frame}/masks", f"intrinsics={CAMERA}")
+    assert predict(run, frame / "said.csv", *words, "up=-y", "page=false") == 1
+    rows = table(frame / "said.csv")
+    assert [row["file"] for row in rows] == ["a.png[1]", "a.png[2]", "b.png"]
+    assert "no mask of its name" in rows[2]["reason"]
+    assert not (frame / "said.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["depth={at}/depth.png"], "takes mask=FILE"),
+        (["depth={at}/depth.png", "mask={at}/mask.png"], "intrinsics=fx,fy,cx,cy of the depth"),
+        (["depth={at}/depth.png", "mask={at}/mask.png", "box=1,2,3,4"], "not both"),
+        (["depth={at}/depth.png", "box=1,2,3", "intrinsics=5,5,5,5"], "expected 4 numbers"),
+        (["depth={at}/depth.png", "mask={at}/gone.png", "intrinsics=5,5,5,5"], "gone.png is not"),
+        (["depth={at}/gone.png", "mask={at}/mask.png"], "gone.png is not there"),
+        (["depth={at}", "intrinsics=5,5,5,5"], "give mask=FOLDER"),
+        (["depth={at}/depth.png", "up=z"], "up=z: expected 3 numbers"),
+        (["input={at}", "mask={at}/mask.png"], "mask= is for depth images"),
+        (["input={at}", "depth={at}/depth.png"], "give input=PATH for clouds, or depth="),
+        (["depth={at}/depth.png", "depth_scale=5"], "depth_scale=5: metres a unit"),
+    ],
+)
+def test_mistakes_are_told_in_words(run, frame, capsys, words, message):
+    given = [word.format(at=frame) for word in words]
+    assert predict(run, frame / "said.csv", *given) == 1
+    assert message in capsys.readouterr().err
+    assert not (frame / "said.csv").exists()
+
+
+def test_an_archive_with_labels_shows_right_and_wrong(run, tmp_path, capsys):
+    """Its classes are ten; of three of them the net's names are put in."""
+    arrays = write_archive(tmp_path / "objects.npz", {"train": 4, "test": 2})
+    ours = dict(zip(CLASSES, ["ball", "rod", "slab", "ball"], strict=False))
+    arrays["cls"] = np.array([ours.get(cls, cls) for cls in arrays["cls"].tolist()])
+    arrays["occ"][arrays["tier"] == "hard"] = 0.3
+    np.savez(tmp_path / "objects.npz", **arrays)
+    out = tmp_path / "said.csv"
+    assert predict(run, out, f"input={tmp_path}/objects.npz", "part=adapt") == 0
+    rows = table(out)
+    of_part = np.flatnonzero(arrays["dev"] == "adapt")
+    assert [row["file"] for row in rows] == [f"objects.npz[{i}]" for i in of_part]
+    assert [row["tier"] for row in rows] == arrays["tier"][of_part].tolist()
+    assert [row["label"] for row in rows] == arrays["cls"][of_part].tolist()
+    for row in rows:
+        assert ("30% of its outline covered" in row["caution"]) == (row["tier"] == "hard")
+    judged = [row for row in rows if row["label"] in ("ball", "rod", "slab")]
+    right = [row for row in judged if row["label"] == row["class"]]
+    clean = [row for row in judged if row["tier"] == "clean"]
+    said = capsys.readouterr().out
+    assert f"right {len(right)} of {len(judged)} (" in said
+    assert f"clean {sum(row in right for row in clean)} of {len(clean)} (" in said
+    page = (tmp_path / "said.html").read_text()
+    assert f"{len(right)} of {len(judged)} right" in page
+    assert f"Wrong: {len(judged) - len(right)} " in page
+    cards = re.findall(r'<div class="card wrong">.*?class="said">(\w+) (\d+)%', page)
+    assert len(cards) == len(judged) - len(right) > 1
+    sure = [int(percent) for _, percent in cards]
+    assert sure == sorted(sure, reverse=True)
+    assert "covered" in page
+    assert "chair 4" in html.unescape(page)  # not a class of the net
+    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert len(pictures) == len(rows)
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(pictures[0]))).convert("RGB"))
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10  # a cloud is drawn
+
+
+def test_a_sample_is_always_the_same(run, tmp_path):
+    write_archive(tmp_path / "objects.npz", {"train": 2, "test": 1})
+    for out in ("a.csv", "b.csv"):
+        words = (f"input={tmp_path}/objects.npz", "sample=7", "page=false")
+        assert predict(run, tmp_path / out, *words) == 0
+    assert len(table(tmp_path / "a.csv")) == 7
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+
+
+def test_labels_of_clouds_are_their_files_or_folders(run, tmp_path):
+    rng = np.random.default_rng(0)
+    (tmp_path / "in" / "Rod" / "new").mkdir(parents=True)
+    np.save(tmp_path / "in" / "Rod" / "new" / "a.npy", rng.normal(size=(64, 3)))
+    np.savez(tmp_path / "in" / "b.npz", points=rng.normal(size=(2, 64, 3)), label=[2, 0])
+    np.save(tmp_path / "in" / "c.npy", rng.normal(size=(64, 3)))
+    assert predict(run, tmp_path / "said.csv", f"input={tmp_path}/in") == 0
+    found = {row["file"]: row["label"] for row in table(tmp_path / "said.csv")}
+    assert found == {"Rod/new/a.npy": "rod", "b.npz[0]": "slab", "b.npz[1]": "ball", "c.npy": ""}
