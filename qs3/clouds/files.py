@@ -225,11 +225,28 @@ def _npy_header(path: Path, file: Any) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _npy(path: Path) -> CloudFile:
+    return _of_array(path, read_npy(path))
+
+
+def read_npy(
+    path: Path, check: Callable[[tuple[int, ...], np.dtype], None] | None = None
+) -> np.ndarray:
+    """The array of an .npy file, of any shape and type but objects.
+
+    Args:
+        path: of the file.
+        check: of shape and type, before memory is taken; raises DataError.
+
+    Raises:
+        DataError: damaged, pickled, or of another size than its header says; what `check` raises.
+    """
     with _readable(path, ".npy file"), open(path, "rb") as file:
-        _npy_header(path, file)
+        shape, dtype = _npy_header(path, file)
+        if check:
+            check(shape, dtype)
         file.seek(0)
-        array = np.load(file, allow_pickle=False)
-    return _of_array(path, array)
+        array: np.ndarray = np.load(file, allow_pickle=False)
+    return array
 
 
 def _npz(path: Path) -> CloudFile:

@@ -9,8 +9,9 @@ Class folders may carry any name of `qs3.classes`, in any case: `night_stand` is
 `val`, `valid` and `validation` count as train: validation sets are cut from train later, so
 that a model is selected in one way for every dataset.
 
-Hidden files, `__MACOSX` and files that are not meshes are ignored. Nothing is ignored that
-looks like a mesh and lies where it cannot be understood: that is an error.
+Folders of other classes are left alone, so all of ModelNet40 serves as it is; `left_alone` names
+them. Hidden files, `__MACOSX` and files that are not meshes are ignored. Nothing is ignored that
+looks like a mesh and lies in a class where it cannot be understood: that is an error.
 """
 
 from __future__ import annotations
@@ -43,14 +44,14 @@ class MeshFolder:
 
     Attributes:
         path: the root; its sub-folders are classes.
-        classes: the wanted ones; folders of other names are then left alone. None: all known,
-            and a folder of another name is an error, since it may be a misspelt class.
+        classes: the wanted ones; None: all known. A wanted one that is not there is an error,
+            which names the folders that are no class: it may be misspelt.
         test_fraction: of the meshes of a class whose folder has no splits, the part for test.
         half: "all", or "first" or "second": two disjoint halves of every class and split, so
             that a source and a target domain made from one folder share no shape.
         skip: stems of files to leave out, as if they were not there.
         known: the classes of the dataset, in label order.
-        keep_colliders: as `load_mesh`.
+        keep_colliders, up: as `load_mesh`.
     """
 
     path: Path
@@ -60,6 +61,7 @@ class MeshFolder:
     skip: tuple[str, ...] = ()
     known: tuple[str, ...] = CLASSES
     keep_colliders: bool = False
+    up: str = "z"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
@@ -82,11 +84,10 @@ class MeshFolder:
             ConfigError: a folder or file cannot be assigned to a class and split.
             DataError: a link leads out of the root.
         """
-        wanted = self.classes or self.known
         folders = self._class_folders()
         found: list[MeshItem] = []
-        for cls in (name for name in self.known if name in wanted):
-            groups = self._groups(cls, folders.get(cls, []))
+        for cls in (name for name in self.known if name in self._wanted):
+            groups = self._groups(cls, folders[cls])
             chosen = [
                 self._item(cls, split, stem, file)
                 for split in SPLITS
@@ -100,26 +101,38 @@ class MeshFolder:
             found.extend(chosen)
         return found
 
+    def left_alone(self) -> list[str]:
+        """Names of the folders with meshes of classes that are not wanted, or not known; sorted."""
+        return [
+            entry.name
+            for entry in _visible(self.path)
+            if entry.is_dir()
+            and known_as(entry.name, self.known) not in self._wanted
+            and _mesh_below(entry)
+        ]
+
+    @property
+    def _wanted(self) -> tuple[str, ...]:
+        return self.classes or self.known
+
     def _class_folders(self) -> dict[str, list[Path]]:
+        """The folders of each wanted class; each has one at least."""
         if not self.path.is_dir():
             raise MissingDataError(f"there is no folder of meshes at {self.path}")
         folders: dict[str, list[Path]] = {}
-        unknown = []
         for entry in _visible(self.path):
-            if not entry.is_dir():
-                continue
             cls = known_as(entry.name, self.known)
-            if cls is None:
-                unknown.append(entry.name)
-            elif self.classes is None or cls in self.classes:
+            if entry.is_dir() and cls in self._wanted:
                 self._refuse_link_outside(entry)
                 folders.setdefault(cls, []).append(entry)
-        if unknown and self.classes is None:
-            raise ConfigError(
-                f"{self.path}: {', '.join(repr(name) for name in unknown)} is not the name of a "
-                f"class. Known: {', '.join((*self.known, *ALIASES))}. Rename the folder or move it "
-                "away, or name the classes that are wanted with classes=[...]: then all other "
-                "folders are left alone"
+        if missing := [name for name in self._wanted if name not in folders]:
+            there = [name for name in self.known if name in folders]
+            rest = f"leave them out with classes=[{','.join(there)}]" if there else LAYOUTS
+            others = ", ".join(map(repr, self.left_alone()))
+            raise MissingDataError(
+                f"{self.path} has no folder of {', '.join(missing)}: add them, or {rest}"
+                + f". Its folders of other names: {others}; known names are "
+                f"{', '.join((*self.known, *ALIASES))}" * bool(others)
             )
         return folders
 
@@ -140,10 +153,9 @@ class MeshFolder:
                 f"{self._origin(split_file)}. Move all files into train and test, or none"
             )
         if not loose and not any(given.values()):
-            what = "has no mesh" if folders else "has no folder"
             raise MissingDataError(
-                f"class {cls!r} {what} in {self.path} ({LAYOUTS}, as {', '.join(SUFFIXES)}). "
-                "Add it, or leave it out with classes=[...]"
+                f"class {cls!r} has no mesh in {self.path} ({LAYOUTS}, as {', '.join(SUFFIXES)}). "
+                "Add some, or leave it out with classes=[...]"
             )
         if loose:
             return self._split(cls, self._by_stem(cls, loose))
@@ -204,7 +216,7 @@ class MeshFolder:
             id=f"{cls}/{split}/{stem}",
             cls=cls,
             split=split,
-            load=partial(load_mesh, file, keep_colliders=self.keep_colliders),
+            load=partial(load_mesh, file, keep_colliders=self.keep_colliders, up=self.up),
             origin=self._origin(file),
             path=file,
         )

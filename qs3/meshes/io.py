@@ -7,7 +7,8 @@ Files are untrusted: sizes are limited, nothing outside of the file's folder is 
 whatever a reader stumbles over becomes a MeshError that names the file.
 
 Axes and units are the file's own, with one exception: glTF, COLLADA and 3MF say which axis is up,
-so their meshes are turned to z up (and COLLADA's and 3MF's are scaled to metres).
+so their meshes are turned to z up (and COLLADA's and 3MF's are scaled to metres). Of the other
+formats the caller says it.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.config.checks import check_choice
 from qs3.errors import MeshError
 from qs3.meshes.formats import collada, gltf, obj, off, ply, stl, threemf
-from qs3.meshes.formats.arrays import Triangles, check_counts
+from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.mesh import Mesh
 
@@ -40,7 +42,14 @@ SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """Suffixes of the files that `load_mesh` reads, in lower case."""
 
 
-def load_mesh(path: str | Path, keep_colliders: bool = False) -> Mesh:
+DECLARE_UP = (".glb", ".gltf", ".dae", ".3mf")
+"""Those of files that say which axis is up, or whose standard does."""
+
+AXES = ("z", "y")
+"""Which axis may be up in the other files."""
+
+
+def load_mesh(path: str | Path, keep_colliders: bool = False, up: str = "z") -> Mesh:
     """Read a mesh; polygons are cut into triangles, the parts of a scene are put together.
 
     Duplicate faces and faces of either orientation are accepted, and vertices are not merged.
@@ -49,15 +58,21 @@ def load_mesh(path: str | Path, keep_colliders: bool = False) -> Mesh:
         path: of a file with one of `SUFFIXES`, in any case.
         keep_colliders: keep a scene's nodes that stand for collisions and that nobody sees (see
             `qs3.meshes.formats.colliders`); else they are left out, and counted in the mesh.
+        up: one of `AXES`, which is up in a file that does not say (not of `DECLARE_UP`); "y" is
+            turned to z up, (x, y, z) -> (x, -z, y).
 
     Raises:
         MeshError: the file is missing, empty, truncated, too large or damaged, or holds no
             surface; the message names the file and the reason.
     """
+    check_choice("up", up, AXES)
     path, colliders = Path(path), Colliders(skip=not keep_colliders)
     try:
         with np.errstate(all="ignore"):  # what is not finite is found and named below
-            return _checked(*_read(path, colliders), colliders.count)
+            vertices, faces = _read(path, colliders)
+            if up == "y" and path.suffix.lower() not in DECLARE_UP:
+                vertices = vertices @ Y_UP_TO_Z_UP.T
+            return _checked(vertices, faces, colliders.count)
     except MeshError as error:
         raise MeshError(f"{path}: {error}. Export the mesh again or remove the file") from error
     except MemoryError as error:

@@ -21,11 +21,18 @@ class Placing(Protocol):
 
 @dataclass(frozen=True)
 class UnitCube:
-    """The paper's placing: largest side 1 m, box centred on the origin, random yaw."""
+    """The paper's placing: largest side 1 m, box centred on the origin, random yaw.
+
+    Attributes:
+        yaw: false leaves the object turned as its file has it, as ModelNet10's clouds are.
+    """
+
+    yaw: bool = True
 
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A scaled, centred and turned copy."""
-        return _place(mesh, 1 / _largest_side(mesh), on_floor=False, rng=rng)
+        yaw_rad = _yaw_rad(rng)  # drawn in any case: what else is drawn does not depend on it
+        return _place(mesh, 1 / _largest_side(mesh), False, yaw_rad if self.yaw else 0.0)
 
 
 @dataclass(frozen=True)
@@ -44,7 +51,11 @@ class RealSize:
         """A turned copy on the floor."""
         side = _largest_side(mesh)
         plausible = self.min_side_m <= side <= self.max_side_m
-        return _place(mesh, 1.0 if plausible else self.fallback_side_m / side, True, rng)
+        return _place(mesh, 1.0 if plausible else self.fallback_side_m / side, True, _yaw_rad(rng))
+
+
+def _yaw_rad(rng: np.random.Generator) -> float:
+    return rng.uniform(0, 2 * np.pi)
 
 
 def _largest_side(mesh: Mesh) -> float:
@@ -55,12 +66,11 @@ def _largest_side(mesh: Mesh) -> float:
     return side
 
 
-def _place(mesh: Mesh, scale: float, on_floor: bool, rng: np.random.Generator) -> Mesh:
+def _place(mesh: Mesh, scale: float, on_floor: bool, yaw_rad: float) -> Mesh:
     low, high = mesh.bounds
     anchor = (low + high) / 2
     if on_floor:
         anchor[2] = low[2]
-    yaw = rng.uniform(0, 2 * np.pi)
-    c, s = np.cos(yaw), np.sin(yaw)
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     return Mesh((mesh.vertices - anchor) * scale @ turn.T, mesh.faces)

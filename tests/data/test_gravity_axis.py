@@ -14,9 +14,11 @@ from qs3.data.importers import NamedArrays, NpyTree, PointDAH5, XyzTree
 from qs3.data.inspection.gravity import (
     UPS,
     UpModel,
+    catalogue_model,
     judge_set,
-    upright_examples,
+    turned,
 )
+from qs3.data.inspection.upright import learnt, seen_from_above, upright_examples
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.catalogue import Catalogue
 from tests.fixtures import published as fixtures
@@ -146,3 +148,38 @@ def test_each_direction_is_found(some, up):
     for cls in THREE:
         verdict = model.judge(clouds[cls] @ matrix.T, cls)
         assert (verdict.up, verdict.axis_sure, verdict.sign_sure) == (UPS[up], True, True)
+
+
+def turned_each(clouds, rng):
+    return np.stack([turned(cloud, rng.uniform(0, 2 * np.pi)) for cloud in clouds])
+
+
+@pytest.mark.parametrize("scans", [False, True], ids=["whole", "seen from above"])
+@pytest.mark.parametrize("lie", [False, True], ids=["upright", "lying"])
+def test_objects_that_lie_are_found_though_each_is_turned_by_another_angle(scans, lie):
+    """What a scan of meshes with y up looks like: no axis is common to the clouds."""
+    rng = np.random.default_rng(0)
+    for cls in THREE:
+        items = Catalogue(seed=23, train=16, test=0, classes=(cls,)).items()
+        meshes = [item.load() for item in items]
+        clouds = np.stack([surface_sample(m.vertices, m.faces, 2048, rng) for m in meshes])
+        clouds = turned_each(clouds[..., [0, 2, 1]] * [1, 1, -1] if lie else clouds, rng)
+        if scans:
+            clouds = np.stack([seen_from_above(cloud, rng)[:512] for cloud in clouds])
+        verdict = catalogue_model().judge(clouds, cls)
+        assert (verdict.lies, verdict.stands) == (lie, not lie), verdict
+        assert (verdict.contradicts(), verdict.confirms()) == (lie, not lie), verdict
+
+
+def test_a_shape_alike_on_all_sides_tells_nothing():
+    """Of balls called chairs nothing is said, neither for z nor against it."""
+    balls = np.random.default_rng(0).normal(size=(12, 512, 3))
+    balls /= np.linalg.norm(balls, axis=2, keepdims=True)
+    verdict = catalogue_model().judge(balls, "chair")
+    assert not any((verdict.axis_sure, verdict.stands, verdict.confirms()))
+
+
+def test_the_model_on_disk_is_what_is_learnt():
+    shipped, again = catalogue_model(), learnt("bathtub")
+    for name, values in again.items():
+        np.testing.assert_allclose(getattr(shipped, name)["bathtub"], values, rtol=2e-4, atol=1e-6)

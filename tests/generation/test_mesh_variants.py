@@ -141,7 +141,9 @@ def test_an_open_surface_is_scanned_from_both_sides(tmp_path):
     folder.mkdir(parents=True)
     for i in range(6):
         sheet.export(folder / f"sheet_{i}.ply")
-    pointset = generate(config(tmp_path, tmp_path / "meshes", "classes=[chair]", "workers=0"))
+    pointset = generate(
+        config(tmp_path, tmp_path / "meshes", "classes=[chair]", "workers=0", "up=z")
+    )
     assert len(pointset) == 6
     clean = open_pointset(tmp_path / "specklenet10", "points_clean").points
     for cloud in clean:

@@ -70,12 +70,22 @@ def test_what_is_no_mesh_is_ignored(tmp_path):
 
 
 def test_unknown_folders(tmp_path):
-    make(tmp_path, *(f"{name}/a.off" for name in CLASSES), "toilet/a.off")
-    with pytest.raises(ConfigError, match=r"'toilet'.*bathtub.*night_stand.*classes="):
+    others = [name for name in CLASSES if name != "cabinet"]
+    make(tmp_path, *(f"{name}/a.off" for name in others), "toilet/a.off", "cabinets/a.off")
+    make(tmp_path, "docs/read.me")
+    with pytest.raises(MissingDataError) as error:
         MeshFolder(tmp_path).items()
-    items = MeshFolder(tmp_path, classes=CLASSES).items()
-    assert [item.cls for item in items] == list(CLASSES)
+    said = str(error.value)
+    assert "no folder of cabinet: add them, or leave them out with classes=[" in said
+    assert f"[{','.join(others)}]" in said
+    assert "folders of other names: 'cabinets', 'toilet'; known names are bathtub, " in said
+    assert "night_stand" in said
+    make(tmp_path, "night_stand/train/a.off")
+    folder = MeshFolder(tmp_path)
+    assert [item.cls for item in folder.items()] == list(CLASSES)
+    assert folder.left_alone() == ["cabinets", "toilet"]
     assert ids(tmp_path) == ["chair/train/a"]
+    assert len(MeshFolder(tmp_path, classes=("chair",)).left_alone()) == 11
 
 
 @pytest.mark.parametrize("settings", [{}, {"classes": ("chair", "plant")}])
@@ -83,7 +93,7 @@ def test_missing_classes_and_roots(tmp_path, settings):
     with pytest.raises(MissingDataError, match="no folder of meshes"):
         MeshFolder(tmp_path / "gone", **settings).items()
     make(tmp_path, *(f"{name}/a.off" for name in CLASSES if name != "plant"))
-    with pytest.raises(MissingDataError, match=r"'plant' has no folder.*classes="):
+    with pytest.raises(MissingDataError, match=r"no folder of plant.*classes="):
         MeshFolder(tmp_path, **settings).items()
     make(tmp_path, "plant/readme.txt")
     with pytest.raises(MissingDataError, match=r"'plant' has no mesh.*classes="):

@@ -4,32 +4,44 @@ A cloud is described as it would look standing on each of its six sides: what it
 from bottom to top hold. A ridge regression per class learns from shapes that are known to stand
 upright which of the six descriptions is the right one. The descriptions do not change when the
 object turns about the vertical axis, and half of the shapes to learn from are seen from above
-only and noisy, so scans can be judged as well.
+only and noisy, so scans can be judged as well. What was learnt from the embedded catalogue lies
+beside this file; `qs3.data.inspection.upright` made it.
+
+Objects that lie and were then turned about z, each by its own angle, as meshes with y up are when
+they are scanned as they stand, have no axis in common that could be found. So each cloud is also
+asked whether it would look better on its side, whichever that is.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.classes import CLASSES
-from qs3.geometry.sampling import surface_sample, unit_ball
-from qs3.meshes.catalogue import Catalogue
+from qs3.geometry.sampling import unit_ball
 
 UPS: tuple[str, ...] = ("+z", "-z", "+x", "-x", "+y", "-y")
 """The directions that may point up, in the order of all arrays here."""
 
+POINTS = 512
+"""Of a cloud that are looked at."""
+
+LEARNT = Path(__file__).with_name("gravity.json")
+"""The model of the embedded catalogue."""
+
+_PARTS = ("mean", "scale", "weights")
 _SLICES = 10
-_POINTS = 512  # of a cloud that are looked at
 _JUDGED = 100  # clouds a class
-_SHAPES = 40  # of the catalogue a class, to learn from
 _RIDGE = 100.0
 _SURE_SHARE = 0.6  # of the clouds that prefer the best direction to the second best
 _SURE_SD = 3.0  # standard errors between their mean scores
+_LEAST_SD = 0.3  # of a score's difference within a class, where few clouds happen to agree
+_YAWS_RAD = np.arange(4) * np.pi / 8  # with four sides each: a side every 22.5 degrees
 
 
 @dataclass(frozen=True)
@@ -44,6 +56,10 @@ class Verdict:
         sign_share: share of the clouds that prefer `up` to its opposite.
         axis_sure: the axis is told from the other two by most clouds and beyond chance.
         sign_sure: the same of the sign; a bookshelf looks alike upside down.
+        on_z_share: share of the clouds that look better on z, either way round, than on any side.
+        stands: most clouds do, and beyond chance.
+        lies: most clouds look better on one of their sides, and beyond chance; each may have
+            another one.
     """
 
     cls: str
@@ -53,10 +69,18 @@ class Verdict:
     sign_share: float
     axis_sure: bool
     sign_sure: bool
+    on_z_share: float
+    stands: bool
+    lies: bool
 
     def contradicts(self) -> bool:
         """Whether the evidence is clear and against +z."""
-        return self.axis_sure and (self.up[1] != "z" or (self.sign_sure and self.up == "-z"))
+        upside_down = self.sign_sure and self.up == "-z"
+        return self.lies or (self.axis_sure and (self.up[1] != "z" or upside_down))
+
+    def confirms(self) -> bool:
+        """Whether the evidence is clear and for the axis z; then the sign is not against it."""
+        return self.stands and self.axis_sure and not self.contradicts()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +108,18 @@ class UpModel:
 
     def scores(self, clouds: Float[np.ndarray, "n p 3"], cls: str) -> Float[np.ndarray, "n 6"]:
         """How well each direction of `UPS` does as "up"; the mean over the six is 0."""
-        x = _features(describe(clouds), self.mean[cls], self.scale[cls])
-        score = x @ self.weights[cls]
+        score = self._raw(clouds, cls)
         return score - score.mean(axis=1, keepdims=True)
+
+    def on_z(self, clouds: Float[np.ndarray, "n p 3"], cls: str) -> Float[np.ndarray, " n"]:
+        """How much better a cloud looks on z, either way round, than on the best of 16 sides."""
+        turns = np.stack([self._raw(turned(clouds, yaw), cls) for yaw in _YAWS_RAD], axis=1)
+        upright = turns[..., :2].mean(axis=1).max(axis=1)  # z does not turn: one score, with noise
+        return upright - turns[..., 2:].max(axis=(1, 2))
+
+    def _raw(self, clouds: np.ndarray, cls: str) -> np.ndarray:
+        """[n, 6] scores, comparable within a cloud and its turned copies."""
+        return _features(describe(clouds), self.mean[cls], self.scale[cls]) @ self.weights[cls]
 
     def judge(self, clouds: Float[np.ndarray, "n p 3"], cls: str) -> Verdict:
         """Which way is up in clouds [n, P, 3] of one class; one direction for all of them."""
@@ -95,15 +128,20 @@ class UpModel:
         along = score.reshape(-1, 3, 2).max(axis=2)  # [n, 3 axes]
         axis = best // 2
         rival = max((a for a in range(3) if a != axis), key=lambda a: along[:, a].mean())
-        sign_share, sign_sure = _prefers(score[:, best] - score[:, best ^ 1])
+        sign_share, sign_sure = prefers(score[:, best] - score[:, best ^ 1])
+        on_z = self.on_z(clouds, cls)
+        on_z_share, stands = prefers(on_z)
         return Verdict(
             cls=cls,
             clouds=len(score),
             up=UPS[best],
             axis_share=float((score.argmax(axis=1) // 2 == axis).mean()),
             sign_share=sign_share,
-            axis_sure=_prefers(along[:, axis] - along[:, rival])[1],
+            axis_sure=prefers(along[:, axis] - along[:, rival])[1],
             sign_sure=sign_sure,
+            on_z_share=on_z_share,
+            stands=stands,
+            lies=prefers(-on_z)[1],
         )
 
 
@@ -133,59 +171,16 @@ def judge_set(
 
 @cache
 def catalogue_model() -> UpModel:
-    """The model of the embedded catalogue: whole surfaces, and scans from above, with noise."""
-    return UpModel.fit({cls: upright_examples(cls, _SHAPES) for cls in CLASSES})
-
-
-def upright_examples(cls: str, shapes: int, seed: int = 7) -> Float[np.ndarray, "n 512 3"]:
-    """Clouds of the catalogue's objects of a class, z up: four of each shape, two of them scans."""
-    rng = np.random.default_rng([seed, CLASSES.index(cls)])
-    catalogue = Catalogue(seed=seed, train=shapes, test=0, classes=(cls,), families="all")
-    clouds = []
-    for item in catalogue.items():
-        mesh = item.load()
-        for kind in range(4):
-            cloud = surface_sample(mesh.vertices, mesh.faces, 4 * _POINTS, rng)
-            cloud = turned(
-                cloud * rng.uniform(0.8, 1.25, 3), rng.uniform(0, 2 * np.pi) * (kind % 2)
-            )
-            if kind >= 2:
-                cloud = seen_from_above(cloud, rng)
-                cloud = cloud + rng.normal(0, 0.01 * np.ptp(cloud, axis=0).max(), cloud.shape)
-            few = len(cloud) < _POINTS
-            picked = rng.integers(0, len(cloud), _POINTS) if few else rng.permutation(len(cloud))
-            clouds.append(cloud[picked[:_POINTS]])
-    return np.stack(clouds)
+    """The model of the embedded catalogue, as `qs3.data.inspection.upright` learnt it."""
+    found = json.loads(LEARNT.read_text())
+    parts = {part: {cls: np.array(of[part]) for cls, of in found.items()} for part in _PARTS}
+    return UpModel(**parts)
 
 
 def turned(cloud: Float[np.ndarray, "*b 3"], yaw_rad: float) -> Float[np.ndarray, "*b 3"]:
     """The cloud turned about z."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return cloud @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=cloud.dtype)
-
-
-def seen_from_above(
-    cloud: Float[np.ndarray, "p 3"], rng: np.random.Generator
-) -> Float[np.ndarray, "m 3"]:
-    """The points that are in front in one of four views, 15 to 45 degrees above the horizon."""
-    cells, views = 50, 4
-    centred = cloud - cloud.mean(axis=0)
-    size = max(float(np.abs(centred).max()), 1e-12)
-    kept = np.zeros(len(cloud), dtype=bool)
-    first, arc = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2.6)
-    for view in range(views):
-        azimuth = first + arc * view / (views - 1)
-        elevation = np.deg2rad(rng.uniform(15, 45))
-        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0])
-        away = np.array([np.cos(azimuth), np.sin(azimuth), 0]) * np.cos(elevation)
-        towards = away + np.array([0, 0, np.sin(elevation)])
-        picture = centred @ np.stack([right, np.cross(towards, right)], axis=1) / size
-        column, row = ((picture + 1.8) / 3.6 * cells).astype(int).T  # corners lie at sqrt(3)
-        nearness = centred @ towards / size
-        front = np.full(cells * cells, -np.inf)
-        np.maximum.at(front, row * cells + column, nearness)
-        kept |= nearness > front[row * cells + column] - 0.07
-    return cloud[kept]
 
 
 def describe(clouds: Float[np.ndarray, "n p 3"]) -> Float[np.ndarray, "n 6 f"]:
@@ -196,8 +191,8 @@ def describe(clouds: Float[np.ndarray, "n p 3"]) -> Float[np.ndarray, "n 6 f"]:
     their centre is off the axis; and of the whole the height and the two sides of the base. In
     units of the unit ball; at most 512 points of a cloud are taken, evenly.
     """
-    step = max(1, clouds.shape[1] // _POINTS)
-    clouds = unit_ball(np.asarray(clouds, dtype=np.float64)[:, ::step][:, :_POINTS])
+    step = max(1, clouds.shape[1] // POINTS)
+    clouds = unit_ball(np.asarray(clouds, dtype=np.float64)[:, ::step][:, :POINTS])
     n, points, _ = clouds.shape
     found = []
     for up in UPS:
@@ -244,9 +239,9 @@ def _features(described: np.ndarray, mean: np.ndarray, scale: np.ndarray) -> np.
     return np.concatenate([x, x**2 - 1], axis=-1)
 
 
-def _prefers(difference: np.ndarray) -> tuple[float, bool]:
-    """Share of positive differences, and whether most are and their mean is beyond chance."""
+def prefers(difference: Float[np.ndarray, " n"]) -> tuple[float, bool]:
+    """Share of positive differences of scores, and whether most are, beyond chance."""
     share = float((difference > 0).mean())
-    error = float(difference.std()) / np.sqrt(max(len(difference) - 1, 1))
+    error = max(float(difference.std()), _LEAST_SD) / np.sqrt(len(difference))
     sure = share >= _SURE_SHARE and float(difference.mean()) > _SURE_SD * error
     return share, bool(sure)

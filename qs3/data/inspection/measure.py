@@ -70,6 +70,7 @@ def inspect(opened: Opened, bounds: Bounds, advance: Advance = lambda: None) -> 
         "gravity": {
             "by_class": {v.cls: dataclasses.asdict(v) for v in verdicts},
             "contradicting": [v.cls for v in verdicts if v.contradicts()],
+            "confirming": [v.cls for v in verdicts if v.confirms()],
         },
         "spacing": measures.summary(values, measures.groups(data, chosen)),
         "copies": measures.copies(data, opened.rows),

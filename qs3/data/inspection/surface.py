@@ -75,8 +75,12 @@ def surfaces_of(meta: dict[str, Any], meshes: Path | None = None) -> tuple[Surfa
         if meshes is None:
             return None, "it was made from a folder of meshes: give it with meshes=PATH"
         config = meta.get("config") or {}
-        keys = {key: config[key] for key in ("test_fraction", "half") if key in config}
+        keys: dict[str, Any] = {
+            key: config[key] for key in ("test_fraction", "half") if key in config
+        }
         keys["keep_colliders"] = settings.get("colliders") == "keep"
+        keys["up"] = settings.get("up", "z")
+        keys["classes"] = config.get("classes") or None
         items = MeshFolder(path=meshes, **keys).items()
     elif isinstance(source, dict) and source.get("_target_") == _CATALOGUE:
         values = {key: value for key, value in source.items() if key != "_target_"}

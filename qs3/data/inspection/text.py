@@ -143,23 +143,33 @@ def _spaced(of: Numbers) -> list[str]:
 def _ups(up: Numbers) -> list[str]:
     if not up["by_class"]:
         return ["unknown: no clouds with labels of the ten classes"]
-    rows = [["class", "up", "clouds", "along this axis", "this way, not the other", "evidence"]]
+    shares = ["along this axis", "this way, not the other", "rather on z"]
+    rows = [["class", "up", "clouds", *shares, "evidence"]]
     for cls, of in up["by_class"].items():
         shown, evidence = "?", "weak"
         if of["axis_sure"]:
             shown, evidence = f"{of['up'][1]}?", "of the axis only"
             if of["sign_sure"]:
                 shown, evidence = of["up"], "clear"
-        shares = [f"{of['axis_share']:.0%}", f"{of['sign_share']:.0%}"]
+        if of["lies"] and not (of["axis_sure"] and of["up"][1] != "z"):
+            shown, evidence = "lies", "on its sides, each cloud its own way"
+        shares = [f"{of[share]:.0%}" for share in ("axis_share", "sign_share", "on_z_share")]
         rows.append([cls, shown, str(of["clouds"]), *shares, evidence])
+    return [_table(rows), _up_verdict(up)]
+
+
+def _up_verdict(up: Numbers) -> str:
+    weak = [cls for cls in up["by_class"] if cls not in up["contradicting"] + up["confirming"]]
+    untold = f"; of {', '.join(weak)} the shapes do not tell" if weak else ""
     if up["contradicting"]:
-        verdict = (
-            f"WARNING: {', '.join(up['contradicting'])} do not stand upright on z. A wrong axis "
-            "costs tens of points of accuracy: check the importer's `up`"
+        return (
+            f"WARNING: {', '.join(up['contradicting'])} do not stand upright on z{untold}. A wrong "
+            "axis costs tens of points of accuracy: check the importer's `up`, or for clouds from "
+            "generate.py the `up` of the meshes"
         )
-    else:
-        verdict = "no class contradicts z up; judged by the embedded catalogue's upright shapes"
-    return [_table(rows), verdict]
+    if up["confirming"]:
+        return f"z is up, by the shapes of {', '.join(up['confirming'])}{untold}"
+    return "unknown: the shapes of no class tell which way is up; look at clouds.png"
 
 
 def _copies(copies: Numbers, points: float) -> list[str]:
