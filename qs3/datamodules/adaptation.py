@@ -15,7 +15,7 @@ from torch import Tensor
 from qs3.data.domain import Domain
 from qs3.data.ensure_source import check_or_make
 from qs3.datamodules.augment import Augment
-from qs3.datamodules.batches import Batches, Table, generator_of
+from qs3.datamodules.batches import Batches, Piece, Table, generator_of
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
@@ -153,6 +153,8 @@ class AdaptationData(LightningDataModule):
             tables = {"target": self._pseudo_labelled(), **tables}
         elif self.uses_target:
             tables["target"] = Table(self.target.clouds, {})
+        steps = self.phases.steps(epoch)
+        start, _ = self.phases.span(self.phases.phase(epoch))
         return Batches(
             tables,
             self.batch_size if warmup else self.scheme.batch_size,
@@ -160,6 +162,7 @@ class AdaptationData(LightningDataModule):
             epoch=epoch,
             rank=self.trainer.global_rank if self.trainer else 0,
             world=self.trainer.world_size if self.trainer else 1,
+            piece=None if steps is None else Piece(start, *steps),
         )
 
     def val_dataloader(self) -> Batches:

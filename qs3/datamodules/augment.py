@@ -9,14 +9,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from qs3.config.checks import check_ranges
+from qs3.config.checks import check_int, check_ranges
+
+REGION_SHARE = (0.1, 0.25)
+"""Of a cloud's points, from which and up to which share a dropped region takes."""
 
 
 @dataclass(frozen=True)
 class Augment:
-    """Random rotation about the up axis, anisotropic scale, shift and jitter, in this order.
+    """Holes, random rotation about the up axis, anisotropic scale, shift and jitter, in this order.
 
     Attributes:
+        drop_regions: empty one to so many regions of each cloud, at most 3 (see `drop_regions`);
+            0 drops nothing.
         rotate_z: turn each cloud about z by U(0, 2π).
         scale: factor of each axis, U(1 / scale, scale); 1 leaves the size alone.
         shift: added to each axis, U(-shift, shift).
@@ -25,6 +30,7 @@ class Augment:
             the paper's descends from 0.02.
     """
 
+    drop_regions: int = 0
     rotate_z: bool = True
     scale: float = 1.0
     shift: float = 0.0
@@ -33,7 +39,8 @@ class Augment:
 
     def __post_init__(self) -> None:
         noise = dict.fromkeys(("shift", "jitter_sigma", "jitter_clip"), ">= 0")
-        check_ranges(self, "protocol.augment.", scale=">= 1", **noise)
+        check_ranges(self, "protocol.augment.", scale=">= 1", drop_regions="[0, 3]", **noise)
+        check_int("protocol.augment.drop_regions", self.drop_regions, 0)
 
     def __call__(
         self, points: Float[Tensor, "b n 3"], generator: torch.Generator
@@ -44,6 +51,8 @@ class Augment:
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
 
+        if self.drop_regions:
+            points = drop_regions(points, self.drop_regions, generator)
         if self.rotate_z:
             points = rotate_z(points, 2 * math.pi * uniform(b))
         if self.scale > 1.0:
@@ -63,3 +72,32 @@ def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, " b"]) -> Floa
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]  # [B, 1]
     x, y, z = points.unbind(dim=2)  # [B, N] each
     return torch.stack([cos * x - sin * y, sin * x + cos * y, z], dim=2)
+
+
+def drop_regions(
+    points: Float[Tensor, "b n 3"], most: int, generator: torch.Generator
+) -> Float[Tensor, "b n 3"]:
+    """Empty one to `most` regions of each cloud, and repeat points at random in their places.
+
+    A region is the ball around a point that is left, with a tenth to a quarter of the cloud's n
+    points. The paper's M_d (section 4.3) has such holes and gives no parameters: these are those
+    of ours on disk (`qs3.generation.recipes.RegionDropout`), which has new points where this one
+    repeats some, and the same holes in every epoch.
+    """
+    b, n = points.shape[:2]
+    low, high = REGION_SHARE
+
+    def uniform() -> Tensor:
+        return torch.rand(b, generator=generator, device=points.device)
+
+    left = torch.ones(b, n, dtype=torch.bool, device=points.device)
+    regions = 1 + (most * uniform()).long().clamp(max=most - 1)  # [B]
+    for region in range(most):
+        centre = torch.multinomial(left.float(), 1, generator=generator)  # [B, 1]
+        size = (n * (low + (high - low) * uniform())).long() * (region < regions)  # [B]
+        distance = (points - points.take_along_dim(centre[..., None], dim=1)).square().sum(dim=2)
+        order = distance.masked_fill(~left, torch.inf).argsort(dim=1, stable=True)
+        nearest = torch.arange(n, device=points.device) < size[:, None]  # [B, N], in that order
+        left &= ~torch.zeros_like(left).scatter(1, order, nearest)
+    other = torch.multinomial(left.float(), n, replacement=True, generator=generator)  # [B, N]
+    return torch.where(left[..., None], points, points.take_along_dim(other[..., None], dim=1))

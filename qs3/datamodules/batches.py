@@ -65,6 +65,20 @@ def balanced(classes: Int[Tensor, " n"], generator: torch.Generator) -> Int[Tens
     return order
 
 
+@dataclass(frozen=True)
+class Piece:
+    """An epoch that is not one pass over the data but a piece of a longer way through them.
+
+    Attributes:
+        way: which one; two phases of a run take different ways.
+        first, stop: its batches, counted from the way's beginning.
+    """
+
+    way: int
+    first: int
+    stop: int
+
+
 class Batches:
     """One epoch: `{"source": {"points", "y_source"}, ..., "index": i, "epoch": e}` per step.
 
@@ -78,6 +92,8 @@ class Batches:
         seed, epoch: of the run, and counted from 0.
         shuffle: False keeps the tables' order, and each cloud's sample 0 (evaluation).
         rank, world: of `world` processes each takes every `world`-th cloud, as many as the others.
+        piece: instead of one pass these batches, all of `batch_size`. Each cloud still comes once
+            before any comes again.
     """
 
     def __init__(
@@ -90,12 +106,17 @@ class Batches:
         shuffle: bool = True,
         rank: int = 0,
         world: int = 1,
+        piece: Piece | None = None,
     ) -> None:
         self.tables = dict(tables)
         self.seed, self.epoch, self.shuffle = seed, epoch, shuffle
         self.rank, self.world = rank, world
+        self.piece = piece
         first = next(iter(self.tables.values()))
-        self.sizes = _sizes(-(-len(first) // world), batch_size)
+        if piece is None:
+            self.sizes = _sizes(-(-len(first) // world), batch_size)
+        else:
+            self.sizes = [batch_size] * (piece.stop - piece.first)
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -122,16 +143,20 @@ class Batches:
         """This process's positions of the epoch: its share of one order after another."""
         n, needed = len(table), sum(self.sizes)
         each = -(-n // self.world)  # all processes take equally many: some clouds come twice
+        begin = 0 if self.piece is None else self.piece.first * self.sizes[0]
+        way: tuple[int | str, ...] = (self.epoch,)
+        if self.piece is not None:
+            way = ("way", self.piece.way)
         shares = []
-        for passed in range(-(-needed // each)):
+        for passed in range(begin // each, -(-(begin + needed) // each)):
             if self.shuffle:
-                order = table.order(self._generator("shuffle", name, self.epoch, passed))
+                order = table.order(self._generator("shuffle", name, *way, passed))
             else:
                 order = torch.arange(n)
             shares.append(
                 order.repeat(1 + self.world)[: each * self.world][self.rank :: self.world]
             )
-        return torch.cat(shares)[:needed]
+        return torch.cat(shares)[begin % each :][:needed]
 
     def _generator(self, *names: int | str) -> torch.Generator:
         return torch.Generator().manual_seed(derive(self.seed, *names))

@@ -19,14 +19,26 @@ class Phases:
     """The epochs of one `Trainer.fit`: a warm-up, then rounds of equal length.
 
     Phase 0 is the warm-up, phase r + 1 is round r. All epochs count from 0.
+
+    Attributes:
+        warmup: epochs of the warm-up.
+        rounds: their number.
+        epochs: of each round.
+        warmup_steps, round_steps: batches of the warm-up and of each round, spread evenly over its
+            epochs; None: an epoch is one pass over what is trained on.
     """
 
     warmup: int
     rounds: int = 0
     epochs: int = 0
+    warmup_steps: int | None = None
+    round_steps: int | None = None
 
     def __post_init__(self) -> None:
         check_int("protocol.epochs", self.warmup, 1)
+        _check_steps("protocol", self.warmup_steps, self.warmup)
+        if self.rounds:
+            _check_steps("selftraining", self.round_steps, self.epochs)
 
     @property
     def total(self) -> int:
@@ -54,10 +66,30 @@ class Phases:
         """Whether `epoch` is the last of its phase."""
         return self.span(self.phase(epoch))[1] == epoch + 1
 
+    def steps(self, epoch: int) -> tuple[int, int] | None:
+        """First batch of an epoch and the first one after it, counted from its phase's beginning.
+
+        None where an epoch is one pass.
+        """
+        phase = self.phase(epoch)
+        steps = self.warmup_steps if phase == 0 else self.round_steps
+        if steps is None:
+            return None
+        start, stop = self.span(phase)
+        done, epochs = epoch - start, stop - start
+        return steps * done // epochs, steps * (done + 1) // epochs
+
     def cosine(self, epoch: int) -> float:
         """Factor on the learning rate: from 1 towards 0 along a half cosine, in each phase anew."""
         start, stop = self.span(self.phase(epoch))
         return 0.5 * (1.0 + math.cos(math.pi * (epoch - start) / (stop - start)))
+
+
+def _check_steps(group: str, steps: int | None, epochs: int) -> None:
+    if steps is not None and check_int(f"{group}.steps", steps, 1) < epochs:
+        raise ConfigError(
+            f"{group}.steps={steps} must be at least {group}.epochs={epochs}, one an epoch"
+        )
 
 
 @dataclass(frozen=True)
@@ -68,6 +100,8 @@ class SelfTrainingConfig:
         selector: a `qs3.selftraining.selectors.Selector`.
         rounds: number of rounds; 0 is not self-training.
         epochs: of each round.
+        steps: batches of each round, spread over its epochs, however many pseudo-labels there are;
+            None: an epoch is one pass over them.
         batch_size: of each round.
         theta: confidence that a pseudo-label must exceed, in round 0; 0 is for selectors that have
             thresholds of their own (CBST), and for them alone.
@@ -88,6 +122,7 @@ class SelfTrainingConfig:
     selector: Any = None
     rounds: int = 0
     epochs: int = 10
+    steps: int | None = None
     batch_size: int = 32
     theta: float = 0.8
     epsilon: float = 0.0

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from qs3.datamodules.augment import Augment, rotate_z
+from qs3.datamodules.augment import REGION_SHARE, Augment, drop_regions, rotate_z
 from qs3.errors import ConfigError
 
 
@@ -51,7 +51,70 @@ def test_all_off_changes_nothing():
     assert torch.equal(off(points, generator()), points)
 
 
-@pytest.mark.parametrize("settings", [{"scale": 0.5}, {"shift": -1.0}, {"jitter_clip": -0.1}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *({"scale": 0.5}, {"shift": -1.0}, {"jitter_clip": -0.1}),
+        *({"drop_regions": 4}, {"drop_regions": -1}, {"drop_regions": 1.5}),
+    ],
+)
 def test_wrong_settings(settings):
     with pytest.raises(ConfigError, match=r"protocol\.augment"):
         Augment(**settings)
+
+
+def line(clouds: int, n: int) -> torch.Tensor:
+    """Points 0, 1, ..., n - 1 on the x axis: a region is an interval, and a point its own name."""
+    x = torch.arange(n, dtype=torch.float32)
+    return torch.stack([x, 0 * x, 0 * x], dim=1).expand(clouds, n, 3)
+
+
+def gaps(cloud: torch.Tensor, n: int) -> list[int]:
+    """Lengths of the runs of missing numbers on the `line`."""
+    missing = [i not in set(cloud[:, 0].int().tolist()) for i in range(n)]
+    runs = "".join(" x"[m] for m in missing).split()
+    return [len(run) for run in runs]
+
+
+def test_one_region_is_one_hole_of_a_tenth_to_a_quarter():
+    n = 200
+    points = line(64, n)
+    holed = drop_regions(points, 1, generator())
+    sizes = [gaps(cloud, n) for cloud in holed]
+    assert all(len(found) == 1 for found in sizes)
+    low, high = (share * n for share in REGION_SHARE)
+    assert all(low <= size <= high for (size,) in sizes)
+    assert len({size for (size,) in sizes}) > 10
+    assert torch.equal(points, line(64, n))
+    assert torch.equal(holed, drop_regions(points, 1, generator()))
+    assert not torch.equal(holed, drop_regions(points, 1, generator(1)))
+
+
+def test_what_is_left_stays_in_its_place_and_the_rest_repeats_it():
+    points = torch.rand(8, 100, 3, generator=generator())
+    holed = drop_regions(points, 3, generator(1))
+    for before, after in zip(points, holed, strict=True):
+        stays = (before == after).all(dim=1)
+        known = {tuple(p) for p in before[stays].tolist()}
+        assert {tuple(p) for p in after.tolist()} == known
+        assert 25 <= len(known) <= 90
+
+
+def test_one_to_three_regions_are_about_equally_frequent():
+    n = 300
+    holed = drop_regions(line(600, n), 3, generator())
+    lost = torch.tensor([float(sum(gaps(cloud, n))) for cloud in holed]) / n
+    assert lost.min() >= 0.099
+    assert lost.max() <= 0.75
+    assert float(lost.mean()) == pytest.approx(2 * sum(REGION_SHARE) / 2, abs=0.02)
+
+
+def test_dropping_comes_before_the_rest_and_off_draws_nothing():
+    """With 0 the same numbers as ever are drawn; with more, whole clouds keep their size."""
+    points = torch.rand(4, 50, 3, generator=generator())
+    assert torch.equal(
+        Augment()(points, generator(1)), Augment(drop_regions=0)(points, generator(1))
+    )
+    holed = Augment(drop_regions=2, jitter_sigma=0.0)(points, generator(1))
+    assert holed.shape == points.shape
+    assert len(holed[0].unique(dim=0)) < 50

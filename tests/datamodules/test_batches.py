@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.datamodules.batches import Batches, Table, balanced
+from qs3.datamodules.batches import Batches, Piece, Table, balanced
 from qs3.datamodules.clouds import Clouds
 from qs3.utils.seeding import derive
 
@@ -145,3 +145,45 @@ def test_processes_get_different_clouds_of_a_balanced_epoch():
     parts = [set(seen(batches(400, balance="class", rank=r, world=2))) for r in range(2)]
     assert len(parts[0]) > 60
     assert parts[0] & parts[1] <= {0}  # the only cloud of its class
+
+
+@given(
+    n=st.integers(2, 30),
+    other=st.integers(2, 30),
+    size=st.integers(2, 8),
+    cuts=st.lists(st.integers(1, 6), min_size=1, max_size=5),
+    world=st.integers(1, 3),
+)
+def test_pieces_of_a_way_put_together_are_the_way(n, other, size, cuts, world):
+    """However it is cut into epochs: the same batches of each process, and none is short."""
+
+    def epoch(piece, number, rank=0):
+        tables = {"a": table(n), "b": table(other)}
+        more = {"rank": rank, "world": world, "piece": piece}
+        return Batches(tables, size, seed=0, epoch=number, **more)
+
+    ends = list(itertools.accumulate(cuts))
+    for rank in range(world):
+        whole = epoch(Piece(7, 0, ends[-1]), 0, rank)
+        pieces = [
+            epoch(Piece(7, end - count, end), i, rank)
+            for i, (count, end) in enumerate(zip(cuts, ends, strict=True))
+        ]
+        for name in ("a", "b"):
+            parts = [y for piece in pieces for y in seen(piece, name)]
+            assert parts == seen(whole, name)
+        assert [len(piece) for piece in pieces] == cuts
+        assert all(len(batch["a"]["points"]) == size for piece in pieces for batch in piece)
+
+
+@given(n=st.integers(2, 30), size=st.integers(2, 8))
+def test_on_a_way_every_cloud_comes_before_any_comes_again(n, size):
+    passes = 3
+    way = seen(batches(n, size, piece=Piece(0, 0, -(-passes * n // size))))
+    for i in range(passes):
+        assert sorted(way[i * n : (i + 1) * n]) == list(range(n))
+
+
+def test_two_phases_take_different_ways():
+    first, second = (seen(batches(20, piece=Piece(way, 0, 5))) for way in (0, 5))
+    assert first != second

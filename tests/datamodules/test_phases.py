@@ -1,6 +1,10 @@
 from __future__ import annotations
 
+import itertools
+
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from qs3.datamodules.phases import Phases, SelfTrainingConfig, no_rounds
 from qs3.errors import ConfigError
@@ -60,3 +64,41 @@ def test_none_ignores_what_an_experiment_set_for_rounds():
 def test_warmup_needs_an_epoch(epochs):
     with pytest.raises(ConfigError, match=r"protocol\.epochs must be a whole number >= 1"):
         Phases(warmup=epochs)
+
+
+@given(
+    warmup=st.integers(1, 20),
+    rounds=st.integers(0, 4),
+    epochs=st.integers(1, 9),
+    more=st.tuples(st.integers(0, 500), st.integers(0, 500)),
+)
+def test_steps_are_spread_evenly_over_the_epochs_of_each_phase(warmup, rounds, epochs, more):
+    steps = (warmup + more[0], epochs + more[1])
+    phases = Phases(warmup, rounds, epochs, *steps)
+    for phase in range(rounds + 1):
+        pieces = [phases.steps(epoch) for epoch in range(*phases.span(phase))]
+        assert pieces[0][0] == 0
+        assert pieces[-1][1] == steps[min(phase, 1)]
+        assert all(one[1] == two[0] for one, two in itertools.pairwise(pieces))
+        sizes = [stop - first for first, stop in pieces]
+        assert max(sizes) - min(sizes) <= 1
+        assert min(sizes) >= 1
+
+
+def test_without_steps_an_epoch_is_one_pass():
+    assert Phases(3, 2, 4).steps(0) is None
+    assert Phases(3, 2, 4, warmup_steps=30).steps(3) is None
+    assert Phases(3, 2, 4, round_steps=30).steps(2) is None
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [
+        ((2, None), r"protocol\.steps=2 must be at least protocol\.epochs=3"),
+        ((None, 3), r"selftraining\.steps=3 must be at least selftraining\.epochs=4"),
+        ((0, None), r"protocol\.steps"),
+    ],
+)
+def test_an_epoch_without_a_step_is_refused(steps, message):
+    with pytest.raises(ConfigError, match=message):
+        Phases(3, 2, 4, *steps)

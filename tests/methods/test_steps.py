@@ -181,9 +181,17 @@ FAULTS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_watch_sees_a_fault(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Faulty(nn.Module):
+        def __init__(self, net: nn.Module) -> None:
+            super().__init__()
+            self.net = net
+
+        def forward(self, points: Tensor) -> Tensor:
+            return FAULTS[fault](self.net(points))
+
     class Wrong(SourceOnly):
         def loss(self, net: Any, batch: Any, generator: Any) -> dict[str, Tensor]:
-            return super().loss(lambda points: FAULTS[fault](net(points)), batch, generator)
+            return super().loss(Faulty(net), batch, generator)
 
     monkeypatch.setitem(CASES, fault, Case(Wrong, 1))
     try:

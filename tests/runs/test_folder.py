@@ -138,14 +138,14 @@ def test_clear_keeps_what_hydra_wrote(tmp_path):
 @pytest.mark.parametrize(
     ("words", "name"),
     [
-        (["experiment=cad10"], "cad10/seed0-0bde6542"),
-        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-baf9e381"),
-        (["experiment=qs3_s2d"], "qs3_s2d/seed0-ba603178"),
-        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-5064507b"),
-        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-5064507b"),
-        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-5064507b"),
-        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-5ef91b28"),
-        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-ba603178"),
+        (["experiment=cad10"], "cad10/seed0-aba5abc9"),
+        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-780fd389"),
+        (["experiment=qs3_s2d"], "qs3_s2d/seed0-4badbe78"),
+        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-a4dbf282"),
+        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-a4dbf282"),
+        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-a4dbf282"),
+        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-16a213e3"),
+        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-4badbe78"),
     ],
 )
 def test_a_command_finds_its_run(words, name):

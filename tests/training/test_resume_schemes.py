@@ -32,6 +32,7 @@ SCHEMES = {
     "crst_mrkld": ("selftraining=crst_mrkld", FREE),
     "random": ("selftraining=random",),
     "confident": ("selftraining=confident",),
+    "steps": ("selftraining=qbst", "protocol.steps=8", "selftraining.steps=5"),
     "continued_alone": ("selftraining=qbst", "selftraining.init=continue", "selftraining.pcm=true"),
 }
 METHODS = {

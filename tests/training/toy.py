@@ -11,10 +11,19 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
+from qs3.data.made_of import MadeOf
 from qs3.data.store import ManifestRow, write_pointset
 
 CLASSES = ("ball", "rod", "slab")
 _SHAPES = {"ball": (1.0, 1.0, 1.0), "rod": (0.2, 0.2, 1.0), "slab": (1.0, 1.0, 0.15)}
+MADE_OF = {
+    "specklenet10": MadeOf(
+        objects="embedded catalogue", sensor="speckle_stereo", views=5, meshes="0123456789ab"
+    ),
+    "kinectsim10": MadeOf(
+        objects="embedded catalogue", sensor="kinect_like", views=4, benchmark="kinectsim10 v2"
+    ),
+}
 CONF = Path(__file__).parents[2] / "conf"
 
 
@@ -51,7 +60,7 @@ def write_domain(
         classes=CLASSES,
         arrays={"points": np.array(clouds, dtype=np.float32)},
         rows=rows,
-        meta={},
+        meta=MADE_OF.get(name, MadeOf()).meta,
     )
 
 
