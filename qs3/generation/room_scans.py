@@ -1,0 +1,205 @@
+"""One view of an object in a room, cut out of the depth image as objects of real frames are cut.
+
+`RoomScan` imitates how real single-view datasets come about (NYU Depth V2, SUN RGB-D): somebody
+stands in a room, the object is somewhere in the picture, other things cover a part of it, an
+annotator draws its mask, and `qs3.data.frames.cutting` cuts by the same rules as it does there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from qs3.config.checks import check_ranges
+from qs3.data.frames.cutting import cut, inliers, own_pixels
+from qs3.data.frames.images import DepthImage, Pinhole
+from qs3.data.frames.rules import Rules
+from qs3.errors import ConfigError
+from qs3.generation.camera_poses import direction
+from qs3.generation.provenance import Keep, preview_of, provenance_of
+from qs3.generation.recipes import Cloud, MaskCrop, TooFewPointsError
+from qs3.generation.scenes import Room, Surroundings
+from qs3.generation.view_files import save_view
+from qs3.geometry.cameras import Intrinsics, look_at
+from qs3.geometry.sampling import farthest_point_sampling_np
+from qs3.meshes.mesh import Mesh
+from qs3.meshes.placement import Placing, RealSize
+from qs3.sensors.base import DepthFrame, DepthSensor
+from qs3.sensors.renderers.base import Renderer
+from qs3.utils.seeding import object_rng
+
+_BARE = Keep()
+_AROUND_M = 0.3
+"""The picture is taken so far around the object, for what covers its outline."""
+_RAISED = 0.5
+"""Share of the objects of a class in `RoomScan.stands_m` that do not stand on the floor."""
+
+
+@dataclass(frozen=True)
+class RoomCamera:
+    """Somebody stands in a room; the object is anywhere in the picture.
+
+    Attributes:
+        min_height_m, max_height_m: of the camera above the floor.
+        min_distance_m, max_distance_m: along the floor, from the object's middle.
+        clearance_m: at least so far from the circle around the object's footprint.
+        spread: the object's middle lies within this share of the picture's half width and height.
+        min_pitch_deg, max_pitch_deg: how far the camera looks down.
+        roll_deg: standard deviation.
+    """
+
+    min_height_m: float = 1.1
+    max_height_m: float = 1.7
+    min_distance_m: float = 1.3
+    max_distance_m: float = 4.5
+    clearance_m: float = 0.6
+    spread: float = 0.85
+    min_pitch_deg: float = -5.0
+    max_pitch_deg: float = 40.0
+    roll_deg: float = 1.5
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "recipe.camera.", clearance_m=">= 0", spread="[0, 1]")
+        for name in ("height_m", "distance_m", "pitch_deg"):
+            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
+            if low > high:
+                raise ConfigError(
+                    f"recipe.camera.min_{name}={low} is above recipe.camera.max_{name}={high}"
+                )
+
+    def pose(self, rng: np.random.Generator, box_m: np.ndarray, lens: Intrinsics) -> np.ndarray:
+        """[4, 4] world_from_camera before an object with box [2, 3]; the floor is z = 0."""
+        middle = box_m.mean(axis=0)
+        radius = float(np.hypot(*(box_m[1] - box_m[0])[:2])) / 2
+        away = max(rng.uniform(self.min_distance_m, self.max_distance_m), radius + self.clearance_m)
+        azimuth = rng.uniform(0, 2 * np.pi)
+        height = rng.uniform(self.min_height_m, self.max_height_m)
+        eye = np.array([*(middle[:2] + away * direction(azimuth, 0.0)[:2]), height])
+        half = np.array([lens.width_px, lens.height_px]) / (2 * lens.focal_px)
+        right, down = np.arctan(rng.uniform(-self.spread, self.spread, 2) * half)
+        pitch = np.arctan2(height - middle[2], away) - down
+        low, high = np.deg2rad([self.min_pitch_deg, self.max_pitch_deg])
+        ahead = direction(azimuth + np.pi + right, -float(np.clip(pitch, low, high)))
+        pose = look_at(eye, eye + ahead)
+        roll = np.deg2rad(rng.normal(0, self.roll_deg))
+        turn = np.array(
+            [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
+        )
+        pose[:3, :3] = pose[:3, :3] @ turn
+        return pose
+
+
+@dataclass(frozen=True)
+class RoomScan:
+    """Mesh to points through one depth image of a room.
+
+    Attributes:
+        sensor: that takes it.
+        placing: of the mesh on the floor.
+        stands_m: by class the lowest and highest thing that it stands on, of which half of its
+            objects do; a class that is not here stands on the floor.
+        scene: what is around it.
+        camera: where it is looked from.
+        mask: how carelessly the mask is drawn.
+        rules: by which it is cut, and when it is refused.
+        points: of the final cloud; a smaller one repeats points.
+        attempts: pictures that are taken, each from elsewhere, until one is not refused.
+        clean: also make the twin from the true depth of what is seen.
+        views: 1, the only number of views there is.
+    """
+
+    sensor: DepthSensor
+    placing: Placing = field(default_factory=RealSize)
+    stands_m: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    scene: Surroundings = field(default_factory=Room)
+    camera: RoomCamera = field(default_factory=RoomCamera)
+    mask: MaskCrop = field(default_factory=MaskCrop)
+    rules: Rules = field(default_factory=Rules)
+    points: int = 2048
+    attempts: int = 12
+    clean: bool = True
+    views: int = 1
+    needs_renderer: bool = True
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "recipe.", points=">= 1", attempts=">= 1")
+        if self.views != 1:
+            raise ConfigError(f"views={self.views}: a scan of a room is one view; leave views out")
+        if not isinstance(self.mask, MaskCrop):
+            raise ConfigError(
+                "a scan of a room is cut by a mask: leave crop out, or take crop=mask"
+            )
+
+    def make(
+        self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
+    ) -> Cloud:
+        """See Recipe.make."""
+        if renderer is None:
+            raise ConfigError("RoomScan needs a renderer: set renderer=mitsuba or blender")
+        cls = object_id.split("/")[0]
+        placed = self._placed(mesh, cls, object_id, object_rng(seed, object_id, 0))
+        around = placed.bounds + np.array([[-_AROUND_M], [_AROUND_M]])
+        why = "it is outside the picture"
+        for attempt in range(self.attempts):
+            rng = object_rng(seed, object_id, 1 + attempt)
+            pose = self.camera.pose(rng, placed.bounds, self.sensor.intrinsics)
+            bodies = self.scene.bodies(placed, pose[None, :3, 3], rng)
+            explain = keep.views is not None
+            frame = self.sensor.scan(bodies, around, pose, renderer, rng, explain=explain)
+            if frame is None:
+                continue
+            image, mask = depth_image(frame, pose), self.mask.keep(frame, rng)
+            piece = cut(image, mask, cls, self.rules)
+            if not piece.refused:
+                own, _, _ = own_pixels(image, mask, self.rules)
+                if self.rules.drop_outliers:
+                    own[own] = inliers(image.points_m[own], self.rules)
+                return self._cloud(frame, own, pose, object_id, keep)
+            why = piece.why
+        raise TooFewPointsError(
+            f"none of {self.attempts} pictures (recipe.attempts) shows it well enough; "
+            f"of the last one: {why}"
+        )
+
+    def _placed(self, mesh: Mesh, cls: str, object_id: str, rng: np.random.Generator) -> Mesh:
+        """On the floor, or on something else."""
+        placed = self.placing.place(mesh, rng, object_id)
+        raised, height = rng.random() < _RAISED, rng.random()
+        if cls not in self.stands_m or not raised:
+            return placed
+        low, high = self.stands_m[cls]
+        return Mesh(placed.vertices + np.array([0, 0, low + (high - low) * height]), placed.faces)
+
+    def _cloud(
+        self, frame: DepthFrame, own: np.ndarray, pose: np.ndarray, object_id: str, keep: Keep
+    ) -> Cloud:
+        """Of the pixels `own` [h, w], sampled; the twin has the same pixels where they are true."""
+        depth = np.where(own, frame.depth_m, np.nan)
+        points = frame.points(depth, pose).astype(np.float32)
+        order = farthest_point_sampling_np(points, self.points)
+        arrays = {"points": points[order]}
+        if self.clean:
+            true = frame.points(np.where(own & (frame.label == 1), frame.clean_m, np.nan), pose)
+            if not len(true):
+                raise TooFewPointsError("no pixel that was cut shows the object")
+            true = true.astype(np.float32)
+            arrays["points_clean"] = true[farthest_point_sampling_np(true, self.points)]
+        if keep.provenance:
+            arrays["provenance"] = provenance_of(frame, depth, 0)[order]
+        if keep.views is not None:
+            save_view(keep.views, object_id, 0, frame, pose, pose)
+        preview = preview_of(frame) if object_id in keep.previews else {}
+        return Cloud(arrays, 1, len(points), (frame,), preview)
+
+
+def depth_image(frame: DepthFrame, world_from_camera: np.ndarray) -> DepthImage:
+    """A frame as `qs3.data.frames` sees one: its window as the picture, the pose's rotation."""
+    lens, step = frame.camera.intrinsics, frame.step_px
+    focal = lens.focal_px / step
+    camera = Pinhole(
+        focal, focal, (lens.cx_px - frame.left) / step, (lens.cy_px - frame.top) / step
+    )
+    depth = np.nan_to_num(frame.depth_m, nan=0.0)
+    return DepthImage(depth, camera, world_from_camera[:3, :3])
