@@ -7,6 +7,8 @@ from hypothesis import settings
 
 from tests.slow import is_slow
 
+_SLOW_S = 2400
+
 # One thread a process: tests start many short ones, and two OpenMP teams on two cores spend
 # their time waiting for each other. Set before anything imports torch.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -27,7 +29,9 @@ if os.environ.get("QS3_CHECK_SHAPES"):  # `make test-all`
 
 @pytest.hookimpl(tryfirst=True)  # before pytest leaves out what is marked
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what `tests/slow.py` lists."""
+    """Mark what `tests/slow.py` lists; slow tests get the time that a busy machine takes."""
     for item in items:
         if is_slow(item.nodeid):
             item.add_marker(pytest.mark.slow)
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(_SLOW_S))

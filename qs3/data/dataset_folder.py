@@ -11,8 +11,31 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from qs3.data.made_of import MadeOf
+from qs3.data.store import is_finished, read_meta
+from qs3.errors import DataError
+
 RECIPE, PARTS, VIEWS = "recipe.json", "parts", "views"
 CLOUDS, INFRARED, CONFIG = "clouds.png", "infrared.png", "config.yaml"
+
+
+def check_ours(folder: Path, command: str, elsewhere: str) -> None:
+    """Refuse to make a dataset where a finished one lies that has no recipe: it was imported.
+
+    Args:
+        folder: of the dataset.
+        command: that would replace it, for the message.
+        elsewhere: its setting that names another folder.
+
+    Raises:
+        DataError: says what is there.
+    """
+    if is_finished(folder) and not (folder / RECIPE).is_file():
+        raise DataError(
+            f"{folder} holds a dataset that {command} did not make "
+            f"({MadeOf.of(read_meta(folder))}) and never replaces, not with force=true either; "
+            f"give another {elsewhere}, or delete the folder if nobody needs it"
+        )
 
 
 def delete_dataset(folder: Path) -> None:

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from qs3.classes import class_list
 from qs3.config.location import typed
 from qs3.data.importers import Importer, import_into
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import read_manifest
 from qs3.data.store import PointSet, is_begun, is_finished, open_pointset, read_meta
 from qs3.errors import ConfigError, DataError, MissingDataError
@@ -33,6 +34,8 @@ class Domain:
         title: as in a sentence, e.g. "SpeckleNet10".
         path: folder of the store.
         variant: which array of the store: "points", or "points_clean" for the clean twin.
+        twin_of: folder of a store that holds the same objects, and `variant` beside its clouds, if
+            that store was generated; what `path` holds itself comes first.
         published: how to read the published files, if there are any: an `Importer`, or its
             config (instantiated when it is needed).
         simulated: the target's reality is simulated; every output about it says so.
@@ -51,6 +54,7 @@ class Domain:
     title: str
     path: str | Path
     variant: str = "points"
+    twin_of: str | Path | None = None
     published: Importer | Mapping[str, Any] | None = None
     simulated: bool = False
     gravity: str = "z"
@@ -90,7 +94,12 @@ class Domain:
     @property
     def folder(self) -> Path:
         """The store's folder as an absolute path."""
-        return Path(self.path).absolute()
+        own = Path(self.path).absolute()
+        if self.twin_of is None or is_finished(own) or is_begun(own):
+            return own
+        other = Path(self.twin_of).absolute()
+        there = is_finished(other) and (other / f"{self.variant}.npy").is_file()
+        return other if there else own
 
     @property
     def label(self) -> str:
@@ -116,16 +125,21 @@ class Domain:
 
         Raises:
             MissingDataError: what was looked for, where to get it, and the commands.
+            DataError: a dataset that was made here and the published files are both there.
         """
-        if is_finished(self.folder):
-            return
         importer = self.importer()
-        if importer is not None and importer.is_there():
+        published = importer if importer is not None and importer.is_there() else None
+        if is_finished(self.folder):
+            if published is not None:
+                self._refuse_two(published)
+            return
+        if published is not None:
             return
         unfinished = is_begun(self.folder)
         lines = [
             f"domain {self.name}: {self.label} is not there. Looked for:",
             f"  {self.folder / 'meta.yaml'}{'   (begun but not finished)' * unfinished}",
+            *([f"  {Path(self.twin_of).absolute() / self.variant}.npy"] if self.twin_of else []),
             *(f"  {pattern}" for pattern in (importer.looks_for() if importer else [])),
         ]
         if self.how_to_get:
@@ -158,12 +172,43 @@ class Domain:
                 f"{self.folder} was made with the classes {', '.join(dataset.classes)}; the config "
                 f"of domain {self.name} says {', '.join(self.names)}"
             )
-        if "imported" in dataset.meta:
-            self._compare_counts(dataset)
+        if "imported" in dataset.meta and (problems := self._other_counts(dataset)):
+            text = "%s does not have the published numbers of clouds: %s"
+            log.warning(text, self.label, ", ".join(problems))
         return dataset
 
-    def _compare_counts(self, dataset: PointSet) -> None:
-        """Warn once, by name, if there are not as many clouds as were published."""
+    def check_unpublished(self) -> None:
+        """Raise DataError if published files are there: a dataset made here would pass for them."""
+        importer = self.importer()
+        if importer is not None and importer.is_there():
+            raise DataError(
+                f"domain {self.name}: the published files of {self.label} are in {importer.root}, "
+                "and a dataset made here would be taken for them. Give it a place of its own with "
+                "paths.data_dir=PATH, move the published files away, or say that they are not "
+                "meant: domain.published=null here, data.source.published=null in training"
+            )
+
+    def _refuse_two(self, importer: Importer) -> None:
+        """Raise DataError if the store was not imported: which of the two is meant?"""
+        meta = read_meta(self.folder)
+        if "imported" not in meta:
+            raise DataError(
+                f"domain {self.name}: two datasets are there for {self.label}: in {self.folder} "
+                f"one that was made here ({MadeOf.of(meta)}), in {importer.root} the published "
+                "files. To use the published ones, delete or rename the first folder; to use the "
+                "one made here, move the published files away or set published=null (in training "
+                "data.source.published=null or data.target.published=null)"
+            )
+
+    def made_of(self, dataset: PointSet) -> MadeOf:
+        """What this domain's dataset is made of; incomplete published files are not published."""
+        made = dataset.made_of
+        if made.published and self._other_counts(dataset):
+            return replace(made, published=False, objects=f"{made.objects}, in other numbers")
+        return made
+
+    def _other_counts(self, dataset: PointSet) -> list[str]:
+        """In which splits and classes there are not as many clouds as were published."""
         found, problems = dataset.counts(), []
         for split, counts in (self.expected_counts or {}).items():
             have = found.get(split, {})
@@ -172,9 +217,7 @@ class Domain:
                 for cls, count in zip(dataset.classes, counts, strict=True)
                 if have.get(cls, 0) != count
             ]
-        if problems:
-            text = "%s does not have the published numbers of clouds: %s"
-            log.warning(text, self.label, ", ".join(problems))
+        return problems
 
     def _refuse_stale(self, importer: Importer) -> None:
         """Raise DataError if the store was imported with other settings than today's."""

@@ -25,6 +25,7 @@ from torch_geometric.data import Data, Dataset, InMemoryDataset
 
 from qs3.classes import class_list
 from qs3.data.domain import Domain
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.data.store import PointSet, is_begun, is_finished, write_pointset
 from qs3.errors import ConfigError, DataError
@@ -144,7 +145,7 @@ def from_pyg(
         classes=names,
         arrays={"points": clouds},
         rows=rows,
-        meta={"made_from": "a dataset of torch_geometric"},
+        meta=MadeOf(objects="a dataset of torch_geometric").meta,
     )
 
 

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import (
     AGAIN,
     MANIFEST,
@@ -94,6 +95,11 @@ class PointSet:
     def labelled(self) -> bool:
         """Whether the classes of the clouds are known."""
         return bool((self.labels >= 0).all())
+
+    @property
+    def made_of(self) -> MadeOf:
+        """Whose objects these are, and what gave the points."""
+        return MadeOf.of(self.meta)
 
     def indices(self, split: str) -> np.ndarray:
         """[n] int64 positions of a split's clouds, in the dataset's order."""

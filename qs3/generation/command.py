@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
-from qs3.data.dataset_folder import CLOUDS, CONFIG, INFRARED, delete_dataset
+from qs3.data.dataset_folder import CLOUDS, CONFIG, INFRARED, check_ours, delete_dataset
 from qs3.data.domain import Domain
 from qs3.data.store import (
     ManifestRow,
@@ -25,15 +25,17 @@ from qs3.data.store import (
     open_pointset,
     write_pointset,
 )
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
 from qs3.generation.disk import check_folder, disk_errors_explained
+from qs3.generation.made_of import made_of
 from qs3.generation.plan import (
     benchmark,
     check,
     check_recipe,
     describe,
     keep,
+    left_alone,
     mesh_items,
     mesh_root,
     stated_hash,
@@ -41,6 +43,7 @@ from qs3.generation.plan import (
 )
 from qs3.generation.provenance import PROVENANCE
 from qs3.generation.shards import Parts
+from qs3.generation.up_axis import with_up_axis
 from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import write_text
@@ -50,6 +53,7 @@ from qs3.utils.progress import progress_bar
 log = logging.getLogger(__name__)
 
 _FAILURES_SHOWN = 5
+_FOLDERS_SHOWN = 8
 
 
 def generate(cfg: DictConfig) -> PointSet:
@@ -65,11 +69,14 @@ def generate(cfg: DictConfig) -> PointSet:
         ConfigError: a setting is wrong, or the folder holds another dataset.
         MissingDataError: the mesh folder or one of its classes is not there.
         RenderError: the renderer cannot be used on this machine.
-        DataError: every object failed (or, with strict=true, any), or the disk is full.
+        DataError: every object failed (or, with strict=true, any), the disk is full, or the
+            folder holds, or the domain has, a published dataset.
     """
     check(cfg)
+    cfg = with_up_axis(cfg)
     domain: Domain = build(cfg.domain)
     folder = domain.folder
+    _check_place(domain, cfg.force)
     items = mesh_items(cfg)
     parts = Parts(folder)
     job = Job(
@@ -114,6 +121,17 @@ def generate(cfg: DictConfig) -> PointSet:
         )
     _check_strict(cfg, pointset, items, folder)
     return pointset
+
+
+def _check_place(domain: Domain, force: bool) -> None:
+    """Raise where the dataset would replace, or pass for, one that was not made here."""
+    check_ours(domain.folder, "generate.py", "paths.data_dir")
+    domain.check_unpublished()
+    if force and domain.folder != Path(domain.path).absolute():
+        raise ConfigError(
+            f"{domain.name} is part of the dataset in {domain.folder}, and force=true would "
+            "replace all of it: generate that domain with force=true"
+        )
 
 
 def _check_strict(cfg: DictConfig, pointset: PointSet, items: list[MeshItem], folder: Path) -> None:
@@ -184,6 +202,13 @@ def _write(
     domain: Domain, items: list[MeshItem], outcomes: list[Outcome], recipe: Any, cfg: DictConfig
 ) -> PointSet:
     good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
+    made = made_of(
+        cfg,
+        (item.cls for item in items),
+        (outcome.mesh_sha256 for outcome in outcomes),
+        benchmark(cfg, recipe),
+    )
+    others = left_alone(cfg)
     rows = [
         ManifestRow(
             id=item.id,
@@ -199,7 +224,7 @@ def _write(
         )
         for item, outcome in zip(items, outcomes, strict=True)
     ]
-    return write_pointset(
+    made_here = write_pointset(
         domain.folder,
         name=domain.folder.name,
         classes=domain.names,
@@ -207,13 +232,17 @@ def _write(
         rows=rows,
         meta={
             "simulated": domain.simulated,
-            "benchmark": benchmark(cfg, recipe),
+            **made.meta,
+            **({"folders_left_alone": {"count": len(others), "names": others}} if others else {}),
             "settings": recipe["settings"],
             "versions": recipe["versions"],
             "config": stored_config(cfg),
         },
         tables={"provenance": PROVENANCE} if cfg.provenance else None,
     )
+    if domain.variant == "points":
+        return made_here
+    return open_pointset(domain.folder, domain.variant, verify=False)
 
 
 def _without_root(reason: str, cfg: DictConfig) -> str:
@@ -241,8 +270,11 @@ def _report(
         log.info(
             "%d files hold colliders, which were left out (manifest.csv); colliders=keep", noted
         )
-    if kind := pointset.meta.get("benchmark"):
-        log.info("this is %s", kind)
+    if others := pointset.meta.get("folders_left_alone"):
+        names, count = others["names"][:_FOLDERS_SHOWN], others["count"]
+        more = ", ..." * (count > len(names))
+        log.info("%d folders of other classes were left alone: %s%s", count, ", ".join(names), more)
+    log.info("made of: %s", pointset.made_of)
     pictures = " and ".join(n for n in (CLOUDS, INFRARED) if (folder / n).is_file())
     log.info("in %s: look at %s", folder, pictures)
     log.info("content hash %s, %.0f s", pointset.sha256[:16], seconds)

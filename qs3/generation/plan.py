@@ -30,6 +30,7 @@ from qs3.utils.version import VERSION
 _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
 COLLIDERS = ("skip", "keep")
+UPS = ("auto", "z", "y")
 _SWITCHES = ("provenance", "keep_views", "force", "strict")
 # Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
 _OF_LOOKING = ("scene", "tracking", "crop")
@@ -53,6 +54,7 @@ def check(cfg: DictConfig) -> None:
     for key in _SWITCHES:
         check_bool(key, cfg[key])
     check_choice("colliders", cfg.colliders, COLLIDERS)
+    check_choice("up", cfg.up, UPS)
     if cfg.paths.data_dir is None or not str(cfg.paths.data_dir).strip():
         raise ConfigError(f"paths.data_dir must name a folder, got {cfg.paths.data_dir!r}")
     if cfg.meshes is None and cfg.half != "all":
@@ -92,9 +94,17 @@ def check_recipe(recipe: Any, cfg: DictConfig) -> None:
 
 
 def mesh_items(cfg: DictConfig) -> list[MeshItem]:
-    """The objects to scan, from the user's folder or the embedded catalogue."""
+    """The objects to scan, from the user's folder or the embedded catalogue.
+
+    `up` has been decided (`qs3.generation.up_axis`); undecided, it is z.
+    """
     classes = tuple(cfg.classes) if cfg.classes else None
     if cfg.meshes is None:
+        if cfg.up == "y":
+            raise ConfigError(
+                "up=y is for meshes of yours, and the embedded catalogue has z up: give a folder "
+                "with meshes=PATH, or leave it out"
+            )
         if missing := sorted(set(classes or known_classes(cfg)) - set(CLASSES)):
             raise ConfigError(
                 f"the embedded catalogue has no {', '.join(missing)}: give a folder of meshes with "
@@ -102,16 +112,27 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
             )
         items = build(cfg.catalogue, classes=classes or CLASSES).items()
     else:
-        items = MeshFolder(
-            path=mesh_root(cfg),
-            classes=classes,
-            test_fraction=cfg.test_fraction,
-            half=cfg.half,
-            known=known_classes(cfg),
-            keep_colliders=cfg.colliders == "keep",
-        ).items()
+        items = mesh_folder(cfg).items()
     kept = _first_of_each(items, cfg.limit, cfg.fraction)
     return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]
+
+
+def left_alone(cfg: DictConfig) -> list[str]:
+    """Folders of other classes beside the user's; see `MeshFolder.left_alone`."""
+    return [] if cfg.meshes is None else mesh_folder(cfg).left_alone()
+
+
+def mesh_folder(cfg: DictConfig) -> MeshFolder:
+    """The user's meshes."""
+    return MeshFolder(
+        path=mesh_root(cfg),
+        classes=tuple(cfg.classes) if cfg.classes else None,
+        test_fraction=cfg.test_fraction,
+        half=cfg.half,
+        known=known_classes(cfg),
+        keep_colliders=cfg.colliders == "keep",
+        up="y" if cfg.up == "y" else "z",
+    )
 
 
 def mesh_root(cfg: DictConfig) -> Path:
@@ -160,11 +181,12 @@ def settings(cfg: DictConfig) -> dict[str, Any]:
     """The settings that decide the bytes of an object, as plain values."""
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     chosen = {
-        "domain": Path(plain["domain"]["path"]).name,
+        "domain": build(cfg.domain).folder.name,
         "seed": plain["seed"],
         "recipe": _with_content_of_poses(plain["recipe"]),
         "meshes": "folder" if plain["meshes"] else plain["catalogue"],
         **({"colliders": "keep"} if plain["colliders"] == "keep" else {}),
+        **({"up": "y"} if plain["meshes"] and plain["up"] == "y" else {}),
     }
     if plain["renderer"]:
         chosen["renderer"] = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}

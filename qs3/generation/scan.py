@@ -13,6 +13,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.generation.plan import check, check_recipe
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud
+from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.base import DepthFrame
 
@@ -105,12 +106,14 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
             )
     scanner = Scanner(cfg)
     keep = Keep(provenance=cfg.provenance)
-    return {name: _scan(scanner, name, solid, keep) for name, solid in solids.items()}
+    return {name: _scan(scanner, name, solid, cfg.up, keep) for name, solid in solids.items()}
 
 
-def _scan(scanner: Scanner, name: str, solid: Any, keep: Keep) -> Scan:
+def _scan(scanner: Scanner, name: str, solid: Any, up: str, keep: Keep) -> Scan:
     try:
         mesh = solid if isinstance(solid, Mesh) else Mesh.from_trimesh(solid)
+        if up == "y":
+            mesh = Mesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces)
         cloud = scanner.cloud(mesh, name, keep)
     except DataError as error:
         raise type(error)(f"{name}: {error}") from error

@@ -36,12 +36,22 @@ class Room:
         wall: probability of a wall behind the object.
         max_clutter: up to so many pieces stand around the object ...
         max_occluders: ... and so many close to it, where they hide a part of it.
+        clutter_m, occluder_m: the largest side of either along the floor; pieces are up to 1.6
+            times as high.
+        max_between: up to so many pieces stand between the first camera and the object, some way
+            before it, as a table stands before a chair; as large as `between_m` along the floor
+            and as high as `between_height_m`.
         min_albedo, max_albedo: of every body, drawn for each.
     """
 
     wall: float = 0.5
     max_clutter: int = 5
     max_occluders: int = 2
+    clutter_m: float = 0.5
+    occluder_m: float = 0.3
+    max_between: int = 0
+    between_m: float = 1.0
+    between_height_m: float = 0.8
     min_albedo: float = 0.25
     max_albedo: float = 0.9
 
@@ -67,17 +77,44 @@ class Room:
         pieces = []
         for _ in range(int(rng.integers(0, self.max_clutter + 1))):
             away = radius + rng.uniform(0.25, 1.2)
-            pieces.append(_piece(centre, away, floor, rng, largest_m=0.5))
+            pieces.append(_piece(centre, away, floor, rng, largest_m=self.clutter_m))
         for _ in range(int(rng.integers(0, self.max_occluders + 1))):
             # Touching or nearly touching the object's circle, lower than most objects.
             away = radius + rng.uniform(0.02, 0.2)
-            pieces.append(_piece(centre, away, floor, rng, largest_m=0.3))
+            pieces.append(_piece(centre, away, floor, rng, largest_m=self.occluder_m))
+        if self.max_between:
+            for _ in range(int(rng.integers(0, self.max_between + 1))):
+                pieces.append(self._between(centre, radius, floor, eyes_m[0], rng))
         rest += [piece for piece in pieces if not _around_an_eye(piece, eyes_m)]
         albedos = rng.uniform(self.min_albedo, self.max_albedo, len(rest) + 1)
         return tuple(
             Body(part, albedo=float(albedo), label=int(part is mesh))
             for part, albedo in zip([mesh, *rest], albedos, strict=True)
         )
+
+    def _between(
+        self,
+        centre: np.ndarray,
+        radius: float,
+        floor: float,
+        eye_m: np.ndarray,
+        rng: np.random.Generator,
+    ) -> Mesh:
+        """A box on the floor, beside or on the line from the object to a camera."""
+        ahead = eye_m[:2] - centre[:2]
+        distance = float(np.hypot(*ahead))
+        along = ahead / max(distance, 1e-9)
+        size = rng.uniform(
+            [0.15, 0.15, 0.2], [self.between_m, self.between_m, self.between_height_m]
+        )
+        nearest = radius + size[:2].max() / 2
+        away = nearest + rng.uniform(0.05, 0.5) * max(distance - nearest, 0.1)
+        aside = rng.normal(0, radius + 0.2) * np.array([-along[1], along[0]])
+        yaw = rng.uniform(0, 2 * np.pi)
+        c, s = np.cos(yaw), np.sin(yaw)
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * size[:2]
+        ring = corners @ np.array([[c, s], [-s, c]]) + centre[:2] + away * along + aside
+        return _prism(ring, floor, floor + float(size[2]))
 
 
 def _quad(centre: np.ndarray, height: float, half_m: float) -> Mesh:

@@ -13,6 +13,7 @@ from typing import Final, Literal
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from qs3.data.made_of import MadeOf
 from qs3.errors import DataError
 from qs3.utils.files import write_text
 
@@ -210,6 +211,14 @@ class DataHashes:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
+class DataMadeOf:
+    """What both datasets are made of."""
+
+    source: MadeOf
+    target: MadeOf
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Times:
     """Wall time over all starts of the run."""
 
@@ -254,6 +263,7 @@ class RunMetrics:
     quality: AccuracyEstimates
     training: TrainingAccuracy | None = None
     data: DataHashes
+    made_of: DataMadeOf
     times: Times
     versions: dict[str, str]
 
@@ -261,6 +271,16 @@ class RunMetrics:
     def target_text(self) -> str:
         """The target's name, with "(simulated)" where that is so."""
         return f"{self.target}{' (simulated)' if self.simulated else ''}"
+
+    @property
+    def domains(self) -> dict[str, MadeOf]:
+        """By name what each domain is made of, the source first; only one if they are the same."""
+        return {self.source: self.made_of.source, self.target: self.made_of.target}
+
+    @property
+    def data_text(self) -> str:
+        """Such as "specklenet10 (embedded catalogue, ...), depthscannet10 (published files)"."""
+        return ", ".join(f"{name} ({made})" for name, made in self.domains.items())
 
 
 _SCHEMA: TypeAdapter[RunMetrics] = TypeAdapter(RunMetrics)

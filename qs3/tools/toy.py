@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.config.quoting import override
+from qs3.data.made_of import MadeOf
 from qs3.data.store import ManifestRow, PointSet, write_pointset
 
 SHAPES = {
@@ -114,5 +115,5 @@ def _write(
         classes=tuple(SHAPES),
         arrays={"points": np.array(clouds, dtype=np.float32)},
         rows=rows,
-        meta={},
+        meta=MadeOf(objects="toy shapes").meta,
     )

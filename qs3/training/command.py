@@ -45,7 +45,13 @@ def train(cfg: DictConfig) -> RunMetrics:
         seed=check_int("seed", cfg.seed, 0),
         folder=hashing.run_folder(cfg),
         scheme=scheme,
-        phases=Phases(cfg.protocol.epochs, scheme.rounds, scheme.epochs),
+        phases=Phases(
+            cfg.protocol.epochs,
+            scheme.rounds,
+            scheme.epochs,
+            cfg.protocol.steps,
+            scheme.steps,
+        ),
         source=build(cfg.data.source),
         target=build(cfg.data.target),
     )
@@ -103,7 +109,7 @@ def judged(cfg: DictConfig, metrics: RunMetrics) -> str:
 
 
 def headline(metrics: RunMetrics) -> str:
-    """The result in one line; says when the target is simulated."""
+    """The result in one line; says what the data are made of, and when the target is simulated."""
     final, run = metrics.final, f"{metrics.experiment}, seed {metrics.seed}"
     target = metrics.target_text
     if final.accuracy is None:
@@ -111,11 +117,12 @@ def headline(metrics: RunMetrics) -> str:
         estimate = in_words(metrics.quality)
         return (
             f"{run}: no labels to judge {target} by; predicted {counts}"
-            f"{f'; {estimate}' if estimate else ''}{_chosen(metrics)}"
+            f"{f'; {estimate}' if estimate else ''}; data: {metrics.data_text}{_chosen(metrics)}"
         )
     return (
         f"{run}: accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
-        f"on {target}, majority rate {final.majority_rate:.1%}{_chosen(metrics)}"
+        f"on {target}, majority rate {final.majority_rate:.1%}; data: {metrics.data_text}"
+        f"{_chosen(metrics)}"
     )
 
 

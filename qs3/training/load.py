@@ -15,6 +15,7 @@ from qs3.datamodules.splits import labels_of, load_clouds, subsample_splits
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
 from qs3.methods.base import Method
+from qs3.runs.metrics import DataMadeOf
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
 
@@ -31,6 +32,7 @@ class Loaded:
         split: which split of the target is evaluated.
         stored_points: of a cloud on disk.
         started: what `started.json` says: hashes of data and config, versions.
+        made_of: what the labelled dataset and the target are made of.
     """
 
     data: AdaptationData
@@ -38,6 +40,7 @@ class Loaded:
     split: str
     stored_points: int
     started: dict[str, Any]
+    made_of: DataMadeOf
 
 
 def load_data(run: Run, method: Method) -> Loaded:
@@ -62,6 +65,8 @@ def load_data(run: Run, method: Method) -> Loaded:
     source, target = run.source.open(verify=False), run.target.open(verify=False)
     _check_classes(source, target, cfg.num_classes)
     started = note_start(run, source, target)
+    of_target = run.target.made_of(target)
+    labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
     if (few := cfg.data.clouds_a_split) is not None:
         target = subsample_splits(target, few)
@@ -75,7 +80,8 @@ def load_data(run: Run, method: Method) -> Loaded:
         cfg.evaluation.rotations,
         _objects_by_id(target, run.target),
     )
-    return Loaded(data, evaluation, split, target.points.shape[1], started)
+    made_of = DataMadeOf(source=labelled, target=of_target)
+    return Loaded(data, evaluation, split, target.points.shape[1], started, made_of)
 
 
 def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:

@@ -95,6 +95,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
         quality=outcome.quality,
         training=outcome.training,
         data=DataHashes(**loaded.started["data"]),
+        made_of=loaded.made_of,
         times=Times(seconds=round(built.clock.seconds(), 1)),
         versions=loaded.started["versions"],
     )

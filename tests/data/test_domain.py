@@ -132,6 +132,45 @@ def test_clean_twin_is_the_same_objects(tmp_path):
     assert 0.001 < np.abs(noisy.points - clean.points).mean() < 0.01
 
 
+def test_two_datasets_of_one_domain_are_refused(tmp_path):
+    fixtures.write_domain("specklenet10", tmp_path, SPLITS)
+    fixtures.write_store(tmp_path / "specklenet10", SPLITS)
+    with pytest.raises(DataError) as error:
+        domain("specklenet10", tmp_path).check()
+    said = str(error.value)
+    assert f"in {tmp_path / 'specklenet10'} one that was made here (a fixture)" in said
+    assert f"in {tmp_path / 'published' / 'specklenet10'} the published files" in said
+    assert "delete or rename the first folder" in said
+    assert "data.source.published=null" in said
+    made = domain("specklenet10", tmp_path, "published=null").open()
+    assert made.made_of.objects == "a fixture"
+    (tmp_path / "specklenet10").rename(tmp_path / "elsewhere")
+    assert domain("specklenet10", tmp_path).open().made_of.published
+
+
+def test_clean_twin_beside_the_published_files_is_of_its_own(tmp_path):
+    fixtures.write_domain("specklenet10", tmp_path, SPLITS)
+    published = domain("specklenet10", tmp_path).open()
+    with pytest.raises(MissingDataError) as error:  # the published dataset has no twin
+        domain("specklenet10_clean", tmp_path).check()
+    for place in ("specklenet10_clean/meta.yaml", "specklenet10/points_clean.npy"):
+        assert str(tmp_path / place) in str(error.value)
+    fixtures.write_domain("specklenet10_clean", tmp_path, SPLITS)
+    clean = domain("specklenet10_clean", tmp_path).open()
+    assert clean.made_of.objects == "a fixture"
+    again = domain("specklenet10", tmp_path).open()
+    assert (again.sha256, str(again.made_of)) == (published.sha256, "published files")
+
+
+def test_incomplete_published_files_do_not_count_as_published(tmp_path):
+    fixtures.write_domain("modelnet10", tmp_path, SPLITS)
+    found = domain("modelnet10", tmp_path)
+    assert str(found.made_of(found.open())) == "published files, in other numbers"
+    exact = [f"expected_counts.{s}={[n] * 10}" for s, n in SPLITS.items()]
+    found = domain("modelnet10", tmp_path, *exact)
+    assert found.made_of(found.open()).published
+
+
 def test_changed_import_settings_are_noticed(tmp_path):
     fixtures.write_domain("scannet10", tmp_path, SPLITS)
     data = domain("scannet10", tmp_path).open()

@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-from itertools import zip_longest
 
 import pytest
 from omegaconf import OmegaConf
@@ -13,6 +12,7 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from qs3.generation.camera_poses import AnchoredViews
 from qs3.generation.plan import benchmark, check, describe, mesh_items, stored_config
+from qs3.generation.scenes import Alone, Room
 from qs3.tools import quickstart
 from tests.generation.generating import ROOT
 from tests.generation.generating import composed as config
@@ -20,6 +20,7 @@ from tests.generation.generating import composed as config
 DOMAINS = (
     *("specklenet10", "specklenet10_clean", "blensor10", "kinectsim10"),
     *("modelnet10", "modelnet10_dropout"),
+    *("specklenet10_view", "specklenet10_kinect", "roomscan10"),
 )
 
 
@@ -151,12 +152,14 @@ def test_help_says_what_conf_has(help_text):
 @pytest.mark.parametrize("domain", ["specklenet10", "kinectsim10"])
 def test_scene_tracking_and_crop_go_with_every_domain_that_looks(domain):
     groups = ("scene", "tracking", "crop")
-    for choices in zip_longest(*map(names, groups)):
-        chosen = [(group, name) for group, name in zip(groups, choices, strict=True) if name]
+    lists = [names(group) for group in groups]
+    for i in range(max(map(len, lists))):
+        chosen = [(group, some[i % len(some)]) for group, some in zip(groups, lists, strict=True)]
         cfg = config(f"domain={domain}", *(f"{group}={name}" for group, name in chosen))
         check(cfg)
         recipe, choice = build(cfg.recipe), dict(chosen)
-        assert type(recipe.scene).__name__.lower() == choice["scene"]
+        kinds = {"alone": Alone, "room": Room, "furnished": Room}
+        assert type(recipe.scene) is kinds[choice["scene"]]
         assert (recipe.drift.shift_m > 0) == (choice["tracking"] == "drifting")
         assert type(recipe.crop).__name__.lower() == f"{choice['crop']}crop"
     recipe = build(config(f"domain={domain}", "scene=room", "scene.max_clutter=0").recipe)

@@ -29,6 +29,15 @@ def test_unit_cube_forgets_unit_and_place(seed, unit):
     assert (high - low)[2] == pytest.approx(1.0)  # the largest side is the height
 
 
+def test_without_yaw_an_object_stays_turned_as_its_file_has_it():
+    """And what is drawn after it is the same."""
+    some, other = np.random.default_rng(3), np.random.default_rng(3)
+    placed = UnitCube(yaw=False).place(box(), some)
+    np.testing.assert_allclose(np.ptp(placed.vertices, axis=0), np.array([0.4, 0.6, 0.9]) / 0.9)
+    UnitCube().place(box(), other)
+    assert some.random() == other.random()
+
+
 def test_real_size_keeps_metres_and_stands_on_the_floor():
     placed = RealSize().place(box(), np.random.default_rng(0))
     low, high = placed.bounds

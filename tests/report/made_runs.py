@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import matplotlib.image
 
+from qs3.data.made_of import MadeOf
 from qs3.runs.metrics import (
     AccuracyEstimates,
     DataHashes,
+    DataMadeOf,
     EpochScores,
     Evaluated,
     Loading,
@@ -19,6 +21,9 @@ from qs3.runs.metrics import (
     read_metrics,
     write_metrics,
 )
+
+PUBLISHED = MadeOf(objects="published files", published=True)
+CATALOGUE = MadeOf(objects="embedded catalogue", sensor="kinect_like", views=4, meshes="c" * 12)
 
 
 def scores(accuracy=0.5, **changes):
@@ -65,7 +70,10 @@ def metrics(seed=0, accuracy=0.5, **changes):
         "times": Times(seconds=60.0),
         "versions": {"qs3": "0.1.0"},
     }
-    return RunMetrics(seed=seed, **{**content, **changes})
+    content |= changes
+    target = CATALOGUE if content["simulated"] else PUBLISHED
+    content.setdefault("made_of", DataMadeOf(source=PUBLISHED, target=target))
+    return RunMetrics(seed=seed, **content)
 
 
 def write_run(log_dir, **changes):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.data.importers.base import Importer, Item, by_class, class_of, cloud_id, split_of
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
 
@@ -31,6 +32,10 @@ class NamedArrays(Importer):
     def path(self) -> Path:
         """Of the .npz."""
         return self.root / self.file
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects=f"arrays of {self.path.name}")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

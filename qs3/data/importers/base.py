@@ -17,6 +17,7 @@ import numpy as np
 
 from qs3.classes import ALIASES, known_as
 from qs3.config.checks import check_choice, check_int
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
 from qs3.errors import DataError
@@ -70,9 +71,6 @@ class Importer(abc.ABC):
     complete: ClassVar[bool] = True
     """Whether a class without clouds in a split means that something is wrong."""
 
-    made_of: ClassVar[str] = ""
-    """What its clouds are, where a name does not tell it; goes into the store's meta.yaml."""
-
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", Path(self.folder))
         check_int("published.points", self.points, 1)
@@ -98,6 +96,10 @@ class Importer(abc.ABC):
         Raises:
             DataError: names the file or folder that does not fit the format.
         """
+
+    def made_of(self) -> MadeOf:
+        """What the store is made of; goes into its meta.yaml."""
+        return MadeOf(objects="published files", published=True)
 
     def object_of(self, id_: str) -> str:
         """Which object a cloud shows, where its id tells; else "".
@@ -191,8 +193,7 @@ def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequenc
             classes=classes,
             arrays={"points": clouds},
             rows=rows,
-            meta={"imported": settings}
-            | ({"made_of": importer.made_of} if importer.made_of else {}),
+            meta={"imported": settings, **importer.made_of().meta},
         )
         if folder.is_dir():  # holds a lock at most
             shutil.rmtree(folder)

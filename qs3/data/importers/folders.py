@@ -48,6 +48,7 @@ from qs3.data.importers.base import (
     unique,
     visible,
 )
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError, DataError
 
@@ -86,6 +87,10 @@ class CloudFolder(Importer):
         check_int("published.test_every", self.test_every, 0)
         if self.test_every == 1:
             raise ConfigError("published.test_every=1 leaves nothing for training; 0 tests nothing")
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects=f"own clouds of {self.root.name}")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

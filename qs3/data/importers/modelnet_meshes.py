@@ -33,6 +33,7 @@ from qs3.data.importers.base import (
     unique,
 )
 from qs3.data.importers.trees import list_tree
+from qs3.data.made_of import MadeOf
 from qs3.errors import DataError, MeshError
 from qs3.utils.seeding import derive
 
@@ -52,6 +53,10 @@ class ModelNetMeshes(Importer):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_int("published.seed", self.seed, 0)
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects="ModelNet's published meshes", sensor="surface samples")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

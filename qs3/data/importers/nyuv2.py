@@ -13,7 +13,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -25,6 +24,7 @@ from qs3.data.frames.nyuv2 import CAMERA, LabelledFrames, read_splits
 from qs3.data.frames.rules import Rules
 from qs3.data.frames.vertical import Mounting, angle_deg, floor_up, mounting, planes_up
 from qs3.data.importers.frame_importer import Cut, Cutter, FrameImporter, FrameTask
+from qs3.data.made_of import MadeOf
 from qs3.errors import ConfigError, DataError
 from qs3.utils.progress import progress_bar
 
@@ -53,8 +53,6 @@ class NYUv2(FrameImporter):
     with_contents: Mapping[str, Sequence[str]] = field(default_factory=dict)
     camera: Mapping[str, float] | None = None
 
-    made_of: ClassVar[str] = "real objects cut from the raw depth of NYU Depth V2 (Kinect v1)"
-
     def __post_init__(self) -> None:
         super().__post_init__()
         for way in self.vertical:
@@ -80,6 +78,10 @@ class NYUv2(FrameImporter):
             "the labelled dataset": self.root / self.file,
             "its splits": self.root / self.splits,
         }
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects="real objects cut from the raw depth of NYU Depth V2 (Kinect v1)")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

@@ -9,6 +9,9 @@
     inlier         [P] bool       optional: false for stray points
     sub            [N] text       optional: finer name
     dev            [N] text       optional: which part of a development split it is of
+    pixels         [N] int        optional: pixels with depth that it was cut from
+    rim, occ       [N] float      optional: share of its outline that the picture cuts off, and that
+                                  something nearer covers
 
 Frames in a row show one room: objects of one block of frames are no independent samples, and a
 part of the archive that judges is blocks away from one that is trained on.
@@ -29,6 +32,7 @@ import numpy as np
 from qs3.config.checks import check_bool, check_int
 from qs3.data.importers.arrays import plain_arrays
 from qs3.data.importers.base import Importer, Item, class_of
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError, MissingDataError
 
@@ -48,8 +52,11 @@ _KINDS = {
     "inlier": ("b", "[P] of bool"),
     "sub": ("U", "[N] of text"),
     "dev": ("U", "[N] of text"),
+    "pixels": ("iu", "[N] of whole numbers"),
+    "rim": ("f", "[N] of numbers"),
+    "occ": ("f", "[N] of numbers"),
 }
-_OPTIONAL = ("inlier", "sub", "dev")
+_OPTIONAL = ("inlier", "sub", "dev", "pixels", "rim", "occ")
 _REQUIRED = tuple(key for key in _KINDS if key not in _OPTIONAL)
 
 
@@ -61,6 +68,7 @@ class Archive:
         path: of the file.
         cls, sub, tier, dev: [N] text; `sub` is `cls` and `dev` empty where the file has none.
         frame: [N] number of the frame.
+        pixels, rim, occ: [N]; None where the file has none.
     """
 
     path: Path
@@ -69,6 +77,9 @@ class Archive:
     tier: np.ndarray
     dev: np.ndarray
     frame: np.ndarray
+    pixels: np.ndarray | None
+    rim: np.ndarray | None
+    occ: np.ndarray | None
     _tenths: np.ndarray
     _centre: np.ndarray
     _start: np.ndarray
@@ -77,6 +88,10 @@ class Archive:
     def __len__(self) -> int:
         """N."""
         return len(self.cls)
+
+    def size(self, index: int) -> int:
+        """Points of an object, stray ones too."""
+        return int(self._start[index + 1] - self._start[index])
 
     def cloud(self, index: int, inliers_only: bool) -> np.ndarray:
         """[n, 3] float32 metres, z up, the camera at the origin."""
@@ -115,7 +130,6 @@ class ObjectArchive(Importer):
     tiers: Sequence[str] = TIERS
 
     complete: ClassVar[bool] = False
-    made_of: ClassVar[str] = "real objects of an archive that was cut from depth images"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -135,6 +149,10 @@ class ObjectArchive(Importer):
     def path(self) -> Path:
         """Of the .npz."""
         return self.root / Path(self.file).expanduser()
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects=f"real objects cut from depth images, archive {self.path.name}")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""
@@ -267,6 +285,9 @@ def read_archive(path: Path) -> Archive:
         found["tier"],
         found.get("dev", np.full(n, "")),
         found["img"].astype(np.int64),
+        found.get("pixels"),
+        found.get("rim"),
+        found.get("occ"),
         found["xyz_tenth_mm"],
         found["centre_m"],
         start,

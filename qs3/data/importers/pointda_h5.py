@@ -18,6 +18,7 @@ import numpy as np
 
 from qs3.clouds.files import own_dataset
 from qs3.data.importers.base import Importer, Item, cloud_id, inside, turned
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
 
@@ -35,6 +36,12 @@ class PointDAH5(Importer):
     """
 
     undo_mirror: bool = True
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        if self.undo_mirror:  # published figures were measured on mirror images
+            return MadeOf(objects="published files, no longer mirrored")
+        return super().made_of()
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from qs3.data.frames.sunrgbd import (
     read_splits,
 )
 from qs3.data.importers.frame_importer import Cut, Cutter, FrameImporter, FrameTask
+from qs3.data.made_of import MadeOf
 from qs3.errors import ConfigError
 
 log = logging.getLogger(__name__)
@@ -50,8 +50,6 @@ class SUNRGBD(FrameImporter):
     sensors: Sequence[str] = SENSORS
     splits: str = SPLITS
 
-    made_of: ClassVar[str] = "real objects cut by their boxes from the raw depth of SUN RGB-D"
-
     def __post_init__(self) -> None:
         super().__post_init__()
         for sensor in self.sensors:
@@ -63,6 +61,10 @@ class SUNRGBD(FrameImporter):
     def files(self) -> Mapping[str, Path]:
         """See `FrameImporter`."""
         return {"the boxes": self.root / META, "the splits": self.root / self.splits}
+
+    def made_of(self) -> MadeOf:
+        """See `Importer`."""
+        return MadeOf(objects="real objects cut by their boxes from the raw depth of SUN RGB-D")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

@@ -21,7 +21,8 @@ import numpy as np
 
 from qs3.classes import CLASSES
 from qs3.config.checks import check_int
-from qs3.data.dataset_folder import RECIPE, delete_dataset
+from qs3.data.dataset_folder import RECIPE, check_ours, delete_dataset
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.data.scannet.files import SceneFiles, find_scenes
 from qs3.data.scannet.labels import LabelMap, read_label_map, read_scene_list
@@ -80,12 +81,12 @@ def extract(
         out: folder of the dataset.
         settings: None is the defaults.
         workers: processes; 0 works in this one.
-        force: delete what is at `out` first.
+        force: delete first what an earlier call left at `out`.
 
     Raises:
         ConfigError: `out` was made with other settings.
         MissingDataError: a file or the folder of scenes is not there.
-        DataError: no object gave a cloud.
+        DataError: no object gave a cloud, or `out` holds a dataset of other origin.
     """
     settings = settings or Extraction()
     check_int("workers", workers, 0)
@@ -99,6 +100,7 @@ def extract(
     }
     make_folder(out)
     with locked(out / ".lock"):
+        check_ours(out, "qs3 scannet", "out")
         if force and (is_finished(out) or (out / RECIPE).is_file()):
             (out / SCENES).unlink(missing_ok=True)
             delete_dataset(out)
@@ -192,7 +194,7 @@ def _write(
         rows=[_row(files, one) for files, one in objects],
         meta={
             "simulated": False,
-            "source": "ScanNet: .sens depth cropped by 2D instance masks, fused, sampled",
+            **MadeOf(objects="ScanNet's raw depth, cropped by its masks here").meta,
             "scenes": len(results),
             "scenes_failed": sum(bool(result.reason) for result in results),
             "scenes_sha256": digest,

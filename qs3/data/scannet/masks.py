@@ -101,6 +101,25 @@ def read_png(data: bytes, where: str) -> np.ndarray:
     Raises:
         DataError: another kind of picture, too large, or damaged; begins with `where`.
     """
+    width, height, bits, colour = png_header(data, where)
+    if colour != _GREY or bits not in (8, 16):
+        raise DataError(f"{where}: expected grey with 8 or 16 bits, not type {colour}, {bits}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise DataError(f"{where}: the PNG cannot be read ({error})") from error
+    dtype = np.uint8 if bits == 8 else np.uint16
+    if image is None or image.shape != (height, width) or image.dtype != dtype:
+        raise DataError(f"{where}: the PNG cannot be read")
+    return image
+
+
+def png_header(data: bytes, where: str) -> tuple[int, int, int, int]:
+    """Width, height, bits and type of colour (0 grey, 2 RGB, 3 palette, 4 and 6 with alpha).
+
+    Raises:
+        DataError: no PNG, a broken one, or one with a side of more than 4096 px or none.
+    """
     if len(data) > _MAX_PNG_BYTES:
         raise DataError(f"{where}: the PNG has more than {_MAX_PNG_BYTES} bytes; refused")
     if len(data) < _HEADER.size:
@@ -110,15 +129,6 @@ def read_png(data: bytes, where: str) -> np.ndarray:
         raise DataError(f"{where}: not a PNG")
     if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
         raise DataError(f"{where}: a PNG of {width} x {height} px; refused")
-    if colour != _GREY or bits not in (8, 16):
-        raise DataError(f"{where}: a mask is grey with 8 or 16 bits, not type {colour}, {bits}")
     if not data.endswith(b"IEND\xaeB`\x82"):
         raise DataError(f"{where}: the PNG is broken off")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(f"{where}: the PNG cannot be read ({error})") from error
-    dtype = np.uint8 if bits == 8 else np.uint16
-    if image is None or image.shape != (height, width) or image.dtype != dtype:
-        raise DataError(f"{where}: the PNG cannot be read")
-    return image
+    return width, height, bits, colour

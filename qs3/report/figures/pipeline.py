@@ -210,8 +210,9 @@ def kept_object(
 
 def _item(cfg: Any, object_id: str | None) -> MeshItem:
     from qs3.generation.plan import mesh_items
+    from qs3.generation.up_axis import with_up_axis
 
-    items = {item.id: item for item in mesh_items(cfg)}
+    items = {item.id: item for item in mesh_items(with_up_axis(cfg))}
     if object_id is None:
         return items.get(_OFTEN_THERE) or next(iter(items.values()))
     if object_id not in items:
@@ -228,7 +229,8 @@ def _item_of_file(cfg: Any, path: str | Path, object_id: str | None) -> MeshItem
         )
     if not path.is_file():
         raise MissingDataError(f"mesh={path}: there is no such file")
-    load = partial(load_mesh, path, keep_colliders=cfg.colliders == "keep")
+    up = "y" if cfg.up == "y" else "z"
+    load = partial(load_mesh, path, keep_colliders=cfg.colliders == "keep", up=up)
     return MeshItem(object_id or path.stem, "", "train", load, path.name, path)
 
 

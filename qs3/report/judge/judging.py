@@ -67,6 +67,7 @@ class Family:
         seeds: theirs; empty where not known.
         points: of a cloud as the nets see it.
         target: what they were adapted to.
+        data: what both domains are made of; "" where not known.
         figures: by tier.
     """
 
@@ -75,6 +76,7 @@ class Family:
     seeds: tuple[int, ...]
     points: int
     target: str
+    data: str
     figures: tuple[Figures, ...]
 
 
@@ -160,14 +162,16 @@ def judge(
     subsets = {"all": every, **{tier: tiers == tier for tier in TIERS if (tiers == tier).any()}}
     families, differences = [], []
     base: tuple[Family, np.ndarray] | None = None
-    for name, members, seeds in _families(list(predictors)):
+    for name, members, seeds, trained in _families(list(predictors)):
         picked = np.stack([guesses[file] for file in members])
         first = predictors[members[0]]
         figures = tuple(
             _figures(tier, picked[:, of], truth[of], blocks[of], common)
             for tier, of in subsets.items()
         )
-        families.append(Family(name, members, seeds, first.points, first.result.target, figures))
+        families.append(
+            Family(name, members, seeds, first.points, first.result.target, trained, figures)
+        )
         right = picked == truth
         base = base or (families[0], right)
         if len(families) > 1:
@@ -269,13 +273,14 @@ def find_runs(runs: Sequence[str]) -> list[Path]:
     return list(found)
 
 
-def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[int, ...]]]:
-    """Name, files and seeds of the runs of each config that saw the same data.
+def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[int, ...], str]]:
+    """Name, files, seeds and data of the runs of each config that saw the same data.
 
     Raises:
         ConfigError: a seed is there twice.
     """
     members: dict[tuple[str, ...], dict[int, Path]] = {}
+    trained: dict[tuple[str, ...], str] = {}
     for file in files:
         metrics = read_metrics(file.parent)
         if metrics is None:
@@ -283,6 +288,7 @@ def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[
             continue
         key = (metrics.experiment, metrics.hash, metrics.data.source, metrics.data.target)
         of = members.setdefault(key, {})
+        trained[key] = metrics.data_text
         if metrics.seed in of:
             raise ConfigError(
                 f"{file.parent} and {of[metrics.seed].parent} are the same run twice; give one"
@@ -292,7 +298,8 @@ def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[
     for words, of in members.items():
         seeds = tuple(sorted(seed for seed in of if seed >= 0))
         name = " ".join(words[:2])
-        found.append((name, tuple(of[seed] for seed in sorted(of)), seeds))
+        runs = tuple(of[seed] for seed in sorted(of))
+        found.append((name, runs, seeds, trained.get(words, "")))
     return found
 
 

@@ -32,6 +32,7 @@ def text(verdict: Verdict) -> str:
         "Mean ± SEM over seeds; in brackets the interval at 95 %, with blocks of frames as clusters"
         " and, of several runs, seeds.",
     ]
+    lines += [f"data of {family.name}: {family.data}" for family in v.families if family.data]
     if v.differences:
         lines += ["", f"less {v.families[0].name}, paired object by object", *aligned(_less(v))]
         if any(d.seeds < 2 for d in v.differences):

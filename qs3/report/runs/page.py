@@ -89,8 +89,8 @@ def key_figures(run: RunFiles) -> dict[str, str]:
         return {"status": "not finished", "epochs done": str(done)}
     m, final = run.metrics, run.metrics.final
     found = {
-        "source": m.source,
-        "target": run.target,
+        "source": f"{m.source}, made of: {m.made_of.source}",
+        "target": f"{run.target}, made of: {m.made_of.target}",
         "method": m.method,
         "self-training": m.selftraining,
         "model": m.model,

@@ -203,6 +203,12 @@ def task(metrics: RunMetrics) -> str:
     return f"{metrics.source} -> {metrics.target}{simulated}"
 
 
+def data_lines(results: Iterable[RunMetrics]) -> list[str]:
+    """What the data of runs are made of: "specklenet10: embedded catalogue, ..."; each once."""
+    found = (f"data: {name}: {made}" for r in results for name, made in r.domains.items())
+    return list(dict.fromkeys(found))
+
+
 def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -> str:
     """An aligned text table of the runs in `folders`, a line a config; percentages.
 
@@ -239,5 +245,6 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
         notes += [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
     if any("(!)" in line[-2] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
+    notes += data_lines(result for g in groups for result in g.results)
     caption = "Accuracy on the target's test split in %, mean ± SEM over seeds."
     return "\n".join([caption, *aligned(lines), *notes])

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from qs3.errors import ConfigError, DataError
+from qs3.report.tables.aggregate import data_lines
 from qs3.report.tables.cells import Cell, Table
 from qs3.report.tables.formats import SIMULATED, marks
+from qs3.report.tables.made_of import data_marks, results_of
 from qs3.report.tables.paired import LEVEL, Difference, compare_on_average
 from qs3.runs.predictions import FILE, read_predictions
 from qs3.utils import text_table
@@ -167,7 +169,8 @@ def text(
     if table:
         # Whatever else is missing: numbers on a simulated target are never shown without the word.
         simulated = [mark for mark in marks(table) if mark.startswith(SIMULATED)]
-        head = [f"{'## ' if markdown else ''}{table.title}", "", *simulated, ""]
+        head = [f"{'## ' if markdown else ''}{table.title}", "", *simulated, *data_marks(table), ""]
+        notes += data_lines(results_of(table))
     layout = text_table.markdown if markdown else text_table.aligned
     body = layout(lines) if len(lines) > 1 else []
     return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"

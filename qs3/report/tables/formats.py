@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from qs3.report.tables.aggregate import FEW_SEEDS, Group, task
+from qs3.report.tables.aggregate import FEW_SEEDS, Group, data_lines, task
 from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Table
+from qs3.report.tables.made_of import OTHER_DATA, data_marks, is_other, results_of
 from qs3.utils import text_table
 from qs3.utils.text_table import latex_row, latex_text
 
@@ -32,7 +33,7 @@ def _plain_grid(table: Table) -> list[list[str]]:
     for name, cells in table.rows.items():
         line = [name]
         for i, cell in enumerate(cells):
-            line += [cell.text(metric) if cell else "" for metric in table.metrics]
+            line += _ours(table, cell)
             if _has_paper(table, i):
                 line.append(cell.paper.text() if cell and cell.paper else "")
         if not many:
@@ -67,11 +68,22 @@ def _benchmark_grid(table: Table) -> list[list[str]]:
         if any(cell and cell.runnable for cell in cells):
             line = [name, "ours"]
             for cell in cells:
-                line += [cell.text(metric) if cell else "" for metric in table.metrics]
-            line += [table.average_text(name, metric) for metric in table.metrics]
+                line += _ours(table, cell)
+            other = any(is_other(table, cell) for cell in cells)
+            line += [_marked(table.average_text(name, metric), other) for metric in table.metrics]
             rules = dict.fromkeys(_rule(c, "student") for c in cells if c and c.group)
             lines.append([*line, " or ".join(_RULES.get(rule, rule) for rule in rules if rule)])
     return lines
+
+
+def _ours(table: Table, cell: Cell | None) -> list[str]:
+    """Our figures of a cell, by metric."""
+    other = is_other(table, cell)
+    return [_marked(cell.text(m) if cell else "", other) for m in table.metrics]
+
+
+def _marked(text: str, other: bool) -> str:
+    return f"{text} {OTHER_DATA}" if other and text else text
 
 
 def _has_paper(table: Table, column: int) -> bool:
@@ -133,6 +145,7 @@ def marks(table: Table) -> list[str]:
     found = [name for i in range(len(table.columns)) for name in table.simulated(i)]
     if found:
         lines.append(f"{SIMULATED}: {', '.join(dict.fromkeys(found))}")
+    lines += data_marks(table)
     if any(cell.incomplete for cell in table.cells):
         lines.append(f"{INCOMPLETE} seeds that failed, are not finished or do not fit: see below")
     return lines
@@ -143,6 +156,7 @@ def remarks(table: Table) -> list[str]:
     found = [g for cell in table.cells if (g := cell.group) and g.finished]
     targets = {g.first.target: g.first.simulated for g in found if g.first}
     lines = [*marks(table), *table.notes]
+    lines += data_lines(results_of(table))
     for target, simulated_ in targets.items():
         of = [g for g in found if g.first and g.first.target == target]
         simulated = "simulated target" if simulated_ else "target"
@@ -226,8 +240,9 @@ def csv_text(table: Table) -> str:
     """A line a cell and metric, in percent, with the command and what is wrong."""
     rows: list[list[Any]] = [
         ["row", "column", "metric", "mean", "sem", "n", "seeds", "paper_mean", "paper_sem",
-         "paper_selected", "paper_source", "task", "target", "simulated", "teacher_selected",
-         "student_selected", "seconds", "problems", "hash", "command"]
+         "paper_selected", "paper_source", "task", "target", "simulated", "source_made_of",
+         "target_made_of", "teacher_selected", "student_selected", "seconds", "problems", "hash",
+         "command"]
     ]  # fmt: skip
     for cell in table.cells:
         known = cell.group.first if cell.group else None
@@ -241,6 +256,7 @@ def csv_text(table: Table) -> str:
             values += [paper.selected, paper.source] if paper else ["", ""]
             values += [task(known) if known else "", cell.target]
             values.append(str(cell.simulated).lower() if cell.target else "")
+            values += [known.made_of.source, known.made_of.target] if known else ["", ""]
             values += [_rule(cell, "teacher"), _rule(cell, "student")]
             values.append(" ".join(f"{value:g}" for value in times))
             values.append("; ".join(cell.group.problems) if cell.group else "")

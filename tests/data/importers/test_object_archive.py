@@ -51,7 +51,7 @@ def test_points_classes_and_parts(file, tmp_path):
         }  # fmt: skip
         block = f"block{arrays['img'][i] // 30:04d}"
         assert found.importer().object_of(row.id) == block
-    assert data.meta["made_of"] == "real objects of an archive that was cut from depth images"
+    assert str(data.made_of).startswith("real objects cut from depth images, archive ")
     kept = domain(path, tmp_path / "kept", inliers_only="false")
     kept.open()
     sizes = {row.valid_points for row in read_manifest(kept.folder, data.classes)}

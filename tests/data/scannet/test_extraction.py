@@ -17,6 +17,7 @@ from tests.commands import main
 from tests.data.scannet.conftest import LOST
 from tests.data.scannet.rooms import write_lists, write_scene
 from tests.data.scannet.writing import ID_OF, write_zip
+from tests.fixtures.published import write_store
 
 SMALL = Extraction(min_points=600)
 TRAIN, VAL, NEITHER = "scene0001_00", "scene0007_01", "scene0100_00"
@@ -236,6 +237,12 @@ def test_force_starts_over_and_a_strange_folder_is_refused(written, finished, tm
     (tmp_path / "mine" / "thesis.txt").write_text("")
     with pytest.raises(DataError, match=r"holds thesis\.txt and no recipe\.json"):
         run(written, tmp_path / "mine")
+    imported = tmp_path / "imported"
+    write_store(imported, {"train": 1})
+    before = contents(imported)
+    with pytest.raises(DataError, match=r"did not make \(a fixture\) and never replaces"):
+        run(written, imported, force=True)
+    assert contents(imported) == before
 
 
 def test_a_scene_of_both_lists_is_an_error(written, tmp_path):

@@ -1,0 +1,53 @@
+"""What a generated dataset is made of, from its config and the meshes that were read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+from omegaconf import DictConfig, OmegaConf
+
+from qs3.config.compose import choices, composing
+from qs3.data.made_of import MadeOf
+from qs3.generation.plan import known_classes, mesh_root
+
+
+def made_of(
+    cfg: DictConfig, classes: Iterable[str], meshes: Iterable[str], benchmark: str
+) -> MadeOf:
+    """The line for figures; of a folder of meshes its last name, and not where it lies.
+
+    Args:
+        cfg: conf/generate.yaml, composed.
+        classes: of the objects.
+        meshes: hash of each mesh that could be read.
+        benchmark: see `qs3.generation.plan.benchmark`.
+    """
+    objects = "embedded catalogue"
+    if cfg.meshes is not None:
+        root = mesh_root(cfg).resolve()
+        # Below `raw/` PyTorch Geometric and `qs3 download` keep what a dataset is made from.
+        objects = f"meshes of {(root.parent if root.name == 'raw' else root).name}"
+    there = set(classes)
+    several = "\n".join(sorted(set(meshes) - {""}))
+    return MadeOf(
+        objects=objects,
+        sensor=_sensor(cfg),
+        views=cfg.views,
+        without=", ".join(name for name in known_classes(cfg) if name not in there),
+        benchmark=benchmark,
+        meshes=hashlib.sha256(several.encode()).hexdigest()[:12],
+    )
+
+
+def _sensor(cfg: DictConfig) -> str:
+    """The name of the sensor's file in conf/sensor; its class where a value was changed."""
+    if not cfg.sensor:
+        holes = " with holes" if cfg.recipe.get("dropout") else ""
+        return f"surface samples{holes}"
+    plain = OmegaConf.to_container(cfg.sensor)
+    with composing() as compose:
+        for name in choices("sensor"):
+            if OmegaConf.to_container(compose(None, [f"+sensor={name}"]).sensor) == plain:
+                return name
+    return f"{cfg.sensor._target_.rsplit('.', 1)[-1]} with changed settings"

@@ -1,0 +1,127 @@
+"""What a generated dataset says it is made of, and where it may lie beside a published one."""
+
+import dataclasses
+import logging
+import shutil
+
+import pytest
+
+from qs3.classes import CLASSES, MODELNET40
+from qs3.config.hydra import build
+from qs3.data.store import is_finished
+from qs3.errors import ConfigError, DataError
+from qs3.generation.command import generate
+from qs3.generation.made_of import made_of
+from tests.fixtures.modelnet import write_off_tree
+from tests.fixtures.published import write_xyz_tree
+from tests.generation.generating import QUICK, composed, config
+
+FAST = [*QUICK[:-1], "views=1", "renderer.samples=1", "workers=0"]
+WITHOUT = "without bathtub, bed, bookshelf, cabinet, monitor, plant, sofa"
+
+
+def domain(name, data_dir):
+    return build(composed(f"domain={name}", f"paths.data_dir={data_dir}").domain)
+
+
+def test_it_names_meshes_sensor_views_and_missing_classes(finished, meshes, tmp_path):
+    seen = finished[1].made_of
+    assert str(seen) == f"meshes of {meshes.name}, speckle_stereo_small, 2 views, {WITHOUT}"
+    assert domain("specklenet10", finished[0].parent).made_of(finished[1]) == seen
+
+    def samples(*more):
+        shutil.rmtree(tmp_path / "modelnet10", ignore_errors=True)
+        return generate(config(tmp_path, meshes, "workers=0", *more, domain="modelnet10")).made_of
+
+    assert samples() == dataclasses.replace(seen, sensor="surface samples", views=0)
+    assert samples("scans=2").meshes == seen.meshes
+    assert samples("half=first").meshes != seen.meshes
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["domain=specklenet10"], "embedded catalogue, speckle_stereo, 5 views"),
+        (["domain=blensor10"], "embedded catalogue, blensor_kinect, 5 views"),
+        (["domain=kinectsim10"], "embedded catalogue, kinect_like, 4 views"),
+        (
+            ["domain=specklenet10", "sensor.baseline_m=0.2"],
+            "embedded catalogue, SpeckleStereo with changed settings, 5 views",
+        ),
+        (["domain=modelnet10"], "embedded catalogue, surface samples"),
+        (["domain=modelnet10_dropout"], "embedded catalogue, surface samples with holes"),
+    ],
+)
+def test_the_sensor_has_the_name_of_its_file(words, said):
+    assert str(made_of(composed(*words), CLASSES, ["a"], "")) == said
+
+
+def test_all_of_modelnet40_serves_as_it_is(tmp_path, caplog):
+    root = tmp_path / "ModelNet40" / "raw"
+    write_off_tree(root, {"train": 2, "test": 1}, MODELNET40)
+    where = [f"meshes={root}", f"paths.data_dir={tmp_path / 'data'}"]
+    with caplog.at_level(logging.INFO):
+        data = generate(composed("domain=specklenet10", *FAST, *where))
+    assert data.counts() == {
+        "train": dict.fromkeys(CLASSES, 2),
+        "test": dict.fromkeys(CLASSES, 1),
+    }
+    cabinets = [name for name in data.ids if name.startswith("cabinet/")]
+    assert cabinets == [
+        *(f"cabinet/train/night_stand_000{i}" for i in (1, 2)), "cabinet/test/night_stand_0003"
+    ]  # fmt: skip
+    ours = {*CLASSES, "night_stand"}
+    others = [name for name in MODELNET40 if name not in ours]
+    assert data.meta["folders_left_alone"] == {"count": 30, "names": others}
+    assert "30 folders of other classes were left alone: airplane, bench, " in caplog.text
+    assert str(data.made_of) == "meshes of ModelNet40, speckle_stereo_small, 1 view"
+    assert f"made of: {data.made_of}" in caplog.text
+
+
+def test_an_imported_dataset_is_never_replaced(meshes, tmp_path):
+    write_xyz_tree(tmp_path / "published" / "specklenet10", {"train": 1, "test": 1})
+    before = domain("specklenet10", tmp_path).open().sha256
+    one = ["workers=0", "limit=1", "classes=[chair]", "domain.published=null"]
+    for force in ("true", "false"):
+        with pytest.raises(DataError) as error:
+            generate(config(tmp_path, meshes, *one, f"force={force}"))
+        said = str(error.value)
+        assert f"{tmp_path / 'specklenet10'} holds a dataset that generate.py did not make" in said
+        assert "(published files)" in said
+        assert "give another paths.data_dir" in said
+    assert domain("specklenet10", tmp_path).open().sha256 == before
+
+
+def test_beside_published_files_nothing_is_made_that_would_pass_for_them(meshes, tmp_path):
+    write_xyz_tree(tmp_path / "published" / "specklenet10", {"train": 1, "test": 1})
+    one = ["workers=0", "limit=1", "classes=[chair]"]
+    for force in ("true", "false"):
+        with pytest.raises(DataError, match=r"published/specklenet10, and a dataset made here .*"):
+            generate(config(tmp_path, meshes, *one, f"force={force}"))
+    assert not is_finished(tmp_path / "specklenet10")
+    assert domain("specklenet10", tmp_path).open().made_of.published
+
+
+def test_the_clean_twin_is_made_beside_the_published_dataset(meshes, tmp_path):
+    write_xyz_tree(tmp_path / "published" / "specklenet10", {"train": 1, "test": 1})
+    before = domain("specklenet10", tmp_path).open().sha256
+    one = ["workers=0", "limit=1", "classes=[chair]"]
+    made = generate(config(tmp_path, meshes, *one, domain="specklenet10_clean"))
+    clean = domain("specklenet10_clean", tmp_path)
+    assert clean.folder == tmp_path / "specklenet10_clean"
+    assert clean.open().sha256 == made.sha256
+    assert str(made.made_of).startswith(f"meshes of {meshes.name}, ")
+    published = domain("specklenet10", tmp_path).open()
+    assert (published.sha256, str(published.made_of)) == (before, "published files")
+
+
+def test_the_clean_twin_of_a_generated_dataset_is_there_already(finished, meshes):
+    folder, noisy = finished
+    settings = (folder.parent, meshes, "workers=0")
+    clean = generate(config(*settings, domain="specklenet10_clean"))
+    assert clean.ids == noisy.ids
+    assert clean.sha256 != noisy.sha256
+    assert not (folder.parent / "specklenet10_clean").exists()
+    with pytest.raises(ConfigError, match=r"specklenet10_clean is part of the dataset in .*force"):
+        generate(config(*settings, "force=true", domain="specklenet10_clean"))
+    assert is_finished(folder)
