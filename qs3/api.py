@@ -68,10 +68,10 @@ def generate(*arguments: Any) -> Any:
     A dataset: workers are processes of their own; workers=0 uses this one.
 
     Meshes: first one `trimesh.Trimesh`, `trimesh.Scene` or `qs3.meshes.mesh.Mesh`, or a list or a
-    dict of them, then the words. They are metres with z up, as they stand (trimesh leaves glTF
-    files y up). Everything happens in this process, and nothing is written. An object's bytes
-    depend on the seed and on its id: the key of a dict, "object" for a single mesh, "0", "1", ...
-    in a list. With the id of a dataset's object they are those of the dataset.
+    dict of them, then the words. They are metres with z up, as they stand, or with "up=y" y up
+    (trimesh leaves glTF files so). Everything happens in this process, and nothing is written. An
+    object's bytes depend on the seed and on its id: the key of a dict, "object" for a single mesh,
+    "0", "1", ... in a list. With the id of a dataset's object they are those of the dataset.
 
     Returns:
         Of words the dataset; of a mesh a `qs3.generation.scan.Scan`; of a list or dict one each.
@@ -108,6 +108,7 @@ def load(
         predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
         probabilities = predictor([cloud_a, cloud_b])  # [2, classes] float64
         predictor.classes  # their names, in that order
+        found = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
 
     A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`).
 

@@ -39,7 +39,7 @@ def commands() -> dict[str, set[str]]:
     """Every command of ours that a page shows, by the words that name it, with its keys."""
     found: dict[str, set[str]] = {}
     for page in PAGES:
-        text = page.read_text("utf-8")
+        text = re.sub(r"\\\n\s*", "", page.read_text("utf-8"))  # commands of several lines
         lines = [line for block in INDENTED.findall(text) for line in block.splitlines()]
         lines += re.findall(r"`((?:qs3|python) [^`\n]+)`", text)
         for line in lines:
@@ -51,6 +51,16 @@ def commands() -> dict[str, set[str]]:
             keys = {word.partition("=")[0] for word in words if "=" in word}
             found.setdefault(" ".join(head), set()).update(keys)
     return found
+
+
+def test_pages_that_code_and_configs_name_are_there():
+    missing = {}
+    for folder, suffix in (("qs3", "*.py"), ("conf", "*.yaml"), ("tests", "*.py")):
+        for file in sorted((ROOT / folder).rglob(suffix)):
+            named = re.findall(r"\bdocs/[\w/-]+\.(?:md|csv|json|png)", file.read_text("utf-8"))
+            if gone := [name for name in named if not (ROOT / name).is_file()]:
+                missing[str(file.relative_to(ROOT))] = gone
+    assert not missing
 
 
 def test_commands_of_the_documents_exist():

@@ -4,7 +4,7 @@ Three estimates of their accuracy, made from confidences alone, and what else hi
 All of them learn what a confidence means on labelled validation clouds of the source, and carry it
 over to the target. That carries over only in part: clouds of another domain, or of no known class,
 get high confidences too, so the estimates are too high as a rule. By how much was measured on
-simulated targets: docs/predictions.md.
+simulated targets: docs/how-to/predict.md.
 """
 
 from __future__ import annotations

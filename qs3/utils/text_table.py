@@ -12,8 +12,8 @@ Rows = Sequence[Sequence[str]]
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-    "±": r"$\pm$", "→": r"$\rightarrow$", "†": r"$\dagger$", "<": r"$<$", ">": r"$>$",
-    "|": r"$|$",
+    "±": r"$\pm$", "→": r"$\rightarrow$", "†": r"$\dagger$", "‡": r"$\ddagger$",
+    "<": r"$<$", ">": r"$>$", "|": r"$|$",
 }  # fmt: skip
 
 

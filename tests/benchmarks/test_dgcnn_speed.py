@@ -14,8 +14,15 @@ from torch_geometric.nn import EdgeConv as PygEdgeConv
 
 from qs3.geometry.neighbours import knn
 from qs3.models.dgcnn import EdgeConv, dgcnn
-from tests.models.fast.test_edgeconv_pyg import edges
 from tests.models.reference import NaiveDGCNN
+
+
+def _edges(index: torch.Tensor) -> torch.Tensor:
+    """[2, b * n * k] from neighbours [b, n, k]: source and target of all edges of a batch."""
+    b, n, k = index.shape
+    offset = (torch.arange(b) * n)[:, None, None]
+    target = (torch.arange(n)[None, :, None] + offset).expand(b, n, k)
+    return torch.stack([(index + offset).reshape(-1), target.reshape(-1)])
 
 
 def _step(model: nn.Module, points: torch.Tensor, labels: torch.Tensor) -> Callable[[], None]:
@@ -72,7 +79,7 @@ def test_layer_against_pyg(
     theirs = PygEdgeConv(mlp, aggr="max")
     x = torch.randn(2, 1024, c, requires_grad=True)
     index = knn(x.detach(), 20)
-    pairs = edges(index)
+    pairs = _edges(index)
     benchmark.pedantic(lambda: ours(x, index).sum().backward(), rounds=4, warmup_rounds=1)
     times = []
     for _ in range(3 if benchmark.enabled else 1):
