@@ -24,6 +24,7 @@ def _built(
     data_dir: str | None,
     target: str | None,
     overrides: str,
+    kept: str | None = None,
     runs: bool = True,
 ) -> Table:
     """The table that the options ask for, with our runs; `runs`: there are some, one may think."""
@@ -32,9 +33,11 @@ def _built(
 
     extra = shlex.split(overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
-    if runs and log_dir and not Path(log_dir).is_dir():
+    if kept and not Path(kept).is_dir():
+        raise ConfigError(f"kept={kept} is not there; `qs3 report keep` makes such a folder")
+    if runs and not kept and log_dir and not Path(log_dir).is_dir():
         raise ConfigError(f"log_dir={log_dir} is not there; it is the paths.log_dir of the runs")
-    return build_table(table, log_dir or "logs", extra, target)
+    return build_table(table, log_dir or "logs", extra, target, kept)
 
 
 def _saved_at(table: Table, out: str | None, given: dict[str, Any]) -> Path:
@@ -78,6 +81,16 @@ def _train(
     if not status:
         print(f"next: qs3 report table={table.name}")
     return status
+
+
+def _keep(into: str, **given: Any) -> None:
+    from qs3.report.tables.keeping import finished_runs, keep
+
+    table = _built(**given)
+    written = keep(table, into)
+    for folder in written:
+        print(f"kept {folder}")
+    print(f"{len(finished_runs(table))} finished runs of table {table.name}, {len(written)} new")
 
 
 def _compare(base: str | None, out: str | None, **given: Any) -> None:
@@ -190,6 +203,7 @@ _TABLE = (
     Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
     Option("target", text("NAME"), "another target domain for all of the table"),
     Option("overrides", text('"A=B ..."'), "that the runs had beyond the table's", ""),
+    Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: taken up, not run"),
 )
 _OUT = Option("out", text("FOLDER"), "where the files go (default LOG_DIR/tables)")
 
@@ -223,6 +237,17 @@ TRAIN = Command(
         "qs3 report train table=uda launcher=slurm jobs=16 hydra.launcher.partition=gpu",
     ),
     others={_LAUNCHER: "settings of the launcher"},
+)
+
+KEEP = Command(
+    "qs3 report keep",
+    "keep the results of a table's finished runs, small enough to commit",
+    _keep,
+    (*_TABLE, Option("into", text("FOLDER"), "where they go", required=True)),
+    (
+        "qs3 report keep table=real into=docs/results/real",
+        "qs3 report table=real kept=docs/results/real",
+    ),
 )
 
 COMPARE = Command(
@@ -297,6 +322,7 @@ REPORT = Group(
     {
         "table": TABLE,
         "train": TRAIN,
+        "keep": KEEP,
         "compare": COMPARE,
         "effects": EFFECTS,
         "judge": "qs3.report.judge.cli:JUDGE",

@@ -24,6 +24,7 @@ from qs3.config.quoting import override
 from qs3.errors import ConfigError
 from qs3.report.tables.aggregate import Group, group, load_runs
 from qs3.report.tables.cells import Cell, Published, Table
+from qs3.report.tables.keeping import with_kept
 
 _SUPERVISED = "qs3.methods.supervised.Supervised"
 
@@ -51,6 +52,7 @@ def build_table(
     log_dir: str | Path = "logs",
     extra: Sequence[str] = (),
     target: str | None = None,
+    kept: str | Path | None = None,
 ) -> Table:
     """Read a table's file and find our runs of its cells.
 
@@ -60,6 +62,7 @@ def build_table(
         extra: overrides of train.py for every cell, as the runs had them.
         target: another target domain for all cells, e.g. "kinectsim10"; the paper's numbers,
             measured on another target, are then left out.
+        kept: folder of results of runs that need not be there any more (`keeping.keep`).
 
     Raises:
         ConfigError: no such table, its file or an override is wrong, or `target` is given for
@@ -91,7 +94,7 @@ def build_table(
         averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
     except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
-    groups = {(g.experiment, g.hash): g for g in group(load_runs(log_dir))}
+    groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
     filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
     columns = tuple(_column(column, target) for column in spec.columns)
     rows = {
