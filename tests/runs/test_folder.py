@@ -52,7 +52,10 @@ def config(**changes):
 IGNORED = (
     *("seed", "force", "paths.data_dir", "logger.wandb", "callbacks.progress.enabled"),
     *("data.source.make", "data.source.synthesis", "data.cache_dir"),
-    *(f"data.source.{name}" for name in ("path", "title", "symbol", "published.folder")),
+    *(
+        f"data.source.{name}"
+        for name in ("path", "title", "symbol", "published.folder", "published.file")
+    ),
 )
 HASHED = (
     *("experiment_name", "data.points", "callbacks.mine", "selftraining.theta", "new_key"),
