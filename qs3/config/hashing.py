@@ -29,7 +29,7 @@ _UNHASHED = (
         f"data.{domain}.{key}"
         for domain in ("source", "target")
         for key in (
-            *("path", "twin_of", "published.folder", "title", "symbol"),
+            *("path", "twin_of", "published.folder", "title", "symbol", "unit"),
             *("synthesis", "how_to_get", "make", "stand_in"),
         )
     ),
