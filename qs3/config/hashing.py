@@ -29,7 +29,8 @@ _UNHASHED = (
         f"data.{domain}.{key}"
         for domain in ("source", "target")
         for key in (
-            *("path", "twin_of", "published.folder", "published.file", "title", "symbol"),
+            *("path", "twin_of", "title", "symbol", "unit"),
+            *("published.folder", "published.file"),
             *("synthesis", "how_to_get", "make", "stand_in"),
         )
     ),

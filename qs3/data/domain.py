@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.classes import class_list
+from qs3.config.checks import check_choice
 from qs3.config.location import typed
 from qs3.data.importers import Importer, import_into
 from qs3.data.made_of import MadeOf
@@ -22,6 +23,8 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 log = logging.getLogger(__name__)
 
 VARIANTS = ("points", "points_clean")
+SCALES = ("unit_ball", "metres")
+"""How large clouds are as a net sees them: divided by their radius, or as they are."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ class Domain:
         simulated: the target's reality is simulated; every output about it says so.
         gravity: the axis that points up in the store: "z"; or "none" for clouds in the frame of
             their camera, which training should not turn about z (protocol.augment.rotate_z=false).
+        unit: of the store's coordinates, "metres"; or "none" if sizes mean nothing (CAD shapes,
+            clouds that were normalised) or nobody knows.
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
         expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
@@ -58,6 +63,7 @@ class Domain:
     published: Importer | Mapping[str, Any] | None = None
     simulated: bool = False
     gravity: str = "z"
+    unit: str = "none"
     how_to_get: str = ""
     make: str | None = None
     stand_in: str | None = None
@@ -75,6 +81,7 @@ class Domain:
                 f"domain {self.name}: gravity is {self.gravity!r}, but the clouds of a store stand "
                 "on z; let the importer turn them (its key `up`)"
             )
+        check_choice(f"domain {self.name}: unit", self.unit, ("metres", "none"))
         object.__setattr__(self, "path", Path(self.path))
         classes = class_list(self.classes)
         if not classes or len(set(classes)) < len(classes):
@@ -119,6 +126,20 @@ class Domain:
             raise ConfigError(
                 f"domain {self.name}: `published` is wrong: {error.__cause__ or error}"
             ) from error
+
+    def check_scale(self, scale: str) -> None:
+        """Find out whether a net can see the clouds at this scale.
+
+        Raises:
+            ConfigError: not one of `SCALES`, or metres of clouds that are not in metres.
+        """
+        if check_choice("data.scale", scale, SCALES) == "metres" and self.unit != "metres":
+            raise ConfigError(
+                f"data.scale=metres: the clouds of domain {self.name} are not in metres, or nobody "
+                "knows (its key `unit`). Set data.scale=unit_ball, choose a domain with real sizes "
+                "such as roomscan10, or, if you know that they are in metres, say so: "
+                "data.source.unit=metres or data.target.unit=metres"
+            )
 
     def check(self) -> None:
         """Find out, in milliseconds, whether `open` has something to open.

@@ -41,7 +41,8 @@ class AdaptationData(LightningDataModule):
             clouds of each class (see `batches.balanced`). For the source alone: how often the
             target's classes occur is not known.
         make_source: a generated source that is not there is made first.
-        points, fps_starts, val, eval_batch_size, cache_dir, clouds_a_split: see `DomainData`.
+        points, scale, fps_starts, val, eval_batch_size, cache_dir, clouds_a_split: see
+            `DomainData`.
         clouds_a_class: of the labelled domain; see `DomainData`.
 
     Attributes:
@@ -63,6 +64,7 @@ class AdaptationData(LightningDataModule):
         owner: str = "source",
         uses_target: bool = False,
         points: int = 1024,
+        scale: str = "unit_ball",
         fps_starts: int = 4,
         val: str = "lineage",
         sampler: str = "shuffled",
@@ -81,6 +83,7 @@ class AdaptationData(LightningDataModule):
             )
         shared: dict[str, Any] = {
             "points": points,
+            "scale": scale,
             "fps_starts": fps_starts,
             "eval_batch_size": eval_batch_size,
             "cache_dir": cache_dir,

@@ -1,4 +1,4 @@
-"""Clouds as a net sees them, taken from where they lie on disk: unit ball, then farthest points.
+"""Clouds as a net sees them, taken from where they lie on disk: centred, scaled, farthest points.
 
 Nothing is copied until a batch asks for it: the stored clouds stay a memmap, and of the samples
 only the indices are kept. Processes that train on the same dataset share both in the page cache.
@@ -17,7 +17,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class Clouds:
-    """n clouds of m points in the unit ball, each in `starts` different samples.
+    """n clouds of m points about their centroid, each in `starts` different samples.
 
     Attributes:
         stored: [N, P, 3] float32, as published; e.g. a memmap.
@@ -26,6 +26,7 @@ class Clouds:
         centre: [N, 3] float32, a cloud's centroid about its first point.
         radius: [N] float32, largest distance from the centroid; 1 where it is 0.
         rows: [n] which of the N clouds these are.
+        scale: "unit_ball": a batch's clouds are divided by their radius; "metres": they are not.
     """
 
     stored: Float[np.ndarray, "N P 3"]
@@ -33,9 +34,14 @@ class Clouds:
     centre: Float[np.ndarray, "N 3"]
     radius: Float[np.ndarray, " N"]
     rows: Int[np.ndarray, " n"]
+    scale: str = "unit_ball"
 
     @staticmethod
-    def of(stored: Float[np.ndarray, "n p 3"], order: np.ndarray | None = None) -> Clouds:
+    def of(
+        stored: Float[np.ndarray, "n p 3"],
+        order: np.ndarray | None = None,
+        scale: str = "unit_ball",
+    ) -> Clouds:
         """All of `stored`; its clouds are read once, for their balls (see `geometry.unit_ball`)."""
         centre = np.empty((len(stored), 3), dtype=np.float32)
         radius = np.empty(len(stored), dtype=np.float32)
@@ -43,7 +49,7 @@ class Clouds:
             moved = cloud - cloud[:1]
             centre[i] = moved.mean(axis=0)
             radius[i] = np.linalg.norm(moved - centre[i], axis=1).max() or 1.0
-        return Clouds(stored, order, centre, radius, np.arange(len(stored)))
+        return Clouds(stored, order, centre, radius, np.arange(len(stored)), scale)
 
     def __len__(self) -> int:
         """How many there are."""
@@ -57,6 +63,10 @@ class Clouds:
     def at(self, index: Shaped[np.ndarray, " k"]) -> Clouds:
         """A part of these clouds, by positions or by a mask; nothing is copied."""
         return dataclasses.replace(self, rows=self.rows[index])
+
+    def in_unit_ball(self) -> Clouds:
+        """The same clouds, each divided by its radius; nothing is copied."""
+        return dataclasses.replace(self, scale="unit_ball")
 
     def take(
         self, index: Int[Tensor, " b"], start: Int[Tensor, " b"] | None = None
@@ -74,7 +84,8 @@ class Clouds:
         # In this order, which is `geometry.unit_ball`'s: the same bits as of the whole cloud.
         points -= first[:, None]
         points -= centre[:, None]
-        points /= self.radius[rows, None, None]
+        if self.scale == "unit_ball":
+            points /= self.radius[rows, None, None]
         return torch.from_numpy(np.asarray(points))
 
     def all(self) -> Float[Tensor, "n m 3"]:

@@ -3,9 +3,9 @@
     data = SpeckleNetData(points=256, batch_size=32)
     Trainer(max_epochs=10).fit(my_module, data)
 
-A batch is `{"points": [B, N, 3] float32, "labels": [B] int64}`: clouds in the unit ball, z up,
-sampled by farthest points. Without labels the key "labels" is not there; without a trainer, that
-takes them away, the step's "index" and "epoch" are there as well.
+A batch is `{"points": [B, N, 3] float32, "labels": [B] int64}`: clouds in the unit ball (or in
+metres, if `scale` says so), z up, sampled by farthest points. Without labels the key "labels" is
+not there; without a trainer, that takes them away, the step's "index" and "epoch" are there too.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ class DomainData(LightningDataModule):
     Args:
         domain: a `Domain`, or the name of one of conf/domain, such as "modelnet10".
         points: of a cloud as a net sees it.
+        scale: "unit_ball", or "metres" for clouds that keep their size.
         fps_starts: samples of each training cloud, from other first points; an epoch draws one.
         batch_size: of training batches, at least 2 (batch norm).
         eval_batch_size: of all others.
@@ -63,7 +64,8 @@ class DomainData(LightningDataModule):
         sha256: of the dataset, after `setup`.
 
     Raises:
-        ConfigError: no such domain, rule or sampler; labels are asked for and there are none.
+        ConfigError: no such domain, rule, sampler or scale; labels are asked for and there are
+            none; metres are asked for and the clouds are not in metres.
         DataError: from a loader, if its clouds have not been set up or there is no such split.
         MissingDataError: from `prepare_data`, if there are no files; says how to get them.
     """
@@ -73,6 +75,7 @@ class DomainData(LightningDataModule):
         domain: Domain | str,
         *,
         points: int = 1024,
+        scale: str = "unit_ball",
         fps_starts: int = 4,
         batch_size: int = 16,
         eval_batch_size: int = 64,
@@ -90,7 +93,8 @@ class DomainData(LightningDataModule):
         super().__init__()
         if isinstance(domain, str):
             domain = compose_domain(domain, {"paths.data_dir": str(data_dir)})
-        self.domain = domain
+        domain.check_scale(scale)
+        self.domain, self.scale = domain, scale
         self.points, self.fps_starts = points, fps_starts
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size
         self.augment, self.seed, self.has_labels = augment, seed, labels
@@ -169,7 +173,7 @@ class DomainData(LightningDataModule):
         self.train, self.validation = train.at(chosen), train.at(held_out)
 
     def _load(self, dataset: PointSet, split: str, starts: int) -> Labelled | Unlabelled:
-        found = load_clouds(dataset, split, self.points, starts, self.cache_dir)
+        found = load_clouds(dataset, split, self.points, starts, self.cache_dir, scale=self.scale)
         if not self.has_labels:
             return found
         labels = labels_of(dataset, split)

@@ -38,12 +38,14 @@ def prepare(
     starts: int = 1,
     cache_dir: Path | None = None,
     key: str = "",
+    scale: str = "unit_ball",
 ) -> Clouds:
-    """Each cloud in the unit ball, and in it `starts` samples of `count` farthest points.
+    """Each cloud about its centroid, and of it `starts` samples of `count` farthest points.
 
     Sample 0 begins at point 0, the others at points that are a function of the cloud's bytes
     (`start_points`). A cloud is not normalised again after sampling. Nothing is random, so
-    evaluation, which takes sample 0, is deterministic.
+    evaluation, which takes sample 0, is deterministic. Which points are farthest does not depend
+    on a cloud's size: all scales share the cached indices, taken in the unit ball.
 
     Args:
         points: clouds as stored, e.g. a memmap; kept, not copied.
@@ -51,6 +53,7 @@ def prepare(
         starts: samples of each cloud, at most p.
         cache_dir: where to keep the indices for the next run; None keeps nothing.
         key: names the clouds: the dataset with its hash, and the split.
+        scale: of the clouds, see `Clouds`.
 
     Raises:
         ConfigError: the clouds have fewer points than asked for.
@@ -59,7 +62,7 @@ def prepare(
     if not 1 <= count <= stored:
         raise ConfigError(f"data.points is {count}, but the clouds of {key} have {stored} points")
     if count == stored:
-        return Clouds.of(points)
+        return Clouds.of(points, scale=scale)
     starts = min(starts, stored)
 
     def work() -> np.ndarray:
@@ -67,7 +70,7 @@ def prepare(
         return sample_all(points, count, starts)
 
     if cache_dir is None:
-        return Clouds.of(points, work())
+        return Clouds.of(points, work(), scale)
     cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
     name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
     shape = (n, starts, count)
@@ -77,7 +80,7 @@ def prepare(
             order = _read(cache, shape, name)
             if order is None:
                 order = _kept(cache, work(), name)
-    return Clouds.of(points, order)
+    return Clouds.of(points, order, scale)
 
 
 def remove_old_leftovers(cache_dir: Path) -> None:

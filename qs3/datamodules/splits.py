@@ -46,12 +46,21 @@ class Labelled:
 
 
 def load_clouds(
-    dataset: PointSet, split: str, points: int, starts: int = 1, cache_dir: Path | None = None
+    dataset: PointSet,
+    split: str,
+    points: int,
+    starts: int = 1,
+    cache_dir: Path | None = None,
+    *,
+    scale: str,
 ) -> Unlabelled:
-    """A split's clouds, prepared (see `prepare`), without their labels."""
+    """A split's clouds, prepared (see `prepare`), without their labels.
+
+    `scale` has no default: who forgot it would show a net clouds of another size, and no error.
+    """
     part = dataset.split(split)
     key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
-    clouds = prepare(part.points, points, starts=starts, cache_dir=cache_dir, key=key)
+    clouds = prepare(part.points, points, starts=starts, cache_dir=cache_dir, key=key, scale=scale)
     return Unlabelled(clouds, part.ids)
 
 

@@ -1,7 +1,8 @@
 """What the clouds of training were like, and whether another cloud is like them.
 
 Five measures of a cloud, which its position, its size and a rotation about the up axis leave as
-they are, and for each the range in which the training clouds of source and target lie. A cloud
+they are (and its size, for nets that see metres), and for each the range in which the training
+clouds of source and target lie. A cloud
 outside one of them is one that the classifier was never asked about. This guarantees nothing: a
 cloud inside all ranges can still show an object of no known class, and get a confident answer.
 """
@@ -26,6 +27,9 @@ MEASURES = {
 }
 """Names of the measures and what they are."""
 
+OF_METRES = {"size": "largest distance of a point from the centroid, in metres"}
+"""Measured of clouds that keep their size: a net would say something of millimetres, too."""
+
 _TAIL = 0.001  # of the clouds of a domain, on either side
 _MOST = 1000  # clouds that are measured of a domain; 3 ms each
 
@@ -35,7 +39,7 @@ def measure(stored: Float[np.ndarray, "p 3"], sample: Float[np.ndarray, "m 3"]) 
 
     Args:
         stored: the cloud before it was sampled; only how many different points it has is asked.
-        sample: as the net sees it, in the unit ball, z up.
+        sample: of it, in the unit ball, z up.
     """
     different = np.unique(np.asarray(sample, dtype=np.float64), axis=0)
     spacing = 0.0
@@ -54,6 +58,14 @@ def measure(stored: Float[np.ndarray, "p 3"], sample: Float[np.ndarray, "m 3"]) 
     }
 
 
+def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
+    """The `MEASURES` of a cloud in its sample number 0, with `OF_METRES` if it is in metres."""
+    row = clouds.rows[index]
+    sample = clouds.in_unit_ball().take(torch.tensor([index]))[0].numpy()
+    found = measure(np.asarray(clouds.stored[row]), sample)
+    return {**found, "size": float(clouds.radius[row])} if clouds.scale == "metres" else found
+
+
 def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
     """Of each measure the least and the largest usual value: [low, high].
 
@@ -70,8 +82,7 @@ def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
     low = np.min([each[0] for each in ranges], axis=0)
     high = np.max([each[1] for each in ranges], axis=0)
     low[0], high[0] = np.floor(low[0]), np.inf  # points: of many, none is too many
-    names = tuple(MEASURES)
-    return {name: [float(low[i]), float(high[i])] for i, name in enumerate(names)}
+    return {name: [float(low[i]), float(high[i])] for i, name in enumerate(found[0])}
 
 
 def relax_min_points(usual: Mapping[str, list[float]], seen: int) -> dict[str, list[float]]:
@@ -109,11 +120,7 @@ def ood_reasons_of_all(
 def _measured(clouds: Clouds, most: int) -> list[dict[str, float]]:
     """The measures of at most `most` clouds, evenly spaced."""
     chosen = np.unique(np.linspace(0, len(clouds) - 1, min(len(clouds), most)).astype(int))
-    found = []
-    for i in chosen:
-        stored = np.asarray(clouds.stored[clouds.rows[i]])
-        found.append(measure(stored, clouds.take(torch.tensor([i]))[0].numpy()))
-    return found
+    return [measure_one(clouds, int(i)) for i in chosen]
 
 
 def _different(points: Float[np.ndarray, "p 3"]) -> int:

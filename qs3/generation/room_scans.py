@@ -7,7 +7,6 @@ annotator draws its mask, and `qs3.data.frames.cutting` cuts by the same rules a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,8 +32,6 @@ from qs3.utils.seeding import object_rng
 _BARE = Keep()
 _AROUND_M = 0.3
 """The picture is taken so far around the object, for what covers its outline."""
-_RAISED = 0.5
-"""Share of the objects of a class in `RoomScan.stands_m` that do not stand on the floor."""
 
 
 @dataclass(frozen=True)
@@ -97,10 +94,8 @@ class RoomScan:
 
     Attributes:
         sensor: that takes it.
-        placing: of the mesh on the floor.
-        stands_m: by class the lowest and highest thing that it stands on, of which half of its
-            objects do; a class that is not here stands on the floor.
-        scene: what is around it.
+        placing: of the mesh in the room, whose floor is z = 0.
+        scene: what is around it, and under it if it is placed above the floor.
         camera: where it is looked from.
         mask: how carelessly the mask is drawn.
         rules: by which it is cut, and when it is refused.
@@ -112,7 +107,6 @@ class RoomScan:
 
     sensor: DepthSensor
     placing: Placing = field(default_factory=RealSize)
-    stands_m: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     scene: Surroundings = field(default_factory=Room)
     camera: RoomCamera = field(default_factory=RoomCamera)
     mask: MaskCrop = field(default_factory=MaskCrop)
@@ -139,13 +133,13 @@ class RoomScan:
         if renderer is None:
             raise ConfigError("RoomScan needs a renderer: set renderer=mitsuba or blender")
         cls = object_id.split("/")[0]
-        placed = self._placed(mesh, cls, object_id, object_rng(seed, object_id, 0))
+        placed = self.placing.place(mesh, object_rng(seed, object_id, 0), object_id)
         around = placed.bounds + np.array([[-_AROUND_M], [_AROUND_M]])
         why = "it is outside the picture"
         for attempt in range(self.attempts):
             rng = object_rng(seed, object_id, 1 + attempt)
             pose = self.camera.pose(rng, placed.bounds, self.sensor.intrinsics)
-            bodies = self.scene.bodies(placed, pose[None, :3, 3], rng)
+            bodies = self.scene.bodies(placed, pose[None, :3, 3], rng, floor_m=0.0)
             explain = keep.views is not None
             frame = self.sensor.scan(bodies, around, pose, renderer, rng, explain=explain)
             if frame is None:
@@ -162,15 +156,6 @@ class RoomScan:
             f"none of {self.attempts} pictures (recipe.attempts) shows it well enough; "
             f"of the last one: {why}"
         )
-
-    def _placed(self, mesh: Mesh, cls: str, object_id: str, rng: np.random.Generator) -> Mesh:
-        """On the floor, or on something else."""
-        placed = self.placing.place(mesh, rng, object_id)
-        raised, height = rng.random() < _RAISED, rng.random()
-        if cls not in self.stands_m or not raised:
-            return placed
-        low, high = self.stands_m[cls]
-        return Mesh(placed.vertices + np.array([0, 0, low + (high - low) * height]), placed.faces)
 
     def _cloud(
         self, frame: DepthFrame, own: np.ndarray, pose: np.ndarray, object_id: str, keep: Keep

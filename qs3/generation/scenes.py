@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
+from qs3.config.checks import check_ranges
+from qs3.errors import ConfigError
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.base import Body
+
+_HAIR = 1e-4
+"""What an object stands on is so far below it: its bottom face is in no other face's plane."""
 
 
 class Surroundings(Protocol):
     """What stands around the object."""
 
-    def bodies(self, mesh: Mesh, eyes_m: np.ndarray, rng: np.random.Generator) -> tuple[Body, ...]:
-        """The object first (label 1), then the rest (label 0)."""
+    def bodies(
+        self,
+        mesh: Mesh,
+        eyes_m: np.ndarray,
+        rng: np.random.Generator,
+        floor_m: float | None = None,
+    ) -> tuple[Body, ...]:
+        """The object first (label 1), then the rest (label 0).
+
+        `floor_m`: height of the floor; None: the object stands on it.
+        """
         ...
 
 
@@ -23,9 +38,67 @@ class Surroundings(Protocol):
 class Alone:
     """The object floats in the dark, as in the paper."""
 
-    def bodies(self, mesh: Mesh, eyes_m: np.ndarray, rng: np.random.Generator) -> tuple[Body, ...]:
+    def bodies(
+        self,
+        mesh: Mesh,
+        eyes_m: np.ndarray,
+        rng: np.random.Generator,
+        floor_m: float | None = None,
+    ) -> tuple[Body, ...]:
         """The object, with the default albedo."""
         return (Body(mesh, albedo=0.8, label=1),)
+
+
+@dataclass(frozen=True)
+class Support:
+    """What an object above the floor stands on: a block, or a board on four legs.
+
+    Attributes:
+        min_margin_m, max_margin_m: the top is wider than the object by so much, drawn for each of
+            its four sides, so that the object stands anywhere on it.
+        block: probability of a block down to the floor (a chest, a cabinet); else it is a board on
+            legs (a table, a desk).
+        min_board_m, max_board_m: thickness of the board.
+        min_leg_m, max_leg_m: of the legs.
+    """
+
+    min_margin_m: float = 0.03
+    max_margin_m: float = 0.4
+    block: float = 0.4
+    min_board_m: float = 0.02
+    max_board_m: float = 0.06
+    min_leg_m: float = 0.03
+    max_leg_m: float = 0.08
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "scene.support.", block="[0, 1]")
+        for name in ("margin_m", "board_m", "leg_m"):
+            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
+            if not 0 < low <= high:
+                raise ConfigError(
+                    f"scene.support: 0 < min_{name} <= max_{name} must hold, got {low} and {high}"
+                )
+
+    def under(self, mesh: Mesh, floor: float, rng: np.random.Generator) -> Mesh:
+        """It stands on z = `floor`, its top a hair below the object's lowest point."""
+        yaw = rng.uniform(0, 2 * np.pi)
+        turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+        own = mesh.vertices[:, :2] @ turn.T  # in the frame of the top, whose sides are its axes
+        margins = rng.uniform(self.min_margin_m, self.max_margin_m, (2, 2))
+        low, high = own.min(axis=0) - margins[0], own.max(axis=0) + margins[1]
+        block = rng.random() < self.block
+        board = rng.uniform(self.min_board_m, self.max_board_m)
+        leg = min(rng.uniform(self.min_leg_m, self.max_leg_m), float((high - low).min()) / 4)
+        top = float(mesh.bounds[0, 2]) - _HAIR
+        under = floor if block else max(top - board, floor)
+        parts = [_prism(_rectangle(low, high) @ turn, under, top)]
+        if under > floor:
+            # Inside the board's outline and up to its middle: no two faces in one plane.
+            near, far = low + leg / 4, high - 1.25 * leg
+            for corner in ([x, y] for x in (near[0], far[0]) for y in (near[1], far[1])):
+                foot = _rectangle(np.array(corner), np.array(corner) + leg)
+                parts.append(_prism(foot @ turn, floor, (under + top) / 2))
+        return _joined(parts)
 
 
 @dataclass(frozen=True)
@@ -42,6 +115,7 @@ class Room:
             before it, as a table stands before a chair; as large as `between_m` along the floor
             and as high as `between_height_m`.
         min_albedo, max_albedo: of every body, drawn for each.
+        support: what an object stands on that is above the floor.
     """
 
     wall: float = 0.5
@@ -54,22 +128,34 @@ class Room:
     between_height_m: float = 0.8
     min_albedo: float = 0.25
     max_albedo: float = 0.9
+    support: Support = field(default_factory=Support)
 
-    def bodies(self, mesh: Mesh, eyes_m: np.ndarray, rng: np.random.Generator) -> tuple[Body, ...]:
-        """The object, the floor it stands on, and the rest.
+    def bodies(
+        self,
+        mesh: Mesh,
+        eyes_m: np.ndarray,
+        rng: np.random.Generator,
+        floor_m: float | None = None,
+    ) -> tuple[Body, ...]:
+        """The object, the floor, what it stands on if that is not the floor, and the rest.
 
         Args:
             mesh: the object, placed.
             eyes_m: [V, 3] where the cameras will be; nothing is put there, and no wall
                 between them and the object.
             rng: of the scene.
+            floor_m: height of the floor, on which all else stands; None: the object does, too.
         """
         low, high = mesh.bounds
         centre, half = (low + high) / 2, (high - low) / 2
         radius = float(np.hypot(half[0], half[1]))
-        floor = float(low[2])
+        floor = float(low[2]) if floor_m is None else floor_m
 
         rest = [_quad(centre, floor, 6.0)]
+        if low[2] > floor + _HAIR:
+            rest.append(self.support.under(mesh, floor, rng))
+            # All else keeps away from the furniture as it does from an object on the floor.
+            radius = float(np.hypot(*(rest[-1].vertices[:, :2] - centre[:2]).T).max())
         if rng.random() < self.wall:
             behind = centre[:2] - eyes_m[:, :2].mean(axis=0)
             angle = np.arctan2(behind[1], behind[0]) + rng.uniform(-0.6, 0.6)
@@ -117,11 +203,24 @@ class Room:
         return _prism(ring, floor, floor + float(size[2]))
 
 
+def _rectangle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """[4, 2] corners, counter-clockwise from above."""
+    (x0, y0), (x1, y1) = low, high
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def _joined(parts: Sequence[Mesh]) -> Mesh:
+    before = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + n for part, n in zip(parts, before, strict=True)]),
+    )
+
+
 def _quad(centre: np.ndarray, height: float, half_m: float) -> Mesh:
     x, y = centre[:2]
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half_m + [x, y]
-    # A hair below the object, so that its own bottom face is not in the floor's plane.
-    vertices = np.column_stack([corners, np.full(4, height - 1e-4)])
+    vertices = np.column_stack([corners, np.full(4, height - _HAIR)])
     return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 
 

@@ -284,6 +284,8 @@ def _told(
             else f"{sum(holed)} points of {len(holed)} objects have no depth or are stray (column "
             "dropped)"
         )
+    if predictor.in_metres and inputs.kind == "files":
+        lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
     if predictor.result.gravity == "none" and inputs.kind != "depth images":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
     if inputs.others:

@@ -166,6 +166,12 @@ def metadata(predictor: Predictor) -> dict[str, str]:
     """What using the net takes besides its weights; stands in the ONNX file's metadata_props."""
     result = predictor.result
     upright = result.gravity == "z"
+    unit, scaling = (
+        "none: clouds are scaled to the unit ball",
+        ", divide by the largest distance from it",
+    )
+    if predictor.in_metres:
+        unit, scaling = "metre: clouds keep their size", ""
     return {
         "qs3": VERSION,
         "classes": json.dumps(list(predictor.classes)),
@@ -173,8 +179,8 @@ def metadata(predictor: Predictor) -> dict[str, str]:
         "any_number_of_points": str(any_points(predictor)).lower(),
         "up": "z" if upright else "none (frame of the camera)",
         "target": result.target,
-        "unit": "none: clouds are scaled to the unit ball",
-        "normalisation": "subtract the mean of the points, divide by the largest distance from it",
+        "unit": unit,
+        "normalisation": f"subtract the mean of the points{scaling}",
         "sampling": f"then farthest point sampling to {predictor.points} points, from the first "
         f"one on; in training clouds had {result.stored_points} points before",
         "input": f"{INPUT}: float32 [clouds, points, 3]",

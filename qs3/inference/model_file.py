@@ -19,7 +19,7 @@ from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationE
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.evaluation.ood import MEASURES
+from qs3.evaluation.ood import MEASURES, OF_METRES
 from qs3.runs.checkpoints import save
 from qs3.utils.version import VERSION
 
@@ -53,10 +53,10 @@ def _different(value: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _ranges(value: dict[str, list[float]]) -> dict[str, list[float]]:
-    if not set(value) <= set(MEASURES) or any(
+    if not set(value) <= {*MEASURES, *OF_METRES} or any(
         math.isnan(x) for ends in value.values() for x in ends
     ):
-        raise ValueError(f"should be [low, high] of {', '.join(MEASURES)}")
+        raise ValueError(f"should be [low, high] of {', '.join({**MEASURES, **OF_METRES})}")
     return value
 
 
@@ -75,6 +75,7 @@ class Result:
         stored_points: of a cloud of the target as it is stored, before sampling.
         target: name of the domain it was adapted to.
         gravity: the axis that points up in the clouds, "z"; "none": camera frame.
+        scale: of a cloud as the net sees it: "unit_ball", or "metres" if it knows sizes.
         usual: of each measure of `qs3.evaluation.ood` the range in training, [low, high].
         weights: of the net.
     """
@@ -85,6 +86,7 @@ class Result:
     stored_points: _Points
     target: str
     gravity: Annotated[str, Field(pattern="^(z|none)$")]
+    scale: Annotated[str, Field(pattern="^(unit_ball|metres)$")]
     usual: Annotated[dict[str, _Ends], AfterValidator(_ranges)]
     weights: Annotated[dict[str, Tensor], Field(min_length=1)]
 

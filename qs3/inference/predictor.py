@@ -1,12 +1,14 @@
 """Using a trained classifier: `qs3.load(run)(clouds)`.
 
     predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
-    probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up
+    probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up;
+                                                   # in metres if predictor.in_metres
     objects = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
 
 A cloud goes the way of the target's clouds in the run: thinned to as many points as these were
 stored with (farthest points from the first one on), or filled up by repeating its points from the
-first on; put into the unit ball; and of it the farthest `points` points. The test clouds of a run
+first on; put into the unit ball, or of a net that sees metres only centred; and of it the farthest
+`points` points. The test clouds of a run
 get the probabilities of its predictions.csv.
 """
 
@@ -32,7 +34,7 @@ from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.ood import measure, ood_reasons, relax_min_points
+from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 
 BATCH = 32  # clouds: more are no faster on a CPU
@@ -42,7 +44,7 @@ class Prepared(NamedTuple):
     """A cloud as the net sees it.
 
     Attributes:
-        points: [m, 3] in the unit ball.
+        points: [m, 3] about the centroid, in the unit ball or in metres.
         given: how many points there were.
         strange: how it differs from the clouds of training, as text; see `qs3.evaluation.ood`.
     """
@@ -103,11 +105,16 @@ class Predictor:
         """Points of a cloud as the net sees it."""
         return self.result.points
 
+    @property
+    def in_metres(self) -> bool:
+        """Whether it sees how large clouds are: then they must be in metres."""
+        return self.result.scale == "metres"
+
     def prepare(self, cloud: np.ndarray, name: str = "the cloud", up: str = "z") -> Prepared:
         """A cloud [n, >= 3] of any n >= 1 as the net sees it.
 
         Args:
-            cloud: x y z in any unit.
+            cloud: x y z in any unit; in metres if the net sees sizes (`in_metres`).
             name: for messages: its file.
             up: the axis that points up in it: x, y, z, -x, -y or -z.
 
@@ -124,10 +131,11 @@ class Predictor:
         stored = np.ascontiguousarray(stored)  # as on disk: sums take another order otherwise
         whole = stored[None]  # [1, P, 3]
         some = self.points < rules.points
-        ready = Clouds.of(whole, sample(whole, self.points, 1) if some else None).all()[0]
+        order = sample(whole, self.points, 1) if some else None
+        one = Clouds.of(whole, order, self.result.scale)
         usual = relax_min_points(self.result.usual, self.points)
-        found = ood_reasons(measure(stored, ready.numpy()), usual)
-        return Prepared(ready, len(cloud), tuple(found))
+        found = ood_reasons(measure_one(one, 0), usual)
+        return Prepared(one.all()[0], len(cloud), tuple(found))
 
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
@@ -151,7 +159,8 @@ class Predictor:
         """Class probabilities of clouds, float64, a row a cloud.
 
         Args:
-            clouds: [N, P, 3], or a list of clouds with different numbers of points.
+            clouds: [N, P, 3], or a list of clouds with different numbers of points; their unit as
+                in `prepare`.
             names: theirs, for messages; None counts them from 0.
             up: the axis that points up in them.
             batch_size: clouds that the net sees at a time.

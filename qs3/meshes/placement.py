@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
-from qs3.errors import MeshError
+from qs3.config.checks import check_ranges
+from qs3.errors import ConfigError, MeshError
 from qs3.meshes.mesh import Mesh
 
 
@@ -52,6 +54,41 @@ class RealSize:
         side = _largest_side(mesh)
         plausible = self.min_side_m <= side <= self.max_side_m
         return _place(mesh, 1.0 if plausible else self.fallback_side_m / side, True, _yaw_rad(rng))
+
+
+@dataclass(frozen=True)
+class OnFurniture(RealSize):
+    """As `RealSize`, and things of some classes stand on furniture: above the floor, z = 0.
+
+    Attributes:
+        stands_m: by class the lowest and highest top that they stand on; things of a class that is
+            not here stand on the floor. The class is the first word of the id.
+        raised: probability that a thing of these classes does not stand on the floor.
+        tallest_m: taller ones always do, as floor lamps and trees.
+    """
+
+    stands_m: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    raised: float = 0.5
+    tallest_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "recipe.placing.", raised="[0, 1]", tallest_m="> 0")
+        for cls, ends in self.stands_m.items():
+            if len(ends) != 2 or not 0 < ends[0] <= ends[1]:
+                raise ConfigError(
+                    f"recipe.placing.stands_m.{cls}={list(ends)}: expected [lowest, highest] in "
+                    "metres, 0 < lowest <= highest"
+                )
+
+    def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
+        """A turned copy on the floor or above it."""
+        placed = super().place(mesh, rng, object_id)
+        raised, height = rng.random() < self.raised, rng.random()
+        ends = self.stands_m.get(object_id.split("/")[0])
+        if ends is None or not raised or placed.bounds[1, 2] > self.tallest_m:
+            return placed
+        low, high = ends
+        return Mesh(placed.vertices + np.array([0, 0, low + (high - low) * height]), placed.faces)
 
 
 def _yaw_rad(rng: np.random.Generator) -> float:

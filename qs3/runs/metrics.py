@@ -73,9 +73,10 @@ class Selection:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Loading:
-    """Points of a cloud, samples of each, and how source clouds are drawn."""
+    """Points of a cloud, its scale, samples of each, and how source clouds are drawn."""
 
     points: int
+    scale: str
     fps_starts: int
     sampler: str
 

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config import hashing
 from qs3.config.checks import check_bool, check_choice, check_float, check_int
-from qs3.config.hydra import build, in_multirun
+from qs3.config.hydra import build, component_names, in_multirun
 from qs3.data.ensure_source import check_or_make
 from qs3.data.store import is_finished
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
@@ -30,6 +30,15 @@ log = logging.getLogger(__name__)
 
 TEACHERS = ("source_val", "last")
 SCHEDULES = ("cosine", "plateau")
+UNIT_BALL_ONLY = {
+    name: "its 27 voxels divide [-1, 1]^3, and in metres a small object would lie in one of them"
+    for name in ("qs3.methods.defrec.DefRec", "qs3.methods.gast.Gast")
+} | {
+    "qs3.models.simpleview.simpleview": "its cameras stand 1.4 from the cloud's middle and would "
+    "lose a large object's points"
+}
+"""Parts that cannot see metres, by name (their modules import torch), and why."""
+
 _SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
 
 
@@ -56,6 +65,7 @@ def train(cfg: DictConfig) -> RunMetrics:
         target=build(cfg.data.target),
     )
     _check_rounds(run)
+    _check_scale(run)
     check_objective(cfg.objective)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
@@ -210,6 +220,21 @@ def _check_rounds(run: Run) -> None:
             "has no rounds: selection.teacher decides what is reported; set "
             f"selection.student={LAST}, or a selftraining with rounds"
         )
+
+
+def _check_scale(run: Run) -> None:
+    """Refuse metres for clouds that have none, and for parts that assume the unit ball."""
+    cfg = run.cfg
+    used = (run.target,) if _is_upper_bound(cfg) else (run.source, run.target)
+    for domain in used:
+        domain.check_scale(cfg.data.scale)
+    for group in ("method", "model"):
+        why = UNIT_BALL_ONLY.get(cfg[group].get("_target_"))
+        if why and cfg.data.scale != "unit_ball":
+            raise ConfigError(
+                f"data.scale={cfg.data.scale} and {group}={component_names(cfg)[group]}: {why}; "
+                f"set data.scale=unit_ball, or choose another {group}"
+            )
 
 
 def _warn_of_one_domain(run: Run) -> None:

@@ -72,7 +72,13 @@ def load_data(run: Run, method: Method) -> Loaded:
         target = subsample_splits(target, few)
     split = _evaluated_split(target)
     evaluation = Evaluation(
-        load_clouds(target, split, cfg.data.points, cache_dir=data.target_domain.cache_dir),
+        load_clouds(
+            target,
+            split,
+            cfg.data.points,
+            cache_dir=data.target_domain.cache_dir,
+            scale=cfg.data.scale,
+        ),
         labels_of(target, split) if split == "test" else None,
         _labels_by_id(target, "train"),
         target.classes,

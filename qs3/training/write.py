@@ -67,6 +67,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
         selection=_selection(run, loaded, built, outcome),
         loading=Loading(
             points=cfg.data.points,
+            scale=cfg.data.scale,
             fps_starts=data.labelled.clouds.starts,
             sampler=cfg.data.sampler,
         ),
@@ -132,6 +133,7 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         stored_points=loaded.stored_points,
         target=run.target.name,
         gravity=run.target.gravity,
+        scale=run.cfg.data.scale,
         usual=limits(loaded.data.all_labelled, loaded.data.target.clouds),
         weights=copy_weights(outcome.net),
     )

@@ -59,7 +59,7 @@ def test_clouds_a_second(
         else:
             np.savetxt(files[-1], cloud, fmt="%.6f")
     usual = {name: [0.0, 1e9] for name in ("points", "spacing", "middle", "thickness", "height")}
-    result = Result({}, CLASSES, 1024, 2048, "made", "z", usual, {})
+    result = Result({}, CLASSES, 1024, 2048, "made", "z", "unit_ball", usual, {})
     predictor = Predictor(net, result, torch.device("cpu"))
     threads = torch.get_num_threads()
     settings = Settings(ckpt="", input="clouds", threads=threads)

@@ -37,6 +37,21 @@ def test_without_choice_the_whole_cloud_in_its_order():
     assert np.array_equal(clouds.all().numpy(), unit_ball(STORED))
 
 
+def test_in_metres_clouds_are_centred_and_keep_their_size():
+    corners = np.array([[0, 0, 0], [4, 0, 0], [0, 2, 0], [4, 2, 0]], dtype=np.float32)
+    stored = np.stack([corners, 2 * corners]) + np.float32(8)
+    about = np.array([[-2, -1, 0], [2, -1, 0], [-2, 1, 0], [2, 1, 0]], dtype=np.float32)
+    clouds = Clouds.of(stored, scale="metres")
+    assert np.array_equal(clouds.all().numpy(), [about, 2 * about])
+    np.testing.assert_allclose(clouds.radius, [5**0.5, 20**0.5], rtol=1e-6)
+    order = np.array([[[3, 0]], [[1, 2]]], dtype=np.int16)
+    some = Clouds.of(stored, order, "metres").at(np.array([1])).take(torch.tensor([0]))
+    assert np.array_equal(some.numpy(), 2 * about[None, [1, 2]])
+    ball = clouds.in_unit_ball()
+    assert ball.stored is clouds.stored
+    assert np.array_equal(ball.all().numpy(), unit_ball(stored))
+
+
 def test_a_batch_is_a_copy(mapped):
     mapped.take(torch.tensor([1])).zero_()
     assert np.array_equal(mapped.stored, STORED)

@@ -215,6 +215,17 @@ def test_batches_are_the_clouds_of_the_store(data_dir):
     assert torch.equal(clouds_of(data.predict_dataloader()), clouds_of(data.test_dataloader()))
 
 
+def test_batches_in_metres_keep_the_clouds_sizes(data_dir):
+    data = DomainData("kinectsim10", points=64, fps_starts=1, scale="metres", data_dir=data_dir)
+    data.setup()
+    (batch,) = data.test_dataloader()
+    stored = open_pointset(data_dir / "kinectsim10").split("test").points.astype(np.float64)
+    centred = stored - stored.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(batch["points"].numpy(), centred, atol=1e-5)
+    with pytest.raises(ConfigError, match="domain specklenet10 are not in metres"):
+        adaptation(data_dir, scale="metres")
+
+
 def test_training_clouds_are_divided_once(data_dir):
     data = made(data_dir)
     assert len(data.train.ids) + len(data.validation.ids) == len(data.whole.ids) == 72
@@ -334,6 +345,8 @@ def test_each_has_its_domain_and_says_what_is_missing(kind, name, tmp_path):
         ({"val": "other"}, "val must be one of .*lineage.*'other'"),
         ({"sampler": "other"}, "sampler must be one of .*balanced.*'other'"),
         ({"points": 65}, "points is 65"),
+        ({"scale": "feet"}, "scale must be one of .*metres.*'feet'"),
+        ({"scale": "metres"}, "domain specklenet10 are not in metres"),
     ],
 )
 def test_wrong_settings_are_errors_for_people(data_dir, settings, message):

@@ -56,6 +56,25 @@ def test_evaluation_sees_the_sample_from_point_0():
         assert np.array_equal(seen, ball[sample(stored[None], 10, 1)[0, 0]])
 
 
+def test_the_cached_samples_serve_both_scales(tmp_path):
+    """Farthest points do not depend on a cloud's size, so one file holds those of both."""
+    ball = prepare(CLOUDS, 10, starts=2, cache_dir=tmp_path, key="key")
+    file = cached(tmp_path)
+    before = file.read_bytes()
+    metres = prepare(CLOUDS, 10, starts=2, cache_dir=tmp_path, key="key", scale="metres")
+    assert cached(tmp_path).read_bytes() == before
+    assert np.array_equal(metres.order, ball.order)
+    for i, cloud in enumerate(CLOUDS):
+        centred = cloud - cloud[0] - (cloud - cloud[0]).mean(axis=0)
+        # sampled anew in metres, by the slow and obvious way
+        chosen, nearest = [0], np.full(len(centred), np.inf)
+        for _ in range(9):
+            nearest = np.minimum(nearest, np.linalg.norm(centred - centred[chosen[-1]], axis=1))
+            chosen.append(int(nearest.argmax()))
+        assert metres.order[i, 0].tolist() == chosen
+        assert np.array_equal(metres.all().numpy()[i], centred[chosen])
+
+
 def test_nothing_to_choose_where_all_points_are_taken(tmp_path):
     clouds = prepare(CLOUDS, 40, starts=4, cache_dir=tmp_path)
     assert clouds.starts == 1

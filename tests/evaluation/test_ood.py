@@ -9,7 +9,14 @@ from hypothesis import strategies as st
 
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
-from qs3.evaluation.ood import MEASURES, limits, measure, ood_reasons, relax_min_points
+from qs3.evaluation.ood import (
+    MEASURES,
+    limits,
+    measure,
+    measure_one,
+    ood_reasons,
+    relax_min_points,
+)
 from qs3.geometry.sampling import unit_ball
 
 
@@ -95,6 +102,21 @@ def test_the_tails_are_a_thousandth():
     ]
     # the extremes alone lie beyond 0.1 % and 99.9 % of 400: two a measure, `points` has no spread
     assert 1 <= sum(bool(each) for each in out) <= 8
+
+
+def test_of_clouds_in_metres_the_size_counts_too():
+    rng = np.random.default_rng(0)
+    clouds = rng.normal(size=(300, 128, 3)).astype(np.float32)
+    ball, metres = (prepare(clouds, 64, scale=scale) for scale in ("unit_ball", "metres"))
+    usual = limits(metres)
+    assert {name: usual[name] for name in MEASURES} == limits(ball)
+    sizes = [np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max() for cloud in clouds]
+    assert usual["size"] == pytest.approx(np.quantile(sizes, [0.001, 0.999]), rel=1e-5)
+    assert measure_one(metres, 7)["size"] == pytest.approx(sizes[7], rel=1e-5)
+    assert "size" not in measure_one(ball, 7)
+    millimetres = prepare(1000 * clouds[:1], 64, scale="metres")
+    (reason,) = ood_reasons(measure_one(millimetres, 0), usual)
+    assert reason.startswith("size ")
 
 
 def test_what_is_strange_is_named():

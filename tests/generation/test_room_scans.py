@@ -8,17 +8,23 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
+from scipy.spatial import ConvexHull
 from trimesh.proximity import closest_point_naive
 
 from qs3.config.hydra import build
+from qs3.data.inspection.surface import surfaces_of
+from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import TooFewPointsError
 from qs3.generation.room_scans import RoomCamera
-from qs3.generation.scenes import Room
-from qs3.geometry.cameras import Camera, Intrinsics, project
+from qs3.generation.scenes import Room, Support
+from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh
+from qs3.meshes.placement import OnFurniture
+from qs3.sensors.renderers.base import Scene
 from qs3.utils.seeding import object_rng
 from tests.generation.generating import composed
 
@@ -88,7 +94,7 @@ def test_what_is_cut_lies_on_the_mesh_and_is_one_side_of_it(made):
     points, twin = (made.cloud.arrays[name] for name in ("points", "points_clean"))
     assert points.shape == twin.shape == (2048, 3)
     assert made.cloud.views == 1
-    placed = made.recipe._placed(made.mesh, "chair", ID, object_rng(0, ID, 0))
+    placed = made.recipe.placing.place(made.mesh, object_rng(0, ID, 0), ID)
     solid = trimesh.Trimesh(placed.vertices, placed.faces, process=False)
     for cloud, most in ((twin, 1e-3), (points, 0.05)):
         distance = closest_point_naive(solid, cloud[::32].astype(float))[1]
@@ -114,15 +120,125 @@ def test_an_object_that_no_picture_shows_well_says_why(made):
         recipe.make(made.mesh, ID, 0, made.renderer)
 
 
-def test_things_that_stand_on_others_do_so_half_of_the_time(made):
-    heights = [
-        made.recipe._placed(made.mesh, "lamp", "lamp/x", _rng(seed)).bounds[0, 2]
-        for seed in range(200)
-    ]
-    raised = np.array(heights) > 1e-9
+@pytest.fixture(scope="module")
+def lamp(made):
+    """A table lamp above the floor, as a recipe places it; its id and its seed."""
+    for item in Catalogue(seed=1, train=20, test=0, classes=("lamp",)).items():
+        mesh = item.load()
+        for seed in range(20):
+            placed = made.recipe.placing.place(mesh, object_rng(seed, item.id, 0), item.id)
+            if placed.bounds[0, 2] > 0.6:
+                return SimpleNamespace(mesh=mesh, placed=placed, id=item.id, seed=seed)
+    raise AssertionError
+
+
+def test_things_that_stand_on_others_do_so_half_of_the_time(made, lamp):
+    place = made.recipe.placing.place
+    lows = np.array([place(lamp.mesh, _rng(s), "lamp/x").bounds[0, 2] for s in range(200)])
+    raised = lows > 1e-9
     assert 70 < raised.sum() < 130
-    assert 0.4 <= min(np.array(heights)[raised]) < max(heights) <= 0.8
-    assert made.recipe._placed(made.mesh, "chair", "chair/x", _rng(1)).bounds[0, 2] == 0
+    assert 0.4 <= lows[raised].min() < lows[raised].max() <= 0.8
+    assert not any(place(made.mesh, _rng(s), "chair/x").bounds[0, 2] for s in range(20))
+    floor_lamp = Mesh(
+        lamp.mesh.vertices * [1, 1, 1.01 / np.ptp(lamp.mesh.bounds[:, 2])], lamp.mesh.faces
+    )
+    assert not any(place(floor_lamp, _rng(s), "lamp/x").bounds[0, 2] for s in range(20))
+    always = replace(made.recipe.placing, raised=1.0, tallest_m=2.0)
+    assert all(always.place(floor_lamp, _rng(s), "lamp/x").bounds[0, 2] >= 0.4 for s in range(20))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: OnFurniture(stands_m={"lamp": (0.8, 0.4)}), r"stands_m\.lamp=\[0\.8, 0\.4\]"),
+        (lambda: OnFurniture(stands_m={"lamp": (0.8,)}), r"expected \[lowest, highest\]"),
+        (lambda: OnFurniture(raised=1.5), r"recipe\.placing\.raised must be in \[0, 1\]"),
+        (lambda: Support(min_leg_m=0.1), r"min_leg_m <= max_leg_m must hold, got 0\.1 and 0\.08"),
+        (lambda: Support(block=2), r"scene\.support\.block must be in"),
+    ],
+)
+def test_wrong_furniture_names_its_key(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("block", [0.0, 1.0])
+def test_a_raised_object_stands_on_furniture_that_stands_on_the_floor(made, lamp, block):
+    """As a depth image has it: top, floor and object where they are said to be."""
+    top = lamp.placed.bounds[0, 2]
+    furniture = Support(block=block, min_margin_m=0.2)
+    scene = Room(wall=0, max_clutter=5, max_occluders=2, support=furniture)
+    eyes = np.array([[2.2, 0.3, 1.5], [2.2, 0.3, 0.25]])  # from above, and below the top
+    below = 0
+    for seed in range(4):
+        bodies = scene.bodies(lamp.placed, eyes, _rng(seed), floor_m=0.0)
+        assert [body.label for body in bodies] == [1] + [0] * (len(bodies) - 1)
+        floor, under, *pieces = (body.mesh for body in bodies[1:])
+        assert floor.bounds[:, 2] == pytest.approx(0, abs=2e-4)
+        assert under.bounds[:, 2] == pytest.approx([0, top], abs=2e-4)
+        assert trimesh.Trimesh(under.vertices, under.faces).is_watertight
+        assert all(piece.bounds[0, 2] == 0 for piece in pieces)
+        # Nothing of the room reaches into the furniture: all is outside the circle around it.
+        middle = lamp.placed.bounds[:, :2].mean(axis=0)
+        radius = np.linalg.norm(under.vertices[:, :2] - middle, axis=1).max()
+        for piece in pieces:
+            assert np.linalg.norm(piece.vertices[:, :2] - middle, axis=1).min() > radius
+        ring = ConvexHull(under.vertices[:, :2])
+        alone = bodies[:3]
+        for eye in eyes:
+            camera = Camera(LENS, look_at(eye, np.array([0, 0, top])))
+            (image,) = made.renderer.render(
+                Scene(alone, ambient=1.0), [camera], seed=0, geometry=[True]
+            )
+            place, label = in_world(image, camera)
+            reach = outside_by(ring, place)
+            inside = reach < -0.02
+            assert label.max() == 1
+            assert place[label == 1, 2].min() > top - 1e-3
+            if eye[2] > top:  # the object's foot on the top, and the floor beside it
+                height = place[inside & (label == 0), 2]
+                assert (np.abs(height - top) < 1e-3).sum() > 500
+                assert height.max() < top + 1e-3
+                assert place[label == 1, 2].min() < top + 5e-3
+                beside = (reach > 0.02) & (label == 0)
+                assert beside.sum() > 500
+                np.testing.assert_allclose(place[beside, 2], 0, atol=1e-3)
+            # Between legs the floor is seen where the top is above it.
+            below += (inside & (np.abs(place[:, 2]) < 1e-3)).sum()
+    assert below == 0 if block else below > 500
+
+
+def outside_by(ring, points):
+    """[n] how far points lie outside the sides of a convex ring, from above; below 0: inside."""
+    return (points[:, :2] @ ring.equations[:, :2].T + ring.equations[:, 2]).max(axis=1)
+
+
+def in_world(image, camera):
+    """[n, 3] points that the pixels of an image see, and their labels [n]."""
+    rows, columns = np.nonzero(np.isfinite(image.depth_m))
+    lens, depth = camera.intrinsics, image.depth_m[rows, columns].astype(float)
+    local = np.stack(
+        [(columns - lens.cx_px) / lens.focal_px, (rows - lens.cy_px) / lens.focal_px, 1 + 0 * rows]
+    )
+    pose = camera.world_from_camera
+    return (local * depth).T @ pose[:3, :3].T + pose[:3, 3], image.label[rows, columns]
+
+
+def test_a_scan_of_a_raised_object_is_of_it_alone(cfg, made, lamp):
+    cloud = made.recipe.make(lamp.mesh, lamp.id, lamp.seed, made.renderer)
+    twin = cloud.arrays["points_clean"]
+    solid = trimesh.Trimesh(lamp.placed.vertices, lamp.placed.faces, process=False)
+    assert closest_point_naive(solid, twin[::32].astype(float))[1].max() < 1e-3
+    # The placed mesh is found again for `qs3 compare`.
+    settings = OmegaConf.to_container(cfg.recipe, resolve=True)
+    catalogue = {"_target_": "qs3.meshes.catalogue.Catalogue", "seed": 1, "train": 20, "test": 0}
+    meta = {"settings": {"recipe": settings, "meshes": catalogue, "seed": lamp.seed}}
+    surfaces, reason = surfaces_of(meta, None)
+    assert surfaces is not None, reason
+    found = surfaces.mesh(
+        ManifestRow(id=lamp.id, cls="lamp", split="train", mesh_sha256=lamp.mesh.sha256)
+    )
+    np.testing.assert_array_equal(found.vertices, lamp.placed.vertices)
 
 
 def test_pieces_between_camera_and_object_cover_some_of_it():

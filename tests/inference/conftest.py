@@ -22,13 +22,25 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a finished run: DGCNN, three classes, 32 of 64 points, called from Python."""
+    return _trained(data_dir, tmp_path_factory.mktemp("logs"))
+
+
+@pytest.fixture(scope="session")
+def metric_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same on clouds that keep their size."""
+    metres = ("data.scale=metres", "data.source.unit=metres")
+    return _trained(data_dir, tmp_path_factory.mktemp("metric"), *metres)
+
+
+def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
     overrides = [
         *("experiment=quickstart", "method=source_only", "selftraining=none"),
         f"paths.data_dir={data_dir}",
-        f"paths.log_dir={tmp_path_factory.mktemp('logs')}",
+        f"paths.log_dir={log_dir}",
         *("num_classes=3", "model.k=6", "data.points=32", "data.fps_starts=1"),
         *("protocol.epochs=3", "trainer.threads=1", "callbacks=none", "logger=csv"),
         "report.pictures=false",
+        *more,
     ]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = compose("train", overrides)

@@ -87,6 +87,19 @@ def test_test_clouds_get_what_the_run_said(run, data_dir, clouds, tmp_path, caps
     assert capsys.readouterr().out.endswith(f"saved {out} (replaced what was there)\n")
 
 
+def test_a_net_of_metres_says_how_it_took_the_files(metric_run, run, clouds, tmp_path, capsys):
+    np.save(tmp_path / "test.npy", clouds)
+    np.save(tmp_path / "millimetres.npy", 1000 * clouds)
+    for which, told in ((run, False), (metric_run, True)):
+        out = tmp_path / "said.csv"
+        assert predict(which, tmp_path / "test.npy", out, "page=false") == 0
+        assert ("coordinates were taken as metres" in capsys.readouterr().out) == told
+    expected = read_predictions(metric_run / "predictions.csv").probabilities
+    np.testing.assert_allclose([probabilities(row) for row in table(out)], expected, atol=1e-6)
+    assert predict(metric_run, tmp_path / "millimetres.npy", out, "page=false") == 0
+    assert all("size " in row["reason"] for row in table(out))
+
+
 def test_every_format_in_folders(run, clouds, tmp_path):
     folder = tmp_path / "scans"
     for i, suffix in enumerate(ONE):

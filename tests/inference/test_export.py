@@ -18,7 +18,7 @@ import qs3
 from qs3.errors import ConfigError, Qs3Error
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather, knn
-from qs3.inference.export import Comparison, any_points, export, made_up
+from qs3.inference.export import Comparison, any_points, export, made_up, metadata
 from qs3.inference.model_file import Result
 from qs3.inference.predictor import Predictor
 from qs3.models.base import Backbone, Features, PointClassifier
@@ -41,7 +41,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "how-to" / "predict.md"
 def predictor_of(net: nn.Module, points: int = 64) -> Predictor:
     """With norms and heads that do something: untrained logits hardly differ between clouds."""
     model = {"_target_": "qs3.models.test"}
-    result = Result(model, ("a", "b", "c"), points, points, "made", "z", {}, {})
+    result = Result(model, ("a", "b", "c"), points, points, "made", "z", "unit_ball", {}, {})
     for module in net.modules():
         if isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
             module.running_mean.normal_(0, 0.1)
@@ -164,8 +164,12 @@ assert not any(name.startswith("qs3") for name in sys.modules)
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
 
 
-def test_the_example_of_the_document_needs_numpy_and_onnxruntime_alone(run, tmp_path, capsys):
+@pytest.mark.parametrize("which", ["run", "metric_run"])
+def test_the_example_of_the_document_needs_numpy_and_onnxruntime_alone(
+    which, request, tmp_path, capsys
+):
     """The lines of docs/how-to/predict.md, run as they stand; the same probabilities as ours."""
+    run = request.getfixturevalue(which)
     predictor = qs3.load(run)
     cloud = np.random.default_rng(3).normal(size=(predictor.result.stored_points, 3))
     np.savetxt(tmp_path / "scan.xyz", cloud)
@@ -181,6 +185,16 @@ def test_the_example_of_the_document_needs_numpy_and_onnxruntime_alone(run, tmp_
     ours = predictor([np.loadtxt(tmp_path / "scan.xyz")])[0]
     assert found[0] == predictor.classes[ours.argmax()]
     assert float(found[1]) == pytest.approx(ours.max(), abs=1e-4)
+
+
+def test_the_file_of_a_net_of_metres_says_so(run, metric_run):
+    """The rows that the example in the document lacks: what to do with a cloud before."""
+    ball, metres = metadata(qs3.load(run)), metadata(qs3.load(metric_run))
+    assert ball["unit"].startswith("none")
+    assert ball["normalisation"].endswith("divide by the largest distance from it")
+    assert metres["unit"] == "metre: clouds keep their size"
+    assert metres["normalisation"] == "subtract the mean of the points"
+    assert {name for name in ball if ball[name] != metres[name]} == {"unit", "normalisation"}
 
 
 class Waits(nn.Module):

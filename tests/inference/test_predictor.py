@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 import qs3
 from qs3.data.store import open_pointset
+from qs3.datamodules import DomainData
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.model_file import read_result, write_result
 from qs3.inference.predictor import load
@@ -59,6 +60,27 @@ def test_predictions_of_the_run_to_the_last_digit(run, predictor, test_clouds, t
     state = torch.get_rng_state()
     np.testing.assert_array_equal(qs3.load(alone)(test_clouds[:3]), predictor(test_clouds[:3]))
     assert torch.equal(torch.get_rng_state(), state)  # the caller's random numbers stay
+
+
+def test_a_net_of_metres_sees_what_it_was_tested_on_and_how_large_a_cloud_is(
+    metric_run, data_dir, test_clouds
+):
+    metric = qs3.load(metric_run)
+    assert metric.in_metres
+    data = DomainData("kinectsim10", points=32, scale="metres", data_dir=data_dir)
+    data.setup("test")
+    seen = torch.cat([batch["points"] for batch in data.test_dataloader()])
+    ready = torch.stack([metric.prepare(cloud).points for cloud in test_clouds])
+    assert torch.equal(ready, seen)
+    with torch.no_grad():
+        assert torch.equal(metric.net(ready), metric.net(seen))
+    expected = read_predictions(metric_run / "predictions.csv").probabilities
+    np.testing.assert_array_equal(metric(test_clouds, batch_size=64), expected)
+    # Moving a cloud changes nothing, and its size does.
+    np.testing.assert_allclose(metric(test_clouds[:4] + 8), expected[:4], atol=1e-3)
+    assert np.abs(metric(3 * test_clouds[:4]) - expected[:4]).max() > 1e-2
+    assert metric.prepare(test_clouds[0]).strange == ()
+    assert metric.prepare(1000 * test_clouds[0]).strange[0].startswith("size ")
 
 
 def test_any_number_of_points_any_size_any_place(predictor, test_clouds):
@@ -249,6 +271,7 @@ def test_a_net_of_ones_own_is_asked_for_by_package(run, tmp_path):
         ("points", 65),  # more than stored
         ("stored_points", "64"),
         ("gravity", "down"),
+        ("scale", "feet"),
         ("target", None),
         ("usual", {"spacing": [0.0, float("nan")]}),
         ("usual", {"colour": [0.0, 1.0]}),

@@ -51,7 +51,7 @@ def metrics(seed=0, accuracy=0.5, **changes):
         "selection": Selection(
             teacher=f"source_val, epoch {epoch}", student="last", validation="lineage"
         ),
-        "loading": Loading(points=1024, fps_starts=4, sampler="shuffled"),
+        "loading": Loading(points=1024, scale="unit_ball", fps_starts=4, sampler="shuffled"),
         "final": scores(accuracy),
         "evaluation": Evaluated(
             split="test", labels=accuracy is not None, rotations=0, norms="trained"

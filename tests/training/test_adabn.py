@@ -25,7 +25,7 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
     assert changed >= {"norm.running_mean", "norm.running_var"}
     assert changed <= {"norm.running_mean", "norm.running_var", "norm.num_batches_tracked"}
 
-    target = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", 32)
+    target = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", 32, scale="unit_ball")
     x = torch.relu(target.points @ after["lift.weight"].T + after["lift.bias"]).amax(1)  # [n, 16]
     torch.testing.assert_close(after["norm.running_mean"], x.mean(0), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(after["norm.running_var"], x.var(0), rtol=1e-4, atol=1e-5)

@@ -68,6 +68,16 @@ def test_help_imports_nothing_heavy(tmp_path):
     [
         ((), ("specklenet10", "meta.yaml", "generate.py")),
         (("method=supervised",), ("ConfigError", "set selftraining=none")),
+        (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),
+        (
+            (
+                "data.scale=metres",
+                "data.source.unit=metres",
+                "data.target.unit=metres",
+                "method=gast",
+            ),
+            ("ConfigError", "data.scale=metres and method=gast: its 27 voxels"),
+        ),
     ],
 )
 def test_what_is_missing_or_wrong_is_said_before_anything_heavy_is_imported(tmp_path, words, told):

@@ -104,7 +104,7 @@ def test_the_table_of_a_later_round_is_what_one_process_makes_of_the_weights(
     root, end = both.one.parents[2], WARMUP + EPOCHS - 1
     net = build(toy_config(root, *SETTINGS).model)
     net.load_state_dict(seen_by(both.watched, end)[0]["weights"])
-    target = load_clouds(open_pointset(root / "data/kinectsim10"), "train", points=64)
+    target = load_clouds(open_pointset(root / "data/kinectsim10"), "train", 64, scale="unit_ball")
     probabilities = predict(net, target.points, 64)
     said = TeacherPredictions.of(probabilities, target.ids)
     selected = Qbst().select(said, 0.405).selected

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 import logging
 from dataclasses import replace
@@ -15,9 +16,10 @@ import torch
 from qs3.config import hashing
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
-from qs3.training.command import train
+from qs3.training.command import UNIT_BALL_ONLY, train
 from qs3.utils.locks import owned
 from tests.training.conftest import result_of
+from tests.training.toy import toy_config
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -41,7 +43,9 @@ def test_metrics_and_files(finished):
     assert [int(row["phase"]) for row in rows] == [0] * 4 + [1] * 3 + [2] * 3
     assert metrics.final.accuracy > 0.6  # it learns
     assert 0 <= metrics.final.calibration_error <= 1
-    assert metrics.loading == Loading(points=32, fps_starts=4, sampler="shuffled")
+    assert metrics.loading == Loading(
+        points=32, scale="unit_ball", fps_starts=4, sampler="shuffled"
+    )
     assert metrics.selection.validation == "lineage"
     assert metrics.evaluation == Evaluated(split="test", labels=True, rotations=0, norms="trained")
     rows = table(finished / "round_00" / "pseudo_labels.csv")
@@ -114,6 +118,35 @@ def test_other_loading_is_another_result_and_named(toy, finished, more, where, v
     assert rows != table(finished / "history.csv")[: len(rows)]
 
 
+METRES = ("data.scale=metres", "data.source.unit=metres")
+
+
+def test_metres_are_another_result_and_named(toy, finished):
+    cfg = toy(*METRES, "selftraining=none", "protocol.epochs=1")
+    metrics = train(cfg)
+    assert metrics.loading.scale == "metres"
+    rows = table(hashing.run_folder(cfg) / "history.csv")
+    assert rows != table(finished / "history.csv")[: len(rows)]
+    unit = toy("selftraining=none", "data.source.unit=metres")  # says something, changes nothing
+    assert hashing.config_hash(unit) == hashing.config_hash(toy("selftraining=none"))
+
+
+def test_the_upper_bound_in_metres_asks_only_its_own_domain(toy):
+    words = ("method=supervised", "selftraining=none", "protocol.epochs=1", "data.scale=metres")
+    assert train(toy(*words)).loading.scale == "metres"
+
+
+def test_parts_that_cannot_see_metres_are_parts():
+    """They are told apart by name, so that no module of theirs is imported to say it."""
+    for name in UNIT_BALL_ONLY:
+        module, _, attribute = name.rpartition(".")
+        assert callable(getattr(importlib.import_module(module), attribute))
+    cfg = toy_config(Path("."), *METRES)
+    cfg.model = {"_target_": "qs3.models.simpleview.simpleview"}
+    with pytest.raises(ConfigError, match=r"model=simpleview: its cameras stand 1\.4 from"):
+        train(cfg)
+
+
 def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
     cache = tmp_path / "cache"
     train(toy("selftraining=none", "protocol.epochs=1", f"paths.cache_dir={cache}"))
@@ -134,6 +167,20 @@ def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
         ("data.points=65", r"data\.points is 65"),
         ("data.val=other", r"data\.val"),
         ("data.sampler=other", r"data\.sampler"),
+        ("data.scale=other", r"data\.scale must be one of .*unit_ball.*'other'"),
+        ("data.scale=metres", r"domain specklenet10 are not in metres.*data\.source\.unit=metres"),
+        ("data.scale=metres data.source.unit=feet", r"specklenet10: unit must be one of"),
+        (
+            "data.scale=metres data.source.unit=metres data.target.unit=none",
+            r"domain kinectsim10 are not in metres",
+        ),
+        *(
+            (
+                f"data.scale=metres data.source.unit=metres method={name}",
+                rf"method={name[:6]}: its 27 v",
+            )
+            for name in ("defrec", "defrec_pcm", "gast")
+        ),
         ("data.fps_starts=0", r"data\.fps_starts .* >= 1, got 0"),
         ("evaluation.rotations=-1", r"evaluation\.rotations .* >= 0, got -1"),
         ("num_classes=10", r"num_classes is 10.*set num_classes=3"),

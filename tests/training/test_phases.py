@@ -58,7 +58,7 @@ def kept_run(root: Path, toy_data: Path, *settings: str) -> Kept:
         target = "tests.training.watching.Keep"
         cfg.callbacks.progress = {"_target_": target, "folder": str(root / "kept")}
     metrics = train(cfg)
-    clouds = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", points=32)
+    clouds = load_clouds(open_pointset(toy_data / "kinectsim10"), "train", 32, scale="unit_ball")
     return Kept(cfg, hashing.run_folder(cfg), root / "kept", metrics, clouds)
 
 

@@ -104,7 +104,7 @@ def table_of(cfg: Any, weights: Path, data: Path, rows: Any = slice(None)) -> np
     """What weights say of the target's training clouds, or of some of them."""
     net = build(cfg.model)
     net.load_state_dict(load(weights))
-    points = load_clouds(open_pointset(data / "kinectsim10"), "train", points=32).points
+    points = load_clouds(open_pointset(data / "kinectsim10"), "train", 32, scale="unit_ball").points
     return predict(net, points[rows], 64)
 
 

@@ -66,8 +66,9 @@ INSPECT = Command(
         "qs3 inspect domain=data/specklenet10 variant=points_clean",
     ),
     about="""
-Counts by class and split, sizes, which way is up by the shape, spacing, density, coverage, copies,
-leaks from train to test, odd objects; a contact sheet. Published files are imported first.
+What it is made of, counts by class and split, sizes, which way is up by the shape, spacing,
+density, coverage, copies, leaks from train to test, odd objects; a contact sheet. Published files
+are imported first.
 """,
     others={"": _KEYS},
     interrupted="nothing was saved",
@@ -83,8 +84,8 @@ COMPARE = Command(
         "qs3 compare specklenet10 specklenet10 a.variant=points_clean",
     ),
     about="""
-Class frequencies, spacing, density, coverage, distance to the true surface and how much of it was
-measured (of generated datasets), how well clouds tell their domain;
+What they are made of, class frequencies, spacing, density, coverage, distance to the true surface
+and how much of it was measured (of generated datasets), how well clouds tell their domain;
 one object of each class from both, as a picture.
 """,
     words="A B",

@@ -60,6 +60,7 @@ def inspect(opened: Opened, bounds: Bounds, advance: Advance = lambda: None) -> 
         "domain": opened.label,
         "folder": str(opened.folder),
         "variant": opened.variant,
+        "made_of": str(opened.made_of),
         "sha256": data.sha256,
         "points": int(data.points.shape[1]),
         "looked_at": len(chosen),
@@ -93,6 +94,8 @@ def compare(a: Opened, b: Opened, bounds: Bounds, advance: Advance = lambda: Non
     found: Numbers = {
         "a": a.label,
         "b": b.label,
+        "made_of_a": str(a.made_of),
+        "made_of_b": str(b.made_of),
         "points": count,
         "seed": bounds.seed,
         "within": WITHIN,

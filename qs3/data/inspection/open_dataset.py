@@ -8,6 +8,7 @@ from pathlib import Path
 
 from qs3.config.compose import choices, composed
 from qs3.data.domain import Domain
+from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow, read_manifest
 from qs3.data.store import PointSet, is_finished, open_pointset
 from qs3.errors import ConfigError
@@ -17,7 +18,8 @@ from qs3.errors import ConfigError
 class Opened:
     """A dataset, its manifest's rows (also of failed objects), and what to call it.
 
-    `name` is short, for file names; `label` has title and symbol.
+    `name` is short, for file names; `label` has title and symbol. `made_of` is the domain's word,
+    which knows how many clouds were published; a folder's store has only its own.
     """
 
     name: str
@@ -26,6 +28,7 @@ class Opened:
     variant: str
     data: PointSet
     rows: tuple[ManifestRow, ...]
+    made_of: MadeOf
 
     @property
     def kept(self) -> list[ManifestRow]:
@@ -58,10 +61,11 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
         data = open_pointset(folder, variant)
         more = [variant] * (variant != "points") + ["simulated"] * bool(data.meta.get("simulated"))
         label = f"{data.name} ({', '.join(more)})" if more else data.name
-        return _opened(data.name, label, folder, variant, data)
+        return _opened(data.name, label, folder, variant, data, data.made_of)
     domain = compose_domain(name, overrides)
     data = domain.open()
-    return _opened(domain.name, domain.label, domain.folder, domain.variant, data)
+    made_of = domain.made_of(data)
+    return _opened(domain.name, domain.label, domain.folder, domain.variant, data, made_of)
 
 
 def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
@@ -87,6 +91,8 @@ def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
     return domain
 
 
-def _opened(name: str, label: str, folder: Path, variant: str, data: PointSet) -> Opened:
+def _opened(
+    name: str, label: str, folder: Path, variant: str, data: PointSet, made_of: MadeOf
+) -> Opened:
     rows = tuple(read_manifest(folder, data.classes))
-    return Opened(name, label, folder, variant, data, rows)
+    return Opened(name, label, folder, variant, data, rows, made_of)

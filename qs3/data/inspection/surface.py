@@ -20,7 +20,7 @@ from qs3.geometry.sampling import surface_sample
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.folder import MeshFolder
 from qs3.meshes.mesh import Mesh
-from qs3.meshes.placement import Placing, RealSize, UnitCube
+from qs3.meshes.placement import OnFurniture, Placing, RealSize, UnitCube
 from qs3.meshes.source import MeshItem
 from qs3.utils.seeding import object_rng
 
@@ -28,7 +28,7 @@ _SAMPLES = 8192  # of a surface
 _PAIRS = 1 << 18  # of points and triangles at once
 
 # A store may come from anybody: only these are made from what its meta.yaml says.
-_PLACINGS = {f"{c.__module__}.{c.__qualname__}": c for c in (UnitCube, RealSize)}
+_PLACINGS = {f"{c.__module__}.{c.__qualname__}": c for c in (UnitCube, RealSize, OnFurniture)}
 _DEFAULT_PLACING = next(iter(_PLACINGS))  # of the recipes: UnitCube
 _CATALOGUE = "qs3.meshes.catalogue.Catalogue"
 

@@ -16,6 +16,7 @@ def of_domain(facts: Numbers) -> str:
     counts, extents, spacing = facts["counts"], facts["extents"], facts["spacing"]
     parts = [
         f"{facts['domain']}: {facts['folder']}, {facts['variant']}",
+        f"made of: {facts['made_of']}",
         f"{counts['clouds']} clouds of {facts['points']} points; content {facts['sha256'][:16]}",
     ]
     if facts["looked_at"] < counts["clouds"]:
@@ -66,6 +67,7 @@ def of_pair(facts: Numbers) -> str:
     told += [[by, f"{apart[by]:.1%}"] for by in ("all", "shape", "density")]
     parts = [
         f"# A = {facts['a']}, B = {facts['b']}",
+        f"A is made of: {facts['made_of_a']}.\nB is made of: {facts['made_of_b']}.",
         "## Class frequencies",
         _markdown(frequencies),
         f"Total variation {prior['total_variation']:.3f} (0: equal, 1: disjoint).",

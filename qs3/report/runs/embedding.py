@@ -62,7 +62,7 @@ def draw_embedding(
     parts, labels, names = [], [], []
     for role, data in zip(("source", "target"), sets, strict=True):
         split = "test" if "test" in data.counts() else "train"
-        points = load_clouds(data, split, points=result.points).points
+        points = load_clouds(data, split, result.points, scale=result.scale).points
         chosen = sample(len(points), clouds, derive(run.metrics.seed, "embedding", role))
         parts.append(points[chosen])
         labels.append(_labels(data, split)[chosen])

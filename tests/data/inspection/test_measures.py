@@ -10,6 +10,7 @@ from qs3.data.inspection import gap, measures
 from qs3.data.inspection.measure import WITHIN, Bounds, compare
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
+from qs3.data.made_of import MadeOf
 from qs3.data.store import ManifestRow, write_pointset
 from qs3.errors import ConfigError
 from qs3.generation.recipes import SurfaceSamples
@@ -184,7 +185,10 @@ def test_inspect_says_and_saves(data_dir, tmp_path, capsys):
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "60 clouds of 1024 points" in said
+    made_of = "own clouds of modelnet10_points.npz, in other numbers"
+    assert f"made of: {made_of}\n" in said
     facts = json.loads((tmp_path / "inspection.json").read_text())
+    assert facts["made_of"] == made_of
     assert facts["counts"]["splits"]["train"]["by_class"]["chair"] == 4
     assert set(facts["gravity"]["by_class"]) == set(fixtures.CLASSES)
     assert (tmp_path / "clouds.png").read_bytes().startswith(b"\x89PNG")
@@ -199,6 +203,27 @@ def test_compare_says_and_saves(data_dir, tmp_path, capsys):
     assert facts["prior"]["total_variation"] == 0
     assert 0 <= facts["told_apart"]["density"] <= 1
     assert (tmp_path / "comparison.md").read_text().startswith("# A = ModelNet10")
+
+
+def test_both_say_what_datasets_are_made_of(tmp_path, capsys):
+    """A store by its folder too, where no domain's config knows more than its meta.yaml."""
+    scans = MadeOf(objects="meshes of cad10", sensor="kinect_v1", views=1, without="lamp")
+    samples = MadeOf(objects="embedded catalogue", sensor="surface samples")
+    clouds = np.random.default_rng(0).normal(size=(4, 64, 3))
+    ids = ["a/0", "a/1", "b/0", "b/1"]
+    for name, made in (("one", scans), ("other", samples)):
+        store(tmp_path / name, clouds, ids, ["train"] * 4, **made.meta)
+    assert main(["inspect", f"domain={tmp_path}/one", f"out={tmp_path / 'i'}"]) == 0
+    told = "meshes of cad10, kinect_v1, 1 view, without lamp"
+    assert f"made of: {told}\n" in capsys.readouterr().out
+    assert json.loads((tmp_path / "i/inspection.json").read_text())["made_of"] == told
+    assert main(["compare", f"{tmp_path}/one", f"{tmp_path}/other", f"out={tmp_path / 'c'}"]) == 0
+    text = (tmp_path / "c/comparison.md").read_text()
+    assert f"A is made of: {told}.\n" in text
+    assert "B is made of: embedded catalogue, surface samples.\n" in text
+    assert text.split("##")[0] in capsys.readouterr().out
+    facts = json.loads((tmp_path / "c/comparison.json").read_text())
+    assert (facts["made_of_a"], facts["made_of_b"]) == (told, str(samples))
 
 
 def test_one_domain_against_itself_has_no_gap(data_dir):

@@ -30,8 +30,8 @@ def add_net(folder, seed, *, classes=CLASSES, **changes):
         net = pointnet(num_classes=len(classes))
     values = {
         "model": {**MODEL, "num_classes": len(classes)}, "classes": tuple(classes),
-        "points": 64, "stored_points": 128, "target": "kinectsim10", "gravity": "z", "usual": {},
-        "weights": net.state_dict(),
+        "points": 64, "stored_points": 128, "target": "kinectsim10", "gravity": "z",
+        "scale": "unit_ball", "usual": {}, "weights": net.state_dict(),
     }  # fmt: skip
     write_result(folder / "result.pt", Result(**{**values, **changes}))
     return folder

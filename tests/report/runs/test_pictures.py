@@ -249,7 +249,7 @@ def use_real_net(run):
     model = {"_target_": "qs3.models.pointnet.pointnet", "num_classes": 3, "variant": "basic"}
     first, second = (pointnet(num_classes=3, variant="basic").state_dict() for _ in range(2))
     save(first, run / "warmup_selected.pt")
-    result = Result(model, CLASSES, 32, 64, "kinectsim10", "z", {}, second)
+    result = Result(model, CLASSES, 32, 64, "kinectsim10", "z", "unit_ball", {}, second)
     write_result(run / "result.pt", result)
 
 
