@@ -12,7 +12,8 @@ alone, so a mutant that only a distant test would notice counts as alive.
 cosmic-ray's own runner starts Python and imports torch anew for every mutant. Here a worker has
 the large libraries loaded, works on a copy of the tracked files, and forks a child for each
 mutant. Results are appended as they come: a second call goes on where the first one stopped, and
-those of a module that was changed since are taken out.
+those of a module that was changed since are taken out. Survivors that were read and change
+nothing are listed under `equivalent`, with the reason; shares are printed with and without them.
 """
 
 from __future__ import annotations
@@ -223,18 +224,27 @@ def work(root: Path, number: int, jobs: Any, results: Any) -> None:
     shutil.rmtree(copy.parent, ignore_errors=True)
 
 
-def summary(rows: list[dict[str, str]]) -> str:
-    """A table: of each module how many mutants there were and what share died."""
+def summary(rows: list[dict[str, str]], equivalent: set[tuple[str, str]] = frozenset()) -> str:
+    """A table: of each module how many mutants there were and what share died.
+
+    `equivalent`: (module, change) of survivors that were read and found to change nothing; the last
+    column leaves them out.
+    """
     counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     for row in rows:
+        same = row["outcome"] == ALIVE and (row["module"], row["change"]) in equivalent
         if row["outcome"] != "none":
             for key in ((row["target"], row["module"]), (row["target"], "together")):
-                counts[key][row["outcome"]] += 1
-    lines = ["| target | module | mutants | killed |", "|---|---|---|---|"]
+                counts[key]["equivalent" if same else row["outcome"]] += 1
+    head = ["target", "module", "mutants", "killed", "equivalent", "killed of the others"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for (target, module), count in sorted(counts.items()):
-        dead = count["killed"] + count["timeout"]
-        share = f"{100 * dead / count.total():.1f} %"
-        lines.append(f"| {target} | {module} | {count.total()} | {share} |")
+        dead, same = count["killed"] + count["timeout"], count["equivalent"]
+        shares = [
+            f"{100 * dead / n:.1f} %" if n else "" for n in (count.total(), count.total() - same)
+        ]
+        cells = [target, module, str(count.total()), shares[0], str(same), shares[1]]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -256,6 +266,8 @@ def main(targets_file: str, out: str, *names: str) -> None:
     """Try what has not been tried yet, and print the table."""
     root = Path(os.environ.get("MUTANTS_ROOT", Path(__file__).parents[1])).resolve()
     targets = tomllib.loads(Path(targets_file).read_text())
+    read = targets.pop("equivalent", [])
+    same = {(entry["module"], change) for entry in read for change in entry["changes"]}
     jobs = chosen(root, targets, [name for name in names if name != "again"])
     table = Path(out)
     table.parent.mkdir(parents=True, exist_ok=True)
@@ -288,7 +300,7 @@ def main(targets_file: str, out: str, *names: str) -> None:
             stream.flush()
             if number % 25 == 0:
                 print(f"{number} of {len(wanted)}", file=sys.stderr, flush=True)
-    print(summary(rows))
+    print(summary(rows, same))
 
 
 if __name__ == "__main__":

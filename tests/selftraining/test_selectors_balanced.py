@@ -81,6 +81,29 @@ def test_lrent_worked_by_hand() -> None:
     np.testing.assert_allclose(selection.soft, powers / powers.sum(axis=1, keepdims=True))
 
 
+def test_lrent_at_a_tie_of_its_condition() -> None:
+    # No rank for anybody, so theta = (1, 1), and with alpha = 1 both sides are log 1: not kept.
+    table = [[0.5, 0.5], [0.5, 0.5]]
+    selection, kept = select(Cbst(portion=0.4, labels="lrent", alpha=1.0), table)
+    assert selection.thresholds.tolist() == [1.0, 1.0]
+    assert selection.soft.tolist() == table
+    assert kept == ""
+
+
+def test_the_round_is_the_first_unless_one_is_named() -> None:
+    teacher = TeacherPredictions.of(np.array(TABLE * 3), [f"{i:02d}" for i in range(24)])
+    for selector in (Cbst(step=0.3), Random(Spst())):
+        assert selector.select(teacher, 0.5).mu.tolist() == (
+            selector.select(teacher, 0.5, 0).mu.tolist()
+        )
+        assert selector.select(teacher, 0.5).selected.tolist() == (
+            selector.select(teacher, 0.5, 0).selected.tolist()
+        )
+    assert Cbst(step=0.3).select(teacher, 0.0).selected.sum() < (
+        Cbst(step=0.3).select(teacher, 0.0, 1).selected.sum()
+    )
+
+
 probabilities = st.lists(
     st.lists(st.integers(1, 12), min_size=4, max_size=4), min_size=1, max_size=40
 ).map(lambda rows: np.array([[x / sum(row) for x in row] for row in rows]))
@@ -166,6 +189,7 @@ def test_random_draws_each_sample_equally_often() -> None:
     [
         ({"portion": 0.0}, "portion=0.0"),
         ({"portion": 0.6}, "0 < portion <= most"),
+        ({"most": 1.1}, "most=1.1"),
         ({"step": -0.1}, "step must be >= 0"),
         ({"alpha": 0.0}, "alpha must be > 0"),
         ({"labels": "soft"}, "selftraining.selector.labels"),
