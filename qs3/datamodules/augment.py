@@ -17,9 +17,11 @@ REGION_SHARE = (0.1, 0.25)
 
 @dataclass(frozen=True)
 class Augment:
-    """Holes, random rotation about the up axis, anisotropic scale, shift and jitter, in this order.
+    """Cut, holes, random rotation about the up axis, anisotropic scale, shift, jitter, in this order.
 
     Attributes:
+        crop: the smallest share of a cloud that stays when a plane cuts it (see `crop`), as the
+            picture's border and nearer things cut real objects; 1 leaves it whole.
         drop_regions: empty one to so many regions of each cloud, at most 3 (see `drop_regions`);
             0 drops nothing.
         rotate_z: turn each cloud about z by U(0, 2π).
@@ -30,6 +32,7 @@ class Augment:
             the paper's descends from 0.02.
     """
 
+    crop: float = 1.0
     drop_regions: int = 0
     rotate_z: bool = True
     scale: float = 1.0
@@ -40,17 +43,29 @@ class Augment:
     def __post_init__(self) -> None:
         noise = dict.fromkeys(("shift", "jitter_sigma", "jitter_clip"), ">= 0")
         check_ranges(self, "protocol.augment.", scale=">= 1", drop_regions="[0, 3]", **noise)
+        check_ranges(self, "protocol.augment.", crop="(0, 1]")
         check_int("protocol.augment.drop_regions", self.drop_regions, 0)
 
     def __call__(
-        self, points: Float[Tensor, "b n 3"], generator: torch.Generator
+        self,
+        points: Float[Tensor, "b n 3"],
+        generator: torch.Generator,
+        unit_ball: bool = True,
     ) -> Float[Tensor, "b n 3"]:
-        """A new batch; the one given is left alone. `generator` is on the device of `points`."""
+        """A new batch; the one given is left alone.
+
+        Args:
+            points: clouds about their centroids.
+            generator: on the device of `points`.
+            unit_ball: they are scaled to the unit ball, and are again after a cut.
+        """
         b, like = len(points), {"device": points.device, "dtype": points.dtype}
 
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
 
+        if self.crop < 1.0:
+            points = crop(points, self.crop, generator, unit_ball)
         if self.drop_regions:
             points = drop_regions(points, self.drop_regions, generator)
         if self.rotate_z:
@@ -72,6 +87,31 @@ def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, " b"]) -> Floa
     cos, sin = angle.cos()[:, None], angle.sin()[:, None]  # [B, 1]
     x, y, z = points.unbind(dim=2)  # [B, N] each
     return torch.stack([cos * x - sin * y, sin * x + cos * y, z], dim=2)
+
+
+def crop(
+    points: Float[Tensor, "b n 3"], least: float, generator: torch.Generator, unit_ball: bool
+) -> Float[Tensor, "b n 3"]:
+    """Cut each cloud by a plane of any direction, so that U(least, 1) of its points stay.
+
+    What stays is centred again (and with `unit_ball` scaled again), as a cloud of which nobody has
+    ever seen the rest; points of it are repeated at random in the places of the others.
+    """
+    b, n = points.shape[:2]
+    device = points.device
+    normal = torch.randn(b, 3, 1, generator=generator, device=device).to(points.dtype)
+    share = least + (1 - least) * torch.rand(b, generator=generator, device=device)
+    order = (points @ normal)[..., 0].argsort(dim=1, stable=True)  # [B, N]
+    first = torch.arange(n, device=device) < (share * n).ceil().clamp(min=1)[:, None]
+    left = torch.zeros_like(first).scatter(1, order, first)  # [B, N]
+    other = torch.multinomial(left.float(), n, replacement=True, generator=generator)  # [B, N]
+    centre = (points * left[..., None]).sum(dim=1) / left.sum(dim=1, keepdim=True)  # [B, 3]
+    moved = points - centre[:, None]
+    moved = torch.where(left[..., None], moved, moved.take_along_dim(other[..., None], dim=1))
+    if unit_ball:
+        radius = moved.norm(dim=2).amax(dim=1)[:, None, None]
+        moved = moved / torch.where(radius > 0, radius, 1)
+    return moved
 
 
 def drop_regions(

@@ -159,7 +159,8 @@ class DomainData(LightningDataModule):
             return result
         points, rank = batch["points"], self.trainer.global_rank
         generator = generator_of(batch, "augment", self.seed, rank, points.device)
-        return {**result, "points": self.augment(points, generator)}
+        augmented = self.augment(points, generator, unit_ball=self.scale == "unit_ball")
+        return {**result, "points": augmented}
 
     def _setup_training(self, dataset: PointSet) -> None:
         train = self._load(dataset, "train", starts=self.fps_starts)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from qs3.datamodules.augment import REGION_SHARE, Augment, drop_regions, rotate_z
+from qs3.datamodules.augment import REGION_SHARE, Augment, crop, drop_regions, rotate_z
 from qs3.errors import ConfigError
 
 
@@ -55,6 +55,7 @@ def test_all_off_changes_nothing():
     "settings",
     [
         *({"scale": 0.5}, {"shift": -1.0}, {"jitter_clip": -0.1}),
+        *({"crop": 0.0}, {"crop": 1.1}, {"crop": float("nan")}),
         *({"drop_regions": 4}, {"drop_regions": -1}, {"drop_regions": 1.5}),
     ],
 )
@@ -118,3 +119,43 @@ def test_dropping_comes_before_the_rest_and_off_draws_nothing():
     holed = Augment(drop_regions=2, jitter_sigma=0.0)(points, generator(1))
     assert holed.shape == points.shape
     assert len(holed[0].unique(dim=0)) < 50
+
+
+def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
+    points = torch.rand(64, 50, 3, generator=generator(2), dtype=torch.float64)
+    cut = crop(points, 0.4, generator(1), unit_ball=False)
+    again = crop(points, 0.4, generator(1), unit_ball=False)
+    assert torch.equal(cut, again)
+    shares = []
+    for before, after in zip(points, cut, strict=True):
+        # What stays was moved as a whole: find the move by the differences that all its points have.
+        differences = (before[:, None] - after[None]).reshape(-1, 3)
+        steps, counts = differences.mul(1e4).round().unique(dim=0, return_counts=True)
+        move = steps[counts.argmax()] / 1e4
+        stays = (torch.cdist(before, after + move) < 2e-4).any(dim=1)
+        assert (torch.cdist(after + move, before).amin(dim=1) < 2e-4).all()  # nothing is new
+        assert torch.allclose(
+            (before[stays] - move).mean(dim=0), torch.zeros(3).double(), atol=2e-4
+        )
+        shares.append(float(stays.float().mean()))
+        if not stays.all():  # some plane has them on one side: a support vector machine by force
+            from scipy.optimize import linprog
+
+            sign = torch.where(stays, 1.0, -1.0)[:, None]
+            rows = -(sign * torch.cat([before, torch.ones(50, 1)], dim=1)).numpy()
+            found = linprog([0.0] * 4, rows, [-1.0] * 50, bounds=[(None, None)] * 4)
+            assert found.status == 0
+    assert min(shares) >= 0.4
+    assert len({round(s, 2) for s in shares}) > 15
+    assert 0.6 < sum(shares) / 64 < 0.8
+
+
+def test_a_cut_cloud_fills_the_unit_ball_again_unless_it_has_a_size():
+    points = torch.rand(16, 80, 3, generator=generator()) - 0.5
+    assert torch.allclose(crop(points, 0.3, generator(), True).norm(dim=2).amax(1), torch.ones(16))
+    metres = crop(points, 0.3, generator(), False)
+    assert (metres.norm(dim=2).amax(1) < 0.95).all()
+    augment = Augment(crop=0.3, rotate_z=False, jitter_sigma=0.0)
+    assert torch.equal(augment(points, generator(), unit_ball=False), metres)
+    one = torch.ones(2, 5, 3)  # all points at one place: nothing to divide by
+    assert torch.equal(crop(one, 0.3, generator(), True), torch.zeros(2, 5, 3))
