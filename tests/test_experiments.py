@@ -9,7 +9,7 @@ from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
-from tests.fixtures.published import write_all
+from tests.fixtures.published import write_all, write_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
@@ -22,8 +22,17 @@ def data_dir(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def frames_dir(data_dir):
+    """With frames of NYU Depth V2 too, which take half a minute to render."""
+    write_domain("nyuv2", data_dir)
+    return data_dir
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_experiment_runs(experiment, data_dir, tmp_path):
+def test_experiment_runs(experiment, request, tmp_path):
+    frames = experiment.endswith("_nyu")
+    data_dir = request.getfixturevalue("frames_dir" if frames else "data_dir")
     lines = (ROOT / "conf" / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[1].startswith(f"# python train.py experiment={experiment} ")
     overrides = [

@@ -17,7 +17,7 @@ REGION_SHARE = (0.1, 0.25)
 
 @dataclass(frozen=True)
 class Augment:
-    """Cut, holes, random rotation about the up axis, anisotropic scale, shift, jitter, in this order.
+    """Cut, holes, rotation about the up axis, anisotropic scale, shift and jitter, in this order.
 
     Attributes:
         crop: the smallest share of a cloud that stays when a plane cuts it (see `crop`), as the

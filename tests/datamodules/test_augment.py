@@ -128,7 +128,7 @@ def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
     assert torch.equal(cut, again)
     shares = []
     for before, after in zip(points, cut, strict=True):
-        # What stays was moved as a whole: find the move by the differences that all its points have.
+        # What stays was moved as a whole, by the difference that most pairs of points have.
         differences = (before[:, None] - after[None]).reshape(-1, 3)
         steps, counts = differences.mul(1e4).round().unique(dim=0, return_counts=True)
         move = steps[counts.argmax()] / 1e4
