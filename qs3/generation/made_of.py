@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from omegaconf import DictConfig, OmegaConf
 
-from qs3.config.compose import choices, composing
+from qs3.config.compose import choices, composed
 from qs3.data.made_of import MadeOf
 from qs3.generation.plan import known_classes, mesh_root
 
@@ -46,8 +46,9 @@ def _sensor(cfg: DictConfig) -> str:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
     plain = OmegaConf.to_container(cfg.sensor)
-    with composing() as compose:
-        for name in choices("sensor"):
-            if OmegaConf.to_container(compose(None, [f"+sensor={name}"]).sensor) == plain:
-                return name
+    names = choices("sensor")
+    files = composed(None, *(f"+sensor@{name}={name}" for name in names))  # all of them at once
+    for name in names:
+        if OmegaConf.to_container(files[name]) == plain:
+            return name
     return f"{cfg.sensor._target_.rsplit('.', 1)[-1]} with changed settings"

@@ -3,12 +3,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config import hashing
 from qs3.training.command import train
-from tests.training.toy import CONF, write_toy
+from tests.composing import compose
+from tests.training.toy import write_toy
 
 
 @pytest.fixture(scope="session")
@@ -30,7 +30,6 @@ def run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         *("protocol.epochs=3", "trainer.threads=1", "callbacks=none", "logger=csv"),
         "report.pictures=false",
     ]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", overrides)
+    cfg = compose("train", overrides)
     train(cfg)
     return hashing.run_folder(cfg)
