@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -40,15 +42,21 @@ def made_of(
     )
 
 
+@functools.cache
+def _sensor_files() -> dict[str, Any]:
+    """What each file of conf/sensor says, in one composition."""
+    names = choices("sensor")
+    files = composed(None, *(f"+sensor@{name}={name}" for name in names))
+    return {name: OmegaConf.to_container(files[name]) for name in names}
+
+
 def _sensor(cfg: DictConfig) -> str:
     """The name of the sensor's file in conf/sensor; its class where a value was changed."""
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
     plain = OmegaConf.to_container(cfg.sensor)
-    names = choices("sensor")
-    files = composed(None, *(f"+sensor@{name}={name}" for name in names))  # all of them at once
-    for name in names:
-        if OmegaConf.to_container(files[name]) == plain:
+    for name, settings in _sensor_files().items():
+        if settings == plain:
             return name
     return f"{cfg.sensor._target_.rsplit('.', 1)[-1]} with changed settings"
