@@ -11,14 +11,16 @@ from __future__ import annotations
 import copy
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from qs3.config.compose import composing
+from qs3.config.hydra import build
 from qs3.config.location import CONF
+from qs3.data.domain import Domain
 
 _VALUE = re.compile(r"(?!hydra\b)([a-zA-Z_]\w*)(\.\w+)*=")
 
@@ -42,6 +44,12 @@ def compose(command: str | None, words: Sequence[str]) -> DictConfig:
     except OmegaConfBaseException:
         return by_hydra(command, words)  # for its message
     return cfg
+
+
+def compose_domain(name: str, keys: Mapping[str, str]) -> Domain:
+    """What `qs3.data.inspection.open_dataset.compose_domain` makes of conf/domain/`name`.yaml."""
+    words = [f"{k if k.startswith('paths.') else f'domain.{k}'}={v}" for k, v in keys.items()]
+    return build(compose(None, [f"+domain={name}", "+paths=default", *words]).domain)
 
 
 def _is_value(word: str) -> bool:

@@ -129,7 +129,12 @@ def test_no_target_label_within_reach(toy, tmp_path, watch, settings, class_in_i
     write_domain(tmp_path / "data", "specklenet10", noise=0.05)
     write_shuffled_target(tmp_path / "data", class_in_id)
     watch.truth = truth_of(tmp_path / "data")
-    metrics = train(toy(f"paths.data_dir={tmp_path / 'data'}", *settings))
+    # Two epochs of each phase: the first after its labels were chosen, and a later one.
+    short = [
+        "protocol.epochs=2",
+        *["selftraining.epochs=2"] * ("selftraining=none" not in settings),
+    ]
+    metrics = train(toy(f"paths.data_dir={tmp_path / 'data'}", *short, *settings))
     assert metrics.final.accuracy < 1  # else pseudo-labels would be the labels
     assert watch.planted == [True]
     # What a cloud is called may tell its class. No batch and no loss holds a name.

@@ -9,9 +9,9 @@ import pytest
 from scipy.io import savemat
 
 from qs3.data.frames import nyuv2 as reader
-from qs3.data.inspection.open_dataset import compose_domain
 from qs3.data.store import is_finished, read_manifest
 from qs3.errors import DataError, Qs3Error
+from tests.composing import compose_domain
 from tests.fixtures.frame_files import NAMES, Shot, Thing, write_nyuv2
 
 EXPECTED = {  # frame, name: class and tier; what is not here is refused or of no class
