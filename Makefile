@@ -41,6 +41,10 @@ format: install ## tidy the files
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
+# The tests start many processes; where Python is told to keep no bytecode, each of them and each
+# worker would compile all modules again.
+test test-all: export PYTHONDONTWRITEBYTECODE =
+
 test: install ## all tests that are not slow, on 2 cores
 	$(RUN) -m pytest $(PARALLEL) --ignore=tests/benchmarks
 

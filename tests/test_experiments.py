@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
+from tests.composing import compose
 from tests.fixtures.published import write_all, write_domain
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,11 +39,10 @@ def test_experiment_runs(experiment, request, tmp_path):
         f"experiment={experiment}", "debug=fast", "data.points=128", "logger=csv", "seed=0",
         "trainer.threads=1", f"paths.data_dir={data_dir}", f"paths.log_dir={tmp_path}",
     ]  # fmt: skip
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = compose("train", overrides)
-        rounds = build(cfg.selftraining).rounds  # without self-training they may be set in vain
-        if rounds:
-            cfg = compose("train", [*overrides, "selftraining.rounds=2"])
+    cfg = compose("train", overrides)
+    rounds = build(cfg.selftraining).rounds  # without self-training they may be set in vain
+    if rounds:
+        cfg.selftraining.rounds = 2
     metrics = train(cfg)
     assert metrics.experiment == experiment
     assert metrics == read_metrics(hashing.run_folder(cfg))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from qs3.config.compose import choices, composing
+from qs3.config.compose import choices, composed
 from qs3.data.made_of import MadeOf
 from qs3.generation.plan import known_classes, mesh_root
 
@@ -40,14 +42,21 @@ def made_of(
     )
 
 
+@functools.cache
+def _sensor_files() -> dict[str, Any]:
+    """What each file of conf/sensor says, in one composition."""
+    names = choices("sensor")
+    files = composed(None, *(f"+sensor@{name}={name}" for name in names))
+    return {name: OmegaConf.to_container(files[name]) for name in names}
+
+
 def _sensor(cfg: DictConfig) -> str:
     """The name of the sensor's file in conf/sensor; its class where a value was changed."""
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
     plain = OmegaConf.to_container(cfg.sensor)
-    with composing() as compose:
-        for name in choices("sensor"):
-            if OmegaConf.to_container(compose(None, [f"+sensor={name}"]).sensor) == plain:
-                return name
+    for name, settings in _sensor_files().items():
+        if settings == plain:
+            return name
     return f"{cfg.sensor._target_.rsplit('.', 1)[-1]} with changed settings"

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from qs3.classes import CLASSES
@@ -15,6 +14,7 @@ from qs3.data.domain import Domain, check_all
 from qs3.data.importers import XyzTree
 from qs3.data.scannet.cli import SCANNET
 from qs3.errors import ConfigError, DataError, MissingDataError
+from tests.composing import compose
 from tests.fixtures import published as fixtures
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -29,15 +29,9 @@ WITHOUT_STAND_IN = (*GRASPNET, "modelnet40_meshes")  # classes that cannot be ge
 
 def domain(name, data_dir, *overrides):
     """As train.py would mount it, in a config of our own."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose(
-            overrides=[
-                f"+domain@data.source={name}",
-                f"+paths.data_dir={data_dir}",
-                *(f"data.source.{o}" for o in overrides),
-            ]
-        )
-        return instantiate(cfg.data.source)
+    mounted = [f"+domain@data.source={name}", "+paths=default", f"paths.data_dir={data_dir}"]
+    cfg = compose(None, [*mounted, *(f"data.source.{o}" for o in overrides)])
+    return instantiate(cfg.data.source)
 
 
 def test_fixtures_cover_every_domain():
@@ -68,8 +62,7 @@ def test_missing_data_is_explained(tmp_path, name):
             assert SCANNET.parse(overrides)["out"] == found.folder
             continue
         assert (python, script) == ("python", "generate.py")
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            cfg = compose("generate", overrides)
+        cfg = compose("generate", overrides)
         assert cfg.paths.data_dir == str(tmp_path)
         instantiate(cfg.domain)
         instantiate(cfg.recipe)

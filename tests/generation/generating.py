@@ -4,7 +4,7 @@ import hashlib
 import sys
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
+from tests.composing import compose
 
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = [
@@ -17,8 +17,7 @@ QUICK = [
 
 
 def composed(*overrides, name="generate"):
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose(name, list(overrides))
+    return compose(name, overrides)
 
 
 def config(data_dir, meshes=None, *overrides, domain="specklenet10"):

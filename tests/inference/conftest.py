@@ -3,12 +3,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config import hashing
 from qs3.training.command import train
-from tests.training.toy import CONF, write_toy
+from tests.composing import compose
+from tests.training.toy import write_toy
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +42,6 @@ def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
         "report.pictures=false",
         *more,
     ]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", overrides)
+    cfg = compose("train", overrides)
     train(cfg)
     return hashing.run_folder(cfg)

@@ -7,7 +7,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,18 +16,16 @@ from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.selectors import Qbst, Spst
+from tests.composing import compose
 from tests.selftraining.test_selectors_balanced import select
 from tests.training.toy import CONF
 
 NAMES = sorted(p.stem for p in (CONF / "selftraining").glob("*.yaml") if p.stem != "none")
 
 
-def scheme_of(name: str) -> SelfTrainingConfig:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return build(compose("train", [f"selftraining={name}"]).selftraining)
-
-
-SCHEMES = {name: scheme_of(name) for name in NAMES}
+# In one composition, as every process that collects the tests pays for it.
+_COMPOSED = compose("train", [f"+selftraining@schemes.{name}={name}" for name in NAMES]).schemes
+SCHEMES: dict[str, SelfTrainingConfig] = {name: build(_COMPOSED[name]) for name in NAMES}
 SELECTORS = {name: scheme.selector for name, scheme in SCHEMES.items()} | {
     "qbst ascending": Qbst(order="ascending"),
     "qbst of all": Qbst(counts="all", order="ascending"),

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
 from qs3.config import hashing
 from qs3.data.store import open_pointset
@@ -18,8 +17,9 @@ from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.runs.metrics import TrainingAccuracy
 from qs3.training.command import train
 from qs3.utils.locks import owned
+from tests.composing import compose
 from tests.training.conftest import result_of
-from tests.training.toy import CONF, write_domain
+from tests.training.toy import write_domain
 from tests.training.watching import interrupt
 
 
@@ -40,12 +40,11 @@ def test_overfit_learns_a_few_clouds_by_heart(toy):
 @pytest.mark.parametrize("model", ["dgcnn", "pointnet", "pointnet2"])
 def test_overfit_works_for_real_nets(model, toy_data, tmp_path):
     """As typed, but for the size of the data."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("train", [
-            "experiment=quickstart", "debug=overfit", f"model={model}", "num_classes=3",
-            f"paths.data_dir={toy_data}", f"paths.log_dir={tmp_path}", "data.points=64",
-            "trainer.threads=1", "callbacks=none", "logger=csv",
-        ])  # fmt: skip
+    cfg = compose("train", [
+        "experiment=quickstart", "debug=overfit", f"model={model}", "num_classes=3",
+        f"paths.data_dir={toy_data}", f"paths.log_dir={tmp_path}", "data.points=64",
+        "trainer.threads=1", "callbacks=none", "logger=csv",
+    ])  # fmt: skip
     assert train(cfg).training.accuracy == 1.0
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from qs3.config import hashing
 from qs3.errors import ConfigError
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
-from tests.training.toy import _SHAPES, CONF, overrides
+from tests.composing import compose
+from tests.training.toy import _SHAPES, overrides
 
 
 def write_clouds(folder: Path, count: int, noise: float, labels: bool) -> None:
@@ -39,8 +39,7 @@ def config(root: Path, *more: str) -> DictConfig:
         *(f"data.{d}.published.points=48" for d in ("source", "target")),
         *(f"data.{d}.classes=[ball,rod,slab]" for d in ("source", "target")),
     ]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides(root, *own, *more))
+    return compose("train", overrides(root, *own, *more))
 
 
 @pytest.fixture

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_dir
 from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from qs3.data.made_of import MadeOf
 from qs3.data.store import ManifestRow, write_pointset
+from tests.composing import compose
 
 CLASSES = ("ball", "rod", "slab")
 _SHAPES = {"ball": (1.0, 1.0, 1.0), "rod": (0.2, 0.2, 1.0), "slab": (1.0, 1.0, 0.15)}
@@ -94,5 +94,4 @@ def overrides(root: Path, *more: str) -> list[str]:
 
 def toy_config(root: Path, *more: str) -> DictConfig:
     """The composed config of a toy run."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides(root, *more))
+    return compose("train", overrides(root, *more))

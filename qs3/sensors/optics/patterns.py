@@ -119,18 +119,22 @@ def _spaced_dots(
     rows: int, columns: int, fill: float, spacing: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Random sequential placement on a torus, so that tiles join without a seam."""
-    lit = np.zeros((rows, columns), dtype=bool)
-    blocked = np.zeros((rows, columns), dtype=bool)
+    lit = np.zeros(rows * columns, dtype=bool)
+    blocked = bytearray(rows * columns)  # single elements of arrays are slow
     wanted = round(fill * rows * columns)
     placed = 0
-    offsets = np.arange(-spacing, spacing + 1)
-    for position in rng.permutation(rows * columns):
-        row, column = divmod(int(position), columns)
-        if blocked[row, column]:
+    offsets = range(-spacing, spacing + 1)
+    near = [[(column + i) % columns for i in offsets] for column in range(columns)]
+    for position in rng.permutation(rows * columns).tolist():
+        if blocked[position]:
             continue
-        lit[row, column] = True
-        blocked[np.ix_((row + offsets) % rows, (column + offsets) % columns)] = True
+        lit[position] = True
+        row, column = divmod(position, columns)
+        for i in offsets:
+            start = (row + i) % rows * columns
+            for other in near[column]:
+                blocked[start + other] = 1
         placed += 1
         if placed == wanted:
             break
-    return lit
+    return lit.reshape(rows, columns)

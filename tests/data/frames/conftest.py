@@ -3,7 +3,7 @@
 import pytest
 
 from qs3.data.frames.rules import Rules
-from qs3.data.inspection.open_dataset import compose_domain
+from tests.composing import compose_domain
 from tests.fixtures.frame_files import Shot, Thing, write_nyuv2, write_sunrgbd
 
 BOOKS = ((0, 0.02, 0.62, 0.5, 0.2, 0.2), (0.1, 0.02, 1.12, 0.5, 0.2, 0.2))

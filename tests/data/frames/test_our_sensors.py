@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from trimesh.proximity import closest_point_naive
 
-from qs3.data.inspection.open_dataset import compose_domain
 from qs3.data.store import read_manifest
 from qs3.geometry.cameras import look_at
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.composing import compose_domain
 from tests.data.scannet.rooms import room
 from tests.fixtures.frame_files import Shot, Thing, write_nyuv2
 

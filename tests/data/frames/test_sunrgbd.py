@@ -8,9 +8,9 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from qs3.data.frames.sunrgbd import millimetres, read_frames
-from qs3.data.inspection.open_dataset import compose_domain
 from qs3.data.store import is_finished, read_manifest
 from qs3.errors import DataError, Qs3Error
+from tests.composing import compose_domain
 from tests.fixtures.frame_files import write_sunrgbd
 
 

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.config.compose import composing
 from qs3.config.hashing import config_hash
 from qs3.errors import ConfigError
 from qs3.report.tables import table as tables
@@ -19,6 +18,7 @@ from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import Times
 from qs3.utils.text_table import latex_text
+from tests.composing import compose
 from tests.report.made_runs import write_run
 from tests.report.tables.test_tables import run_cell
 
@@ -60,8 +60,7 @@ def pointda(empty, tmp_path_factory):
     log_dir = tmp_path_factory.mktemp("logs")
     for row, columns, seeds in (("PCM", 6, (0, 1, 2)), ("DefRec+PCM", 5, (0,))):
         for cell in empty["pointda10"].rows[row][:columns]:
-            with composing() as compose:
-                cfg = compose("train", list(cell.overrides))
+            cfg = compose("train", list(cell.overrides))
             known = {"experiment": cfg.experiment_name, "hash": config_hash(cfg)}
             for seed in seeds:
                 known |= {"target": cell.target, "simulated": False}
@@ -180,8 +179,7 @@ def test_what_is_published_alone_is_never_run(pointda, tmp_path):
 def test_failed_seeds_are_in_every_format(tmp_path):
     cell = build_table("quickstart", tmp_path).cells[0]
     run_cell(tmp_path, cell, seeds=(0, 1))
-    with composing() as compose:
-        cfg = compose("train", [*cell.overrides, "seed=2"])
+    cfg = compose("train", [*cell.overrides, "seed=2"])
     known = {"experiment": cfg.experiment_name, "hash": config_hash(cfg)}
     damaged = write_run(tmp_path, **known, seed=2, accuracy=0.9) / "metrics.json"
     damaged.write_text(damaged.read_text()[:-9])
@@ -189,8 +187,7 @@ def test_failed_seeds_are_in_every_format(tmp_path):
     begun.mkdir()
     (begun / "started.json").write_text("{}")
     other = build_table("quickstart", tmp_path).cells[1]
-    with composing() as compose:
-        cfg = compose("train", [*other.overrides, "seed=0"])
+    cfg = compose("train", [*other.overrides, "seed=0"])
     (tmp_path / cfg.experiment_name / f"seed0-{config_hash(cfg)}").mkdir(parents=True)
     table = build_table("quickstart", tmp_path)
     assert grid(table)[2][1:3] == ["not finished †"] * 2

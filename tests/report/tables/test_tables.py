@@ -18,6 +18,7 @@ from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes, EpochScores, Warmup
 from tests.commands import main
+from tests.composing import compose
 from tests.report.made_runs import scores, write_run
 
 EXPECTED = ("ablation", "noise", "quickstart", "self_training", "uda")
@@ -25,17 +26,16 @@ EXPECTED = ("ablation", "noise", "quickstart", "self_training", "uda")
 
 def run_cell(log_dir, cell, seeds=(0, 1, 2), **changes):
     """Leave results for a cell, as if its command had been run."""
-    with composing() as compose:
-        for seed in seeds:
-            cfg = compose("train", [*cell.overrides, f"seed={seed}"])
-            folder = write_run(
-                log_dir,
-                experiment=cfg.experiment_name,
-                hash=config_hash(cfg),
-                seed=seed,
-                **{"accuracy": 0.5 + seed / 100, **changes},
-            )
-            assert folder.resolve() == run_folder(cfg)  # so that what we fake is what is looked for
+    for seed in seeds:
+        cfg = compose("train", [*cell.overrides, f"seed={seed}"])
+        folder = write_run(
+            log_dir,
+            experiment=cfg.experiment_name,
+            hash=config_hash(cfg),
+            seed=seed,
+            **{"accuracy": 0.5 + seed / 100, **changes},
+        )
+        assert folder.resolve() == run_folder(cfg)  # so that what we fake is what is looked for
 
 
 def test_every_cell_composes(empty):
