@@ -40,6 +40,7 @@ class Classifier(LightningModule):
         seed: of the run.
         schedule: of the learning rate, see `qs3.engine.schedules`.
         smoothing: of class labels, see `qs3.methods.base.class_loss`.
+        metres: whether clouds keep their size.
         regulariser_weight: of what a backbone wants in the loss (`Features.regulariser`).
     """
 
@@ -53,6 +54,7 @@ class Classifier(LightningModule):
         seed: int,
         schedule: str = "cosine",
         smoothing: float = 0.0,
+        metres: bool = False,
         regulariser_weight: float = 0.0,
     ) -> None:
         super().__init__()
@@ -61,6 +63,7 @@ class Classifier(LightningModule):
         self.net = self.fresh_net(phase=0)
         self.method, self.student = method, student
         method.smoothing = student.smoothing = smoothing
+        method.metres = student.metres = metres
         self._plateau: Plateau | None = None
         self._loaded_plateau: dict[str, Any] | None = None
         self.regulariser_weight = regulariser_weight

@@ -27,11 +27,14 @@ class Method(nn.Module):
         labels: whose labels it trains on: "source", or "target_train" (the upper bound only).
         uses_target: whether its batches hold unlabelled target clouds.
         smoothing: of class labels (`class_loss`); the trainer sets it to `protocol.smoothing`.
+        metres: whether clouds keep their size (`data.scale`); the trainer says so. A loss with
+            lengths in it divides by each cloud's size then.
     """
 
     labels: ClassVar[str] = "source"
     uses_target: ClassVar[bool] = False
     smoothing: float = 0.0
+    metres: bool = False
 
     def prepare(self, net: nn.Module) -> None:
         """Make the heads that this method puts on `net`. Called once, before `loss`.

@@ -47,6 +47,12 @@ def voxel_centre(voxel: Int[Tensor, " b"]) -> Float[Tensor, "b 3"]:
     return (cell + 0.5) * (2 / GRID) - 1
 
 
+def cloud_size(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b 1 1"]:
+    """Largest distance of a point from the origin; 1 where all points lie there."""
+    size = points.norm(dim=2).amax(dim=1)[:, None, None]
+    return torch.where(size > 0, size, 1)
+
+
 def deform(points: Float[Tensor, "b n 3"], generator: torch.Generator, min_points: int) -> Deformed:
     """Deform one voxel of each cloud.
 

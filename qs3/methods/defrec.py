@@ -16,7 +16,7 @@ from qs3.config.checks import check_float, check_int
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.chamfer import masked_chamfer
-from qs3.methods.deform import deform
+from qs3.methods.deform import cloud_size, deform
 from qs3.methods.mixup import source_loss
 from qs3.models.base import Features
 from qs3.models.norms import use_domain
@@ -86,10 +86,12 @@ class DefRec(Method):
 
     def _reconstruction(self, net: Any, points: Tensor, generator: torch.Generator) -> Tensor:
         assert self.head is not None, "prepare() comes first"
-        deformed = deform(points, generator, self.min_points)
-        predicted = self.head(net.features(deformed.points))  # [B, N, 3]
+        size = cloud_size(points) if self.metres else 1.0
+        unit = points / size
+        deformed = deform(unit, generator, self.min_points)
+        predicted = self.head(net.features(deformed.points * size))  # [B, N, 3] in the unit ball
         mask = deformed.mask
-        per_cloud = masked_chamfer(predicted, points, mask, mask)  # [B], 0 without a voxel
+        per_cloud = masked_chamfer(predicted, unit, mask, mask)  # [B], 0 without a voxel
         return self.defrec_weight * self.scale * per_cloud.sum() / mask.any(1).sum().clamp_min(1)
 
 

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from qs3.config.checks import check_int
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.methods.base import Method, feature_dims, weight
-from qs3.methods.deform import VOXELS, deform
+from qs3.methods.deform import VOXELS, cloud_size, deform
 from qs3.methods.mixup import join, source_loss
 from qs3.models.norms import use_domain
 
@@ -92,8 +92,9 @@ class Gast(Method):
 
     def _where(self, net: Any, points: Tensor, generator: torch.Generator) -> Tensor:
         assert self.def_head is not None
-        deformed = deform(points, generator, self.min_points)
-        logits = self.def_head(net.features(deformed.points).global_)  # [B, 27]
+        size = cloud_size(points) if self.metres else 1.0
+        deformed = deform(points / size, generator, self.min_points)
+        logits = self.def_head(net.features(deformed.points * size).global_)  # [B, 27]
         each = F.cross_entropy(logits, deformed.voxel, reduction="none")  # [B]
         counts = deformed.mask.any(1)
         return torch.where(counts, each, 0.0).sum() / counts.sum().clamp_min(1)

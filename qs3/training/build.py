@@ -81,6 +81,7 @@ def _classifier(run: Run, method: Method) -> Classifier:
         seed=run.seed,
         schedule=cfg.protocol.schedule,
         smoothing=cfg.protocol.smoothing,
+        metres=cfg.data.scale == "metres",
         regulariser_weight=cfg.protocol.regulariser,
     )
     if cfg.compile:

@@ -31,9 +31,6 @@ log = logging.getLogger(__name__)
 TEACHERS = ("source_val", "last")
 SCHEDULES = ("cosine", "plateau")
 UNIT_BALL_ONLY = {
-    name: "its 27 voxels divide [-1, 1]^3, and in metres a small object would lie in one of them"
-    for name in ("qs3.methods.defrec.DefRec", "qs3.methods.gast.Gast")
-} | {
     "qs3.models.simpleview.simpleview": "its cameras stand 1.4 from the cloud's middle and would "
     "lose a large object's points"
 }

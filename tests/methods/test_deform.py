@@ -3,7 +3,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.methods.deform import VOXELS, deform, voxel_centre, voxel_of
+from qs3.methods.deform import VOXELS, cloud_size, deform, voxel_centre, voxel_of
+from qs3.methods.defrec import DefRec
+from qs3.methods.gast import Gast
+from tests.methods.shapes import tiny_net
 
 
 def test_voxels_and_centres_known_answers() -> None:
@@ -58,3 +61,37 @@ def test_all_randomness_is_the_generator_s() -> None:
     assert torch.equal(torch.get_rng_state(), state)
     assert torch.equal(draws[0].points, draws[1].points)
     assert not torch.equal(draws[0].points, draws[2].points)
+
+
+@pytest.mark.parametrize(
+    ("method", "terms"),
+    [
+        (Gast(min_points=2, rot_weight=0.0), ("def_source", "def_target")),
+        (DefRec(min_points=2, dropout=0.0), ("defrec",)),
+    ],
+)
+def test_a_cloud_s_size_changes_nothing_but_what_the_net_sees(method, terms) -> None:
+    """Clouds of 0.2 to 3 m: the loss of the unit ball, if the net divides by their size."""
+    net = tiny_net()
+    features, seen = net.features, []
+    generator = torch.Generator().manual_seed(3)
+    clouds = torch.randn(6, 64, 3, generator=generator)
+    clouds = clouds / cloud_size(clouds)
+    size = torch.tensor([0.2, 0.5, 1.0, 1.3, 2.0, 3.0])[:, None, None]
+    labels = torch.arange(6) % 4
+
+    def loss(points: torch.Tensor, divide: torch.Tensor | float) -> dict[str, torch.Tensor]:
+        net.features = lambda x: (seen.append(x), features(x / divide))[1]
+        batch = {"source": {"points": points, "y_source": labels}, "target": {"points": points}}
+        return method.loss(net, batch, torch.Generator().manual_seed(0))
+
+    method.prepare(net)
+    method.metres = False
+    unit = loss(clouds, 1.0)
+    in_unit_ball, seen = seen[-1], []
+    method.metres = True
+    metres = loss(clouds * size, size)
+    for term in terms:
+        torch.testing.assert_close(metres[term], unit[term])
+    torch.testing.assert_close(seen[-1], in_unit_ball * size)
+    assert cloud_size(torch.zeros(2, 5, 3)).flatten().tolist() == [1.0, 1.0]

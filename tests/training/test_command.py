@@ -74,9 +74,9 @@ def test_help_imports_nothing_heavy(tmp_path):
                 "data.scale=metres",
                 "data.source.unit=metres",
                 "data.target.unit=metres",
-                "method=gast",
+                "model=simpleview",
             ),
-            ("ConfigError", "data.scale=metres and method=gast: its 27 voxels"),
+            ("ConfigError", "data.scale=metres and model=simpleview: its cameras"),
         ),
     ],
 )

@@ -174,13 +174,6 @@ def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
             "data.scale=metres data.source.unit=metres data.target.unit=none",
             r"domain kinectsim10 are not in metres",
         ),
-        *(
-            (
-                f"data.scale=metres data.source.unit=metres method={name}",
-                rf"method={name[:6]}: its 27 v",
-            )
-            for name in ("defrec", "defrec_pcm", "gast")
-        ),
         ("data.fps_starts=0", r"data\.fps_starts .* >= 1, got 0"),
         ("evaluation.rotations=-1", r"evaluation\.rotations .* >= 0, got -1"),
         ("num_classes=10", r"num_classes is 10.*set num_classes=3"),
