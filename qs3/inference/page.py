@@ -238,12 +238,13 @@ def _card(row: Row, sample: Sample, classes: Sequence[str]) -> str:
     tags = [f'<span class="tag">{escape(caution.words)}</span>' for caution in row.cautions]
     tags += [_strange(words) for words in row.reason.split("; ") if words]
     tier = f", {row.tier}" if row.tier else ""
+    size = f"<br>{_size(_z_up(sample))}" if sample.tier or sample.picture else ""
     return (
         f'<div class="card {style}{" two" * (len(images) > 1)}">{"".join(images)}'
         f'<span class="bar" style="width:{sure:.0%}"></span>'
         f'<div><span class="said">{escape(best)} {sure:.0%}</span>{is_}</div>'
         f'<div class="soft">then {second}</div><div>{"".join(tags)}</div>'
-        f'<div class="file">{escape(row.file)}, {row.points} points{tier}</div></div>'
+        f'<div class="file">{escape(row.file)}, {row.points} points{tier}{size}</div></div>'
     )
 
 
@@ -251,6 +252,13 @@ def _strange(words: str) -> str:
     """A measure out of the range of training, explained when pointed at."""
     meaning = MEASURES.get(words.split(" ")[0], "")
     return f'<span class="tag" title="{escape(meaning)}">{STRANGE}: {escape(words)}</span>'
+
+
+def _size(cloud: np.ndarray) -> str:
+    """How large it is: a chair's back and a monitor look alike when both fill their card."""
+    angles = np.linspace(0, np.pi, 18, endpoint=False)
+    across = cloud[:, :2] @ np.stack([np.cos(angles), np.sin(angles)])  # [n, 18]
+    return f"{np.ptp(across, axis=0).max():.2f} m wide, {np.ptp(cloud[:, 2]):.2f} m high"
 
 
 def _z_up(sample: Sample) -> np.ndarray:

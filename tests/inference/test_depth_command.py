@@ -87,6 +87,11 @@ def test_each_object_of_a_mask_gets_what_the_net_says_of_its_cloud(run, frame, c
     page = (frame / "said.html").read_text()
     assert page.count('<img alt="cloud"') == page.count('<img alt="depth image"') == 2
     assert "nobody knows which are right" in page
+    sizes = re.findall(r"png\[(\d)\].*?<br>([\d.]+) m wide, ([\d.]+) m high", page)
+    (ball, rod) = ((float(wide), float(high)) for _, wide, high in sorted(sizes))
+    assert 0.7 < ball[0] < 1.05  # a side to the diagonal
+    assert 0.2 < rod[0] < 0.35
+    assert [ball[1], rod[1]] == pytest.approx([0.7, 1.0], abs=0.06)
     in_python = predictor.predict_depth(depth / 1000, SHOT.camera, mask=mask, up=SHOT.up_in_camera)
     np.testing.assert_allclose([one.probabilities for one in in_python], expected, atol=1e-6)
     assert [one.cls for one in in_python] == [row["class"] for row in rows]
@@ -241,5 +246,6 @@ def test_labels_of_clouds_are_their_files_or_folders(run, tmp_path):
     np.savez(tmp_path / "in" / "b.npz", points=rng.normal(size=(2, 64, 3)), label=[2, 0])
     np.save(tmp_path / "in" / "c.npy", rng.normal(size=(64, 3)))
     assert predict(run, tmp_path / "said.csv", f"input={tmp_path}/in") == 0
+    assert "m wide" not in (tmp_path / "said.html").read_text()  # files may be of any unit
     found = {row["file"]: row["label"] for row in table(tmp_path / "said.csv")}
     assert found == {"Rod/new/a.npy": "rod", "b.npz[0]": "slab", "b.npz[1]": "ball", "c.npy": ""}
