@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -92,7 +93,7 @@ def test_lrent_at_a_tie_of_its_condition() -> None:
 
 def test_the_round_is_the_first_unless_one_is_named() -> None:
     teacher = TeacherPredictions.of(np.array(TABLE * 3), [f"{i:02d}" for i in range(24)])
-    for selector in (Cbst(step=0.3), Random(Spst())):
+    for selector in (Cbst(step=0.3), Random(Qbst())):
         assert selector.select(teacher, 0.5).mu.tolist() == (
             selector.select(teacher, 0.5, 0).mu.tolist()
         )
@@ -191,6 +192,7 @@ def test_random_draws_each_sample_equally_often() -> None:
         ({"portion": 0.6}, "0 < portion <= most"),
         ({"most": 1.1}, "most=1.1"),
         ({"step": -0.1}, "step must be >= 0"),
+        ({"step": True}, "step must be a number"),
         ({"alpha": 0.0}, "alpha must be > 0"),
         ({"labels": "soft"}, "selftraining.selector.labels"),
     ],
@@ -202,3 +204,31 @@ def test_wrong_settings_name_the_key(settings, message) -> None:
         Random(Qbst(), pool="some")
     with pytest.raises(ConfigError, match="must be a selector"):
         Random("qbst")
+    with pytest.raises(ConfigError, match=r"selftraining\.selector\.seed .* >= 0, got -1"):
+        Random(Qbst(), seed=-1)
+
+
+def test_random_takes_its_defaults_and_says_whose_thresholds_it_has() -> None:
+    table = [[0.9 - 0.01 * i, 0.1 + 0.01 * i] for i in range(30)]
+    table += [row[::-1] for row in table]
+    ids = [f"{i:02d}" for i in range(60)]
+    assert (
+        select(Random(Qbst()), table, 0.7, ids)[1]
+        == select(Random(Qbst(), seed=0, pool="confident"), table, 0.7, ids)[1]
+    )
+    assert (
+        select(Random(Qbst(), seed=1), table, 0.7, ids)[1]
+        != (select(Random(Qbst()), table, 0.7, ids)[1])
+    )
+    p = np.array(table).max(axis=1)
+    assert (p[select(Random(Qbst()), table, 0.7, ids)[0].selected] > 0.7).all()
+    assert (p[select(Random(Qbst(), pool="all"), table, 0.7, ids)[0].selected] <= 0.7).any()
+    assert Random(Cbst()).own_thresholds is True
+    assert Random(Qbst()).own_thresholds is False
+
+
+@pytest.mark.parametrize("selector", [Cbst(), Random(Qbst())])
+def test_a_selector_is_not_changed_once_it_is_checked(selector) -> None:
+    field = dataclasses.fields(selector)[0].name
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(selector, field, -1)
