@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import math
 
 import pytest
 from hypothesis import given
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 
 from qs3.datamodules.phases import Phases, SelfTrainingConfig, no_rounds
 from qs3.errors import ConfigError
+from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.selectors import Qbst
 
 
@@ -17,6 +20,56 @@ def test_epochs_belong_to_phases():
     assert [phases.phase(e) for e in range(8)] == [0, 0, 0, 1, 1, 2, 2, 2]
     assert [e for e in range(7) if phases.starts(e)] == [0, 3, 5]
     assert [e for e in range(7) if phases.ends(e)] == [2, 4, 6]
+
+
+@given(warmup=st.integers(1, 300), rounds=st.integers(0, 5), epochs=st.integers(1, 300))
+def test_phases_are_a_list_of_epochs_cut_into_pieces(warmup, rounds, epochs):
+    phases = Phases(warmup, rounds, epochs)
+    written_out = [0] * warmup + [r for r in range(1, rounds + 1) for _ in range(epochs)]
+    assert phases.total == len(written_out)
+    assert [phases.phase(e) for e in range(phases.total)] == written_out
+    for epoch, phase in enumerate(written_out):
+        around = (written_out[epoch - 1] if epoch else None, *written_out[epoch + 1 : epoch + 2])
+        assert phases.starts(epoch) is (around[0] != phase)
+        assert phases.ends(epoch) is (len(around) == 1 or around[1] != phase)
+    for phase in range(rounds + 1):
+        first = written_out.index(phase)
+        assert phases.span(phase) == (first, first + written_out.count(phase))
+
+
+def test_an_epoch_past_the_end_is_of_the_last_phase_and_ends_nothing():
+    phases = Phases(warmup=3, rounds=2, epochs=2)
+    assert [(phases.phase(e), phases.starts(e), phases.ends(e)) for e in (7, 8)] == [
+        (2, False, False)
+    ] * 2
+    assert not Phases(warmup=3).starts(4)
+
+
+def test_the_settings_of_a_schedule_cannot_be_changed_while_it_runs():
+    for made, key in ((Phases(3), "warmup"), (SelfTrainingConfig(), "rounds")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(made, key, 4)
+
+
+def test_what_is_not_said_is_the_paper_s():
+    """Sec. 5.1: ten epochs a round, batches of 32, theta 0.8; nothing that other methods add."""
+    assert dataclasses.asdict(SelfTrainingConfig()) == {
+        "selector": None,
+        "rounds": 0,
+        "epochs": 10,
+        "steps": None,
+        "batch_size": 32,
+        "theta": 0.8,
+        "epsilon": 0.0,
+        "init": "scratch",
+        "use_source": False,
+        "pcm": False,
+        "weight_step": 0.0,
+        "mrkld": 0.0,
+        "missing_class": "warn",
+        "rehearsal": False,
+    }
+    assert dataclasses.astuple(Phases(3)) == (3, 0, 0, None, None)
 
 
 def test_each_phase_has_its_own_cosine():
@@ -54,6 +107,43 @@ def test_theta_grows_without_rounding_error():
 def test_wrong_settings_name_the_key(settings, message):
     with pytest.raises(ConfigError, match=message):
         SelfTrainingConfig(**{"selector": Qbst(), "rounds": 2, **settings})
+
+
+def test_the_smallest_settings_are_allowed():
+    scheme = SelfTrainingConfig(Qbst(), rounds=1, epochs=1, batch_size=2, theta=0.01, mrkld=0)
+    assert (scheme.epochs, scheme.batch_size, scheme.theta_of(0)) == (1, 2, 0.01)
+
+
+def test_a_threshold_of_0_is_for_selectors_with_their_own():
+    assert SelfTrainingConfig(Cbst(), rounds=2, theta=0.0).theta_of(1) == 0.0
+    for theta in (1.0, -0.1, 1.5):
+        with pytest.raises(ConfigError, match=r"theta must be in \(0, 1\)"):
+            SelfTrainingConfig(Cbst(), rounds=2, theta=theta)
+    with pytest.raises(ConfigError, match=r"theta \+ epsilon \* \(rounds - 1\) .* got -0\.1 "):
+        SelfTrainingConfig(Cbst(), rounds=2, theta=0.0, epsilon=-0.1)
+
+
+@pytest.mark.parametrize(
+    ("theta", "epsilon", "rounds"),
+    [(0.5, 0.25, 3), (0.5, -0.25, 3), (0.9, 0.2, 2), (0.1, -0.2, 2)],
+    ids=["reaches 1", "reaches 0", "passes 1", "passes 0"],
+)
+@pytest.mark.parametrize("selector", [Qbst(), Cbst()], ids=["qbst", "cbst"])
+def test_the_last_round_s_threshold_lies_in_between(selector, theta, epsilon, rounds):
+    with pytest.raises(ConfigError, match=r"theta \+ epsilon \* \(rounds - 1\)"):
+        SelfTrainingConfig(selector, rounds=rounds, theta=theta, epsilon=epsilon)
+    before = SelfTrainingConfig(selector, rounds=rounds - 1, theta=theta, epsilon=epsilon)
+    assert 0 < before.theta_of(rounds - 2) < 1
+
+
+def test_the_weight_of_the_losses_stays_above_0():
+    """1 - step (e - 1) in the last of e = 3 * 4 epochs: 11 steps of 1/11 are one too many."""
+    kept = SelfTrainingConfig(Qbst(), rounds=3, epochs=4, weight_step=0.0909)
+    assert math.isclose(1 - kept.weight_step * 11, 0.0001)
+    for step in (0.0910, 1 / 11, 0.5, -0.01):
+        with pytest.raises(ConfigError, match=r"weight_step .* below 1 after 11 epochs, got"):
+            SelfTrainingConfig(Qbst(), rounds=3, epochs=4, weight_step=step)
+    assert SelfTrainingConfig(Qbst(), rounds=1, epochs=1, weight_step=5.0).weight_step == 5.0
 
 
 def test_none_ignores_what_an_experiment_set_for_rounds():
@@ -96,7 +186,7 @@ def test_without_steps_an_epoch_is_one_pass():
     [
         ((2, None), r"protocol\.steps=2 must be at least protocol\.epochs=3"),
         ((None, 3), r"selftraining\.steps=3 must be at least selftraining\.epochs=4"),
-        ((0, None), r"protocol\.steps"),
+        ((0, None), r"protocol\.steps must be a whole number >= 1"),
     ],
 )
 def test_an_epoch_without_a_step_is_refused(steps, message):
