@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.classes import class_list
-from qs3.config.checks import check_choice
+from qs3.config.checks import check_choice, check_float
 from qs3.config.location import typed
 from qs3.data.importers import Importer, import_into
 from qs3.data.made_of import MadeOf
@@ -23,8 +23,9 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 log = logging.getLogger(__name__)
 
 VARIANTS = ("points", "points_clean")
-SCALES = ("unit_ball", "metres")
-"""How large clouds are as a net sees them: divided by their radius, or as they are."""
+SCALES = ("unit_ball", "metres", "above_floor")
+"""How clouds are as a net sees them: divided by their radius; of their size, about their centroid;
+or of their size, over the floor."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class Domain:
             their camera, which training should not turn about z (protocol.augment.rotate_z=false).
         unit: of the store's coordinates, "metres"; or "none" if sizes mean nothing (CAD shapes,
             clouds that were normalised) or nobody knows.
+        floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
+            where the camera is the origin; None: nobody knows.
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
         expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
@@ -64,6 +67,7 @@ class Domain:
     simulated: bool = False
     gravity: str = "z"
     unit: str = "none"
+    floor_m: float | None = None
     how_to_get: str = ""
     make: str | None = None
     stand_in: str | None = None
@@ -82,6 +86,8 @@ class Domain:
                 "on z; let the importer turn them (its key `up`)"
             )
         check_choice(f"domain {self.name}: unit", self.unit, ("metres", "none"))
+        if self.floor_m is not None:
+            check_float(f"domain {self.name}: floor_m", self.floor_m)
         object.__setattr__(self, "path", Path(self.path))
         classes = class_list(self.classes)
         if not classes or len(set(classes)) < len(classes):
@@ -131,14 +137,24 @@ class Domain:
         """Find out whether a net can see the clouds at this scale.
 
         Raises:
-            ConfigError: not one of `SCALES`, or metres of clouds that are not in metres.
+            ConfigError: not one of `SCALES`; metres of clouds that are not in metres; heights above
+                a floor of which nobody knows where it is.
         """
-        if check_choice("data.scale", scale, SCALES) == "metres" and self.unit != "metres":
+        if check_choice("data.scale", scale, SCALES) == "unit_ball":
+            return
+        if self.unit != "metres":
             raise ConfigError(
-                f"data.scale=metres: the clouds of domain {self.name} are not in metres, or nobody "
-                "knows (its key `unit`). Set data.scale=unit_ball, choose a domain with real sizes "
-                "such as roomscan10, or, if you know that they are in metres, say so: "
+                f"data.scale={scale}: the clouds of domain {self.name} are not in metres, or "
+                "nobody knows (its key `unit`). Set data.scale=unit_ball, choose a domain with "
+                "real sizes such as roomscan10, or, if you know that they are in metres, say so: "
                 "data.source.unit=metres or data.target.unit=metres"
+            )
+        if scale == "above_floor" and self.floor_m is None:
+            raise ConfigError(
+                f"data.scale=above_floor: nobody knows where the floor is in the clouds of domain "
+                f"{self.name} (its key `floor_m`). Set data.scale=metres, or say it: "
+                "data.source.floor_m=0 if objects stand on z = 0, data.target.floor_m=-1.25 if the "
+                "origin is a camera 1.25 m above the floor"
             )
 
     def check(self) -> None:
@@ -196,7 +212,7 @@ class Domain:
         if "imported" in dataset.meta and (problems := self._other_counts(dataset)):
             text = "%s does not have the published numbers of clouds: %s"
             log.warning(text, self.label, ", ".join(problems))
-        return dataset
+        return replace(dataset, floor_m=self.floor_m)
 
     def check_unpublished(self) -> None:
         """Raise DataError if published files are there: a dataset made here would pass for them."""

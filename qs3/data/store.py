@@ -78,6 +78,7 @@ class PointSet:
         sha256: hash of these clouds with their ids, labels and splits (of the whole dataset,
             also after `split`); goes into every result.
         meta: what meta.yaml holds.
+        floor_m: z of the floor under every cloud, if a `Domain` that opened it knows.
     """
 
     name: str
@@ -88,6 +89,7 @@ class PointSet:
     ids: tuple[str, ...]
     sha256: str
     meta: Mapping[str, Any]
+    floor_m: float | None = None
 
     def __len__(self) -> int:
         """N."""

@@ -101,7 +101,7 @@ class AdaptationData(LightningDataModule):
         self.target_domain = DomainData(target, labels=False, **shared)
         self.owner, self.uses_target = owner, uses_target
         self.phases, self.scheme, self.augment = phases, scheme, augment
-        self.unit_ball = scale == "unit_ball"
+        self.scale = scale
         self.batch_size, self.eval_batch_size, self.seed = batch_size, eval_batch_size, seed
         self.pseudo: tuple[Tensor, Tensor] | None = None
 
@@ -187,7 +187,7 @@ class AdaptationData(LightningDataModule):
             if isinstance(part, dict):
                 points, rank = part["points"], self.trainer.global_rank
                 generator = generator_of(batch, name, self.seed, rank, points.device)
-                points = self.augment(points, generator, unit_ball=self.unit_ball)
+                points = self.augment(points, generator, self.scale)
                 result[name] = {**part, "points": points}
         return result
 

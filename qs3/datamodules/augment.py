@@ -17,7 +17,7 @@ REGION_SHARE = (0.1, 0.25)
 
 @dataclass(frozen=True)
 class Augment:
-    """Cut, holes, rotation about the up axis, anisotropic scale, shift and jitter, in this order.
+    """Cut, holes, rotation about z, anisotropic scale, shift, lift and jitter, in this order.
 
     Attributes:
         crop: the smallest share of a cloud that stays when a plane cuts it (see `crop`), as the
@@ -27,6 +27,8 @@ class Augment:
         rotate_z: turn each cloud about z by U(0, 2π).
         scale: factor of each axis, U(1 / scale, scale); 1 leaves the size alone.
         shift: added to each axis, U(-shift, shift).
+        lift: added to z alone, U(-lift, lift): how high a camera hangs is not known to the
+            decimetre (`data.scale=above_floor`).
         jitter_sigma: standard deviation of the noise on each coordinate.
         jitter_clip: bound of that noise. PointNet, which the paper cites, has 0.05; the code that
             the paper's descends from 0.02.
@@ -37,11 +39,12 @@ class Augment:
     rotate_z: bool = True
     scale: float = 1.0
     shift: float = 0.0
+    lift: float = 0.0
     jitter_sigma: float = 0.01
     jitter_clip: float = 0.05
 
     def __post_init__(self) -> None:
-        noise = dict.fromkeys(("shift", "jitter_sigma", "jitter_clip"), ">= 0")
+        noise = dict.fromkeys(("shift", "lift", "jitter_sigma", "jitter_clip"), ">= 0")
         check_ranges(self, "protocol.augment.", scale=">= 1", drop_regions="[0, 3]", **noise)
         check_ranges(self, "protocol.augment.", crop="(0, 1]")
         check_int("protocol.augment.drop_regions", self.drop_regions, 0)
@@ -50,14 +53,14 @@ class Augment:
         self,
         points: Float[Tensor, "b n 3"],
         generator: torch.Generator,
-        unit_ball: bool = True,
+        scale: str = "unit_ball",
     ) -> Float[Tensor, "b n 3"]:
         """A new batch; the one given is left alone.
 
         Args:
-            points: clouds about their centroids.
+            points: clouds as `scale` says.
             generator: on the device of `points`.
-            unit_ball: they are scaled to the unit ball, and are again after a cut.
+            scale: see `qs3.datamodules.clouds`; they are so again after a cut.
         """
         b, like = len(points), {"device": points.device, "dtype": points.dtype}
 
@@ -65,7 +68,7 @@ class Augment:
             return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
 
         if self.crop < 1.0:
-            points = crop(points, self.crop, generator, unit_ball)
+            points = crop(points, self.crop, generator, scale)
         if self.drop_regions:
             points = drop_regions(points, self.drop_regions, generator)
         if self.rotate_z:
@@ -75,6 +78,9 @@ class Augment:
             points = points * (low + (high - low) * uniform(b, 1, 3))
         if self.shift > 0.0:
             points = points + self.shift * (2 * uniform(b, 1, 3) - 1)
+        if self.lift > 0.0:
+            up = torch.tensor([0.0, 0.0, self.lift], device=points.device, dtype=points.dtype)
+            points = points + up * (2 * uniform(b, 1, 1) - 1)
         if self.jitter_sigma > 0.0:
             noise = torch.randn(points.shape, generator=generator, device=points.device)
             noise = (self.jitter_sigma * noise).clamp(-self.jitter_clip, self.jitter_clip)
@@ -90,12 +96,13 @@ def rotate_z(points: Float[Tensor, "b n 3"], angle: Float[Tensor, " b"]) -> Floa
 
 
 def crop(
-    points: Float[Tensor, "b n 3"], least: float, generator: torch.Generator, unit_ball: bool
+    points: Float[Tensor, "b n 3"], least: float, generator: torch.Generator, scale: str
 ) -> Float[Tensor, "b n 3"]:
     """Cut each cloud by a plane of any direction, so that U(least, 1) of its points stay.
 
-    What stays is centred again (and with `unit_ball` scaled again), as a cloud of which nobody has
-    ever seen the rest; points of it are repeated at random in the places of the others.
+    What stays is put where `scale` has it: centred again, in the unit ball scaled again, as a cloud
+    of which nobody has ever seen the rest; over the floor it keeps its height. Points of it are
+    repeated at random in the places of the others.
     """
     b, n = points.shape[:2]
     device = points.device
@@ -106,9 +113,11 @@ def crop(
     left = torch.zeros_like(first).scatter(1, order, first)  # [B, N]
     other = torch.multinomial(left.float(), n, replacement=True, generator=generator)  # [B, N]
     centre = (points * left[..., None]).sum(dim=1) / left.sum(dim=1, keepdim=True)  # [B, 3]
+    if scale == "above_floor":
+        centre[:, 2] = 0
     moved = points - centre[:, None]
     moved = torch.where(left[..., None], moved, moved.take_along_dim(other[..., None], dim=1))
-    if unit_ball:
+    if scale == "unit_ball":
         radius = moved.norm(dim=2).amax(dim=1)[:, None, None]
         moved = moved / torch.where(radius > 0, radius, 1)
     return moved

@@ -26,7 +26,9 @@ class Clouds:
         centre: [N, 3] float32, a cloud's centroid about its first point.
         radius: [N] float32, largest distance from the centroid; 1 where it is 0.
         rows: [n] which of the N clouds these are.
-        scale: "unit_ball": a batch's clouds are divided by their radius; "metres": they are not.
+        scale: "unit_ball": a batch's clouds are divided by their radius; "metres": they are not;
+            "above_floor": they are not, and z is the height above the floor, not the centroid.
+        floor: z of the floor in `stored`; for "above_floor".
     """
 
     stored: Float[np.ndarray, "N P 3"]
@@ -35,12 +37,14 @@ class Clouds:
     radius: Float[np.ndarray, " N"]
     rows: Int[np.ndarray, " n"]
     scale: str = "unit_ball"
+    floor: float = 0.0
 
     @staticmethod
     def of(
         stored: Float[np.ndarray, "n p 3"],
         order: np.ndarray | None = None,
         scale: str = "unit_ball",
+        floor: float = 0.0,
     ) -> Clouds:
         """All of `stored`; its clouds are read once, for their balls (see `geometry.unit_ball`)."""
         centre = np.empty((len(stored), 3), dtype=np.float32)
@@ -49,7 +53,7 @@ class Clouds:
             moved = cloud - cloud[:1]
             centre[i] = moved.mean(axis=0)
             radius[i] = np.linalg.norm(moved - centre[i], axis=1).max() or 1.0
-        return Clouds(stored, order, centre, radius, np.arange(len(stored)), scale)
+        return Clouds(stored, order, centre, radius, np.arange(len(stored)), scale, floor)
 
     def __len__(self) -> int:
         """How many there are."""
@@ -86,6 +90,8 @@ class Clouds:
         points -= centre[:, None]
         if self.scale == "unit_ball":
             points /= self.radius[rows, None, None]
+        elif self.scale == "above_floor":
+            points[..., 2] += (first + centre)[:, None, 2] - np.float32(self.floor)
         return torch.from_numpy(np.asarray(points))
 
     def all(self) -> Float[Tensor, "n m 3"]:

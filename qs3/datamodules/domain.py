@@ -42,7 +42,8 @@ class DomainData(LightningDataModule):
     Args:
         domain: a `Domain`, or the name of one of conf/domain, such as "modelnet10".
         points: of a cloud as a net sees it.
-        scale: "unit_ball", or "metres" for clouds that keep their size.
+        scale: "unit_ball", "metres" for clouds that keep their size, or "above_floor" for those
+            that keep their height above the floor, too.
         fps_starts: samples of each training cloud, from other first points; an epoch draws one.
         batch_size: of training batches, at least 2 (batch norm).
         eval_batch_size: of all others.
@@ -65,7 +66,8 @@ class DomainData(LightningDataModule):
 
     Raises:
         ConfigError: no such domain, rule, sampler or scale; labels are asked for and there are
-            none; metres are asked for and the clouds are not in metres.
+            none; metres are asked for and the clouds are not in metres, or heights above a floor of
+            which nobody knows where it is.
         DataError: from a loader, if its clouds have not been set up or there is no such split.
         MissingDataError: from `prepare_data`, if there are no files; says how to get them.
     """
@@ -159,7 +161,7 @@ class DomainData(LightningDataModule):
             return result
         points, rank = batch["points"], self.trainer.global_rank
         generator = generator_of(batch, "augment", self.seed, rank, points.device)
-        augmented = self.augment(points, generator, unit_ball=self.scale == "unit_ball")
+        augmented = self.augment(points, generator, self.scale)
         return {**result, "points": augmented}
 
     def _setup_training(self, dataset: PointSet) -> None:

@@ -39,6 +39,7 @@ def prepare(
     cache_dir: Path | None = None,
     key: str = "",
     scale: str = "unit_ball",
+    floor: float = 0.0,
 ) -> Clouds:
     """Each cloud about its centroid, and of it `starts` samples of `count` farthest points.
 
@@ -53,7 +54,7 @@ def prepare(
         starts: samples of each cloud, at most p.
         cache_dir: where to keep the indices for the next run; None keeps nothing.
         key: names the clouds: the dataset with its hash, and the split.
-        scale: of the clouds, see `Clouds`.
+        scale, floor: of the clouds, see `Clouds`.
 
     Raises:
         ConfigError: the clouds have fewer points than asked for.
@@ -62,7 +63,7 @@ def prepare(
     if not 1 <= count <= stored:
         raise ConfigError(f"data.points is {count}, but the clouds of {key} have {stored} points")
     if count == stored:
-        return Clouds.of(points, scale=scale)
+        return Clouds.of(points, None, scale, floor)
     starts = min(starts, stored)
 
     def work() -> np.ndarray:
@@ -70,7 +71,7 @@ def prepare(
         return sample_all(points, count, starts)
 
     if cache_dir is None:
-        return Clouds.of(points, work(), scale)
+        return Clouds.of(points, work(), scale, floor)
     cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
     name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
     shape = (n, starts, count)
@@ -80,7 +81,7 @@ def prepare(
             order = _read(cache, shape, name)
             if order is None:
                 order = _kept(cache, work(), name)
-    return Clouds.of(points, order, scale)
+    return Clouds.of(points, order, scale, floor)
 
 
 def remove_old_leftovers(cache_dir: Path) -> None:

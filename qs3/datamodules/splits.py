@@ -16,6 +16,7 @@ from torch import Tensor
 from qs3.data.store import PointSet, evenly
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
+from qs3.errors import ConfigError
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +58,25 @@ def load_clouds(
     """A split's clouds, prepared (see `prepare`), without their labels.
 
     `scale` has no default: who forgot it would show a net clouds of another size, and no error.
+
+    Raises:
+        ConfigError: heights above a floor are asked for, and nobody knows where it is.
     """
+    if scale == "above_floor" and dataset.floor_m is None:
+        raise ConfigError(
+            f"{dataset.name}: nobody knows where the floor is (floor_m of its domain)"
+        )
     part = dataset.split(split)
     key = f"{dataset.name}-{dataset.sha256[:16]}-{split}"
-    clouds = prepare(part.points, points, starts=starts, cache_dir=cache_dir, key=key, scale=scale)
+    clouds = prepare(
+        part.points,
+        points,
+        starts=starts,
+        cache_dir=cache_dir,
+        key=key,
+        scale=scale,
+        floor=dataset.floor_m or 0.0,
+    )
     return Unlabelled(clouds, part.ids)
 
 

@@ -1,9 +1,9 @@
 """What the clouds of training were like, and whether another cloud is like them.
 
 Five measures of a cloud, which its position, its size and a rotation about the up axis leave as
-they are (and its size, for nets that see metres), and for each the range in which the training
-clouds of source and target lie. A cloud
-outside one of them is one that the classifier was never asked about. This guarantees nothing: a
+they are (and its size and height, for nets that see these), and for each the range in which the
+training clouds of source and target lie. A cloud outside one of them is one that the classifier was
+never asked about. This guarantees nothing: a
 cloud inside all ranges can still show an object of no known class, and get a confident answer.
 """
 
@@ -29,6 +29,12 @@ MEASURES = {
 
 OF_METRES = {"size": "largest distance of a point from the centroid, in metres"}
 """Measured of clouds that keep their size: a net would say something of millimetres, too."""
+
+OF_HEIGHTS = {"base": "height of its lowest point above the floor, in metres"}
+"""Measured of clouds that keep their height, too: a floor in the wrong place shows here."""
+
+ALL = (*MEASURES, *OF_METRES, *OF_HEIGHTS)
+"""Names of all there are."""
 
 _TAIL = 0.001  # of the clouds of a domain, on either side
 _MOST = 1000  # clouds that are measured of a domain; 3 ms each
@@ -59,11 +65,15 @@ def measure(stored: Float[np.ndarray, "p 3"], sample: Float[np.ndarray, "m 3"]) 
 
 
 def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
-    """The `MEASURES` of a cloud in its sample number 0, with `OF_METRES` if it is in metres."""
+    """The `MEASURES` of a cloud in its sample number 0, and those that its scale adds."""
     row = clouds.rows[index]
     sample = clouds.in_unit_ball().take(torch.tensor([index]))[0].numpy()
     found = measure(np.asarray(clouds.stored[row]), sample)
-    return {**found, "size": float(clouds.radius[row])} if clouds.scale == "metres" else found
+    if clouds.scale != "unit_ball":
+        found["size"] = float(clouds.radius[row])
+    if clouds.scale == "above_floor":
+        found["base"] = float(np.asarray(clouds.stored[row])[:, 2].min() - clouds.floor)
+    return found
 
 
 def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:

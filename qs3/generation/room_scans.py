@@ -7,13 +7,15 @@ annotator draws its mask, and `qs3.data.frames.cutting` cuts by the same rules a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Bool
 
 from qs3.config.checks import check_ranges
 from qs3.data.frames.cutting import cut, inliers, own_pixels
 from qs3.data.frames.images import DepthImage, Pinhole
+from qs3.data.frames.pieces import pieces
 from qs3.data.frames.rules import Rules
 from qs3.errors import ConfigError
 from qs3.generation.camera_poses import direction
@@ -100,6 +102,9 @@ class RoomScan:
         mask: how carelessly the mask is drawn.
         rules: by which it is cut, and when it is refused.
         points: of the final cloud; a smaller one repeats points.
+        torn: probability that of an object which depth edges tear apart only one piece is cut: who
+            splits masks where the depth jumps and joins nothing has a chair's back and its seat as
+            two chairs.
         attempts: pictures that are taken, each from elsewhere, until one is not refused.
         clean: also make the twin from the true depth of what is seen.
         views: 1, the only number of views there is.
@@ -112,13 +117,14 @@ class RoomScan:
     mask: MaskCrop = field(default_factory=MaskCrop)
     rules: Rules = field(default_factory=Rules)
     points: int = 2048
+    torn: float = 0.0
     attempts: int = 12
     clean: bool = True
     views: int = 1
     needs_renderer: bool = True
 
     def __post_init__(self) -> None:
-        check_ranges(self, "recipe.", points=">= 1", attempts=">= 1")
+        check_ranges(self, "recipe.", points=">= 1", attempts=">= 1", torn="[0, 1]")
         if self.views != 1:
             raise ConfigError(f"views={self.views}: a scan of a room is one view; leave views out")
         if not isinstance(self.mask, MaskCrop):
@@ -145,9 +151,15 @@ class RoomScan:
             if frame is None:
                 continue
             image, mask = depth_image(frame, pose), self.mask.keep(frame, rng)
-            piece = cut(image, mask, cls, self.rules)
+            own, _, _ = own_pixels(image, mask, self.rules)
+            rules, edge_px = self.rules, None
+            apart = object_rng(seed, object_id, 1 + attempt, 1)  # not of those that exist without
+            if apart.random() < self.torn:
+                mask, edge_px = one_piece(image, own, cls, rules, apart), 0
+                rules = replace(rules, join_m=0.0)
+                own = mask
+            piece = cut(image, mask, cls, rules, edge_px)
             if not piece.refused:
-                own, _, _ = own_pixels(image, mask, self.rules)
                 if self.rules.drop_outliers:
                     own[own] = inliers(image.points_m[own], self.rules)
                 return self._cloud(frame, own, pose, object_id, keep)
@@ -177,6 +189,23 @@ class RoomScan:
             save_view(keep.views, object_id, 0, frame, pose, pose)
         preview = preview_of(frame) if object_id in keep.previews else {}
         return Cloud(arrays, 1, len(points), (frame,), preview)
+
+
+def one_piece(
+    image: DepthImage,
+    own: Bool[np.ndarray, "h w"],
+    cls: str,
+    rules: Rules,
+    rng: np.random.Generator,
+) -> Bool[np.ndarray, "h w"]:
+    """One of the pieces of an object's pixels that are large enough for its class, or the largest.
+
+    Nothing is joined: what a depth edge parts is two pieces, however near to each other they are.
+    """
+    number = pieces(own, image.depth_m, rules)
+    sizes = np.bincount(number[own])
+    enough = np.flatnonzero(sizes >= rules.limits_of(cls).pixels)
+    return number == (rng.choice(enough) if len(enough) else 0)
 
 
 def depth_image(frame: DepthFrame, world_from_camera: np.ndarray) -> DepthImage:

@@ -42,6 +42,8 @@ PREDICT = Command(
         Option("intrinsics", text("F,F,C,C|FILE"), "of the depth camera: fx,fy,cx,cy", ""),
         Option("depth_scale", NUMBER, "metres a unit (default: 0.001; 1 of floats)"),
         Option("up", text("AXIS|X,Y,Z"), "clouds: x y z -x -y or -z; depth: see below", ""),
+        Option("floor", NUMBER, "clouds: where the floor is on that axis, in metres"),
+        Option("camera_height", NUMBER, "depth: of the camera above the floor, in metres"),
         Option("part", text("NAME"), "of an archive of objects: this part alone", ""),
         Option("sample", whole(), "only so many, drawn at random, always the same ones"),
         Option("out", text("FILE"), ".csv or .json", "predictions.csv"),
@@ -58,8 +60,10 @@ PREDICT = Command(
     ),
     about="""
 CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of points,
-any unit, any place. Other files are passed over. Which way is up is not guessed (default z), and
-the wrong axis costs most of the accuracy. Labels: the file's own, or a folder called as a class.
+any unit, any place. A net that knows sizes takes them as metres; one that knows heights wants
+floor=, which is 0 if objects stand on z = 0. Other files are passed over. Which way is up is not
+guessed (default z), and the wrong axis costs most of the accuracy. Labels: the file's own, or a
+folder called as a class.
 
 DEPTH IMAGES are .png of 16 bits, in millimetres, or .npy; 0 is not measured. A mask has 0 where no
 object is and a number for each object. A list is .csv, .json or .yaml with a row an object or a
@@ -67,7 +71,7 @@ picture: depth, mask, object (number in the mask), box, intrinsics, up, depth_sc
 are relative to it, and what is empty holds as given here. up=x,y,z is up in the camera's frame (x
 right, y down, z forward), at any length: what an accelerometer at rest reads, in these axes. -y is
 a level camera. Without it up is fitted to the planes of the picture, else the camera counts as
-level; the column up says which.
+level; the column up says which. camera_height= is for nets that know heights above the floor.
 
 A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status, class,
 confidence, label, points, dropped, tier, caution, up, out_of_range, reason, and p_<class>, a

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from qs3.config.checks import check_choice
+from qs3.config.checks import check_choice, check_float
 from qs3.data.frames.pointed import LEVEL, PLANES
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError, DataError
@@ -50,6 +50,8 @@ class Settings:
         mask, box, intrinsics: of depth images; see `qs3.inference.depth_list`.
         depth_scale: metres a unit; None: by the kind of numbers.
         up: the axis that points up in clouds (z if ""), or a direction in the depth camera's frame.
+        floor: where the floor is in clouds along that axis, in metres; None: not known.
+        camera_height: of the depth images' camera above the floor, in metres; likewise.
         part: of an archive; "" for all.
         sample: so many of the files, images or objects, drawn at random; None: all.
         out: .csv or .json.
@@ -67,6 +69,8 @@ class Settings:
     intrinsics: str = ""
     depth_scale: float | None = None
     up: str = ""
+    floor: float | None = None
+    camera_height: float | None = None
     part: str = ""
     sample: int | None = None
     out: str = "predictions.csv"
@@ -78,11 +82,15 @@ class Settings:
     def __post_init__(self) -> None:
         if bool(self.input) == bool(self.depth):
             raise ConfigError("give input=PATH for clouds, or depth=PATH for depth images")
-        of_depth = {"mask", "box", "intrinsics", "depth_scale"}
+        of_depth = {"mask", "box", "intrinsics", "depth_scale", "camera_height"}
         if odd := [key for key in sorted(of_depth) if getattr(self, key) and not self.depth]:
             raise ConfigError(f"{odd[0]}= is for depth images; give depth=IMAGE, not input=")
         if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
             raise ConfigError(f"depth_scale={self.depth_scale:g}: metres a unit, in (0, 1]")
+        if self.depth and self.floor is not None:
+            raise ConfigError("floor= is for clouds; of depth images give camera_height=METRES")
+        if self.camera_height is not None:
+            check_float("camera_height", self.camera_height, ">= 0")
         if self.input:
             check_choice("up", self.up or "z", UP_AXES)
         if Path(self.out).suffix.lower() not in (".csv", ".json"):
@@ -110,6 +118,12 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     predictor = load(settings.ckpt, device=settings.device)
     classes = predictor.classes
     inputs = find(predictor)
+    if predictor.needs_floor and inputs.kind == "files" and settings.floor is None:
+        raise ConfigError(
+            "the classifier knows heights above the floor, and nothing in these clouds tells where "
+            "it is: give floor=Z, 0 if objects stand on z = 0, minus the camera's height if the "
+            "camera is the origin"
+        )
     if settings.sample and settings.sample < len(inputs.units):
         drawn = np.random.default_rng(0).choice(len(inputs.units), settings.sample, replace=False)
         inputs = inputs._replace(units=[inputs.units[i] for i in sorted(drawn)])
@@ -123,7 +137,7 @@ def predict_command(settings: Settings) -> tuple[str, int]:
                 gallery.add(row, sample)
     seconds = time.monotonic() - began
     records = [record(row, classes) for row in rows]
-    lines = _told(rows, records, inputs, predictor, seconds)
+    lines = _told(rows, records, inputs, predictor, settings, seconds)
     if out.suffix.lower() == ".json":
         text = as_json(records, classes, predictor.result.target)
     else:
@@ -202,12 +216,13 @@ def predict_units(
     threads_before = torch.get_num_threads()
     pool = ThreadPoolExecutor(settings.threads, initializer=torch.set_num_threads, initargs=(1,))
     running: deque[Future[list[tuple[Row, Sample | None]]]] = deque()
-    net = predictor.net
+    net, height = predictor.net, settings.camera_height
+    floor = settings.floor if height is None else -height
     try:
         # Once for all: threads that change and restore a net's domain would do it to one another.
         with use_domain(net, norms_for(net, "target")):
             for batch in _batches(units, settings.batch_size, advance):
-                running.append(pool.submit(_judged, predictor, batch))
+                running.append(pool.submit(_judged, predictor, batch, floor))
                 if len(running) > 2 * settings.threads:
                     yield from running.popleft().result()
             while running:
@@ -233,7 +248,9 @@ def _batches(
         yield batch
 
 
-def _judged(predictor: Predictor, batch: Sequence[Row | Sample]) -> list[tuple[Row, Sample | None]]:
+def _judged(
+    predictor: Predictor, batch: Sequence[Row | Sample], floor: float | None
+) -> list[tuple[Row, Sample | None]]:
     """The rows of a batch: each cloud prepared, and one pass of the net."""
     prepared: dict[int, tuple[Sample, Prepared]] = {}
     rows: dict[int, tuple[Row, Sample | None]] = {}
@@ -242,7 +259,7 @@ def _judged(predictor: Predictor, batch: Sequence[Row | Sample]) -> list[tuple[R
             rows[i] = item, None
             continue
         try:
-            prepared[i] = item, predictor.prepare(item.cloud, item.name, item.axis)
+            prepared[i] = item, predictor.prepare(item.cloud, item.name, item.axis, floor)
         except DataError as error:
             rows[i] = item.row(reason_of(error, item.name), None), None
     if prepared:
@@ -258,6 +275,7 @@ def _told(
     records: Sequence[Mapping[str, Any]],
     inputs: Inputs,
     predictor: Predictor,
+    settings: Settings,
     seconds: float,
 ) -> list[str]:
     """What was done, for the terminal."""
@@ -286,6 +304,13 @@ def _told(
         )
     if predictor.in_metres and inputs.kind == "files":
         lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
+    if predictor.needs_floor and settings.floor is None and settings.camera_height is None:
+        height = -(predictor.result.floor_m or 0.0)
+        lines.append(
+            f"the classifier knows heights: the camera counts as {height:g} m above the floor ("
+            + ("camera_height=" if settings.depth else "floor=")
+            + " says otherwise)"
+        )
     if predictor.result.gravity == "none" and inputs.kind != "depth images":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
     if inputs.others:

@@ -84,10 +84,14 @@ def export_command(ckpt: str | Path, out: str | Path, threads: int = 1) -> str:
     """Export the classifier of a run (or its result.pt) and compare; text for the terminal."""
     from qs3.inference.command import saved
 
+    before = torch.get_num_threads()
     torch.set_num_threads(check_int("threads", threads, 1))
-    predictor = load(ckpt)
-    replaces = Path(out).expanduser().exists()
-    compared = export(predictor, out)
+    try:
+        predictor = load(ckpt)
+        replaces = Path(out).expanduser().exists()
+        compared = export(predictor, out)
+    finally:
+        torch.set_num_threads(before)  # of the whole process: sums of its next net would differ
     how = f"onnxruntime.InferenceSession({str(out)!r})"
     if Path(out).suffix == ".pt2":
         how = f"torch.export.load({str(out)!r}).module()"
@@ -172,6 +176,8 @@ def metadata(predictor: Predictor) -> dict[str, str]:
     )
     if predictor.in_metres:
         unit, scaling = "metre: clouds keep their size", ""
+    if predictor.needs_floor:
+        scaling = " from x and y, and the floor's height from z"
     return {
         "qs3": VERSION,
         "classes": json.dumps(list(predictor.classes)),

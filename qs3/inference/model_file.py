@@ -19,7 +19,7 @@ from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationE
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.evaluation.ood import MEASURES, OF_METRES
+from qs3.evaluation.ood import ALL as MEASURES_OF_CLOUDS
 from qs3.runs.checkpoints import save
 from qs3.utils.version import VERSION
 
@@ -53,10 +53,9 @@ def _different(value: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _ranges(value: dict[str, list[float]]) -> dict[str, list[float]]:
-    if not set(value) <= {*MEASURES, *OF_METRES} or any(
-        math.isnan(x) for ends in value.values() for x in ends
-    ):
-        raise ValueError(f"should be [low, high] of {', '.join({**MEASURES, **OF_METRES})}")
+    odd = any(math.isnan(x) for ends in value.values() for x in ends)
+    if odd or not set(value) <= {*MEASURES_OF_CLOUDS}:
+        raise ValueError(f"should be [low, high] of {', '.join(MEASURES_OF_CLOUDS)}")
     return value
 
 
@@ -75,9 +74,11 @@ class Result:
         stored_points: of a cloud of the target as it is stored, before sampling.
         target: name of the domain it was adapted to.
         gravity: the axis that points up in the clouds, "z"; "none": camera frame.
-        scale: of a cloud as the net sees it: "unit_ball", or "metres" if it knows sizes.
+        scale: of a cloud as the net sees it: "unit_ball", "metres" if it knows sizes, or
+            "above_floor" if it knows heights, too.
         usual: of each measure of `qs3.evaluation.ood` the range in training, [low, high].
         weights: of the net.
+        floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
     """
 
     model: Annotated[dict[str, Any], AfterValidator(_model)]
@@ -86,9 +87,10 @@ class Result:
     stored_points: _Points
     target: str
     gravity: Annotated[str, Field(pattern="^(z|none)$")]
-    scale: Annotated[str, Field(pattern="^(unit_ball|metres)$")]
+    scale: Annotated[str, Field(pattern="^(unit_ball|metres|above_floor)$")]
     usual: Annotated[dict[str, _Ends], AfterValidator(_ranges)]
     weights: Annotated[dict[str, Tensor], Field(min_length=1)]
+    floor_m: Annotated[float, Field(strict=True, allow_inf_nan=False)] | None = None
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
 
@@ -196,7 +198,10 @@ def _checked(file: Path, found: Any) -> Result:
         first = error.errors()[0]
         place, why = ".".join(map(str, first["loc"])) or "the file", first["msg"]
     else:
-        if result.points <= result.stored_points:
+        if result.points > result.stored_points:
+            place, why = "points", "should be at most stored_points"
+        elif (result.scale == "above_floor") != (result.floor_m is not None):
+            place, why = "floor_m", "should be a number for scale above_floor, and for no other"
+        else:
             return result
-        place, why = "points", "should be at most stored_points"
     raise DataError(f"{file} is not a result that qs3 wrote, or damaged: {place}: {why}")

@@ -2,18 +2,20 @@
 
     predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
     probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up;
-                                                   # in metres if predictor.in_metres
+                                                   # in metres if predictor.in_metres, and with
+                                                   # floor= if predictor.needs_floor
     objects = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
 
 A cloud goes the way of the target's clouds in the run: thinned to as many points as these were
 stored with (farthest points from the first one on), or filled up by repeating its points from the
-first on; put into the unit ball, or of a net that sees metres only centred; and of it the farthest
-`points` points. The test clouds of a run
-get the probabilities of its predictions.csv.
+first on; put into the unit ball, or of a net that sees metres only centred, or of one that sees
+heights put over the floor; and of it the farthest `points` points. The test clouds of a run get the
+probabilities of its predictions.csv.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.clouds.files import checked
+from qs3.config.checks import check_float
 from qs3.data.frames.given import Intrinsics, check_intrinsics
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import Pointed, point_out
@@ -44,7 +47,8 @@ class Prepared(NamedTuple):
     """A cloud as the net sees it.
 
     Attributes:
-        points: [m, 3] about the centroid, in the unit ball or in metres.
+        points: [m, 3] about the centroid, in the unit ball or in metres; for a net that sees
+            heights z is that above the floor.
         given: how many points there were.
         strange: how it differs from the clouds of training, as text; see `qs3.evaluation.ood`.
     """
@@ -108,18 +112,33 @@ class Predictor:
     @property
     def in_metres(self) -> bool:
         """Whether it sees how large clouds are: then they must be in metres."""
-        return self.result.scale == "metres"
+        return self.result.scale != "unit_ball"
 
-    def prepare(self, cloud: np.ndarray, name: str = "the cloud", up: str = "z") -> Prepared:
+    @property
+    def needs_floor(self) -> bool:
+        """Whether it sees how high above the floor clouds are: then it must know where that is."""
+        return self.result.floor_m is not None
+
+    def prepare(
+        self,
+        cloud: np.ndarray,
+        name: str = "the cloud",
+        up: str = "z",
+        floor: float | None = None,
+    ) -> Prepared:
         """A cloud [n, >= 3] of any n >= 1 as the net sees it.
 
         Args:
             cloud: x y z in any unit; in metres if the net sees sizes (`in_metres`).
             name: for messages: its file.
             up: the axis that points up in it: x, y, z, -x, -y or -z.
+            floor: where the floor is along that axis, in metres: minus the camera's height where
+                the camera is the origin. For nets that see heights (`needs_floor`); None: as in the
+                target that it was trained for.
 
         Raises:
             DataError: no points, or NaN or infinite coordinates; says which.
+            ConfigError: `floor` is no number.
         """
         cloud = _array(cloud, name)
         if cloud.ndim != 2 or cloud.shape[1] < 3:
@@ -132,10 +151,17 @@ class Predictor:
         whole = stored[None]  # [1, P, 3]
         some = self.points < rules.points
         order = sample(whole, self.points, 1) if some else None
-        one = Clouds.of(whole, order, self.result.scale)
+        one = Clouds.of(whole, order, self.result.scale, self._floor(floor))
         usual = relax_min_points(self.result.usual, self.points)
         found = ood_reasons(measure_one(one, 0), usual)
         return Prepared(one.all()[0], len(cloud), tuple(found))
+
+    def _floor(self, given: float | None) -> float:
+        if given is None:
+            return self.result.floor_m or 0.0
+        if not math.isfinite(floor := check_float("floor", given)):
+            raise ConfigError(f"floor={floor}: expected metres")
+        return floor
 
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
@@ -154,6 +180,7 @@ class Predictor:
         *,
         names: Sequence[str] | None = None,
         up: str = "z",
+        floor: float | None = None,
         batch_size: int = BATCH,
     ) -> Float[np.ndarray, "n c"]:
         """Class probabilities of clouds, float64, a row a cloud.
@@ -163,6 +190,7 @@ class Predictor:
                 in `prepare`.
             names: theirs, for messages; None counts them from 0.
             up: the axis that points up in them.
+            floor: where the floor is in them, as in `prepare`.
             batch_size: clouds that the net sees at a time.
 
         Raises:
@@ -179,7 +207,8 @@ class Predictor:
         names = [f"cloud {i}" for i in range(len(arrays))] if names is None else names
         if not arrays:
             return np.empty((0, len(self.classes)))
-        ready = [self.prepare(c, name, up).points for c, name in zip(arrays, names, strict=True)]
+        pairs = zip(arrays, names, strict=True)
+        ready = [self.prepare(cloud, name, up, floor).points for cloud, name in pairs]
         return self.probabilities(torch.stack(ready), batch_size)
 
     def predict_depth(
@@ -190,6 +219,7 @@ class Predictor:
         mask: np.ndarray | None = None,
         box: Sequence[float] | None = None,
         up: Sequence[float] | None = None,
+        camera_height: float | None = None,
     ) -> list[DepthPrediction]:
         """The classes of the objects of a mask, one a number, or of what lies in a box.
 
@@ -200,6 +230,8 @@ class Predictor:
             box: left, top, right, bottom in pixels.
             up: in the camera's frame (x right, y down, z forward), any length; None: by the planes
                 of the picture, and where it shows none, up in the picture.
+            camera_height: above the floor, in metres, for nets that see heights; None: as in the
+                target that it was trained for.
 
         Returns:
             In the order of the mask's numbers.
@@ -219,9 +251,12 @@ class Predictor:
             camera = Pinhole(*values)
         check_intrinsics(Intrinsics(camera), depth, "the depth image")
         found = point_out(depth, camera, mask=mask, box=box, up=up)
-        return [self._of_depth(one) for one in found]
+        floor = (
+            None if camera_height is None else -check_float("camera_height", camera_height, ">= 0")
+        )
+        return [self._of_depth(one, floor) for one in found]
 
-    def _of_depth(self, one: Pointed) -> DepthPrediction:
+    def _of_depth(self, one: Pointed, floor: float | None) -> DepthPrediction:
         points, cautions = one.piece.points_m, tuple(caution.words for caution in one.cautions)
         if one.why:
             nothing = np.full(len(self.classes), np.nan)
@@ -229,7 +264,7 @@ class Predictor:
             return DepthPrediction(
                 one.name, "", float("nan"), nothing, points, one.tier, said, one.up, ()
             )
-        ready = self.prepare(one.cloud(self.result.gravity), one.name)
+        ready = self.prepare(one.cloud(self.result.gravity), one.name, floor=floor)
         (each,) = self.probabilities(ready.points[None])
         best = int(each.argmax())
         return DepthPrediction(

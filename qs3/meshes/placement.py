@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from qs3.config.checks import check_ranges
+from qs3.config.checks import check_float, check_ranges
 from qs3.errors import ConfigError, MeshError
 from qs3.meshes.mesh import Mesh
 
@@ -63,16 +63,21 @@ class OnFurniture(RealSize):
     Attributes:
         stands_m: by class the lowest and highest top that they stand on; things of a class that is
             not here stand on the floor. The class is the first word of the id.
-        raised: probability that a thing of these classes does not stand on the floor.
+        raised: by class the probability that a thing of it does not stand on the floor; 0 of one
+            that is not here.
         tallest_m: taller ones always do, as floor lamps and trees.
     """
 
     stands_m: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    raised: float = 0.5
+    raised: Mapping[str, float] = field(default_factory=dict)
     tallest_m: float = 1.0
 
     def __post_init__(self) -> None:
-        check_ranges(self, "recipe.placing.", raised="[0, 1]", tallest_m="> 0")
+        check_ranges(self, "recipe.placing.", tallest_m="> 0")
+        for cls, chance in self.raised.items():
+            check_float(f"recipe.placing.raised.{cls}", chance, "[0, 1]")
+            if cls not in self.stands_m:
+                raise ConfigError(f"recipe.placing.raised.{cls}: on what? Give stands_m.{cls}, too")
         for cls, ends in self.stands_m.items():
             if len(ends) != 2 or not 0 < ends[0] <= ends[1]:
                 raise ConfigError(
@@ -83,8 +88,9 @@ class OnFurniture(RealSize):
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A turned copy on the floor or above it."""
         placed = super().place(mesh, rng, object_id)
-        raised, height = rng.random() < self.raised, rng.random()
-        ends = self.stands_m.get(object_id.split("/")[0])
+        cls = object_id.split("/")[0]
+        raised, height = rng.random() < self.raised.get(cls, 0.0), rng.random()
+        ends = self.stands_m.get(cls)
         if ends is None or not raised or placed.bounds[1, 2] > self.tallest_m:
             return placed
         low, high = ends

@@ -36,6 +36,12 @@ UNIT_BALL_ONLY = {
 }
 """Parts that cannot see metres, by name (their modules import torch), and why."""
 
+CENTRED_ONLY = {
+    "qs3.methods.gast.Gast": "it turns parts of clouds about their middle",
+    "qs3.methods.defrec.DefRec": "it deforms parts of clouds in a cube about their middle",
+}
+"""Parts that cannot see heights, likewise."""
+
 _SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
 
 
@@ -220,18 +226,22 @@ def _check_rounds(run: Run) -> None:
 
 
 def _check_scale(run: Run) -> None:
-    """Refuse metres for clouds that have none, and for parts that assume the unit ball."""
+    """Refuse metres or heights for clouds that have none, and for parts that cannot see them."""
     cfg = run.cfg
     used = (run.target,) if _is_upper_bound(cfg) else (run.source, run.target)
     for domain in used:
         domain.check_scale(cfg.data.scale)
-    for group in ("method", "model"):
-        why = UNIT_BALL_ONLY.get(cfg[group].get("_target_"))
-        if why and cfg.data.scale != "unit_ball":
-            raise ConfigError(
-                f"data.scale={cfg.data.scale} and {group}={component_names(cfg)[group]}: {why}; "
-                f"set data.scale=unit_ball, or choose another {group}"
-            )
+    for table, allowed in (
+        (UNIT_BALL_ONLY, ("unit_ball",)),
+        (CENTRED_ONLY, ("metres", "unit_ball")),
+    ):
+        for group in ("method", "model"):
+            why = table.get(cfg[group].get("_target_"))
+            if why and cfg.data.scale not in allowed:
+                raise ConfigError(
+                    f"data.scale={cfg.data.scale} and {group}={component_names(cfg)[group]}: {why};"
+                    f" set data.scale={allowed[0]}, or choose another {group}"
+                )
 
 
 def _warn_of_one_domain(run: Run) -> None:

@@ -136,7 +136,13 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         scale=run.cfg.data.scale,
         usual=limits(loaded.data.all_labelled, loaded.data.target.clouds),
         weights=copy_weights(outcome.net),
+        floor_m=_floor(run),
     )
+
+
+def _floor(run: Run) -> float | None:
+    floor = run.target.floor_m
+    return float(floor) if run.cfg.data.scale == "above_floor" and floor is not None else None
 
 
 def _write_of_files(run: Run, loaded: Loaded, outcome: Outcome) -> None:

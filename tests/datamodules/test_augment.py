@@ -56,7 +56,7 @@ def test_all_off_changes_nothing():
     [
         *({"scale": 0.5}, {"shift": -1.0}, {"jitter_clip": -0.1}),
         *({"crop": 0.0}, {"crop": 1.1}, {"crop": float("nan")}),
-        *({"drop_regions": 4}, {"drop_regions": -1}, {"drop_regions": 1.5}),
+        *({"drop_regions": 4}, {"drop_regions": -1}, {"drop_regions": True}),
     ],
 )
 def test_wrong_settings(settings):
@@ -123,8 +123,8 @@ def test_dropping_comes_before_the_rest_and_off_draws_nothing():
 
 def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
     points = torch.rand(64, 50, 3, generator=generator(2), dtype=torch.float64)
-    cut = crop(points, 0.4, generator(1), unit_ball=False)
-    again = crop(points, 0.4, generator(1), unit_ball=False)
+    cut = crop(points, 0.4, generator(1), scale="metres")
+    again = crop(points, 0.4, generator(1), scale="metres")
     assert torch.equal(cut, again)
     shares = []
     for before, after in zip(points, cut, strict=True):
@@ -150,12 +150,38 @@ def test_a_cut_leaves_what_lies_on_one_side_of_a_plane():
     assert 0.6 < sum(shares) / 64 < 0.8
 
 
+def test_a_cut_over_the_floor_leaves_heights_alone():
+    points = torch.rand(16, 80, 3, generator=generator()) + torch.tensor([0.0, 0.0, 1.0])
+    centred, over = (crop(points, 0.3, generator(1), scale) for scale in ("metres", "above_floor"))
+    for before, after in zip(points, over, strict=True):
+        assert set(after[:, 2].tolist()) <= set(before[:, 2].tolist())
+    assert torch.equal(centred[..., :2], over[..., :2])
+    assert not torch.equal(centred[..., 2], over[..., 2])
+
+
+def test_a_lift_moves_each_cloud_up_or_down_as_a_whole():
+    points = torch.rand(4000, 5, 3, generator=generator())
+    augment = Augment(rotate_z=False, jitter_sigma=0.0, lift=0.2)
+    moved = augment(points, generator(), "above_floor") - points
+    assert torch.equal(moved[..., :2], torch.zeros(4000, 5, 2))
+    by = moved[..., 2]
+    assert torch.allclose(by, by[:, :1].expand(-1, 5), atol=1e-6)
+    assert by.min() >= -0.2 - 1e-6
+    assert by.max() <= 0.2 + 1e-6
+    assert float(by[:, 0].mean()) == pytest.approx(0, abs=0.006)
+    assert float(by[:, 0].std()) == pytest.approx(0.2 / 3**0.5, rel=0.03)
+    with pytest.raises(ConfigError, match=r"protocol\.augment\.lift"):
+        Augment(lift=-0.1)
+
+
 def test_a_cut_cloud_fills_the_unit_ball_again_unless_it_has_a_size():
     points = torch.rand(16, 80, 3, generator=generator()) - 0.5
-    assert torch.allclose(crop(points, 0.3, generator(), True).norm(dim=2).amax(1), torch.ones(16))
-    metres = crop(points, 0.3, generator(), False)
+    assert torch.allclose(
+        crop(points, 0.3, generator(), "unit_ball").norm(dim=2).amax(1), torch.ones(16)
+    )
+    metres = crop(points, 0.3, generator(), "metres")
     assert (metres.norm(dim=2).amax(1) < 0.95).all()
     augment = Augment(crop=0.3, rotate_z=False, jitter_sigma=0.0)
-    assert torch.equal(augment(points, generator(), unit_ball=False), metres)
+    assert torch.equal(augment(points, generator(), scale="metres"), metres)
     one = torch.ones(2, 5, 3)  # all points at one place: nothing to divide by
-    assert torch.equal(crop(one, 0.3, generator(), True), torch.zeros(2, 5, 3))
+    assert torch.equal(crop(one, 0.3, generator(), "unit_ball"), torch.zeros(2, 5, 3))

@@ -52,6 +52,18 @@ def test_in_metres_clouds_are_centred_and_keep_their_size():
     assert np.array_equal(ball.all().numpy(), unit_ball(stored))
 
 
+def test_above_the_floor_clouds_keep_their_height_and_no_other_place():
+    corners = np.array([[0, 0, 0], [4, 0, 0], [0, 2, 1], [4, 2, 1]], dtype=np.float32)
+    stored = np.stack([corners, 2 * corners]) + np.float32([8, 8, -0.75])
+    clouds = Clouds.of(stored, scale="above_floor", floor=-1.25)
+    about = np.array([[-2, -1, 0.5], [2, -1, 0.5], [-2, 1, 1.5], [2, 1, 1.5]])
+    assert np.array_equal(clouds.all()[0].numpy(), about)
+    assert clouds.all()[1, :, 2].tolist() == [0.5, 0.5, 2.5, 2.5]
+    order = np.array([[[3, 0]], [[1, 2]]], dtype=np.int16)
+    some = Clouds.of(stored, order, "above_floor", -1.25).at(np.array([0])).all()
+    assert np.array_equal(some[0].numpy(), about[[3, 0]])
+
+
 def test_a_batch_is_a_copy(mapped):
     mapped.take(torch.tensor([1])).zero_()
     assert np.array_equal(mapped.stored, STORED)

@@ -12,12 +12,13 @@ from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
 from qs3.data.domain import Domain
+from qs3.data.inspection.open_dataset import compose_domain
 from qs3.data.store import PointSet, open_pointset
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
-from qs3.datamodules.splits import Labelled, Unlabelled
+from qs3.datamodules.splits import Labelled, Unlabelled, load_clouds
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import unit_ball
 from tests.training.search import Truth, search
@@ -224,6 +225,21 @@ def test_batches_in_metres_keep_the_clouds_sizes(data_dir):
     np.testing.assert_allclose(batch["points"].numpy(), centred, atol=1e-5)
     with pytest.raises(ConfigError, match="domain specklenet10 are not in metres"):
         adaptation(data_dir, scale="metres")
+
+
+def test_heights_are_taken_from_the_domain_s_floor(data_dir):
+    domain = compose_domain("kinectsim10", {"paths.data_dir": str(data_dir), "floor_m": "-0.5"})
+    data = DomainData(domain, points=64, fps_starts=1, scale="above_floor")
+    data.setup()
+    (batch,) = data.test_dataloader()
+    stored = open_pointset(data_dir / "kinectsim10").split("test").points.astype(np.float64)
+    found = batch["points"].double().numpy()
+    np.testing.assert_allclose(found[..., 2], stored[..., 2] + 0.5, atol=1e-5)
+    np.testing.assert_allclose(found[..., :2].mean(axis=1), 0, atol=1e-5)
+    with pytest.raises(ConfigError, match=r"kinectsim10 \(its key `floor_m`\)"):
+        DomainData("kinectsim10", scale="above_floor", data_dir=data_dir)
+    with pytest.raises(ConfigError, match="kinectsim10: nobody knows where the floor is"):
+        load_clouds(open_pointset(data_dir / "kinectsim10"), "test", 64, scale="above_floor")
 
 
 def test_training_clouds_are_divided_once(data_dir):

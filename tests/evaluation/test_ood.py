@@ -119,6 +119,19 @@ def test_of_clouds_in_metres_the_size_counts_too():
     assert reason.startswith("size ")
 
 
+def test_of_clouds_over_the_floor_the_lowest_point_counts_too():
+    rng = np.random.default_rng(0)
+    clouds = rng.uniform(size=(300, 128, 3)).astype(np.float32)
+    over = prepare(clouds, 64, scale="above_floor", floor=-1.0)
+    assert measure_one(over, 7)["base"] == pytest.approx(clouds[7, :, 2].min() + 1, abs=1e-6)
+    usual = limits(over)
+    assert [*usual] == [*MEASURES, "size", "base"]
+    assert ood_reasons(measure_one(over, 7), usual) == []
+    other = prepare(clouds[7:8], 64, scale="above_floor", floor=0.5)
+    (reason,) = ood_reasons(measure_one(other, 0), usual)
+    assert reason.startswith("base -0.4")
+
+
 def test_what_is_strange_is_named():
     rng = np.random.default_rng(0)
     ends = limits(domain(rng, 300, (1, 1, 1)))

@@ -13,12 +13,14 @@ from scipy.spatial import ConvexHull
 from trimesh.proximity import closest_point_naive
 
 from qs3.config.hydra import build
+from qs3.data.frames.images import DepthImage, Pinhole
+from qs3.data.frames.rules import Limits, Rules
 from qs3.data.inspection.surface import surfaces_of
 from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import TooFewPointsError
-from qs3.generation.room_scans import RoomCamera
+from qs3.generation.room_scans import RoomCamera, one_piece
 from qs3.generation.scenes import Room, Support
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
 from qs3.meshes.catalogue import Catalogue
@@ -132,18 +134,20 @@ def lamp(made):
     raise AssertionError
 
 
-def test_things_that_stand_on_others_do_so_half_of_the_time(made, lamp):
+def test_things_stand_on_others_as_often_as_is_said(made, lamp):
     place = made.recipe.placing.place
+    for cls, least, most in (("lamp", 150, 188), ("plant", 70, 130), ("monitor", 178, 199)):
+        lows = np.array([place(lamp.mesh, _rng(s), f"{cls}/x").bounds[0, 2] for s in range(200)])
+        assert least < (lows > 1e-9).sum() < most
     lows = np.array([place(lamp.mesh, _rng(s), "lamp/x").bounds[0, 2] for s in range(200)])
     raised = lows > 1e-9
-    assert 70 < raised.sum() < 130
     assert 0.4 <= lows[raised].min() < lows[raised].max() <= 0.8
     assert not any(place(made.mesh, _rng(s), "chair/x").bounds[0, 2] for s in range(20))
     floor_lamp = Mesh(
         lamp.mesh.vertices * [1, 1, 1.01 / np.ptp(lamp.mesh.bounds[:, 2])], lamp.mesh.faces
     )
     assert not any(place(floor_lamp, _rng(s), "lamp/x").bounds[0, 2] for s in range(20))
-    always = replace(made.recipe.placing, raised=1.0, tallest_m=2.0)
+    always = replace(made.recipe.placing, raised={"lamp": 1.0}, tallest_m=2.0)
     assert all(always.place(floor_lamp, _rng(s), "lamp/x").bounds[0, 2] >= 0.4 for s in range(20))
 
 
@@ -152,7 +156,11 @@ def test_things_that_stand_on_others_do_so_half_of_the_time(made, lamp):
     [
         (lambda: OnFurniture(stands_m={"lamp": (0.8, 0.4)}), r"stands_m\.lamp=\[0\.8, 0\.4\]"),
         (lambda: OnFurniture(stands_m={"lamp": (0.8,)}), r"expected \[lowest, highest\]"),
-        (lambda: OnFurniture(raised=1.5), r"recipe\.placing\.raised must be in \[0, 1\]"),
+        (
+            lambda: OnFurniture(stands_m={"lamp": (0.4, 0.8)}, raised={"lamp": 1.5}),
+            r"recipe\.placing\.raised\.lamp must be in \[0, 1\]",
+        ),
+        (lambda: OnFurniture(raised={"lamp": 1}), r"raised\.lamp: on what\? Give stands_m\.lamp"),
         (lambda: Support(min_leg_m=0.1), r"min_leg_m <= max_leg_m must hold, got 0\.1 and 0\.08"),
         (lambda: Support(block=2), r"scene\.support\.block must be in"),
     ],
@@ -239,6 +247,62 @@ def test_a_scan_of_a_raised_object_is_of_it_alone(cfg, made, lamp):
         ManifestRow(id=lamp.id, cls="lamp", split="train", mesh_sha256=lamp.mesh.sha256)
     )
     np.testing.assert_array_equal(found.vertices, lamp.placed.vertices)
+
+
+def board(height, x):
+    return trimesh.creation.box(
+        (0.04, 0.6, height),
+        transform=[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, height / 2], [0, 0, 0, 1]],
+    )
+
+
+def test_what_a_depth_edge_tears_apart_gives_one_of_its_pieces(made):
+    """A low board 30 cm before a high one, which the rules here join."""
+    both = trimesh.util.concatenate([board(0.5, 0.15), board(0.9, -0.15)])
+    mesh = Mesh(np.asarray(both.vertices), np.asarray(both.faces))
+    near = replace(
+        made.recipe.camera, min_distance_m=1.5, max_distance_m=2.0, spread=0.2, roll_deg=0
+    )
+    whole = replace(
+        made.recipe,
+        camera=near,
+        torn=0.0,
+        scene=Room(wall=0, max_clutter=0, max_occluders=0),
+        rules=replace(made.recipe.rules, join_m=0.5),
+    )
+    joined, alone = [], []
+    for seed in range(6):
+        placed = whole.placing.place(mesh, object_rng(seed, ID, 0), ID).vertices
+        ahead = placed[:8].mean(axis=0)[:2] - placed[8:].mean(axis=0)[:2]
+        middle = placed[:, :2].mean(axis=0)
+        sides = []
+        for recipe in (whole, replace(whole, torn=1.0)):
+            cloud = recipe.make(mesh, ID, seed, made.renderer).arrays["points_clean"]
+            sides.append(float(np.sign((cloud[:, :2] - middle) @ ahead).mean()))
+        if abs(sides[0]) < 0.9:  # both boards are seen: not from behind
+            joined.append(sides[0])
+            alone.append(sides[1])
+    assert len(joined) >= 4
+    assert sum(abs(side) == 1 for side in alone) > len(alone) / 2
+    assert {1.0, -1.0} <= {*alone}
+
+
+def test_a_piece_is_drawn_among_those_that_are_large_enough():
+    depth = np.full((60, 90), 2.0)
+    depth[:, 30:60], depth[:, 60:] = 2.4, 2.8
+    own = np.ones((60, 90), dtype=bool)
+    own[10:, 60:] = False  # 300 pixels, the others 1,800 each
+    image = DepthImage(depth, Pinhole(500, 500, 44.5, 29.5), np.eye(3))
+    rules = Rules(limits={"default": Limits(pixels=1000)})
+    drawn = [one_piece(image, own, "chair", rules, _rng(seed)) for seed in range(60)]
+    columns = [tuple(np.unique(np.nonzero(mask)[1])[[0, -1]]) for mask in drawn]
+    assert {*columns} == {(0, 29), (30, 59)}
+    assert 15 < columns.count((0, 29)) < 45
+    assert all(mask.sum() == 1800 for mask in drawn)
+    none = replace(rules, limits={"default": Limits(pixels=5000)})
+    own[:, 30:] = own[50:, :30] = False
+    assert np.array_equal(one_piece(image, own, "chair", none, _rng(0)), own)
+    assert not one_piece(image, np.zeros_like(own), "chair", rules, _rng(0)).any()
 
 
 def test_pieces_between_camera_and_object_cover_some_of_it():

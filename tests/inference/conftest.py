@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config import hashing
+from qs3.inference.model_file import read_result, write_result
+from qs3.inference.predictor import Predictor
 from qs3.training.command import train
 from tests.composing import compose
 from tests.training.toy import write_toy
@@ -30,6 +33,19 @@ def metric_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     """The same on clouds that keep their size."""
     metres = ("data.scale=metres", "data.source.unit=metres")
     return _trained(data_dir, tmp_path_factory.mktemp("metric"), *metres)
+
+
+@pytest.fixture
+def high_net(metric_run: Path, tmp_path: Path) -> Path:
+    """That net in a file that says it knows heights; see `over_the_floor`."""
+    result = read_result(metric_run)
+    write_result(tmp_path / "high.pt", replace(result, scale="above_floor", floor_m=-1.25))
+    return tmp_path / "high.pt"
+
+
+def over_the_floor(metric: Predictor) -> Predictor:
+    """The same net, as if it knew heights: 1.25 m above the floor in its target."""
+    return replace(metric, result=replace(metric.result, scale="above_floor", floor_m=-1.25))
 
 
 def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:

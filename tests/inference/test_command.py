@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 
 import qs3
 from qs3.data.store import open_pointset
@@ -98,6 +99,17 @@ def test_a_net_of_metres_says_how_it_took_the_files(metric_run, run, clouds, tmp
     np.testing.assert_allclose([probabilities(row) for row in table(out)], expected, atol=1e-6)
     assert predict(metric_run, tmp_path / "millimetres.npy", out, "page=false") == 0
     assert all("size " in row["reason"] for row in table(out))
+
+
+def test_a_net_of_heights_asks_where_the_floor_of_files_is(high_net, clouds, tmp_path, capsys):
+    np.save(tmp_path / "test.npy", clouds)
+    out = tmp_path / "said.csv"
+    assert predict(high_net, tmp_path / "test.npy", out, "page=false") == 1
+    assert "give floor=Z" in capsys.readouterr().err
+    assert predict(high_net, tmp_path / "test.npy", out, "page=false", "floor=0.25") == 0
+    expected = qs3.load(high_net)(list(clouds), floor=0.25)
+    np.testing.assert_allclose([probabilities(row) for row in table(out)], expected, atol=1e-6)
+    assert "camera counts as" not in capsys.readouterr().out
 
 
 def test_every_format_in_folders(run, clouds, tmp_path):
@@ -240,7 +252,9 @@ def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, 
     (tmp_path / "empty").mkdir()
     write(tmp_path / "a.xyz", clouds[0])
     places = {"run": run, "clouds": tmp_path / "a.xyz", "empty": tmp_path / "empty"}
+    threads = torch.get_num_threads()
     assert main([word.format(**places) for word in words]) == 1
+    assert torch.get_num_threads() == threads
     assert message.format(**places) in capsys.readouterr().err
     assert not (tmp_path / "model.onnx").exists()
     assert not (tmp_path / "predictions.csv").exists()

@@ -99,6 +99,27 @@ def test_each_object_of_a_mask_gets_what_the_net_says_of_its_cloud(run, frame, c
         predictor.predict_depth(depth, SHOT.camera, mask=mask)
 
 
+def test_the_camera_s_height_is_for_nets_that_know_heights(high_net, frame, capsys):
+    up = ",".join(map(str, SHOT.up_in_camera))
+    words = (f"depth={frame}/depth.png", f"mask={frame}/mask.png", f"intrinsics={CAMERA}")
+    words = (*words, f"up={up}", "page=false")
+    depth, mask = seen()
+    predictor, found = qs3.load(high_net), []
+    for height in (None, 1.25, 0.4):
+        more = () if height is None else (f"camera_height={height}",)
+        assert predict(high_net, frame / "said.csv", *words, *more) == 0
+        told = "knows heights: the camera counts as 1.25 m above the floor (camera_height= says"
+        assert (told in capsys.readouterr().out) == (height is None)
+        rows = table(frame / "said.csv")
+        found.append([[float(row[f"p_{name}"]) for name in predictor.classes] for row in rows])
+        objects = predictor.predict_depth(
+            depth / 1000, SHOT.camera, mask=mask, up=SHOT.up_in_camera, camera_height=height
+        )
+        np.testing.assert_allclose([one.probabilities for one in objects], found[-1], atol=1e-6)
+    np.testing.assert_array_equal(found[0], found[1])
+    assert np.abs(np.subtract(found[0], found[2])).max() > 1e-3
+
+
 def test_a_box_without_gravity_and_metres_in_npy(run, frame):
     depth, mask = seen()
     np.save(frame / "metres.npy", np.where(depth > 0, depth / 1000, np.nan))
@@ -184,6 +205,9 @@ def test_two_folders_go_together_by_name(run, frame):
         (["input={at}", "mask={at}/mask.png"], "mask= is for depth images"),
         (["input={at}", "depth={at}/depth.png"], "give input=PATH for clouds, or depth="),
         (["depth={at}/depth.png", "depth_scale=5"], "depth_scale=5: metres a unit"),
+        (["input={at}", "camera_height=1"], "camera_height= is for depth images"),
+        (["depth={at}/depth.png", "floor=0"], "floor= is for clouds"),
+        (["depth={at}/depth.png", "camera_height=-1"], "camera_height must be >= 0"),
     ],
 )
 def test_mistakes_are_told_in_words(run, frame, capsys, words, message):

@@ -29,6 +29,7 @@ from qs3.models.pointnet2 import GroupedMLP, pointnet2
 from qs3.models.rscnn import rscnn
 from qs3.models.simpleview import simpleview
 from tests.commands import main
+from tests.inference.conftest import over_the_floor
 
 # ONNX's script decorator and torch's tree of arguments use what Python and torch call old.
 pytestmark = pytest.mark.filterwarnings(
@@ -195,6 +196,8 @@ def test_the_file_of_a_net_of_metres_says_so(run, metric_run):
     assert metres["unit"] == "metre: clouds keep their size"
     assert metres["normalisation"] == "subtract the mean of the points"
     assert {name for name in ball if ball[name] != metres[name]} == {"unit", "normalisation"}
+    high = metadata(over_the_floor(qs3.load(metric_run)))
+    assert high["normalisation"].endswith("from x and y, and the floor's height from z")
 
 
 class Waits(nn.Module):

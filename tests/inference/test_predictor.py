@@ -7,6 +7,7 @@ import os
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from qs3.inference.model_file import read_result, write_result
 from qs3.inference.predictor import load
 from qs3.models.dgcnn import dgcnn
 from qs3.runs.predictions import read_predictions
+from tests.inference.conftest import over_the_floor
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +83,29 @@ def test_a_net_of_metres_sees_what_it_was_tested_on_and_how_large_a_cloud_is(
     assert np.abs(metric(3 * test_clouds[:4]) - expected[:4]).max() > 1e-2
     assert metric.prepare(test_clouds[0]).strange == ()
     assert metric.prepare(1000 * test_clouds[0]).strange[0].startswith("size ")
+
+
+def test_a_net_of_heights_is_told_where_the_floor_is(metric_run, test_clouds, tmp_path):
+    metric = qs3.load(metric_run)
+    high = over_the_floor(metric)  # -1.25 in its target
+    assert (metric.needs_floor, high.needs_floor, high.in_metres) == (False, True, True)
+    centred, seen = (which.prepare(test_clouds[0]).points for which in (metric, high))
+    assert torch.equal(centred[:, :2], seen[:, :2])
+    lowest = test_clouds[0][:, 2].min()
+    assert float(seen[:, 2].min()) == pytest.approx(lowest + 1.25, abs=0.05)
+    same, given = high.prepare(test_clouds[0], floor=-1.25), high.prepare(test_clouds[0], floor=2)
+    assert torch.equal(same.points, seen)
+    assert torch.allclose(given.points[:, 2], seen[:, 2] - 3.25, atol=1e-5)
+    moved = high(test_clouds[:3] + np.float32([8, -8, 1]), floor=-0.25)
+    np.testing.assert_allclose(moved, high(test_clouds[:3]), atol=1e-3)
+    assert np.abs(high(test_clouds[:3], floor=1) - high(test_clouds[:3])).max() > 1e-2
+    with pytest.raises(ConfigError, match="floor=nan: expected metres"):
+        high.prepare(test_clouds[0], floor=float("nan"))
+    write_result(tmp_path / "result.pt", high.result)
+    assert read_result(tmp_path).floor_m == -1.25
+    write_result(tmp_path / "result.pt", replace(high.result, floor_m=None))
+    with pytest.raises(DataError, match="floor_m: should be a number for scale above_floor"):
+        read_result(tmp_path)
 
 
 def test_any_number_of_points_any_size_any_place(predictor, test_clouds):

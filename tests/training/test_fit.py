@@ -15,8 +15,9 @@ import torch
 
 from qs3.config import hashing
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
+from qs3.inference.model_file import read_result
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
-from qs3.training.command import UNIT_BALL_ONLY, train
+from qs3.training.command import CENTRED_ONLY, UNIT_BALL_ONLY, train
 from qs3.utils.locks import owned
 from tests.training.conftest import result_of
 from tests.training.toy import toy_config
@@ -131,14 +132,18 @@ def test_metres_are_another_result_and_named(toy, finished):
     assert hashing.config_hash(unit) == hashing.config_hash(toy("selftraining=none"))
 
 
-def test_the_upper_bound_in_metres_asks_only_its_own_domain(toy):
-    words = ("method=supervised", "selftraining=none", "protocol.epochs=1", "data.scale=metres")
-    assert train(toy(*words)).loading.scale == "metres"
+def test_the_upper_bound_over_the_floor_asks_only_its_own_domain(toy):
+    words = ("method=supervised", "selftraining=none", "protocol.epochs=1")
+    cfg = toy(*words, "data.scale=above_floor", "data.target.floor_m=-1")
+    assert train(cfg).loading.scale == "above_floor"
+    assert read_result(hashing.run_folder(cfg)).floor_m == -1.0
+    other = toy(*words, "data.scale=above_floor", "data.target.floor_m=0")
+    assert hashing.config_hash(other) != hashing.config_hash(cfg)
 
 
 def test_parts_that_cannot_see_metres_are_parts():
     """They are told apart by name, so that no module of theirs is imported to say it."""
-    for name in UNIT_BALL_ONLY:
+    for name in (*UNIT_BALL_ONLY, *CENTRED_ONLY):
         module, _, attribute = name.rpartition(".")
         assert callable(getattr(importlib.import_module(module), attribute))
     cfg = toy_config(Path("."), *METRES)
@@ -170,6 +175,15 @@ def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
         ("data.scale=other", r"data\.scale must be one of .*unit_ball.*'other'"),
         ("data.scale=metres", r"domain specklenet10 are not in metres.*data\.source\.unit=metres"),
         ("data.scale=metres data.source.unit=feet", r"specklenet10: unit must be one of"),
+        (
+            "data.scale=above_floor data.source.unit=metres data.target.floor_m=0",
+            r"where the floor is in the clouds of domain specklenet10.*floor_m=-1\.25",
+        ),
+        (
+            "data.scale=above_floor data.source.unit=metres data.source.floor_m=0 "
+            "data.target.floor_m=0 method=defrec",
+            r"method=defrec: it deforms parts .*; set data\.scale=metres, or choose",
+        ),
         (
             "data.scale=metres data.source.unit=metres data.target.unit=none",
             r"domain kinectsim10 are not in metres",
