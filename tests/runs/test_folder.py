@@ -139,14 +139,14 @@ def test_clear_keeps_what_hydra_wrote(tmp_path):
 @pytest.mark.parametrize(
     ("words", "name"),
     [
-        (["experiment=cad10"], "cad10/seed0-e2968ca0"),
-        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-5207abc0"),
-        (["experiment=qs3_s2d"], "qs3_s2d/seed0-18bf3575"),
-        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-cf3c7f85"),
-        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-cf3c7f85"),
-        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-cf3c7f85"),
-        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-0c729a07"),
-        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-18bf3575"),
+        (["experiment=cad10"], "cad10/seed0-10308920"),
+        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-bcd0827a"),
+        (["experiment=qs3_s2d"], "qs3_s2d/seed0-e0cd9885"),
+        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-c05e4cb1"),
+        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-c05e4cb1"),
+        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-c05e4cb1"),
+        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-37214609"),
+        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-e0cd9885"),
     ],
 )
 def test_a_command_finds_its_run(words, name):
