@@ -37,7 +37,7 @@ def test_overfit_learns_a_few_clouds_by_heart(toy):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["dgcnn", "pointnet", "pointnet2"])
+@pytest.mark.parametrize("model", ["dgcnn", "pointnet", "pointnet2_ssg"])
 def test_overfit_works_for_real_nets(model, toy_data, tmp_path):
     """As typed, but for the size of the data."""
     cfg = compose("train", [
