@@ -8,11 +8,12 @@ file and finds the runs; `formats` prints.
 from __future__ import annotations
 
 import difflib
+import functools
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -187,28 +188,56 @@ def _fill(
         OverrideParseException,
     )
 
+    filled = []
+    for cell in cells:
+        if not cell.runnable:
+            filled.append(cell)
+            continue
+        try:
+            run = _composed(cell.overrides)
+            if target and run.supervised:
+                # The upper bound has labels of its target: the other target is its source too.
+                cell = replace(cell, overrides=(*cell.overrides, f"domain@data.source={target}"))
+                run = _composed(cell.overrides)
+        except MissingConfigException as error:
+            filled.append(replace(cell, missing=first_line(error)))
+            continue
+        except (ConfigCompositionException, OverrideParseException) as error:
+            raise ConfigError(
+                f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}"
+            ) from error
+        found = groups.get((run.experiment, run.hash))
+        filled.append(replace(cell, group=found, target=run.target, simulated=run.simulated))
+    return filled
+
+
+class _Composed(NamedTuple):
+    """What a table has to know of a cell's config."""
+
+    experiment: str
+    hash: str
+    target: str
+    simulated: bool
+    supervised: bool
+
+
+@functools.lru_cache(maxsize=4096)
+def _composed(words: tuple[str, ...]) -> _Composed:
+    """Of a command line of train.py. Kept: `report train` and effects read a table again and again.
+
+    Raises:
+        HydraException: as Hydra's `compose`.
+    """
     from qs3.config.hashing import config_hash
 
-    filled = []
     with composing() as compose:
-        for cell in cells:
-            if not cell.runnable:
-                filled.append(cell)
-                continue
-            try:
-                cfg = compose("train", list(cell.overrides))
-                if target and cfg.method.get("_target_") == _SUPERVISED:
-                    # The upper bound has labels of its target: the other target is its source too.
-                    words = (*cell.overrides, f"domain@data.source={target}")
-                    cell, cfg = replace(cell, overrides=words), compose("train", list(words))
-            except MissingConfigException as error:
-                filled.append(replace(cell, missing=first_line(error)))
-                continue
-            except (ConfigCompositionException, OverrideParseException) as error:
-                raise ConfigError(
-                    f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}"
-                ) from error
-            found = groups.get((str(cfg.experiment_name), config_hash(cfg)))
-            domain, simulated = str(cfg.data.target.name), bool(cfg.data.target.simulated)
-            filled.append(replace(cell, group=found, target=domain, simulated=simulated))
-    return filled
+        cfg = compose("train", list(words))
+        target = cfg.data.target
+        supervised = cfg.method.get("_target_") == _SUPERVISED
+        return _Composed(
+            str(cfg.experiment_name),
+            config_hash(cfg),
+            str(target.name),
+            bool(target.simulated),
+            supervised,
+        )
