@@ -34,7 +34,11 @@ def test_phases_are_a_list_of_epochs_cut_into_pieces(warmup, rounds, epochs):
         assert phases.ends(epoch) is (len(around) == 1 or around[1] != phase)
     for phase in range(rounds + 1):
         first = written_out.index(phase)
-        assert phases.span(phase) == (first, first + written_out.count(phase))
+        length = written_out.count(phase)
+        assert phases.span(phase) == (first, first + length)
+        for k in {0, length // 3, length - 1}:
+            expected = (1 + math.cos(math.pi * k / length)) / 2
+            assert math.isclose(phases.cosine(first + k), expected, abs_tol=1e-12)
 
 
 def test_an_epoch_past_the_end_is_of_the_last_phase_and_ends_nothing():
