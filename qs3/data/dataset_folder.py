@@ -8,7 +8,6 @@ clouds.png, infrared.png, config.yaml
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
@@ -31,8 +30,7 @@ def check_ours(folder: Path, command: str, elsewhere: str) -> None:
     Raises:
         DataError: says what is there.
     """
-    there = os.path.isdir(folder)  # False, and no error, for a name that no folder can have
-    if there and is_finished(folder) and not (folder / RECIPE).is_file():
+    if is_finished(folder) and not (folder / RECIPE).is_file():
         raise DataError(
             f"{folder} holds a dataset that {command} did not make "
             f"({MadeOf.of(read_meta(folder))}) and never replaces, not with force=true either; "

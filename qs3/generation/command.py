@@ -125,8 +125,14 @@ def generate(cfg: DictConfig) -> PointSet:
 
 def _check_place(domain: Domain, force: bool) -> None:
     """Raise where the dataset would replace, or pass for, one that was not made here."""
-    check_ours(domain.folder, "generate.py", "paths.data_dir")
-    domain.check_unpublished()
+    try:
+        check_ours(domain.folder, "generate.py", "paths.data_dir")
+        domain.check_unpublished()
+    except OSError as error:  # a name that no folder can have
+        raise ConfigError(
+            f"cannot make the folder {domain.folder}: {error.strerror}; choose another one, "
+            "paths.data_dir=PATH"
+        ) from error
     if force and domain.folder != Path(domain.path).absolute():
         raise ConfigError(
             f"{domain.name} is part of the dataset in {domain.folder}, and force=true would "

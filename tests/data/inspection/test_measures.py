@@ -185,7 +185,7 @@ def test_inspect_says_and_saves(data_dir, tmp_path, capsys):
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "60 clouds of 1024 points" in said
-    made_of = "arrays of modelnet10_points.npz, in other numbers"
+    made_of = "arrays of modelnet10_points.npz"
     assert f"made of: {made_of}\n" in said
     facts = json.loads((tmp_path / "inspection.json").read_text())
     assert facts["made_of"] == made_of
