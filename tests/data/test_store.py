@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.data import store
+from qs3.data.made_of import MadeOf
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.errors import DataError, MissingDataError, Qs3Error
 
@@ -78,6 +79,225 @@ def test_split_of_scattered_rows(tmp_path):
     points = np.arange(4)[:, None, None] + np.zeros((4, 2, 3))
     data = make(tmp_path / "d", rows=rows, arrays={"points": points})
     assert data.split("test").points[:, 0, 0].tolist() == [1, 3]
+
+
+def scattered(folder, labels="0120", splits="aaba"):
+    """Clouds of three classes, of which each shows its number; split a is train, b is test."""
+    names = ("bed", "chair", "table")
+    part = {"a": "train", "b": "test"}
+    rows = [
+        ManifestRow(str(i), names[int(label)], part[split])
+        for i, (label, split) in enumerate(zip(labels, splits, strict=True))
+    ]
+    points = np.arange(len(rows))[:, None, None] + np.zeros((len(rows), 2, 3))
+    return make(folder, rows=rows, arrays={"points": points}, classes=names)
+
+
+def numbers(data):
+    return data.points[:, 0, 0].astype(int).tolist()
+
+
+@pytest.mark.parametrize("splits", ["aabbaa", "bbaaab", "ababab", "aaabbb", "abbbba", "bababb"])
+def test_any_split_holds_its_own_clouds_and_no_others(tmp_path, splits):
+    data = scattered(tmp_path / "d", "012012", splits)
+    for letter, split in (("a", "train"), ("b", "test")):
+        expected = [i for i, one in enumerate(splits) if one == letter]
+        part = data.split(split)
+        assert numbers(part) == expected
+        assert part.ids == tuple(map(str, expected))
+        assert part.labels.tolist() == [i % 3 for i in expected]
+        adjacent = expected == list(range(expected[0], expected[-1] + 1))
+        assert np.shares_memory(part.points, data.points) == adjacent
+
+
+def test_members_and_counts_of_each_class(tmp_path):
+    data = scattered(tmp_path / "d", "0120221", "aababaa")
+    assert [data.members(name).tolist() for name in data.classes] == [[0, 3], [1, 6], [2, 4, 5]]
+    assert data.members("cat").tolist() == []
+    assert data.counts() == {
+        "train": {"bed": 2, "chair": 2, "table": 1},
+        "test": {"bed": 0, "chair": 0, "table": 2},
+    }
+    assert [*data.split("test").counts()] == ["test"]
+    assert data.labelled is True
+
+
+def test_clouds_without_classes_have_the_label_minus_1(tmp_path):
+    without = [ManifestRow(str(i), "", "train") for i in range(4)]
+    failed = [
+        ManifestRow(name, "", "test", status="failed", reason="no points") for name in ("x", "y")
+    ]
+    points = {"points": np.zeros((4, 2, 3))}
+    for rows in (without, [*without, *failed]):
+        data = make(tmp_path / "d", rows=rows, arrays=points, classes=("bed", "chair", "table"))
+        assert data.labels.tolist() == [-1] * 4
+        assert data.labelled is False
+        assert data.meta["labelled"] is False
+        assert data.meta["failed"] == len(rows) - 4
+        assert data.counts() == {"train": {"bed": 0, "chair": 0, "table": 0}}
+    assert "labelled" not in scattered(tmp_path / "e").meta
+    assert scattered(tmp_path / "g", "1111", "aaaa").labelled is True
+
+
+def test_evenly_is_at_even_steps_from_the_first_on():
+    positions = np.arange(10) * 3
+    assert store.evenly(positions, 4) == [0, 6, 15, 21]
+    assert store.evenly(positions, 10) == store.evenly(positions, 99) == positions.tolist()
+    assert store.evenly(positions, 1) == [0]
+    assert store.evenly(positions[:0], 4) == []
+    assert all(type(each) is int for each in store.evenly(positions, 3))
+
+
+def test_the_table_of_counts_line_by_line(tmp_path):
+    data = scattered(tmp_path / "d", "0100" * 3, "aaba" * 3)
+    lines = store.counts_text(data, "failed", {"chair": 20})
+    assert [line.split() for line in lines] == [
+        ["clouds", "train", "test", "failed"],
+        ["bed", "6", "3", "0"],
+        ["chair", "3", "0", "20"],
+        ["all", "9", "3", "20"],  # no line for a class without anything
+    ]
+    assert len({len(line) for line in lines}) == 1  # numbers end below each other
+    assert lines[1].endswith(" 0")
+
+
+def test_what_is_begun_is_not_finished(tmp_path):
+    folder = tmp_path / "d"
+    assert not store.is_begun(folder)
+    folder.mkdir()
+    assert not store.is_begun(folder)
+    (folder / ".lock").touch()
+    assert not store.is_begun(folder)
+    for name in ("points.npy", "-", "zebra"):
+        (folder / name).touch()
+        assert store.is_begun(folder)
+        (folder / name).unlink()
+    make(folder)
+    assert store.is_finished(folder)
+    assert not store.is_begun(folder)
+
+
+def test_meta_as_people_read_it(tmp_path):
+    make(tmp_path / "d", meta={"zebra": "Größe", "apple": "word " * 30})
+    text = (tmp_path / "d" / "meta.yaml").read_text()
+    keys = [line.split(":")[0] for line in text.splitlines() if line[:1].isalpha()]
+    assert keys == [
+        *("format", "format_version", "created_by", "name", "classes", "clouds", "points"),
+        *("failed", "sha256", "zebra", "apple"),
+    ]  # nothing is said of tables where there are none
+    assert "Größe" in text
+    assert 90 < max(map(len, text.splitlines()[:-1])) <= 105  # folded at the first word after 100
+
+
+def test_clouds_of_a_dataset_cannot_be_put_in_place_of_others(tmp_path):
+    data = make(tmp_path / "d")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        data.labels = data.labels[::-1]
+    assert data != dataclasses.replace(data)  # arrays have no single truth to compare
+    meta = {"made_of": {"objects": "arrays of x.npz"}}
+    assert str(make(tmp_path / "e", meta=meta).made_of) == str(MadeOf.of(meta))
+
+
+COLUMNS = ("u", "v", "w", "label")
+
+
+def with_table(folder, **changes):
+    rng = np.random.default_rng(1)
+    arrays = {
+        "points": rng.normal(size=(6, 5, 3)),
+        "clean": rng.normal(size=(6, 5, 3)),
+        "seen": rng.normal(size=(6, 5, 4)),
+    }
+    return make(folder, **{"arrays": arrays, "tables": {"seen": COLUMNS}, **changes})
+
+
+def test_tables_are_no_variants_and_are_checked(tmp_path):
+    made = with_table(tmp_path / "d")
+    assert made.meta["tables"] == {"seen": list(COLUMNS)}
+    table, columns = store.open_table(tmp_path / "d", "seen")
+    assert columns == COLUMNS
+    assert table.shape == (6, 5, 4)
+    rng = np.random.default_rng(1)
+    rng.normal(size=(2, 6, 5, 3))
+    np.testing.assert_array_equal(table, rng.normal(size=(6, 5, 4)).astype("f4"))
+    for variant in ("seen", "manifest", "other"):
+        with pytest.raises(DataError, match=r"holds the arrays \['clean', 'points'\], not"):
+            open_pointset(tmp_path / "d", variant)
+    with pytest.raises(DataError, match=r"holds the tables \['seen'\], not 'provenance'"):
+        store.open_table(tmp_path / "d")
+    path = tmp_path / "d" / "seen.npy"
+    data = bytearray(path.read_bytes())
+    data[-1] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"seen\.npy is damaged"):
+        store.open_table(tmp_path / "d", "seen")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tables": {"seen": COLUMNS, "gone": ("a",)}}, r"tables \['gone'\] are not arrays"),
+        ({"tables": {"seen": COLUMNS, "points": ("x",)}}, r"tables \['points'\] are not arrays"),
+        ({"tables": {"seen": COLUMNS[:3]}}, r"\(6, 5, 4\), expected \[N, P, 3\]"),
+        ({"tables": {"seen": (*COLUMNS, "more")}}, r"\(6, 5, 4\), expected \[N, P, 5\]"),
+        ({"tables": {}}, r"array 'seen' .* expected \[N, P, 3\]"),
+    ],
+)
+def test_tables_that_do_not_fit_are_refused(tmp_path, changes, message):
+    with pytest.raises(DataError, match=message):
+        with_table(tmp_path / "d", **changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [
+        ("clean", (7, 5, 3), "6 rows have status ok"),
+        ("clean", (5, 5, 3), "6 rows have status ok"),
+        ("clean", (6, 4, 3), r"'points' has \(6, 5, 3\)"),
+        ("clean", (6, 6, 3), r"'points' has \(6, 5, 3\)"),
+        ("clean", (6, 5, 4), r"expected \[N, P, 3\]"),
+        ("clean", (6, 5), r"expected \[N, P, 3\]"),
+        ("clean", (6, 5, 3, 1), r"expected \[N, P, 3\]"),
+        ("points", (7, 5, 3), "6 rows have status ok"),
+        ("meta", (6, 5, 3), "cannot be called 'meta'"),
+        ("manifest", (6, 5, 3), "cannot be called 'manifest'"),
+        ("a/b", (6, 5, 3), "cannot be called 'a/b'"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(tmp_path, name, shape, message):
+    arrays = {"points": np.zeros((6, 5, 3)), name: np.zeros(shape)}
+    with pytest.raises(DataError, match=message):
+        make(tmp_path / "d", arrays=arrays)
+
+
+@pytest.mark.parametrize("bad", [(0,), (1, 2), (3,), (4, 5), (5,)])
+def test_the_first_cloud_that_is_not_finite_is_named(tmp_path, monkeypatch, bad):
+    monkeypatch.setattr(store, "_CHUNK_CLOUDS", 2)
+    points = np.zeros((6, 5, 3), dtype="f4")
+    points[list(bad), 4, 1] = np.inf
+    with pytest.raises(DataError, match=f"cloud {bad[0]} is not finite"):
+        make(tmp_path / "d", arrays={"points": points})
+    make(tmp_path / "d", arrays={"points": np.zeros((6, 5, 3))})
+    with open(tmp_path / "d" / "points.npy", "r+b") as file:
+        file.seek(-points.nbytes, 2)
+        file.write(points.tobytes())
+    with pytest.raises(DataError, match=rf"cloud {bad[0]} \(id '\w+/{bad[0]}'\) is not finite"):
+        open_pointset(tmp_path / "d", verify=False)
+
+
+def test_the_number_of_clouds_is_checked_against_the_manifest(tmp_path):
+    """A manifest and a description that were both written anew, but not for each other."""
+    for clouds in (5, 7):
+        folder = tmp_path / str(clouds)
+        make(folder)
+        path = folder / "meta.yaml"
+        body = path.read_text().rpartition(store._CHECKSUM)[0]
+        body = body.replace("clouds: 6", f"clouds: {clouds}")
+        path.write_text(body + store._CHECKSUM + store._sha256(body) + "\n")
+        with pytest.raises(
+            DataError, match=rf"manifest\.csv has 6 rows .* promises {clouds} clouds"
+        ):
+            open_pointset(folder)
 
 
 def test_same_input_same_bytes_wherever_it_lies(tmp_path):
@@ -253,6 +473,11 @@ def test_another_version_of_the_format(tmp_path, monkeypatch):
         patch.setattr(store, "FORMAT_VERSION", 2)
         make(tmp_path / "d")
     with pytest.raises(DataError, match="format version 2, this qs3 reads 1"):
+        open_pointset(tmp_path / "d")
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "FORMAT_VERSION", 0)
+        make(tmp_path / "d")
+    with pytest.raises(DataError, match="format version 0, this qs3 reads 1"):
         open_pointset(tmp_path / "d")
 
 
