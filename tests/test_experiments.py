@@ -1,6 +1,8 @@
 """Every experiment file really runs: two batches an epoch, on files in the published formats."""
 
+import functools
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -9,37 +11,31 @@ from qs3.config.hydra import build
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
 from tests.composing import compose
-from tests.fixtures.published import write_all, write_domain
+from tests.fixtures.published import write_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")
-def data_dir(tmp_path_factory):
+def published(tmp_path_factory):
+    """A data folder into which the domains that are asked for are written, each once."""
     folder = tmp_path_factory.mktemp("published")
-    write_all(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def frames_dir(data_dir):
-    """With frames of NYU Depth V2 too, which take half a minute to render."""
-    write_domain("nyuv2", data_dir)
-    return data_dir
+    write = functools.cache(lambda name: write_domain(name, folder))
+    return SimpleNamespace(folder=folder, write=write)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_experiment_runs(experiment, request, tmp_path):
-    frames = experiment.endswith("_nyu")
-    data_dir = request.getfixturevalue("frames_dir" if frames else "data_dir")
+def test_experiment_runs(experiment, published, tmp_path):
     lines = (ROOT / "conf" / "experiment" / f"{experiment}.yaml").read_text().splitlines()
     assert lines[1].startswith(f"# python train.py experiment={experiment} ")
     overrides = [
-        f"experiment={experiment}", "debug=fast", "data.points=128", "logger=csv", "seed=0",
-        "trainer.threads=1", f"paths.data_dir={data_dir}", f"paths.log_dir={tmp_path}",
+        f"experiment={experiment}", "debug=fast", "data.points=64", "logger=csv", "seed=0",
+        "trainer.threads=1", f"paths.data_dir={published.folder}", f"paths.log_dir={tmp_path}",
     ]  # fmt: skip
     cfg = compose("train", overrides)
+    for domain in (cfg.data.source, cfg.data.target):
+        published.write(domain.name)
     rounds = build(cfg.selftraining).rounds  # without self-training they may be set in vain
     if rounds:
         cfg.selftraining.rounds = 2
