@@ -35,6 +35,10 @@ _UNHASHED = (
         )
     ),
 )
+# Keys that came later, with the value at which they do nothing: left out there, so that runs from
+# before them keep their names.
+_OFF = {"protocol.augment.lift": 0.0, "protocol.augment.plate": 0.0}
+_FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
 
@@ -46,12 +50,12 @@ def config_sha256(cfg: DictConfig) -> str:
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
     for key in _UNHASHED:
-        *parents, leaf = key.split(".")
-        node = plain
-        for parent in parents:
-            node = node.get(parent) if isinstance(node, dict) else None
-        if isinstance(node, dict):
-            node.pop(leaf, None)
+        _leave_out(plain, key)
+    for key, off in _OFF.items():
+        _leave_out(plain, key, off)
+    if (plain.get("data") or {}).get("scale") != "above_floor":
+        for key in _FLOORS:
+            _leave_out(plain, key)
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None
     trainer = plain.get("trainer")
@@ -60,6 +64,16 @@ def config_sha256(cfg: DictConfig) -> str:
         trainer["devices"] = 1
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _leave_out(plain: Any, key: str, value: Any = ...) -> None:
+    """Take a key out of nested dicts if it is there, and with `value` if it has that one."""
+    *parents, leaf = key.split(".")
+    node = plain
+    for parent in parents:
+        node = node.get(parent) if isinstance(node, dict) else None
+    if isinstance(node, dict) and (value is ... or node.get(leaf) == value):
+        node.pop(leaf, None)
 
 
 def config_hash(cfg: DictConfig) -> str:

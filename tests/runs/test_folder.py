@@ -67,6 +67,22 @@ def test_hash_sees_what_changes_the_result_and_nothing_else(key):
     assert same == (key in IGNORED)
 
 
+@pytest.mark.parametrize("key", ["lift", "plate"])
+def test_what_came_later_is_hashed_where_it_does_something(key):
+    others = {"protocol.augment.crop": 0.5}
+    off, on = ({**others, f"protocol.augment.{key}": value} for value in (0.0, 0.1))
+    assert hashing.config_hash(config(**off)) == hashing.config_hash(config(**others))
+    assert hashing.config_hash(config(**on)) != hashing.config_hash(config(**others))
+
+
+def test_floors_matter_to_heights_alone():
+    for scale, matters in (("metres", False), ("above_floor", True)):
+        low, high = (
+            config(**{"data.scale": scale, "data.target.floor_m": z}) for z in (-1.25, -1.0)
+        )
+        assert (hashing.config_hash(low) != hashing.config_hash(high)) == matters
+
+
 @pytest.mark.parametrize("none", [{"rounds": 0}, {"_target_": "qs3.datamodules.phases.no_rounds"}])
 def test_hash_ignores_settings_of_rounds_that_there_are_not(none):
     changes = {f"selftraining.{key}": value for key, value in none.items()}
@@ -139,14 +155,14 @@ def test_clear_keeps_what_hydra_wrote(tmp_path):
 @pytest.mark.parametrize(
     ("words", "name"),
     [
-        (["experiment=cad10"], "cad10/seed0-10308920"),
-        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-bcd0827a"),
-        (["experiment=qs3_s2d"], "qs3_s2d/seed0-e0cd9885"),
-        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-c05e4cb1"),
-        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-c05e4cb1"),
-        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-c05e4cb1"),
-        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-37214609"),
-        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-e0cd9885"),
+        (["experiment=cad10"], "cad10/seed0-124082e9"),
+        (["experiment=cad10", "method=dann", "selftraining=spst"], "cad10/seed0-929cc6ea"),
+        (["experiment=qs3_s2d"], "qs3_s2d/seed0-f88b11b8"),
+        (["experiment=qs3_s2d", "trainer=gpu"], "qs3_s2d/seed0-8a7222da"),
+        (["experiment=qs3_s2d", "trainer=gpus_in_turn"], "qs3_s2d/seed0-8a7222da"),
+        (["experiment=qs3_s2d", "trainer=gpu", "trainer.devices=[3]"], "qs3_s2d/seed0-8a7222da"),
+        (["experiment=qs3_s2d", "trainer=ddp"], "qs3_s2d/seed0-c759f053"),
+        (["experiment=qs3_s2d", "hparams_search=qbst_optuna"], "qs3_s2d/seed0-f88b11b8"),
     ],
 )
 def test_a_command_finds_its_run(words, name):
