@@ -32,8 +32,8 @@ class Augment:
         rotate_z: turn each cloud about z by U(0, 2π).
         scale: factor of each axis, U(1 / scale, scale); 1 leaves the size alone.
         shift: added to each axis, U(-shift, shift).
-        lift: added to z alone, U(-lift, lift): how high a camera hangs is not known to the
-            decimetre (`data.scale=above_floor`).
+        lift: of clouds over the floor (`data.scale=above_floor`), and of no others, added to z
+            alone, U(-lift, lift): how high a camera hangs is not known to the decimetre.
         jitter_sigma: standard deviation of the noise on each coordinate.
         jitter_clip: bound of that noise. PointNet, which the paper cites, has 0.05; the code that
             the paper's descends from 0.02.
@@ -86,7 +86,7 @@ class Augment:
             points = points * (low + (high - low) * uniform(b, 1, 3))
         if self.shift > 0.0:
             points = points + self.shift * (2 * uniform(b, 1, 3) - 1)
-        if self.lift > 0.0:
+        if self.lift > 0.0 and scale == "above_floor":
             up = torch.tensor([0.0, 0.0, self.lift], device=points.device, dtype=points.dtype)
             points = points + up * (2 * uniform(b, 1, 1) - 1)
         if self.jitter_sigma > 0.0:

@@ -240,6 +240,8 @@ def test_a_lift_moves_each_cloud_up_or_down_as_a_whole():
     assert by.max() <= 0.2 + 1e-6
     assert float(by[:, 0].mean()) == pytest.approx(0, abs=0.006)
     assert float(by[:, 0].std()) == pytest.approx(0.2 / 3**0.5, rel=0.03)
+    assert torch.equal(augment(points, generator(), "metres"), points)
+    assert torch.equal(augment(points, generator(), "unit_ball"), points)
     with pytest.raises(ConfigError, match=r"protocol\.augment\.lift"):
         Augment(lift=-0.1)
 
