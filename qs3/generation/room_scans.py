@@ -151,15 +151,15 @@ class RoomScan:
             if frame is None:
                 continue
             image, mask = depth_image(frame, pose), self.mask.keep(frame, rng)
-            own, _, _ = own_pixels(image, mask, self.rules)
             rules, edge_px = self.rules, None
             apart = object_rng(seed, object_id, 1 + attempt, 1)  # not of those that exist without
             if apart.random() < self.torn:
+                own, _, _ = own_pixels(image, mask, rules)
                 mask, edge_px = one_piece(image, own, cls, rules, apart), 0
                 rules = replace(rules, join_m=0.0)
-                own = mask
             piece = cut(image, mask, cls, rules, edge_px)
             if not piece.refused:
+                own, _, _ = own_pixels(image, mask, rules, edge_px)
                 if self.rules.drop_outliers:
                     own[own] = inliers(image.points_m[own], self.rules)
                 return self._cloud(frame, own, pose, object_id, keep)

@@ -127,6 +127,12 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     if settings.sample and settings.sample < len(inputs.units):
         drawn = np.random.default_rng(0).choice(len(inputs.units), settings.sample, replace=False)
         inputs = inputs._replace(units=[inputs.units[i] for i in sorted(drawn)])
+    if _camera_is_missing(predictor, settings):
+        key = "camera_height=METRES" if settings.depth else "floor=-METRES"
+        raise ConfigError(
+            "the classifier knows heights above the floor, and its target's clouds say nothing "
+            f"about a camera: give its height, {key}"
+        )
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
     began, gallery, rows = time.monotonic(), Gallery(classes), []
@@ -147,6 +153,11 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         title = f"{Path(settings.input or settings.depth).name}, as {settings.ckpt} sees it"
         lines.append(_save(out.with_suffix(".html"), page(title, rows, gallery, classes)))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _camera_is_missing(predictor: Predictor, settings: Settings) -> bool:
+    given = settings.floor is not None or settings.camera_height is not None
+    return predictor.needs_floor and not given and predictor.camera_height is None
 
 
 def _save(path: Path, text: str) -> str:
@@ -305,9 +316,9 @@ def _told(
     if predictor.in_metres and inputs.kind == "files":
         lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
     if predictor.needs_floor and settings.floor is None and settings.camera_height is None:
-        height = -(predictor.result.floor_m or 0.0)
         lines.append(
-            f"the classifier knows heights: the camera counts as {height:g} m above the floor ("
+            f"the classifier knows heights: the camera counts as {predictor.camera_height:g} m "
+            "above the floor ("
             + ("camera_height=" if settings.depth else "floor=")
             + " says otherwise)"
         )

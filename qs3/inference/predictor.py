@@ -119,6 +119,15 @@ class Predictor:
         """Whether it sees how high above the floor clouds are: then it must know where that is."""
         return self.result.floor_m is not None
 
+    @property
+    def camera_height(self) -> float | None:
+        """Of the target's camera above the floor, in metres, if its clouds have it as the origin.
+
+        None: their floor is at or above the origin, so they say nothing about a camera.
+        """
+        floor = self.result.floor_m
+        return -floor if floor is not None and floor < 0 else None
+
     def prepare(
         self,
         cloud: np.ndarray,

@@ -8,6 +8,7 @@ import html
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +20,7 @@ import qs3
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import point_out
 from qs3.errors import DataError
+from qs3.inference.model_file import write_result
 from tests.commands import main
 from tests.fixtures.frame_files import Shot, Thing, kinect, write_archive
 from tests.fixtures.published import CLASSES
@@ -112,10 +114,17 @@ def test_the_camera_s_height_is_for_nets_that_know_heights(high_net, frame, caps
         assert (told in capsys.readouterr().out) == (height is None)
         rows = table(frame / "said.csv")
         found.append([[float(row[f"p_{name}"]) for name in predictor.classes] for row in rows])
+        (frame / "said.csv").rename(frame / ("last.csv" if height == 0.4 else "first.csv"))
         objects = predictor.predict_depth(
             depth / 1000, SHOT.camera, mask=mask, up=SHOT.up_in_camera, camera_height=height
         )
         np.testing.assert_allclose([one.probabilities for one in objects], found[-1], atol=1e-6)
+    # A target whose clouds stand on z = 0 has no camera to take the height of.
+    write_result(high_net, replace(predictor.result, floor_m=0.0))
+    assert predict(high_net, frame / "none.csv", *words) == 1
+    assert "say nothing about a camera: give its height, camera_height=" in capsys.readouterr().err
+    assert predict(high_net, frame / "none.csv", *words, "camera_height=1.25") == 0
+    assert table(frame / "none.csv") == table(frame / "first.csv")
     np.testing.assert_array_equal(found[0], found[1])
     assert np.abs(np.subtract(found[0], found[2])).max() > 1e-3
 

@@ -221,13 +221,19 @@ def _differences(
 
 
 def _loaded(files: Sequence[Path], device: str) -> dict[Path, Predictor]:
-    """The classifiers, all for clouds with z up."""
+    """The classifiers, all for clouds with z up; and a camera's, if they know heights."""
     found = {file: load(file, device=device) for file in files}
     for file, one in found.items():
         if one.result.gravity != "z":
             raise ConfigError(
                 f"{file} was trained on clouds in the frame of their camera; the archive's have z "
                 "up, so it cannot be judged on them"
+            )
+        if one.needs_floor and one.camera_height is None:
+            raise ConfigError(
+                f"{file} knows heights above the floor, and its target's clouds stand at "
+                f"{one.result.floor_m:g}: the archive's have the camera at the origin, so it "
+                "cannot be judged on them"
             )
     return found
 

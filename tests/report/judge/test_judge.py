@@ -100,6 +100,9 @@ def test_runs_of_other_classes_are_judged_on_what_all_know(archive, logs, tmp_pa
     assert verdict.classes == ("bed", "chair", "sofa")
     assert {family.figures[0].n for family in verdict.families} == {15}
     assert verdict.families[1].name == str(few / "result.pt")
+    standing = add_net(tmp_path, 3, scale="above_floor", floor_m=0.0)
+    with pytest.raises(ConfigError, match=r"heights above the floor, .* clouds stand at 0"):
+        judge([str(standing)], archive)
     camera = add_net(tmp_path, 3, gravity="none")
     with pytest.raises(ConfigError, match="frame of their camera"):
         judge([str(camera)], archive)
