@@ -7,28 +7,30 @@ annotator draws its mask, and `qs3.data.frames.cutting` cuts by the same rules a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool
 
-from qs3.config.checks import check_ranges
+from qs3.config.checks import check_float, check_ranges
 from qs3.data.frames.cutting import cut, inliers, own_pixels
 from qs3.data.frames.images import DepthImage, Pinhole
 from qs3.data.frames.pieces import pieces
 from qs3.data.frames.rules import Rules
 from qs3.errors import ConfigError
+from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
 from qs3.generation.provenance import Keep, preview_of, provenance_of
 from qs3.generation.recipes import Cloud, MaskCrop, TooFewPointsError
-from qs3.generation.scenes import Room, Surroundings
+from qs3.generation.scenes import HAIR_M, Room, Surroundings, around_an_eye
 from qs3.generation.view_files import save_view
 from qs3.geometry.cameras import Intrinsics, look_at
 from qs3.geometry.sampling import farthest_point_sampling_np
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import Placing, RealSize
 from qs3.sensors.base import DepthFrame, DepthSensor
-from qs3.sensors.renderers.base import Renderer
+from qs3.sensors.renderers.base import Body, Renderer
 from qs3.utils.seeding import object_rng
 
 _BARE = Keep()
@@ -47,6 +49,7 @@ class RoomCamera:
         spread: the object's middle lies within this share of the picture's half width and height.
         min_pitch_deg, max_pitch_deg: how far the camera looks down.
         roll_deg: standard deviation.
+        side_deg: how far from straight before it a camera stands that sees an object's front.
     """
 
     min_height_m: float = 1.1
@@ -58,9 +61,12 @@ class RoomCamera:
     min_pitch_deg: float = -5.0
     max_pitch_deg: float = 40.0
     roll_deg: float = 1.5
+    side_deg: float = 75.0
 
     def __post_init__(self) -> None:
-        check_ranges(self, "recipe.camera.", clearance_m=">= 0", spread="[0, 1]")
+        check_ranges(
+            self, "recipe.camera.", clearance_m=">= 0", spread="[0, 1]", side_deg="[0, 180]"
+        )
         for name in ("height_m", "distance_m", "pitch_deg"):
             low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
             if low > high:
@@ -68,12 +74,23 @@ class RoomCamera:
                     f"recipe.camera.min_{name}={low} is above recipe.camera.max_{name}={high}"
                 )
 
-    def pose(self, rng: np.random.Generator, box_m: np.ndarray, lens: Intrinsics) -> np.ndarray:
-        """[4, 4] world_from_camera before an object with box [2, 3]; the floor is z = 0."""
+    def pose(
+        self,
+        rng: np.random.Generator,
+        box_m: np.ndarray,
+        lens: Intrinsics,
+        front_rad: float | None = None,
+    ) -> np.ndarray:
+        """[4, 4] world_from_camera before an object with box [2, 3]; the floor is z = 0.
+
+        `front_rad`: it is seen from within `side_deg` of this azimuth; None: from anywhere.
+        """
         middle = box_m.mean(axis=0)
         radius = float(np.hypot(*(box_m[1] - box_m[0])[:2])) / 2
         away = max(rng.uniform(self.min_distance_m, self.max_distance_m), radius + self.clearance_m)
         azimuth = rng.uniform(0, 2 * np.pi)
+        if front_rad is not None:
+            azimuth = front_rad + np.deg2rad(self.side_deg) * (azimuth / np.pi - 1)
         height = rng.uniform(self.min_height_m, self.max_height_m)
         eye = np.array([*(middle[:2] + away * direction(azimuth, 0.0)[:2]), height])
         half = np.array([lens.width_px, lens.height_px]) / (2 * lens.focal_px)
@@ -98,7 +115,10 @@ class RoomScan:
         sensor: that takes it.
         placing: of the mesh in the room, whose floor is z = 0.
         scene: what is around it, and under it if it is placed above the floor.
+        arrangement: what people have put before it and on it; None: nothing.
         camera: where it is looked from.
+        fronts: by class the probability that it stands with its back to a wall or away from people:
+            its front is seen, which is -y of a mesh as made. Empty if nobody knows where yours is.
         mask: how carelessly the mask is drawn.
         rules: by which it is cut, and when it is refused.
         points: of the final cloud; a smaller one repeats points.
@@ -113,7 +133,9 @@ class RoomScan:
     sensor: DepthSensor
     placing: Placing = field(default_factory=RealSize)
     scene: Surroundings = field(default_factory=Room)
+    arrangement: Arrangement | None = None
     camera: RoomCamera = field(default_factory=RoomCamera)
+    fronts: Mapping[str, float] = field(default_factory=dict)
     mask: MaskCrop = field(default_factory=MaskCrop)
     rules: Rules = field(default_factory=Rules)
     points: int = 2048
@@ -125,6 +147,8 @@ class RoomScan:
 
     def __post_init__(self) -> None:
         check_ranges(self, "recipe.", points=">= 1", attempts=">= 1", torn="[0, 1]")
+        for cls, chance in self.fronts.items():
+            check_float(f"recipe.fronts.{cls}", chance, "[0, 1]")
         if self.views != 1:
             raise ConfigError(f"views={self.views}: a scan of a room is one view; leave views out")
         if not isinstance(self.mask, MaskCrop):
@@ -140,12 +164,15 @@ class RoomScan:
             raise ConfigError("RoomScan needs a renderer: set renderer=mitsuba or blender")
         cls = object_id.split("/")[0]
         placed = self.placing.place(mesh, object_rng(seed, object_id, 0), object_id)
+        front = yaw_between(mesh, placed) - np.pi / 2
         around = placed.bounds + np.array([[-_AROUND_M], [_AROUND_M]])
         why = "it is outside the picture"
         for attempt in range(self.attempts):
             rng = object_rng(seed, object_id, 1 + attempt)
-            pose = self.camera.pose(rng, placed.bounds, self.sensor.intrinsics)
-            bodies = self.scene.bodies(placed, pose[None, :3, 3], rng, floor_m=0.0)
+            arranging = object_rng(seed, object_id, 1 + attempt, 2)
+            seen = front if arranging.random() < self.fronts.get(cls, 0.0) else None
+            pose = self.camera.pose(rng, placed.bounds, self.sensor.intrinsics, seen)
+            bodies = self._bodies(placed, cls, pose, rng, arranging)
             explain = keep.views is not None
             frame = self.sensor.scan(bodies, around, pose, renderer, rng, explain=explain)
             if frame is None:
@@ -169,6 +196,29 @@ class RoomScan:
             f"of the last one: {why}"
         )
 
+    def _bodies(
+        self,
+        placed: Mesh,
+        cls: str,
+        pose: np.ndarray,
+        rng: np.random.Generator,
+        arranging: np.random.Generator,
+    ) -> tuple[Body, ...]:
+        """The scene's, the object first, and the arrangement's, none of it around the camera."""
+        eyes = pose[None, :3, 3]
+        bodies = self.scene.bodies(placed, eyes, rng, floor_m=0.0)
+        if self.arrangement is None:
+            return bodies
+        support = bodies[2].mesh if placed.bounds[0, 2] > HAIR_M else None
+        more = self.arrangement.around(placed, cls, arranging, support)
+        more = [mesh for mesh in more if not around_an_eye(mesh, eyes)]
+        albedo = arranging.uniform(
+            self.arrangement.min_albedo, self.arrangement.max_albedo, len(more)
+        )
+        return bodies + tuple(
+            Body(mesh, albedo=float(a), label=0) for mesh, a in zip(more, albedo, strict=True)
+        )
+
     def _cloud(
         self, frame: DepthFrame, own: np.ndarray, pose: np.ndarray, object_id: str, keep: Keep
     ) -> Cloud:
@@ -189,6 +239,12 @@ class RoomScan:
             save_view(keep.views, object_id, 0, frame, pose, pose)
         preview = preview_of(frame) if object_id in keep.previews else {}
         return Cloud(arrays, 1, len(points), (frame,), preview)
+
+
+def yaw_between(mesh: Mesh, placed: Mesh) -> float:
+    """By how much, in radians counter-clockwise from above, `placed` is a mesh turned about z."""
+    before, after = (m.vertices[:, 0] + 1j * m.vertices[:, 1] for m in (mesh, placed))
+    return float(np.angle(np.vdot(before - before.mean(), after - after.mean())))
 
 
 def one_piece(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -10,10 +9,10 @@ import numpy as np
 
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
-from qs3.meshes.mesh import Mesh
+from qs3.meshes.mesh import Mesh, merge
 from qs3.sensors.renderers.base import Body
 
-_HAIR = 1e-4
+HAIR_M = 1e-4
 """What an object stands on is so far below it: its bottom face is in no other face's plane."""
 
 
@@ -89,16 +88,10 @@ class Support:
         block = rng.random() < self.block
         board = rng.uniform(self.min_board_m, self.max_board_m)
         leg = min(rng.uniform(self.min_leg_m, self.max_leg_m), float((high - low).min()) / 4)
-        top = float(mesh.bounds[0, 2]) - _HAIR
-        under = floor if block else max(top - board, floor)
-        parts = [_prism(_rectangle(low, high) @ turn, under, top)]
-        if under > floor:
-            # Inside the board's outline and up to its middle: no two faces in one plane.
-            near, far = low + leg / 4, high - 1.25 * leg
-            for corner in ([x, y] for x in (near[0], far[0]) for y in (near[1], far[1])):
-                foot = _rectangle(np.array(corner), np.array(corner) + leg)
-                parts.append(_prism(foot @ turn, floor, (under + top) / 2))
-        return _joined(parts)
+        top = float(mesh.bounds[0, 2]) - HAIR_M
+        if block or top - board <= floor:
+            return prism(rectangle(low, high) @ turn, floor, top)
+        return table((low, high), turn, floor, top, board, leg)
 
 
 @dataclass(frozen=True)
@@ -152,7 +145,7 @@ class Room:
         floor = float(low[2]) if floor_m is None else floor_m
 
         rest = [_quad(centre, floor, 6.0)]
-        if low[2] > floor + _HAIR:
+        if low[2] > floor + HAIR_M:
             rest.append(self.support.under(mesh, floor, rng))
             # All else keeps away from the furniture as it does from an object on the floor.
             radius = float(np.hypot(*(rest[-1].vertices[:, :2] - centre[:2]).T).max())
@@ -171,7 +164,7 @@ class Room:
         if self.max_between:
             for _ in range(int(rng.integers(0, self.max_between + 1))):
                 pieces.append(self._between(centre, radius, floor, eyes_m[0], rng))
-        rest += [piece for piece in pieces if not _around_an_eye(piece, eyes_m)]
+        rest += [piece for piece in pieces if not around_an_eye(piece, eyes_m)]
         albedos = rng.uniform(self.min_albedo, self.max_albedo, len(rest) + 1)
         return tuple(
             Body(part, albedo=float(albedo), label=int(part is mesh))
@@ -200,31 +193,42 @@ class Room:
         c, s = np.cos(yaw), np.sin(yaw)
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * size[:2]
         ring = corners @ np.array([[c, s], [-s, c]]) + centre[:2] + away * along + aside
-        return _prism(ring, floor, floor + float(size[2]))
+        return prism(ring, floor, floor + float(size[2]))
 
 
-def _rectangle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def table(
+    corners: tuple[np.ndarray, np.ndarray],
+    turn: np.ndarray,
+    floor: float,
+    top: float,
+    board: float,
+    leg: float,
+) -> Mesh:
+    """A board on four legs, `corners` its outline [2] before `turn` [2, 2]; lengths in metres."""
+    low, high = corners
+    parts = [prism(rectangle(low, high) @ turn, top - board, top)]
+    # Inside the board's outline and up to its middle: no two faces in one plane.
+    near, far = low + leg / 4, high - 1.25 * leg
+    for corner in ([x, y] for x in (near[0], far[0]) for y in (near[1], far[1])):
+        foot = rectangle(np.array(corner), np.array(corner) + leg)
+        parts.append(prism(foot @ turn, floor, top - board / 2))
+    return merge(parts)
+
+
+def rectangle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """[4, 2] corners, counter-clockwise from above."""
     (x0, y0), (x1, y1) = low, high
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
 
 
-def _joined(parts: Sequence[Mesh]) -> Mesh:
-    before = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-    return Mesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + n for part, n in zip(parts, before, strict=True)]),
-    )
-
-
 def _quad(centre: np.ndarray, height: float, half_m: float) -> Mesh:
     x, y = centre[:2]
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half_m + [x, y]
-    vertices = np.column_stack([corners, np.full(4, height - _HAIR)])
+    vertices = np.column_stack([corners, np.full(4, height - HAIR_M)])
     return Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _around_an_eye(piece: Mesh, eyes_m: np.ndarray) -> bool:
+def around_an_eye(piece: Mesh, eyes_m: np.ndarray) -> bool:
     """Whether a camera would be in the piece or nearer to it than 30 cm."""
     low, high = piece.bounds
     return bool(((eyes_m > low - 0.3) & (eyes_m < high + 0.3)).all(axis=1).any())
@@ -253,10 +257,11 @@ def _piece(
     ring = ring @ np.array([[c, s], [-s, c]])
     reach = float(np.linalg.norm(ring, axis=1).max())
     ring += centre[:2] + (away + reach) * np.array([np.cos(angle), np.sin(angle)])
-    return _prism(ring, floor, floor + float(size[2]) * 1.6)
+    return prism(ring, floor, floor + float(size[2]) * 1.6)
 
 
-def _prism(ring: np.ndarray, bottom: float, top: float) -> Mesh:
+def prism(ring: np.ndarray, bottom: float, top: float) -> Mesh:
+    """Upright, closed, over a convex ring [n, 2] that is counter-clockwise from above."""
     n = len(ring)
     vertices = np.concatenate([np.column_stack([ring, np.full(n, z)]) for z in (bottom, top)])
     i = np.arange(n)

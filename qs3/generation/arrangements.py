@@ -1,0 +1,222 @@
+"""What people have put around an object and on it: a table before a chair, chairs at a table.
+
+A room of pieces at random (`scenes.Room`) hides an object by accident. In lived-in rooms it is
+hidden where it is used: of a chair at a table the back alone is seen, of a table among chairs the
+top and of that what no thing stands on, of a lamp among books the shade.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.config.checks import check_float, check_int, check_ranges
+from qs3.errors import ConfigError
+from qs3.generation.scenes import HAIR_M, prism, rectangle, table
+from qs3.geometry.sampling import surface_sample
+from qs3.meshes.mesh import Mesh, merge
+
+_CHAIR_M = (0.38, 0.55)
+_SEAT_M = (0.42, 0.5)
+_BACK_M = (0.75, 1.05)
+"""Of chairs that only hide things: width and depth, height of the seat and of the back."""
+_CELL_M = 0.04
+_SAMPLES = 20_000
+_FLAT_M = 0.03
+"""Under a thing the surface differs by no more than this: a board or a mattress, no pillows."""
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """What stands at an object and on it, drawn anew for each picture.
+
+    Attributes:
+        tables: by class the probability that an object on the floor stands at a table, with what
+            is lower than its board under it or just before it; 0 of a class that is not here.
+        seats: by class the most chairs that stand at an object and partly under it, each facing it
+            at a place of its own; the number is uniform. Only at what has room for them: higher
+            than their seats.
+        min_top_m, max_top_m: height of the table's top.
+        min_side_m, max_side_m: of the table.
+        board_m: thickness of its board and of what hangs under it.
+        leg_m: side of its legs.
+        apart_m: the table is drawn back by up to so much from what it could cover; half of the
+            tables are not.
+        things: by class the most things that stand on an object, 0 of a class that is not here;
+            the number is uniform. Those of "table" are also for the table it stands at, and those
+            of "support" for the furniture that an object above the floor stands on.
+        min_thing_m, max_thing_m: sides of a thing, and its height.
+        min_albedo, max_albedo: of each, as of the room's.
+    """
+
+    tables: Mapping[str, float] = field(default_factory=dict)
+    seats: Mapping[str, int] = field(default_factory=dict)
+    min_top_m: float = 0.7
+    max_top_m: float = 0.78
+    min_side_m: float = 0.7
+    max_side_m: float = 1.6
+    board_m: float = 0.06
+    leg_m: float = 0.05
+    apart_m: float = 0.3
+    things: Mapping[str, int] = field(default_factory=dict)
+    min_thing_m: float = 0.06
+    max_thing_m: float = 0.4
+    min_albedo: float = 0.25
+    max_albedo: float = 0.9
+
+    def __post_init__(self) -> None:
+        positive = dict.fromkeys(("board_m", "leg_m"), "> 0")
+        check_ranges(self, "recipe.arrangement.", apart_m=">= 0", **positive)
+        for cls, chance in self.tables.items():
+            check_float(f"recipe.arrangement.tables.{cls}", chance, "[0, 1]")
+        for name in ("things", "seats"):
+            for cls, most in getattr(self, name).items():
+                check_int(f"recipe.arrangement.{name}.{cls}", most, 0)
+        for name in ("top_m", "side_m", "thing_m"):
+            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
+            if not 0 < low <= high:
+                raise ConfigError(
+                    f"recipe.arrangement: 0 < min_{name} <= max_{name} must hold, got {low} and "
+                    f"{high}"
+                )
+        if not (self.board_m < self.min_top_m and 4 * self.leg_m < self.min_side_m):
+            raise ConfigError(
+                f"recipe.arrangement: no table has board_m={self.board_m} and leg_m={self.leg_m} "
+                f"with min_top_m={self.min_top_m} and min_side_m={self.min_side_m}"
+            )
+
+    def around(
+        self, mesh: Mesh, cls: str, rng: np.random.Generator, support: Mesh | None = None
+    ) -> list[Mesh]:
+        """The table, if there is one, and all things.
+
+        Args:
+            mesh: the object, placed over the floor z = 0.
+            cls: its class.
+            rng: of the picture.
+            support: what it stands on; None: the floor.
+        """
+        found, most = [], self.things.get
+        if rng.random() < self.tables.get(cls, 0.0) and support is None:
+            found.append(self._table(mesh, rng))
+            found += self._on(found[0], most("table", 0), rng)
+        if support is not None:
+            top = float(support.bounds[1, 2])
+            found += self._on(merge([support, mesh]), most("support", 0), rng, top)
+        found += self._on(mesh, most(cls, 0), rng)
+        for _ in range(int(rng.integers(0, self.seats.get(cls, 0) + 1))):
+            seat = self._chair(mesh, rng)
+            if mesh.bounds[1, 2] > _SEAT_M[1] + 0.15:
+                found.append(seat)
+        return found
+
+    def _chair(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
+        """Before one side of the object's footprint, its seat up to two thirds within it."""
+        side = rng.uniform(*_CHAIR_M)
+        seat, back = rng.uniform(*_SEAT_M), rng.uniform(*_BACK_M)
+        outline = table(
+            (np.full(2, -side / 2), np.full(2, side / 2)), np.eye(2), 0.0, seat, 0.05, 0.035
+        )
+        panel = rectangle(np.array([-side / 2, -side / 2]), np.array([-side / 2 + 0.04, side / 2]))
+        gap = 0.0 if rng.random() < 0.6 else 0.15  # between the seat and the back
+        chair = merge([outline, prism(panel, seat + gap + HAIR_M, back)])
+        flat = mesh.vertices[:, :2] - mesh.bounds.mean(axis=0)[:2]
+        yaw = rng.uniform(0, 2 * np.pi)
+        ahead = -np.array([np.cos(yaw), np.sin(yaw)])  # from the chair to the object
+        edge = float((flat @ -ahead).max())
+        away = edge + side * rng.uniform(-0.15, 0.8)  # of its middle: its back is outside
+        aside = rng.uniform(-0.3, 0.3)
+        turn = np.array([ahead, [-ahead[1], ahead[0]]])
+        moved = chair.vertices[:, :2] @ turn + mesh.bounds.mean(axis=0)[:2]
+        moved += -away * ahead + aside * turn[1]
+        return Mesh(np.column_stack([moved, chair.vertices[:, 2]]), chair.faces)
+
+    def _table(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:
+        """On the side away from the object's back: where it is not higher than the table."""
+        top = rng.uniform(self.min_top_m, self.max_top_m)
+        width, depth = rng.uniform(self.min_side_m, self.max_side_m, 2)
+        surface = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
+        middle = mesh.bounds.mean(axis=0)[:2]
+        flat = surface[:, :2] - middle
+        high = surface[:, 2] > top - self.board_m
+        back = flat[high].mean(axis=0) if high.any() else np.zeros(2)
+        if np.hypot(*back) < 0.03:  # nothing above the board, or no side that is higher: a stool
+            yaw = rng.uniform(0, 2 * np.pi)
+            front = np.array([np.cos(yaw), np.sin(yaw)])
+        else:
+            front = -back / np.hypot(*back)
+        turn = np.array([front, [-front[1], front[0]]])  # rows: its axes in the world
+        ahead = flat @ front
+        nearest = (float(ahead[high].max()) if high.any() else float(ahead.min())) + 0.02
+        farthest = max(float(ahead.max()), nearest)
+        edge = rng.uniform(nearest, farthest) + self.apart_m * max(rng.uniform(-1, 1), 0.0)
+        aside = rng.uniform(-0.3, 0.3) * width
+        low = np.array([edge, aside - width / 2])
+        outline = (low, low + np.array([depth, width]))
+        made = table(outline, turn, 0.0, top, self.board_m, self.leg_m)
+        return Mesh(made.vertices + np.array([*middle, 0.0]), made.faces)
+
+    def _on(
+        self, mesh: Mesh, most: int, rng: np.random.Generator, top: float | None = None
+    ) -> list[Mesh]:
+        """Up to `most` boxes and cylinders where the mesh, from above, is flat (and at `top`)."""
+        if most == 0:
+            return []
+        low, heights = heights_of(mesh, rng)
+        found = []
+        for _ in range(int(rng.integers(0, most + 1))):
+            size = rng.uniform(self.min_thing_m, self.max_thing_m, 3)
+            sides = 4 if rng.random() < 0.6 else 16
+            spot, yaw = rng.random(2), rng.uniform(0, 2 * np.pi)
+            flat = flat_within(heights, float(np.hypot(*size[:2])) / 2)
+            if top is not None:
+                flat &= np.abs(heights - top) < _FLAT_M
+            free = np.argwhere(flat)
+            if not len(free):
+                continue
+            cell = free[int(spot[0] * len(free))]
+            ring = _ring(size[:2], sides, yaw) + low + (cell + 0.5) * _CELL_M
+            bottom = float(heights[tuple(cell)]) + HAIR_M
+            found.append(prism(ring, bottom, bottom + float(size[2])))
+        return found
+
+
+def heights_of(
+    mesh: Mesh, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "x y"]]:
+    """How high a mesh is, from above: the grid's lowest corner [m], and z of each cell of 4 cm.
+
+    A cell that shows nothing is -inf. By points on the surface: thin rods may have gaps.
+    """
+    points = surface_sample(mesh.vertices, mesh.faces, _SAMPLES, rng)
+    low = mesh.bounds[0, :2]
+    cells = ((points[:, :2] - low) / _CELL_M).astype(int)
+    heights = np.full(cells.max(axis=0) + 1, -np.inf)
+    np.maximum.at(heights, (cells[:, 0], cells[:, 1]), points[:, 2])
+    return low, heights
+
+
+def flat_within(heights: Float[np.ndarray, "x y"], radius_m: float) -> np.ndarray:
+    """[x, y] bool: where all cells within `radius_m` are there and of nearly one height."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    reach = max(round(radius_m / _CELL_M), 1)
+    # What lies outside the grid is as what shows nothing.
+    lowest = minimum_filter(heights, 2 * reach + 1, mode="constant", cval=-np.inf)
+    highest = maximum_filter(heights, 2 * reach + 1, mode="constant", cval=-np.inf)
+    with np.errstate(invalid="ignore"):
+        return np.isfinite(lowest) & (highest - lowest < _FLAT_M)
+
+
+def _ring(size: np.ndarray, sides: int, yaw: float) -> np.ndarray:
+    """[n, 2] a rectangle's or an ellipse's outline around 0, counter-clockwise."""
+    if sides == 4:
+        ring = rectangle(-size / 2, size / 2)
+    else:
+        turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+        ring = np.column_stack([np.cos(turn), np.sin(turn)]) * size / 2
+    c, s = np.cos(yaw), np.sin(yaw)
+    return ring @ np.array([[c, s], [-s, c]])
