@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 
 from qs3.classes import CLASSES
 from qs3.config.hydra import build
+from qs3.config.location import CONF
 from qs3.errors import ConfigError
 from qs3.generation.camera_poses import AnchoredViews
 from qs3.generation.plan import benchmark, check, describe, mesh_items, stored_config
@@ -103,7 +104,7 @@ def test_a_misspelt_key_is_an_error():
 def test_every_command_of_the_quickstart_composes():
     for command in quickstart.DATASETS:
         check(config(*command.split()[1:]))
-    for row in OmegaConf.load(quickstart.TABLE).rows:
+    for row in OmegaConf.load(CONF / "table" / "quickstart.yaml").rows:
         cfg = config(*row["target test"]["run"].split(), name="train")
         assert cfg.experiment_name == "quickstart"
 
