@@ -38,13 +38,12 @@ def _quickstart(out: str) -> int:
         "The main job in small: few meshes, views, points and epochs, and a SIMULATED target.\n"
         "It shows that everything works; its figures are not the paper's.\n"
     )
-    table = f"table=quickstart data_dir={out}/data log_dir={out}/logs"
     # Nets this small gain little from a second thread, and nothing beside another busy process.
-    at_once = min(len(os.sched_getaffinity(0)), 4)
-    train = f"train {table} seeds=0,1,2 jobs={at_once} overrides='trainer.threads=1 logger=csv'"
+    at_once, runs = min(len(os.sched_getaffinity(0)), 4), "trainer.threads=1 logger=csv"
+    table = f"table=quickstart data_dir={out}/data log_dir={out}/logs overrides={runs!r}"
     commands = (
         *(f"python {command} {paths}" for command in DATASETS),
-        f"qs3 report {train}",
+        f"qs3 report train {table} seeds=0,1,2 jobs={at_once}",
         f"qs3 report {table} out={out}",
         "qs3 report pictures domains=modelnet10,specklenet10,kinectsim10"
         f" data_dir={out}/data out={out}/scans.png",
