@@ -129,6 +129,20 @@ def test_damaged_archives(tmp_path, change, match):
     assert not is_finished(tmp_path / "objects")
 
 
+def test_a_copy_elsewhere_is_the_same_archive_and_other_objects_are_not(file, tmp_path):
+    path, arrays = file
+    domain(path, tmp_path).open()
+    moved = tmp_path / "elsewhere" / "other.npz"
+    moved.parent.mkdir()
+    moved.write_bytes(path.read_bytes())
+    domain(moved, tmp_path).open()
+    arrays = {key: np.array(value) for key, value in arrays.items()}
+    arrays["xyz_tenth_mm"][0, 0] += 1
+    np.savez_compressed(path.with_name("changed.npz"), **arrays)
+    with pytest.raises(DataError, match=r"is not what .*the objects in .*changed\.npz; delete"):
+        domain(path.with_name("changed.npz"), tmp_path).open()
+
+
 def test_a_broken_off_file(tmp_path):
     write_archive(tmp_path / "x.npz", {"train": 1, "test": 1})
     whole = (tmp_path / "x.npz").read_bytes()
