@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ from qs3.data.store import PointSet
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
 
 Numbers = dict[str, Any]
+
+PLATE_M = 0.08
+"""Thinner objects are a front, a back or a top alone."""
 
 
 def sampled(cloud: np.ndarray, count: int) -> Float[np.ndarray, "m 3"]:
@@ -37,6 +41,26 @@ def priors(a: PointSet, b: PointSet) -> Numbers:
 def _shares(data: PointSet) -> dict[str, float]:
     known = max(int(np.sum(data.labels >= 0)), 1)
     return {cls: len(data.members(cls)) / known for cls in data.classes}
+
+
+def over_the_floor(clouds: Sequence[np.ndarray], floor_m: float) -> Numbers:
+    """What of objects in metres is seen: lowest and highest point, the thinnest side, plates.
+
+    Each cloud's points lie between 2 and 98 % of its own, and its thinnest side is their 90 %
+    across the plane that fits them best. `low`, `high` [m over the floor] and `thin` [m] are the
+    quartiles over the clouds, `plates` is the share thinner than `PLATE_M`.
+    """
+    rows = []
+    for cloud in clouds:
+        points = np.asarray(cloud, dtype=np.float64)
+        low, high = np.percentile(points[:, 2], [2, 98]) - floor_m
+        centred = points - points.mean(axis=0)
+        across = centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0]
+        rows.append((low, high, float(np.subtract(*np.percentile(across, [95, 5])))))
+    values = np.array(rows)
+    quartiles = np.percentile(values, [25, 50, 75], axis=0).T.tolist()
+    plates = float((values[:, 2] < PLATE_M).mean())
+    return {**dict(zip(("low", "high", "thin"), quartiles, strict=True)), "plates": plates}
 
 
 def features(clouds: Float[np.ndarray, "n p 3"], more: Float[np.ndarray, "n m"]) -> np.ndarray:

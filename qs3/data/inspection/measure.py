@@ -102,11 +102,17 @@ def compare(a: Opened, b: Opened, bounds: Bounds, advance: Advance = lambda: Non
         "prior": gap.priors(a.data, b.data),
     }
     clouds, labels, values = {}, {}, {}
+    floors = (a.data.floor_m, b.data.floor_m)
     for side, opened in (("a", a), ("b", b)):
         chosen = _of_each(opened, common, _FEATURED, bounds.seed)
         labels[side] = np.repeat(np.arange(len(common)), [len(of) for of in chosen])
         clouds[side] = [gap.sampled(opened.data.points[i], count) for i in np.concatenate(chosen)]
         values[side] = measures.spacing(clouds[side])
+        if (floor_m := opened.data.floor_m) is not None and None not in floors:
+            found[f"floor_{side}"] = {
+                cls: gap.over_the_floor([opened.data.points[i] for i in of], floor_m)
+                for cls, of in zip(common, chosen, strict=True)
+            }
         found[f"cloud_{side}"] = measures.summary(values[side], {})["all"]
         advance()
         found[f"surface_{side}"] = surface(opened, common, bounds)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from qs3.data.inspection import columns
+from qs3.data.inspection.gap import PLATE_M
 from qs3.utils import text_table
 
 Numbers = dict[str, Any]
@@ -77,6 +78,7 @@ def of_pair(facts: Numbers) -> str:
         "point sampling where more are stored. Medians of up to 60 clouds a class, drawn with "
         f"seed {facts['seed']}.",
         *_truths(facts),
+        *_floors(facts),
         "## Told apart by their nearest neighbours",
         _markdown(told),
         "Share of clouds whose most similar cloud is of their own domain (50 %: cannot be told "
@@ -225,3 +227,22 @@ def _truths(facts: Numbers) -> list[str]:
             f"a point within {facts['within']} of the unit ball."
         )
     return ["\n".join(lines)]
+
+
+def _floors(facts: Numbers) -> list[str]:
+    """Where both domains are in metres and know their floor."""
+    if "floor_a" not in facts:
+        return []
+    heads = ("lowest [m]", "highest [m]", "thinnest side [m]", "plates")
+    rows = [["class", *(f"{head} {side}" for head in heads for side in "AB")]]
+    for cls in facts["floor_a"]:
+        of = [facts[f"floor_{side}"][cls] for side in "ab"]
+        cells = [f"{one[key][1]:.2f}" for key in ("low", "high", "thin") for one in of]
+        rows.append([cls, *cells, *(f"{one['plates']:.0%}" for one in of)])
+    return [
+        "## Over the floor",
+        _markdown(rows),
+        f"Medians over the same clouds; plates are thinner than {100 * PLATE_M:.0f} cm. A source "
+        "whose objects reach lower than the target's hides too little of them, or puts them on the "
+        "floor where they stand on furniture.",
+    ]

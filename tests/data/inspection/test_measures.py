@@ -226,6 +226,41 @@ def test_both_say_what_datasets_are_made_of(tmp_path, capsys):
     assert (facts["made_of_a"], facts["made_of_b"]) == (told, str(samples))
 
 
+def test_over_the_floor():
+    """A board of 60 x 40 x 4 cm, leaning by 30 degrees, and a box 50 cm high on the floor."""
+    rng = np.random.default_rng(0)
+    board = rng.uniform(-0.5, 0.5, (20_000, 3)) * [0.6, 0.4, 0.04]
+    tilt = np.deg2rad(60)
+    c, s = np.cos(tilt), np.sin(tilt)
+    board = board @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T + [3, 2, -0.4]
+    box = rng.uniform(-0.5, 0.5, (20_000, 3)) * [0.6, 0.4, 0.5] + np.array([0, 0, -1.0])
+    facts = gap.over_the_floor([board, box, box], floor_m=-1.25)
+    assert facts["plates"] == pytest.approx(1 / 3)
+    assert facts["low"][1:] == pytest.approx([0.01, (0.01 + board_low(0.4, s)) / 2], abs=0.01)
+    assert facts["high"][1] == pytest.approx(0.49, abs=0.005)
+    assert facts["thin"][1] == pytest.approx(0.36, abs=0.01)
+    assert gap.over_the_floor([board], -1.25)["thin"] == pytest.approx([0.036] * 3, abs=0.002)
+
+
+def board_low(side, sine):
+    """Over the floor, 2 % of a leaning board up: its middle is at 0.85 m."""
+    return 0.85 - 0.96 * side * sine / 2
+
+
+@pytest.mark.slow
+def test_heights_are_compared_where_both_know_their_floor(data_dir, tmp_path, capsys):
+    words = ["compare", "kinectsim10", "kinectsim10", f"paths.data_dir={data_dir}"]
+    assert main([*words, f"out={tmp_path / 'a'}"]) == 0
+    assert "## Over the floor" not in capsys.readouterr().out
+    words += ["a.floor_m=0", "b.floor_m=-0.5", f"out={tmp_path / 'b'}"]
+    assert main(words) == 0
+    assert "## Over the floor" in capsys.readouterr().out
+    facts = json.loads((tmp_path / "b" / "comparison.json").read_text())
+    for cls, of in facts["floor_a"].items():
+        assert facts["floor_b"][cls]["low"] == pytest.approx([z + 0.5 for z in of["low"]])
+        assert facts["floor_b"][cls]["plates"] == of["plates"]
+
+
 def test_one_domain_against_itself_has_no_gap(data_dir):
     opened = open_named(f"{data_dir}/kinectsim10", {})
     facts = compare(opened, opened, Bounds())
