@@ -54,7 +54,8 @@ def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
         f"paths.data_dir={data_dir}",
         f"paths.log_dir={log_dir}",
         *("num_classes=3", "model.k=6", "data.points=32", "data.fps_starts=1"),
-        *("protocol.epochs=3", "trainer.threads=1", "callbacks=none", "logger=csv"),
+        *("protocol.epochs=3", "protocol.steps=null", "trainer.threads=1", "callbacks=none"),
+        "logger=csv",
         "report.pictures=false",
         *more,
     ]

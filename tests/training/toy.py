@@ -72,7 +72,7 @@ def write_toy(folder: Path) -> None:
 
 def overrides(root: Path, *more: str) -> list[str]:
     """What turns conf/experiment/quickstart.yaml into a toy run in `root`."""
-    rounds = ["rounds=2", "epochs=3", "batch_size=8", "theta=0.4"]
+    rounds = ["rounds=2", "epochs=3", "steps=null", "batch_size=8", "theta=0.4"]
     return [
         "experiment=quickstart",
         f"paths.data_dir={root / 'data'}",
@@ -82,6 +82,7 @@ def overrides(root: Path, *more: str) -> list[str]:
         *(f"~model.{key}" for key in ("k", "variant", "norm", "dropout")),
         "data.points=32",
         "protocol.epochs=4",
+        "protocol.steps=null",
         "protocol.optimizer.lr=0.02",
         *(f"selftraining.{x}" for x in rounds if "selftraining=none" not in more),
         "trainer.threads=1",
