@@ -36,6 +36,7 @@ from qs3.utils.seeding import object_rng
 _BARE = Keep()
 _AROUND_M = 0.3
 """The picture is taken so far around the object, for what covers its outline."""
+_WORKTOP_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,8 @@ class RoomScan:
         torn: probability that of an object which depth edges tear apart only one piece is cut: who
             splits masks where the depth jumps and joins nothing has a chair's back and its seat as
             two chairs.
+        worktops: by class the probability that its top is not its own: tops in kitchens and of chests
+            are labelled as counters, which leaves of a cabinet its front and maybe a side.
         attempts: pictures that are taken, each from elsewhere, until one is not refused.
         clean: also make the twin from the true depth of what is seen.
         views: 1, the only number of views there is.
@@ -140,6 +143,7 @@ class RoomScan:
     rules: Rules = field(default_factory=Rules)
     points: int = 2048
     torn: float = 0.0
+    worktops: Mapping[str, float] = field(default_factory=dict)
     attempts: int = 12
     clean: bool = True
     views: int = 1
@@ -147,8 +151,9 @@ class RoomScan:
 
     def __post_init__(self) -> None:
         check_ranges(self, "recipe.", points=">= 1", attempts=">= 1", torn="[0, 1]")
-        for cls, chance in self.fronts.items():
-            check_float(f"recipe.fronts.{cls}", chance, "[0, 1]")
+        for name in ("fronts", "worktops"):
+            for cls, chance in getattr(self, name).items():
+                check_float(f"recipe.{name}.{cls}", chance, "[0, 1]")
         if self.views != 1:
             raise ConfigError(f"views={self.views}: a scan of a room is one view; leave views out")
         if not isinstance(self.mask, MaskCrop):
@@ -178,6 +183,9 @@ class RoomScan:
             if frame is None:
                 continue
             image, mask = depth_image(frame, pose), self.mask.keep(frame, rng)
+            if arranging.random() < self.worktops.get(cls, 0.0):
+                top = placed.bounds[1, 2] - pose[2, 3]  # over the camera, as the image's points are
+                mask &= ~(image.points_m[..., 2] > top - _WORKTOP_M)
             rules, edge_px = self.rules, None
             apart = object_rng(seed, object_id, 1 + attempt, 1)  # not of those that exist without
             if apart.random() < self.torn:

@@ -168,10 +168,22 @@ def test_a_table_hides_some_of_its_chair(made):
     assert seen[1].sum() < 0.9 * seen[0].sum()
 
 
+def test_a_worktop_is_not_its_cabinet_s(made):
+    recipe = replace(made.recipe, worktops={"chair": 1.0}, torn=0.0)
+    solid = trimesh.creation.box((0.8, 0.5, 0.8))
+    mesh = Mesh(np.asarray(solid.vertices), np.asarray(solid.faces))
+    for seed in range(2):
+        highest = recipe.make(mesh, ID, seed, made.renderer).arrays["points_clean"][:, 2].max()
+        assert 0.5 < highest < 0.78  # 5 cm and less by the sensor's noise
+        whole = replace(recipe, worktops={}).make(mesh, ID, seed, made.renderer)
+        assert whole.arrays["points_clean"][:, 2].max() == pytest.approx(0.8, abs=1e-3)
+
+
 @pytest.mark.parametrize("chance", [1.5, -0.1])
-def test_a_chance_outside_0_and_1_names_its_key(made, chance):
-    with pytest.raises(ConfigError, match=r"recipe\.fronts\.sofa must be in"):
-        replace(made.recipe, fronts={"sofa": chance})
+@pytest.mark.parametrize("name", ["fronts", "worktops"])
+def test_a_chance_outside_0_and_1_names_its_key(made, name, chance):
+    with pytest.raises(ConfigError, match=rf"recipe\.{name}\.sofa must be in"):
+        replace(made.recipe, **{name: {"sofa": chance}})
 
 
 def test_an_object_that_no_picture_shows_well_says_why(made):
