@@ -126,8 +126,8 @@ class RoomScan:
         torn: probability that of an object which depth edges tear apart only one piece is cut: who
             splits masks where the depth jumps and joins nothing has a chair's back and its seat as
             two chairs.
-        worktops: by class the probability that its top is not its own: tops in kitchens and of chests
-            are labelled as counters, which leaves of a cabinet its front and maybe a side.
+        worktops: by class the probability that its top is not its own: in kitchens it is labelled
+            as a counter, which leaves of a cabinet its front and maybe a side.
         attempts: pictures that are taken, each from elsewhere, until one is not refused.
         clean: also make the twin from the true depth of what is seen.
         views: 1, the only number of views there is.
