@@ -70,11 +70,11 @@ Unit = Callable[[], Iterator[Sample | Row]]
 """Reads one file, one depth image or one object of an archive."""
 
 
-def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
+def find_files(place: str | Path, key: str = "input=") -> tuple[list[Path], Path, int]:
     """The files to read, what their names are relative to, and how many files are passed over.
 
     In a folder: all files of known formats at any depth, in order of their names; hidden ones and
-    links to folders are left out.
+    links to folders are left out. `key` stands before the place in messages.
 
     Raises:
         MissingDataError: nothing there.
@@ -83,10 +83,10 @@ def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
     place = Path(place).expanduser()
     if place.is_file():
         if place.suffix.lower() not in SUFFIXES:
-            raise DataError(f"input={place}: unknown format; known are {', '.join(SUFFIXES)}")
+            raise DataError(f"{key}{place}: unknown format; known are {', '.join(SUFFIXES)}")
         return [place], place.parent, 0
     if not place.is_dir():
-        raise MissingDataError(f"input={place} is not there")
+        raise MissingDataError(f"{key}{place} is not there")
     found, others = [], 0
     for folder, folders, names in os.walk(place):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
@@ -98,7 +98,7 @@ def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
             else:
                 others += 1
     if not found:
-        raise MissingDataError(f"input={place} holds no file of {' '.join(SUFFIXES)}")
+        raise MissingDataError(f"{key}{place} holds no file of {' '.join(SUFFIXES)}")
     return sorted(found), place, others
 
 

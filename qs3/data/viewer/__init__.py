@@ -1,0 +1,1 @@
+"""Clouds that can be turned, in one HTML page that needs nothing else."""
