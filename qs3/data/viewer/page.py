@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.clouds.files import printable
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.orthographic import AZIMUTH_DEG, ELEVATION_DEG
 from qs3.utils.version import VERSION
@@ -125,7 +126,7 @@ def told(parts: Sequence[Part], points: int | None = None) -> tuple[list[str], l
     most = points_each(sum(len(part.shown) for part in parts), points)
     about = [part.about for part in parts]
     if many := sum(len(one.points) > most for part in parts for one in part.shown):
-        about.append(f"{many} clouds are thinned to {most} points each (points= says how many)")
+        about.append(f"thinned to {most} points each: {many} clouds (points= says how many)")
     failed = [words for part in parts for words in part.failed]
     notes = [f"not read: {words}" for words in failed[:_NAMED]]
     return about, notes + [f"not read: {len(failed) - _NAMED} more"] * (len(failed) > _NAMED)
@@ -184,10 +185,10 @@ def page(title: str, parts: Sequence[Part], *, colour: str = "", points: int | N
         '<!doctype html><html lang="en"><head><meta charset="utf-8">',
         f'<meta http-equiv="Content-Security-Policy" content="{_policy(script, style)}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{escape(title)}</title><style>{style}</style></head><body>",
-        f"<h1>{escape(title)}</h1>",
-        *(f'<p class="soft">{escape(line)}</p>' for line in about),
-        *(f'<p class="note">{escape(line)}</p>' for line in notes),
+        f"<title>{_text(title)}</title><style>{style}</style></head><body>",
+        f"<h1>{_text(title)}</h1>",
+        *(f'<p class="soft">{_text(line)}</p>' for line in about),
+        *(f'<p class="note">{_text(line)}</p>' for line in notes),
         "<noscript><p>Clouds are drawn by JavaScript, which is off here.</p></noscript>",
         _BAR,
         f'<div id="grid"></div><p class="soft">qs3 {escape(VERSION)}</p>',
@@ -195,6 +196,10 @@ def page(title: str, parts: Sequence[Part], *, colour: str = "", points: int | N
         f"<script>{script}</script></body></html>\n",
     ]
     return "\n".join(lines)
+
+
+def _text(words: str) -> str:
+    return escape(printable(words))
 
 
 def _policy(script: str, style: str) -> str:
