@@ -22,13 +22,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.clouds.files import printable
+from qs3.data.viewer import COLOURS, MOST_CLOUDS, MOST_IN_ALL, MOST_POINTS
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.orthographic import AZIMUTH_DEG, ELEVATION_DEG
 from qs3.utils.version import VERSION
-
-COLOURS = ("height", "view", "residual", "class", "confidence")
-MOST_CLOUDS, MOST_POINTS, MOST_IN_ALL = 500, 200_000, 3_000_000
-"""Of a page, of a cloud, and of all clouds together: 8 bytes a point and what is known of it."""
 
 _USUAL = 50 * 2048  # points of a page, if nobody says how many
 _USUAL_CLOUD = 50_000  # and of one cloud

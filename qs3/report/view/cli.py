@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from qs3.data.importers.folders import UP_AXES
-from qs3.data.viewer.page import COLOURS, MOST_CLOUDS, MOST_POINTS
+from qs3.data.viewer import COLOURS, MOST_CLOUDS, MOST_POINTS
 from qs3.errors import ConfigError
 from qs3.utils.cli import FLAG, Command, Option, one_of, text, whole
 
@@ -31,7 +30,7 @@ VIEW = Command(
         Option("points", whole(), f"of each, up to {MOST_POINTS} (default: of 50 clouds 2048)"),
         Option("colour", one_of(*COLOURS), "what is shown first (default height)", ""),
         Option("match", text("WORDS"), "only clouds with this in their names", ""),
-        Option("up", one_of(*UP_AXES), "of files: the axis that points up", "z"),
+        Option("up", text("AXIS"), "of files, what points up: x y z -x -y or -z", "z"),
         Option("variant", text("NAME"), "of a dataset, such as points_clean", ""),
         Option("residual", FLAG, "of a dataset: distances to the surface, if they are known", True),
         Option("data_dir", text("FOLDER"), "of runs and domains: where their data are"),

@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from qs3.clouds.files import checked, measured, parse_clouds, printable
+from qs3.config.checks import check_choice
 from qs3.config.compose import choices
 from qs3.data.importers.base import turned
+from qs3.data.importers.folders import UP_AXES
 from qs3.data.importers.object_archive import read_archive
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.viewed import chosen, drawn, part_of
 from qs3.data.store import is_finished
-from qs3.data.viewer.page import MOST_POINTS, Part, Shown, page, points_each, thinned, told
+from qs3.data.viewer import MOST_POINTS
+from qs3.data.viewer.page import Part, Shown, page, points_each, thinned, told
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.inputs import find_files, is_archive, reason_of
 from qs3.report.runs.data import is_run, read_run
@@ -42,6 +45,7 @@ class Settings:
     def __post_init__(self) -> None:
         if Path(self.out).suffix.lower() not in (".html", ".htm"):
             raise ConfigError(f"out={self.out} must end in .html")
+        check_choice("up", self.up, UP_AXES)
         points_each(self.clouds, None)
         points_each(1, self.points)
 
@@ -169,7 +173,7 @@ def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]
         except DataError as error:
             yield f"{own}: {reason_of(error, own)}"
             continue
-        note = f"{dropped} points not finite" if dropped else ""
+        note = f"{dropped} points are not finite" if dropped else ""
         one = Shown(own, cloud, label=label, note=note)
         yield thinned(one, MOST_POINTS)  # of a large file nothing else stays in memory
 

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from qs3.data.viewer import MOST_CLOUDS, MOST_POINTS
 from qs3.data.viewer.page import (
-    MOST_CLOUDS,
-    MOST_POINTS,
     Part,
     Shown,
     nice,
