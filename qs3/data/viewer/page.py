@@ -38,7 +38,7 @@ _BESIDE_DEG = 20.0  # of the camera: straight from there a scan looks whole
 _BAR = """<div id="bar"><div>
 <label>colour <select id="colour"></select></label>
 <label>show <select id="list"></select></label>
-<span class="only"><button id="before" title="Page up">&lsaquo;</button>
+<span class="only several"><button id="before" title="Page up">&lsaquo;</button>
 <button id="after" title="Page down">&rsaquo;</button>
 <button id="back" title="Esc">all</button></span>
 <label class="many">find <input id="words" type="search"></label><span id="count" class="soft">
@@ -122,8 +122,8 @@ def told(parts: Sequence[Part], points: int | None = None) -> tuple[list[str], l
     """What is shown, a line each; and what is not, to be noticed. Also for a terminal."""
     most = points_each(sum(len(part.shown) for part in parts), points)
     about = [part.about for part in parts]
-    if many := sum(len(one.points) > most for part in parts for one in part.shown):
-        about.append(f"thinned to {most} points each: {many} clouds (points= says how many)")
+    if any(len(one.points) > most for part in parts for one in part.shown):
+        about.append(f"at most {most} points of a cloud are shown; points= says how many")
     failed = [words for part in parts for words in part.failed]
     notes = [f"not read: {words}" for words in failed[:_NAMED]]
     return about, notes + [f"not read: {len(failed) - _NAMED} more"] * (len(failed) > _NAMED)

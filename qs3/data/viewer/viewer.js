@@ -312,5 +312,6 @@
   });
   addEventListener("resize", () => redraw());
   legend();
+  document.body.classList.toggle("sole", all.length === 1);
   show(all.length === 1 ? 0 : -1);
 })();

@@ -42,10 +42,11 @@ VIEW = Command(
         "qs3 view logs/qs3_s2d/seed0-5f0c2a71 out=errors.html",
     ),
     about="""
-PATH is a file of clouds in any format of `qs3 predict`, an archive of objects, a folder of files,
-the folder of a dataset or the name of a domain, or the folder of a finished run: its most confident
-errors come first. Several stand on one page. Of more clouds than clouds=, and of more points than
-points=, some are drawn at random, always the same ones, and the page says so.
+PATH is a file of clouds in any format of `qs3 predict`, a mesh, an archive of objects, a folder of
+files, the folder of a dataset or the name of a domain, or the folder of a finished run: its most
+confident errors come first. Several stand on one page. Of more clouds than clouds=, and of more
+points than points=, some are drawn at random, always the same ones, and the page says so. Meshes
+are shown by samples of their surface.
 
 The page is one file that needs neither a network nor qs3. Drag to turn (all together, or each
 alone), click to enlarge, find by words such as "chair" or "wrong". Colours: height; the view that

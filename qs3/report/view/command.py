@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.files import checked, measured, parse_clouds, printable
+from qs3.clouds.files import SUFFIXES, checked, measured, parse_clouds, printable
 from qs3.config.checks import check_choice
 from qs3.config.compose import choices
 from qs3.data.importers.base import turned
@@ -20,11 +21,17 @@ from qs3.data.store import is_finished
 from qs3.data.viewer import MOST_POINTS
 from qs3.data.viewer.page import Part, Shown, page, points_each, thinned, told
 from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.geometry.sampling import surface_sample
 from qs3.inference.inputs import find_files, is_archive, reason_of
+from qs3.meshes.io import DECLARE_UP, load_mesh
+from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.runs.data import is_run, read_run
 from qs3.report.runs.viewed import part_of_run, worst_first
 from qs3.utils.files import write_text
 from qs3.utils.progress import progress_bar
+
+_KNOWN = tuple(dict.fromkeys((*SUFFIXES, *MESHES)))
+_HEADER = 1 << 16  # bytes of a PLY file that its header is looked for in
 
 
 @dataclass(frozen=True)
@@ -133,7 +140,7 @@ def _archive(path: Path, most: int, settings: Settings) -> Part:
 
 
 def _files(place: Path, most: int, settings: Settings) -> Part:
-    files, root, _ = find_files(place, key="")
+    files, root, _ = find_files(place, key="", suffixes=_KNOWN)
     names = [path.relative_to(root).as_posix() for path in files]
     there = np.flatnonzero([settings.match in name for name in names])
     _nothing_if(not len(there), settings, str(place))
@@ -142,15 +149,48 @@ def _files(place: Path, most: int, settings: Settings) -> Part:
     few = drawn(there, most)
     with progress_bar("files", total=len(few)) as advance:
         for i in few:
-            for one in _of_file(files[i], printable(names[i]), most, settings.up):
+            name = printable(names[i])
+            if _is_mesh(files[i]):
+                found = _of_mesh(files[i], name, settings, len(few))
+            else:
+                found = _of_file(files[i], name, most, settings.up)
+            for one in found:
                 if isinstance(one, Shown):
                     shown.append(one)
                 else:
                     failed.append(one)
             advance()
     shown = [shown[i] for i in drawn(np.arange(len(shown)), most)]
-    of = f"{len(few)} of {len(files)} files in " if place.is_dir() else ""
-    return Part(shown, f"{len(shown)} clouds of {of}{place.name}", failed=failed)
+    about = f"{len(few)} of {len(files)} files in {place.name}" if place.is_dir() else place.name
+    clouds = f", {len(shown)} clouds" if len(shown) != len(few) else ""
+    return Part(shown, about + clouds, failed=failed)
+
+
+def _is_mesh(path: Path) -> bool:
+    """Whether a file has a surface; PLY may have one."""
+    if path.suffix.lower() != ".ply":
+        return path.suffix.lower() in MESHES
+    try:
+        with open(path, "rb") as file:
+            header = file.read(_HEADER).partition(b"end_header")[0]
+    except OSError:
+        return False  # said when it is read
+    return re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is not None
+
+
+def _of_mesh(path: Path, name: str, settings: Settings, files: int) -> Iterator[Shown | str]:
+    """Samples of a surface; its vertices alone show little."""
+    count = points_each(files, settings.points)
+    try:
+        mesh = load_mesh(path)
+        cloud = surface_sample(mesh.vertices, mesh.faces, count, np.random.default_rng(0))
+        cloud = checked(cloud, name)
+    except DataError as error:
+        yield f"{name}: {reason_of(error, str(path))}"
+        return
+    if path.suffix.lower() not in DECLARE_UP:
+        cloud = turned(cloud, settings.up)
+    yield Shown(name, cloud, label=_folder(name), note=f"samples of {len(mesh.faces)} faces")
 
 
 def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]:
@@ -163,10 +203,9 @@ def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]
     except DataError as error:
         yield f"{name}: {reason_of(error, str(path))}"
         return
-    folder = name.rpartition("/")[0].rpartition("/")[2]
     for i in drawn(np.arange(len(found.clouds)), most):
         own = f"{name}[{i}]" if found.many else name
-        label = folder if found.labels is None else _words(found.labels[i])
+        label = _folder(name) if found.labels is None else _words(found.labels[i])
         try:
             finite, dropped = measured(found.clouds[i], own)
             cloud = turned(checked(finite, own), up)
@@ -176,6 +215,10 @@ def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]
         note = f"{dropped} points are not finite" if dropped else ""
         one = Shown(own, cloud, label=label, note=note)
         yield thinned(one, MOST_POINTS)  # of a large file nothing else stays in memory
+
+
+def _folder(name: str) -> str:
+    return name.rpartition("/")[0].rpartition("/")[2]
 
 
 def _words(label: object) -> str:

@@ -144,7 +144,7 @@ def test_many_points_are_drawn_from_and_the_page_says_so():
     np.testing.assert_array_equal(few.view, thinned(whole, 7).view)
     assert thinned(whole, 20) is whole
     text = of(whole, one("b", 5), points=7)
-    assert "thinned to 7 points each: 1 clouds" in text
+    assert "at most 7 points of a cloud are shown" in text
     assert [(c["count"], c["of"]) for c in data_of(text)["clouds"]] == [(7, 20), (5, 0)]
 
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 
 from qs3.data.store import open_pointset
 from tests.commands import main
@@ -52,7 +53,7 @@ def test_files_of_all_kinds_with_their_labels(view, tmp_path):
     (folder / "notes.pdf").touch()
     status, said, data = view("scans")
     assert status == 0
-    assert "5 clouds of 4 of 4 files in scans" in said
+    assert "4 of 4 files in scans, 5 clouds" in said
     assert "saved view.html" in said
     assert [(c["name"], c["label"], c["note"]) for c in data["clouds"]] == [
         ("c.npz[0]", "sofa", ""), ("chair/a.xyz", "chair", ""),
@@ -66,6 +67,29 @@ def test_files_of_all_kinds_with_their_labels(view, tmp_path):
     assert names(turned) == ["lamp/old/b.npy[0]", "lamp/old/b.npy[1]"]
     want = np.stack([cloud[:, 0], -cloud[:, 2], cloud[:, 1]], axis=1)  # y up
     np.testing.assert_allclose(places(turned["clouds"][0]), want - want.min(axis=0), atol=1e-4)
+
+
+def test_meshes_are_shown_by_samples_of_their_surface(view, tmp_path):
+    solid = trimesh.creation.box((1, 2, 3))
+    for name in ("table/box.ply", "table/box.off"):
+        (tmp_path / "table").mkdir(exist_ok=True)
+        solid.export(tmp_path / name)
+    np.savetxt(tmp_path / "cloud.xyz", RNG.normal(size=(9, 3)))
+    trimesh.PointCloud(solid.vertices).export(tmp_path / "table" / "corners.ply")
+    (tmp_path / "table" / "cut.stl").write_bytes(b"solid\nfacet normal")
+    status, said, data = view(".", "points=4000", "up=y")
+    assert status == 1
+    assert "not read: table/cut.stl: " in said
+    found = {cloud["name"]: cloud for cloud in data["clouds"]}
+    assert found["table/corners.ply"]["count"] == 8  # of a cloud, as it is
+    for name in ("table/box.ply", "table/box.off"):
+        assert found[name]["label"] == "table"
+        assert found[name]["note"] == "samples of 12 faces"
+        assert found[name]["size"] == pytest.approx([1, 3, 2], abs=0.01)  # y up
+        points = places(found[name])
+        on = np.isclose(points, 0, atol=1e-3) | np.isclose(points, [1, 3, 2], atol=1e-3)
+        assert on.any(axis=1).all()
+        assert found[name]["count"] == 4000
 
 
 def test_damaged_files_are_named_and_the_others_shown(view, tmp_path):
@@ -95,7 +119,7 @@ def test_several_paths_share_the_page(view, tmp_path):
     assert len(data["clouds"]) == 8
     assert {name[0] for name in names(data)} == {"a", "b"}
     assert {(c["count"], c["of"]) for c in data["clouds"]} == {(5, 12)}
-    assert "thinned to 5 points each: 8 clouds" in said
+    assert "at most 5 points of a cloud are shown" in said
 
 
 def test_an_archive_of_objects(view, tmp_path):
