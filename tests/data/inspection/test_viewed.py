@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.viewed import chosen, drawn, part_of
 from qs3.data.store import ManifestRow, write_pointset
+from qs3.generation.provenance import NO_RESIDUAL_M, PROVENANCE
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.placement import UnitCube
 from qs3.utils.seeding import object_rng
 from tests.data.inspection.test_measures import distances
-
-TABLE = ("view", "u_px", "v_px", "residual_m", "incidence_deg")
 
 
 def write(folder, labels=("a", "b", "a"), tables=None, **arrays):
@@ -67,8 +66,8 @@ def test_what_is_drawn_is_not_at_even_steps():
 def test_provenance_gives_views_and_errors(tmp_path):
     table = np.zeros((3, 6, 5))
     table[..., 0] = np.arange(6) % 4
-    table[..., 3] = [0.1, -0.2, -99, 0, 0.3, -0.4]
-    opened = write(tmp_path, tables={"provenance": TABLE}, provenance=table)
+    table[..., 3] = [0.1, -0.2, NO_RESIDUAL_M, 0, 0.3, -0.4]
+    opened = write(tmp_path, tables={"provenance": PROVENANCE}, provenance=table)
     part = part_of(opened, [2, 0], residuals=False)  # these cost nothing
     assert [one.name for one in part.shown] == ["a/2", "a/0"]
     assert [one.note for one in part.shown] == ["from 2", "from 0"]
@@ -82,7 +81,7 @@ def test_provenance_gives_views_and_errors(tmp_path):
 def test_of_the_clean_variant_no_provenance_is_shown(tmp_path):
     """It tells of the measured points."""
     table, clean = np.zeros((3, 6, 5)), np.random.default_rng(0).normal(size=(3, 6, 3))
-    write(tmp_path, tables={"provenance": TABLE}, provenance=table, points_clean=clean)
+    write(tmp_path, tables={"provenance": PROVENANCE}, provenance=table, points_clean=clean)
     part = part_of(open_named(str(tmp_path), {"variant": "points_clean"}), [0])
     assert part.shown[0].view is None
     assert part.shown[0].residual is None
