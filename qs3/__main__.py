@@ -14,6 +14,7 @@ QS3 = Group(
         "download": "qs3.data.download.cli:DOWNLOAD",
         "inspect": "qs3.data.inspection.cli:INSPECT",
         "compare": "qs3.data.inspection.cli:COMPARE",
+        "view": "qs3.report.view.cli:VIEW",
         "scannet": "qs3.data.scannet.cli:SCANNET",
         "predict": "qs3.inference.cli:PREDICT",
         "export": "qs3.inference.cli:EXPORT",

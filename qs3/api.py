@@ -113,7 +113,8 @@ def load(
     A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`).
 
     Args:
-        run: its folder, or the file result.pt of it, which needs nothing beside it.
+        run: its folder, or the file result.pt of it, which needs nothing beside it; or a folder
+            that `qs3 export out=FOLDER` wrote.
         device: where to run it: "cpu", "cuda", "cuda:1".
         packages: where the net of the file may be defined. For a net of your own add your
             package, if you trust it to be built with any arguments.

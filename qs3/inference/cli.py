@@ -7,7 +7,9 @@ from typing import Any
 
 from qs3.utils.cli import FLAG, NUMBER, Command, Option, text, whole
 
-_CKPT = Option("ckpt", text("RUN"), "a finished run's folder, or its result.pt", required=True)
+_CKPT = Option(
+    "ckpt", text("RUN"), "a finished run's or an exported folder, or result.pt", required=True
+)
 _THREADS = Option("threads", whole(), "batches at the same time (default: one a processor)")
 
 
@@ -92,21 +94,26 @@ A damaged file gets status=failed and its reason, and the others go on. The exit
 
 EXPORT = Command(
     "qs3 export",
-    "a trained net for use without qs3, in ONNX or by torch.export",
+    "a trained net for use without qs3 (ONNX, torch.export), or as a folder to publish",
     _export,
     (
         _CKPT,
-        Option("out", text("FILE"), ".onnx, or .pt2 for torch.export.load", "model.onnx"),
+        Option("out", text("PATH"), ".onnx, .pt2 for torch.export.load, or a folder", "model.onnx"),
         _THREADS,
     ),
     (
         "qs3 export ckpt=logs/own_scans/seed0-5f0c2a71 out=model.onnx",
         "qs3 export ckpt=result.pt out=model.pt2",
+        "qs3 export ckpt=logs/own_scans/seed0-5f0c2a71 out=my-classifier",
     ),
     about="""
 It takes prepared clouds [clouds, points, 3] and gives logits; how a cloud is prepared, and the
 names of the classes, stand in the .onnx file's metadata. The written net is run on made-up clouds
 and its logits compared with the net's.
+
+A folder gets model.safetensors, config.json (settings, and the weights' SHA-256) and README.md, the
+model's card with what the run knows of data, command and accuracy: the layout of model hubs.
+qs3.load and `qs3 predict ckpt=FOLDER` read it; nothing in it is run, damage is refused.
 """,
     interrupted="nothing was saved",
 )

@@ -6,6 +6,8 @@ import copy
 import importlib.util
 import json
 import logging
+import re
+import shlex
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,14 +17,19 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml  # type: ignore[import-untyped,unused-ignore]
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError, Qs3Error
+from qs3.inference.model_card import card
+from qs3.inference.model_file import build_net, find_result, read_result, values_of
+from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
 from qs3.inference.predictor import Predictor, load
 from qs3.models.base import PointClassifier
 from qs3.models.norms import norms_for, use_domain
+from qs3.runs.metrics import read_metrics
 from qs3.utils.files import atomic_path, make_folder
 from qs3.utils.version import VERSION
 
@@ -84,6 +91,8 @@ def export_command(ckpt: str | Path, out: str | Path, threads: int = 1) -> str:
     """Export the classifier of a run (or its result.pt) and compare; text for the terminal."""
     from qs3.inference.command import saved
 
+    if not Path(out).suffix:
+        return export_folder(ckpt, Path(out).expanduser())
     before = torch.get_num_threads()
     torch.set_num_threads(check_int("threads", threads, 1))
     try:
@@ -106,6 +115,47 @@ def export_command(ckpt: str | Path, out: str | Path, threads: int = 1) -> str:
     )
 
 
+def export_folder(ckpt: str | Path, folder: Path) -> str:
+    """Write a model's folder (see `qs3.inference.model_folder`); text for the terminal.
+
+    Raises:
+        ConfigError: the folder holds a README.md or config.json of something else, or the result.
+        MissingDataError, DataError: no result there, or damaged.
+    """
+    file, result = find_result(ckpt), read_result(ckpt)
+    if file.parent.resolve() == folder.resolve():
+        raise ConfigError(f"out={folder} is where it comes from; give another folder")
+    if not (folder / WEIGHTS).exists():
+        for name in (CARD, CONFIG):
+            if (folder / name).exists():
+                raise ConfigError(f"out={folder}: a {name} of something else is there; refused")
+    text = card(result, read_metrics(file.parent), _command(file.parent))
+    write_folder(folder, values_of(result), text)
+    again = read_result(folder)
+    same = again.weights.keys() == result.weights.keys() and all(
+        torch.equal(value, again.weights[name]) for name, value in result.weights.items()
+    )
+    if not same:
+        raise Qs3Error(f"{folder} does not hold the weights that were written; is the disk sound?")
+    build_net(again)
+    return (
+        f"saved {folder}: {WEIGHTS} ({(folder / WEIGHTS).stat().st_size / 1e6:.1f} MB), {CONFIG} "
+        f"and {CARD}\nqs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it; read "
+        f"{CARD}, which is the model's card, before you publish it"
+    )
+
+
+def _command(run: Path) -> str:
+    """That trained the run, if it is known; of absolute paths only the last part."""
+    try:
+        words = yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text("utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        return ""
+    given = [str(word) for word in words] if isinstance(words, list) else []
+    kept = [word for word in given if not word.startswith(("paths.", "hydra."))]
+    return shlex.join(["qs3-train", *(re.sub(r"=[/~].*/", "=", word) for word in kept)])
+
+
 def export(
     predictor: Predictor, out: str | Path, clouds: Float[Tensor, "n m 3"] | None = None
 ) -> Comparison:
@@ -119,7 +169,10 @@ def export(
     """
     out = Path(out).expanduser()
     if out.suffix not in SUFFIXES:
-        raise ConfigError(f"out={out} must end in {' or '.join(SUFFIXES)}")
+        raise ConfigError(
+            f"out={out} must end in {' or '.join(SUFFIXES)}, or be a folder without a dot in its "
+            "name"
+        )
     if out.suffix == ".onnx":
         check_packages()
     clouds = made_up(predictor.points) if clouds is None else clouds

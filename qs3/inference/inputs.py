@@ -70,11 +70,14 @@ Unit = Callable[[], Iterator[Sample | Row]]
 """Reads one file, one depth image or one object of an archive."""
 
 
-def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
+def find_files(
+    place: str | Path, key: str = "input=", suffixes: Sequence[str] = SUFFIXES
+) -> tuple[list[Path], Path, int]:
     """The files to read, what their names are relative to, and how many files are passed over.
 
     In a folder: all files of known formats at any depth, in order of their names; hidden ones and
-    links to folders are left out.
+    links to folders are left out. `key` stands before the place in messages; `suffixes` are those
+    of the formats.
 
     Raises:
         MissingDataError: nothing there.
@@ -82,23 +85,23 @@ def find_files(place: str | Path) -> tuple[list[Path], Path, int]:
     """
     place = Path(place).expanduser()
     if place.is_file():
-        if place.suffix.lower() not in SUFFIXES:
-            raise DataError(f"input={place}: unknown format; known are {', '.join(SUFFIXES)}")
+        if place.suffix.lower() not in suffixes:
+            raise DataError(f"{key}{place}: unknown format; known are {', '.join(suffixes)}")
         return [place], place.parent, 0
     if not place.is_dir():
-        raise MissingDataError(f"input={place} is not there")
+        raise MissingDataError(f"{key}{place} is not there")
     found, others = [], 0
     for folder, folders, names in os.walk(place):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
         for name in sorted(names):
             if name.startswith("."):
                 continue
-            if os.path.splitext(name)[1].lower() in SUFFIXES:
+            if os.path.splitext(name)[1].lower() in suffixes:
                 found.append(Path(folder) / name)
             else:
                 others += 1
     if not found:
-        raise MissingDataError(f"input={place} holds no file of {' '.join(SUFFIXES)}")
+        raise MissingDataError(f"{key}{place} holds no file of {' '.join(suffixes)}")
     return sorted(found), place, others
 
 

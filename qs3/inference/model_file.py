@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.ood import ALL as MEASURES_OF_CLOUDS
+from qs3.inference.model_folder import CONFIG, WEIGHTS, read_folder
 from qs3.runs.checkpoints import save
 from qs3.utils.version import VERSION
 
@@ -97,12 +98,17 @@ class Result:
 
 def write_result(path: Path, result: Result) -> None:
     """Save it, atomically."""
+    save({"qs3": VERSION, **values_of(result)}, path)
+
+
+def values_of(result: Result) -> dict[str, Any]:
+    """By name, as tensors and plain values."""
     values = {field.name: getattr(result, field.name) for field in fields(result)}
-    save({"qs3": VERSION, **values, "classes": list(result.classes)}, path)
+    return {**values, "classes": list(result.classes)}
 
 
 def find_result(path: str | Path) -> Path:
-    """The file meant by a run's folder, or by the file itself.
+    """The file meant by the folder of a run or of an exported model, or by the file itself.
 
     Raises:
         MissingDataError: there is none; says what lies there instead.
@@ -112,8 +118,9 @@ def find_result(path: str | Path) -> Path:
         return path
     if not path.is_dir():
         raise MissingDataError(f"{path} is not there; give the folder of a finished run")
-    if (path / FILE).is_file():
-        return path / FILE
+    for name in (FILE, WEIGHTS):
+        if (path / name).is_file():
+            return path / name
     if (path / "started.json").is_file():
         raise MissingDataError(
             f"{path} is the folder of a run that is not finished: it has no {FILE}; repeat its "
@@ -127,11 +134,15 @@ def find_result(path: str | Path) -> Path:
 def read_result(path: str | Path) -> Result:
     """Read and check what `write_result` wrote, in a run's folder or file; nothing in it is run.
 
+    Also a folder of `qs3.inference.model_folder`.
+
     Raises:
         MissingDataError: no such file.
         DataError: damaged, or not a result.
     """
     file = find_result(path)
+    if file.name == WEIGHTS:
+        return _checked(file.parent / CONFIG, read_folder(file.parent))
     try:
         found = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds for damaged and for malicious files

@@ -131,7 +131,7 @@ def _page(run: str, data_dir: str | None, out: str | None) -> None:
         print(f"note: {note}")
     for name, reason in drawn.skipped.items():
         print(f"no {name}: {reason}")
-    for path in (*drawn.pictures.values(), drawn.page):
+    for path in filter(None, (*drawn.pictures.values(), drawn.clouds, drawn.page)):
         print(path)
 
 
@@ -278,7 +278,8 @@ PAGE = Command(
     ("qs3 report page run=logs/qs3_s2d/seed0-5f0c2a71 data_dir=data",),
     about="""
 Curves, confusion, pseudo-labels, classes, calibration; if its data are there, features and clouds
-of both domains, their class balance and the most confident errors; and a page of all, index.html.
+of both domains, their class balance and the most confident errors, also as clouds.html, where they
+can be turned; and a page of all, index.html.
 """,
 )
 

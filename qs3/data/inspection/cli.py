@@ -67,8 +67,8 @@ INSPECT = Command(
     ),
     about="""
 What it is made of, counts by class and split, sizes, which way is up by the shape, spacing,
-density, coverage, copies, leaks from train to test, odd objects; a contact sheet. Published files
-are imported first.
+density, coverage, copies, leaks from train to test, odd objects; a contact sheet, and a page where
+clouds can be turned. Published files are imported first.
 """,
     others={"": _KEYS},
     interrupted="nothing was saved",

@@ -9,10 +9,13 @@ from qs3.data.contact_sheets import class_sheet, scan_picture
 from qs3.data.inspection.measure import COMPARE_STEPS, Bounds, compare, inspect
 from qs3.data.inspection.open_dataset import Opened, open_named
 from qs3.data.inspection.text import of_domain, of_pair
+from qs3.data.inspection.viewed import chosen, part_of
+from qs3.data.viewer.page import page
 from qs3.utils.files import make_folder, write_json, write_text
 from qs3.utils.progress import progress_bar
 
 OUT = Path("out/inspection")
+_TURNABLE = 50  # clouds on the page where they can be turned
 
 
 def inspect_command(
@@ -30,7 +33,11 @@ def inspect_command(
     split = next(iter(opened.data.counts()))
     heading = f"{opened.label}, {split}"
     class_sheet(opened.data, folder / "clouds.png", split=split, heading=heading)
-    return f"{text}\n\nsaved inspection.json, inspection.txt and clouds.png in {folder}"
+    part = part_of(opened, chosen(opened.data, _TURNABLE), residuals=False)
+    write_text(folder / "clouds.html", page(opened.label, [part]))
+    return (
+        f"{text}\n\nsaved inspection.json, inspection.txt, clouds.png and clouds.html in {folder}"
+    )
 
 
 def compare_command(

@@ -19,7 +19,8 @@ class Opened:
     """A dataset, its manifest's rows (also of failed objects), and what to call it.
 
     `name` is short, for file names; `label` has title and symbol. `made_of` is the domain's word,
-    which knows how many clouds were published; a folder's store has only its own.
+    which knows how many clouds were published; a folder's store has only its own. `unit` is "m",
+    or "" where nobody knows.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Opened:
     data: PointSet
     rows: tuple[ManifestRow, ...]
     made_of: MadeOf
+    unit: str = ""
 
     @property
     def kept(self) -> list[ManifestRow]:
@@ -61,11 +63,18 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
         data = open_pointset(folder, variant)
         more = [variant] * (variant != "points") + ["simulated"] * bool(data.meta.get("simulated"))
         label = f"{data.name} ({', '.join(more)})" if more else data.name
-        return _opened(data.name, label, folder, variant, data, data.made_of)
+        rows = tuple(read_manifest(folder, data.classes))
+        return Opened(data.name, label, folder, variant, data, rows, data.made_of)
     domain = compose_domain(name, overrides)
-    data = domain.open()
-    made_of = domain.made_of(data)
-    return _opened(domain.name, domain.label, domain.folder, domain.variant, data, made_of)
+    return opened_domain(domain, domain.open())
+
+
+def opened_domain(domain: Domain, data: PointSet) -> Opened:
+    """A domain whose dataset is open."""
+    unit = "m" if domain.unit == "metres" else ""
+    rows = tuple(read_manifest(domain.folder, data.classes))
+    where = (domain.name, domain.label, domain.folder, domain.variant)
+    return Opened(*where, data, rows, domain.made_of(data), unit)
 
 
 def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
@@ -89,10 +98,3 @@ def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
     cfg = composed(None, f"+domain={name}", "+paths=default", *words, place=f"domain={name}: ")
     domain: Domain = build(cfg.domain)
     return domain
-
-
-def _opened(
-    name: str, label: str, folder: Path, variant: str, data: PointSet, made_of: MadeOf
-) -> Opened:
-    rows = tuple(read_manifest(folder, data.classes))
-    return Opened(name, label, folder, variant, data, rows, made_of)

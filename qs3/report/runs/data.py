@@ -134,6 +134,11 @@ class RunFiles:
         return None if self.metrics is None else self.metrics.final
 
 
+def is_run(folder: Path) -> bool:
+    """Whether it is the folder of a run, finished or not."""
+    return any((folder / name).exists() for name in (METRICS, runs.STARTED, HISTORY))
+
+
 def read_run(folder: str | Path) -> RunFiles:
     """Read a run's folder.
 
@@ -142,7 +147,7 @@ def read_run(folder: str | Path) -> RunFiles:
         DataError: one of its files is damaged.
     """
     folder = Path(folder).expanduser()
-    if not any((folder / name).exists() for name in (METRICS, runs.STARTED, HISTORY)):
+    if not is_run(folder):
         raise MissingDataError(
             f"{folder} is not the folder of a run: it has no {METRICS} and no {HISTORY}; give "
             "<paths.log_dir>/<experiment_name>/seed<seed>-<hash>"

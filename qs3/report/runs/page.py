@@ -24,6 +24,7 @@ _TITLES = {
     "class_balance": "Classes of both domains",
     "mistakes": "Most confident errors",
     "named": "Most confident of each class",
+    "clouds": "Clouds to turn",
 }
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1d2430; margin: 2rem auto; padding: 0 1rem;
@@ -39,11 +40,22 @@ pre { background: #f7f8fa; padding: .8rem; overflow-x: auto; font-size: 13px; }
 """
 
 
-def page(run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str]) -> str:
-    """The page as HTML, with its PNGs inside; `skipped`: why a picture is not there, by name."""
+def page(
+    run: RunFiles, pictures: Mapping[str, Path], skipped: Mapping[str, str], clouds: str = ""
+) -> str:
+    """The page as HTML, with its PNGs inside.
+
+    Args:
+        run: that it is of.
+        pictures: PNGs by name.
+        skipped: why a picture is not there, by name.
+        clouds: the page beside it with clouds that can be turned, if there is one.
+    """
+    link = f'<p><a href="{escape(clouds)}">Clouds to turn</a>, the most confident errors first.</p>'
     parts = [
         *(f'<p class="note">Note: {escape(note)}.</p>' for note in run.notes),
         _table(key_figures(run).items()),
+        *([link] if clouds else []),
     ]
     if run.metrics is not None:
         parts += ["<h2>Quality without labels</h2>", _table(quality_table(run.metrics.quality))]

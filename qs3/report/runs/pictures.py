@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from qs3.data.viewer.page import page as turnable_page
 from qs3.errors import Qs3Error
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
 from qs3.report.runs.clouds import cloud_pictures
 from qs3.report.runs.data import RunFiles, read_run
 from qs3.report.runs.page import page
+from qs3.report.runs.viewed import part_of_run, worst_first
 from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.utils.files import write_text
 from qs3.utils.plotting import save_png
@@ -32,6 +34,8 @@ log = logging.getLogger(__name__)
 
 FOLDER = "pictures"
 PAGE = "index.html"
+CLOUDS = "clouds.html"
+_CLOUDS, _POINTS = 30, 1024  # on the page of clouds: a quarter of a megabyte a run
 
 
 @dataclass(frozen=True)
@@ -43,12 +47,15 @@ class Drawn:
         skipped: why a picture is not there, by name.
         notes: what the run's folder lacks, as text.
         page: the HTML page.
+        clouds: the page with clouds that can be turned, the most confident errors first; None if
+            the target's data are not there.
     """
 
     pictures: Mapping[str, Path]
     skipped: Mapping[str, str]
     notes: tuple[str, ...]
     page: Path
+    clouds: Path | None
 
 
 def draw(
@@ -83,8 +90,19 @@ def draw(
         except NothingToDrawError as reason:
             skipped[name] = str(reason)
             path.unlink(missing_ok=True)
-    write_text(out / PAGE, page(run, pictures, skipped))
-    return Drawn(pictures, skipped, run.notes, out / PAGE)
+    try:
+        clouds = _write_clouds(run, out / CLOUDS, data_dir)
+    except Qs3Error as reason:
+        clouds, skipped["clouds"] = None, str(reason)
+        (out / CLOUDS).unlink(missing_ok=True)
+    write_text(out / PAGE, page(run, pictures, skipped, CLOUDS if clouds else ""))
+    return Drawn(pictures, skipped, run.notes, out / PAGE, clouds)
+
+
+def _write_clouds(run: RunFiles, path: Path, data_dir: str | Path | None) -> Path:
+    part = part_of_run(run, worst_first(run)[:_CLOUDS], data_dir, residuals=False)
+    write_text(path, turnable_page(run.title, [part], points=_POINTS))
+    return path
 
 
 def _makers(

@@ -192,6 +192,7 @@ def test_inspect_says_and_saves(data_dir, tmp_path, capsys):
     assert facts["counts"]["splits"]["train"]["by_class"]["chair"] == 4
     assert set(facts["gravity"]["by_class"]) == set(fixtures.CLASSES)
     assert (tmp_path / "clouds.png").read_bytes().startswith(b"\x89PNG")
+    assert "50 of 60 clouds of" in (tmp_path / "clouds.html").read_text()
 
 
 def test_compare_says_and_saves(data_dir, tmp_path, capsys):

@@ -68,8 +68,11 @@ def test_files_and_page(run, tmp_path):
 
 
 def check_page(run, drawn):
-    """It needs no other file, and says what the run was and is."""
+    """It needs no other file, links one, and says what the run was and is."""
     page = drawn.page.read_text()
+    assert drawn.clouds == run / "pictures" / "clouds.html"
+    assert page.count('<a href="clouds.html">') == 1
+    page = page.replace('<a href="clouds.html">', "")
     assert not re.search(r'(src|href)="(?!data:)', page)
     images = re.findall(r"base64,([A-Za-z0-9+/=]+)", page)
     assert [base64.b64decode(i) for i in images] == [
@@ -276,7 +279,8 @@ def test_command_line(run, toy_data, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
     named = [*ALL[:5], "embedding", *ALL[5:]]
-    shown = [str(out / f"{name}.png") for name in named] + [str(out / "index.html")]
+    shown = [str(out / f"{name}.png") for name in named]
+    shown += [str(out / "clouds.html"), str(out / "index.html")]
     assert capsys.readouterr().out.splitlines() == shown
     assert not_blank(out / "embedding.png")
 
@@ -305,7 +309,7 @@ def test_training_draws_and_its_hash_does_not_know(toy):
     train(cfg)
     pictures = hashing.run_folder(cfg) / "pictures"
     assert {p.name for p in pictures.iterdir()} == {
-        *(f"{name}.png" for name in ALL if name != "pseudo_labels"), "index.html",
+        *(f"{name}.png" for name in ALL if name != "pseudo_labels"), "clouds.html", "index.html",
     }  # fmt: skip
 
 

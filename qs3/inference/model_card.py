@@ -1,0 +1,124 @@
+"""The card of an exported classifier: what it is, what it was found to be worth, what it lacks."""
+
+from __future__ import annotations
+
+import math
+
+from qs3.inference.model_file import Result
+from qs3.runs.metrics import RunMetrics
+from qs3.utils.version import VERSION
+
+_Z = 1.959964  # of a normal distribution: 95 % lie within so many standard deviations
+
+
+def card(result: Result, metrics: RunMetrics | None, command: str = "") -> str:
+    """The card as Markdown, with YAML at its top.
+
+    Args:
+        result: the classifier.
+        metrics: of its run; None if only its file is at hand: then no figures are stated.
+        command: that trained it; "" likewise.
+    """
+    net = result.model["_target_"].rpartition(".")[2]
+    title = f"{net}, {metrics.source} to {metrics.target}" if metrics else f"{net}"
+    lines = [
+        "---",
+        "library_name: qs3",
+        "pipeline_tag: other",
+        "tags: [point-cloud, 3d, classification, depth-sensor, domain-adaptation]",
+        "---",
+        "",
+        f"# {title}",
+        "",
+        f"Classifies point clouds of single objects into {len(result.classes)} classes: "
+        f"{', '.join(map(_text, result.classes))}.",
+        "",
+        "```python",
+        "import qs3",
+        "",
+        'predictor = qs3.load("this folder")',
+        "probabilities = predictor([cloud])  # [n, 3], any n, z up" + _frame(result),
+        "```",
+        "",
+        "Or: `qs3 predict ckpt=FOLDER input=SCANS`.",
+        "",
+        "## Input",
+        "",
+        f"- {_SCALE[result.scale]}",
+        f"- {_GRAVITY[result.gravity]}",
+        f"- {result.points} points, the farthest from each other, of a cloud of "
+        f"{result.stored_points}; others are thinned or filled up.",
+        "",
+        "## Training",
+        "",
+        *(_training(metrics) if metrics else ["Not recorded in the file that this was made from."]),
+        *(["", "```", command, "```"] if command else []),
+        "",
+        "## Accuracy",
+        "",
+        _accuracy(metrics),
+        "",
+        "## Limits",
+        "",
+        "- Every object gets one of these classes, also one of no class, often with high "
+        "confidence.",
+        "- Confidence is not accuracy on clouds of another kind; `qs3 predict` marks clouds out of "
+        "the ranges of training.",
+        "- Which way is up is not guessed.",
+        "- Terms of use are those of the data above; state them when you publish this folder.",
+        "",
+        f"Written by qs3 {VERSION}.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+_SCALE = {
+    "unit_ball": "Any unit and size: clouds are put into the unit ball.",
+    "metres": "Metres: the net knows sizes.",
+    "above_floor": "Metres: the net knows sizes and heights above the floor, which is given.",
+}
+_GRAVITY = {"z": "z up.", "none": "In the frame of the depth camera: x right, y down, z forward."}
+
+
+def _frame(result: Result) -> str:
+    return {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor=Z"}[result.scale]
+
+
+def _training(metrics: RunMetrics) -> list[str]:
+    m = metrics
+    return [
+        f"- Source, with labels: {m.source} ({m.made_of.source})",
+        f"- Target, without: {m.target_text} ({m.made_of.target})",
+        f"- Method: {m.method}; self-training: {m.selftraining}; selected by {m.selection.teacher}",
+        f"- Settings: {m.hash} (SHA-256 {m.config_sha256}), seed {m.seed}",
+        f"- Data (SHA-256): source {m.data.source}, target {m.data.target}",
+        f"- Versions: {', '.join(f'{name} {version}' for name, version in m.versions.items())}",
+    ]
+
+
+def _accuracy(metrics: RunMetrics | None) -> str:
+    if metrics is None:
+        return "Not recorded in the file that this was made from."
+    final = metrics.final
+    if final.accuracy is None:
+        return "Not known: the target has no labels."
+    low, high = wilson(round(final.accuracy * final.n), final.n)
+    return (
+        f"On {final.n} test clouds of {metrics.target_text}: {final.accuracy:.1%} (95 % interval "
+        f"{low:.1%} to {high:.1%} if clouds are independent), balanced "
+        f"{final.balanced_accuracy:.1%}; always the commonest class {final.majority_rate:.1%}."
+    )
+
+
+def wilson(right: int, of: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share (Wilson, "Probable inference", JASA 22, 1927)."""
+    share, spread = right / of, _Z * _Z / of
+    middle = (share + spread / 2) / (1 + spread)
+    half = _Z / (1 + spread) * math.sqrt(share * (1 - share) / of + spread / (4 * of))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def _text(name: str) -> str:
+    """A name as it stands: Markdown and HTML mean nothing in it."""
+    return "".join(c if c.isalnum() or c in " -" else f"&#{ord(c)};" for c in name)
