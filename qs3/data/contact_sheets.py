@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.data.store import PointSet, evenly
+from qs3.data.store import PointSet
 from qs3.errors import DataError
 from qs3.geometry.orthographic import project
 from qs3.utils.files import atomic_path
@@ -81,8 +81,8 @@ def class_sheet(
 ) -> Path:
     """Save a sheet of up to 60 of a split's clouds, two a class at least.
 
-    A row is a class; without labels they come from first to last. They are taken at even steps:
-    scans of one mesh are neighbours in a dataset.
+    A row is a class. They are `drawn`: scans of one mesh are neighbours in a dataset, and families
+    of a catalogue take turns.
 
     Raises:
         DataError: the split is empty.
@@ -94,9 +94,9 @@ def class_sheet(
         columns = max(2, min(columns, _SHEET // len(part.classes)))
         members = {cls: part.members(cls) for cls in part.classes}
         rows = tuple(cls for cls, own in members.items() if len(own))
-        shown = [i for cls in rows for i in padded(evenly(members[cls], columns), columns)]
+        shown = [i for cls in rows for i in padded(drawn(members[cls], columns), columns)]
     else:
-        shown = evenly(np.arange(len(part)), _SHEET)
+        shown = drawn(np.arange(len(part)), _SHEET)
     return contact_sheet(
         [None if i is None else np.asarray(part.points[i]) for i in shown],
         ["" if i is None else short(part.ids[i]) for i in shown],
@@ -204,3 +204,10 @@ class _Figure:
         with atomic_path(path) as temporary:
             Image.fromarray(seen).quantize(256).save(temporary, format="png", optimize=True)
         return Path(path)
+
+
+def drawn(positions: np.ndarray, most: int) -> list[int]:
+    """At most so many of some positions [n], at random, always the same ones, in order."""
+    if len(positions) <= most:
+        return [int(i) for i in positions]
+    return sorted(np.random.default_rng(0).choice(positions, most, replace=False).tolist())

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
+from qs3.data.contact_sheets import drawn
 from qs3.data.inspection.open_dataset import Opened
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.data.store import PointSet, open_table
@@ -20,16 +21,6 @@ from qs3.data.viewer.page import Part, Shown
 
 # As `qs3.generation.provenance` writes them, which stands above this package.
 _VIEW, _RESIDUAL, _NO_RESIDUAL_M = "view", "residual_m", -99.0
-
-
-def drawn(positions: np.ndarray, most: int) -> list[int]:
-    """At most so many of some positions [n], at random, always the same ones, in order.
-
-    Not at even steps: families of a catalogue take turns, and all shown would be of one.
-    """
-    if len(positions) <= most:
-        return [int(i) for i in positions]
-    return sorted(np.random.default_rng(0).choice(positions, most, replace=False).tolist())
 
 
 def chosen(data: PointSet, most: int, match: str = "") -> list[int]:

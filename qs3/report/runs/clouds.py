@@ -138,9 +138,14 @@ class _Domains:
 
 
 def _surest(said: Predictions, which: np.ndarray) -> list[int]:
-    """Positions where `which` [n] holds, the largest probability first, one of each mesh."""
+    """Positions where `which` [n] holds, the largest probability first, one of each mesh.
+
+    Where a "mesh" has objects of several classes it is a room of an archive: then all of them.
+    """
     order = np.argsort(-said.probabilities.max(axis=1), kind="stable")
+    kinds = {(mesh, int(label)) for mesh, label in zip(said.meshes, said.labels, strict=True)}
+    names = said.meshes if len(kinds) == len({mesh for mesh, _ in kinds}) else said.ids
     found: dict[str, int] = {}
     for i in order[which[order]]:
-        found.setdefault(said.meshes[i], int(i))
+        found.setdefault(names[i], int(i))
     return list(found.values())

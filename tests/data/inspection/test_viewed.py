@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from qs3.data.contact_sheets import drawn
 from qs3.data.inspection.open_dataset import open_named
-from qs3.data.inspection.viewed import chosen, drawn, part_of
+from qs3.data.inspection.viewed import chosen, part_of
 from qs3.data.store import ManifestRow, write_pointset
 from qs3.generation.provenance import NO_RESIDUAL_M, PROVENANCE
 from qs3.meshes.catalogue import Catalogue
