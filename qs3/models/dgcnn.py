@@ -60,7 +60,7 @@ class EdgeConv(nn.Module):
         weight = self.linear.weight
         with torch.autocast(x.device.type, enabled=False):
             x = x.to(weight.dtype)
-            if fast.usable(traceable=not uses_batch(self.norm)):
+            if fast.usable(x, anywhere=True, traceable=not uses_batch(self.norm)):
                 return edge_conv(x, index, weight, self.norm, self.negative_slope)
             z = normed(self.norm, self.linear(edges_of(x, index)))  # [b, n, k, d]
             return F.leaky_relu(z, self.negative_slope).max(2)[0]
@@ -155,12 +155,12 @@ class DGCNN(Backbone):
             x = layer(x, knn(x, k))
             levels.append(x)
         per_point = torch.cat(levels, dim=2)  # [B, N, 512]
-        if self.norm5 is None and fast.usable():
+        if self.norm5 is None and fast.usable(x):
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
         y = linear(per_point, self.conv5.weight)  # [B, N, 1024]
         if self.norm5 is not None:
             y = F.leaky_relu(normed(self.norm5, y), 0.2)
-        most, _ = max_over_rows(y) if fast.usable() else y.max(1)
+        most, _ = max_over_rows(y) if fast.usable(x) else y.max(1)
         if self.variant == "defrec":
             return Features(most, per_point)
         return Features(torch.cat([most, y.mean(1)], dim=1), per_point)

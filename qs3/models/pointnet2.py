@@ -89,7 +89,7 @@ class GroupedMLP(nn.Module):
         with torch.autocast(xyz.device.type, enabled=False):
             xyz, centres = xyz.to(weights[0].dtype), centres.to(weights[0].dtype)
             features = None if features is None else features.to(weights[0].dtype)
-            if fast.usable():
+            if fast.usable(xyz):
                 return grouped_mlp_max(xyz, features, centres, index, weights, list(self.norms))
             x = gather(xyz, index) - centres[:, :, None]  # [b, m, k, 3]
             if features is not None:

@@ -73,7 +73,7 @@ class RSConv(nn.Module):
 
         With instance norms the kernel takes one cloud at a time.
         """
-        form = self._fast if fast.usable() else self._plain
+        form = self._fast if fast.usable(points) else self._plain
         best = form(points, features, centres, index)
         return normed(self.channel_norm, self.channel_raising(best)).relu()
 
@@ -148,7 +148,7 @@ class RSCNN(Backbone):
         """Maximum over the 128 centres, in float32 at least."""
         with torch.autocast(points.device.type, enabled=False):
             points = points.detach().to(self.last.weight.dtype)
-            if self.norm == "instance" and fast.usable():
+            if self.norm == "instance" and fast.usable(points):
                 return Features(torch.cat([self._forward(cloud[None]) for cloud in points]), None)
             return Features(self._forward(points), None)
 

@@ -1,15 +1,11 @@
 """A step costs what its forward passes cost: no waiting for the device, no loop over clouds.
 
-Methods are run on torch's `meta` device. Its tensors have shapes but no values, so whatever asks
-for a value fails: `.item()`, `.tolist()`, `.cpu()`, `if tensor:`, indexing by a mask, `nonzero`. On
-a GPU all of these wait for it. And it takes the paths of `qs3.geometry` that a GPU takes: on the
-CPU sampling and neighbours go through numpy, cloud by cloud, which is not a method's business.
-Nets are tiny ones, for the same reason: what a backbone does is tested with it.
+Methods are run on the device without values of `tests.device`. Nets are tiny ones: what a backbone
+does is tested in `tests/models/test_device.py`.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,82 +14,16 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from qs3.datamodules.augment import Augment
 from qs3.methods.base import Method
 from qs3.methods.source_only import SourceOnly
+from tests.device import Watch
 from tests.methods.cases import CASES, Case, batch_of, total
 from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
 
 CONF = Path(__file__).parents[2] / "conf"
 parametrize = pytest.mark.parametrize("name", CASES)
-
-
-class Autocast(torch.autocast):
-    """`meta` has none: the CPU's stands in."""
-
-    def __init__(self, device_type: str, **settings: Any) -> None:
-        super().__init__("cpu" if device_type == "meta" else device_type, **settings)
-
-
-@pytest.fixture(autouse=True)
-def _autocast_on_meta(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch, "autocast", Autocast)
-
-
-class Constants(TorchFunctionMode):
-    """Notes tensors made of Python numbers: on a GPU they come from the CPU's memory."""
-
-    def __init__(self, carried: list[str]) -> None:
-        super().__init__()
-        self.carried = carried
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        if func in (torch.tensor, torch.as_tensor) and not isinstance(args[0], Tensor):
-            self.carried.append(func.__name__)
-        return func(*args, **(kwargs or {}))
-
-
-class Watch(TorchDispatchMode):
-    """Counts operations, and notes those that carry values from one device to another.
-
-    What was drawn from a generator may be carried: a generator is on the device of the batch, so
-    only here, where `meta` has none, do its numbers have to travel.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.counts: Counter[str] = Counter()
-        self.carried: list[str] = []
-        self._drawn: list[Tensor] = []  # kept, so that no other tensor gets their place
-        self._constants = Constants(self.carried)
-
-    def __enter__(self) -> Watch:
-        self._constants.__enter__()
-        return super().__enter__()
-
-    def __exit__(self, *error: Any) -> None:
-        super().__exit__(*error)
-        self._constants.__exit__(*error)
-
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        result = func(*args, **(kwargs or {}))
-        given = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
-        made = [x for x in tree_leaves(result) if isinstance(x, Tensor)]
-        self.counts[str(func)] += 1
-        drawn = all(any(x is d for d in self._drawn) for x in given)
-        if drawn and (given or "generator" in (kwargs or {})):
-            self._drawn += [x for x in made if x.device.type == "cpu"]
-        elif len({x.device for x in (*given, *made)}) > 1:
-            self.carried.append(str(func))
-        return result
 
 
 def _made(name: str) -> tuple[nn.Module, Method]:

@@ -21,6 +21,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.geometry.matmul import matmul_t
+from qs3.models import fast
 from qs3.models.norms import active, statistics, uses_batch
 
 _AT_ONCE = 1 << 20  # values of z worked on at once: 4 MB in float32
@@ -30,8 +31,10 @@ def max_over_rows(x: Float[Tensor, "b n c"]) -> tuple[Float[Tensor, "b c"], Int[
     """`x.max(1)`: values and the first rows that have them, about ten times faster on the CPU.
 
     Pooling of an image in channels-last layout is the only maximum of torch on the CPU that is
-    vectorised and tells where it was.
+    vectorised and tells where it was. On other devices it is any row that has the value.
     """
+    if not fast.on_cpu(x):
+        return x.max(1)
     image = x[:, :, None].permute(0, 3, 1, 2)  # [b, c, n, 1]
     best, where = F.max_pool2d(image, (x.shape[1], 1), return_indices=True)
     return best.flatten(1), where.flatten(1)
