@@ -22,7 +22,7 @@ from qs3.geometry.neighbours import gather, knn
 from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.models.fast.edgeconv import edge_conv
-from qs3.models.fast.pointwise_max import max_over_rows, pooled_linear
+from qs3.models.fast.pointwise_max import max_over_members, max_over_rows, pooled_linear
 from qs3.models.norms import head_norm, make_norm, normed, uses_batch
 
 VARIANTS = ("uda", "simpleview", "defrec")
@@ -63,7 +63,7 @@ class EdgeConv(nn.Module):
             if fast.usable(x, anywhere=True, traceable=not uses_batch(self.norm)):
                 return edge_conv(x, index, weight, self.norm, self.negative_slope)
             z = normed(self.norm, self.linear(edges_of(x, index)))  # [b, n, k, d]
-            return F.leaky_relu(z, self.negative_slope).max(2)[0]
+            return max_over_members(F.leaky_relu(z, self.negative_slope))
 
     def extra_repr(self) -> str:
         """Shown by print(model)."""

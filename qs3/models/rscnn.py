@@ -24,6 +24,7 @@ from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.fast.pointwise_max import max_over_members
 from qs3.models.fast.rsconv import relations, rs_conv
 from qs3.models.norms import make_norm, normed
 
@@ -94,7 +95,7 @@ class RSConv(nn.Module):
         else:
             assert features is not None
             x = torch.cat([d, gather(features, index)], dim=3)  # [b, m, k, 3 + c]
-        return normed(self.norm, w * x).relu().max(2)[0]
+        return max_over_members(normed(self.norm, w * x).relu())
 
     def _fast(
         self, points: Tensor, features: Tensor | None, centres: Tensor, index: Tensor

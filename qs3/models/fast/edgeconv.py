@@ -33,7 +33,7 @@ from torch.nn import functional as F
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import exporting
 from qs3.models import fast
-from qs3.models.fast.pointwise_max import max_over_rows
+from qs3.models.fast.pointwise_max import max_over_members, max_over_rows
 from qs3.models.norms import active, normed, track, uses_batch
 
 _GATHERED = 1 << 20  # values gathered at once on the CPU: 4 MB in float32
@@ -142,7 +142,7 @@ def edge_conv(
         points = x.reshape(b * n, c)
         p, q = points @ w1.T, points @ e.T
         z = p.index_select(0, flat.flatten()).view(b, n, k, -1) + q.view(b, n, 1, -1)
-        return F.leaky_relu(normed(norm, z).max(2)[0], negative_slope)
+        return F.leaky_relu(max_over_members(normed(norm, z)), negative_slope)
     rows = x.reshape(b if isinstance(norm, nn.InstanceNorm1d) else 1, -1, c)  # [g, r, c]
     if uses_batch(norm):
         # about the mean, lest E[z^2] - E[z]^2 cancel; z only changes by W2 centre
