@@ -44,5 +44,5 @@ def farthest_points(x: Tensor, n: int, start: Tensor) -> Tensor:
         "enable_fp_fusion": False,  # the rounding of the steps, so that ties fall alike
     }
     with torch.cuda.device_of(x):
-        _kernel[(b,)](x.contiguous(), start, out, total, n, **settings)
+        _kernel[(b,)](x.contiguous(), start.contiguous(), out, total, n, **settings)
     return out

@@ -107,9 +107,16 @@ def test_kernels_are_of_the_cpu() -> None:
 
 
 def test_farthest_points_are_one_operation() -> None:
-    x, start = torch.rand(2, 20, 3), torch.tensor([3, 19])
-    torch.library.opcheck(farthest_points, (x, 7, start))
-    x, start = x.to("meta"), start.to("meta")
+    x, start = (
+        torch.empty(2, 20, 3, device="meta"),
+        torch.empty(2, dtype=torch.int64, device="meta"),
+    )
     with Watch() as watch:
-        farthest_points(x, 7, start)
+        taken = farthest_points(x, 7, start)
     assert watch.kernels == {"qs3.farthest_points.default": 1}
+    assert taken.shape == (2, 7)
+
+
+@pytest.mark.slow
+def test_farthest_points_as_torch_wants_operations() -> None:
+    torch.library.opcheck(farthest_points, (torch.rand(2, 20, 3), 7, torch.tensor([3, 19])))
