@@ -7,6 +7,8 @@ OUT    ?= out/quickstart
 PIP_ARGS ?=
 # Of pytest; a file's tests run in one process, in order.
 PARALLEL ?= -n 2 --dist loadfile
+# Of `make bench`.
+DEVICE ?= cpu
 
 .DEFAULT_GOAL := help
 .PHONY: help install doctor quickstart lint format test test-all bench mutants docs clean
@@ -51,8 +53,8 @@ test: install ## all tests that are not slow, on 2 cores
 test-all: install ## the slow tests too, shapes in signatures checked, and the benchmarks once each
 	QS3_CHECK_SHAPES=1 $(RUN) -m pytest $(PARALLEL) -m ''
 
-bench: install ## speed, as ratios against named baselines
-	$(RUN) -m pytest tests/benchmarks --benchmark-enable -s
+bench: install ## speed, as ratios against named baselines; of nets and methods on DEVICE=cuda
+	QS3_BENCH_DEVICE=$(DEVICE) $(RUN) -m pytest tests/benchmarks --benchmark-enable -s
 
 mutants: install ## how many faults put into the core the tests notice; hours, goes on where it stopped
 	$(RUN) .ci/mutants.py .ci/mutants.toml docs/results/mutants.csv

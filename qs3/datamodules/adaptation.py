@@ -167,6 +167,7 @@ class AdaptationData(LightningDataModule):
             rank=self.trainer.global_rank if self.trainer else 0,
             world=self.trainer.world_size if self.trainer else 1,
             piece=None if steps is None else Piece(start, *steps),
+            pinned=self._pinned(),
         )
 
     def val_dataloader(self) -> Batches:
@@ -201,7 +202,11 @@ class AdaptationData(LightningDataModule):
 
     def _in_order(self, name: str, table: Table) -> Batches:
         size = self.eval_batch_size
-        return Batches({name: table}, size, seed=self.seed, epoch=0, shuffle=False)
+        pinned = self._pinned()
+        return Batches({name: table}, size, seed=self.seed, epoch=0, shuffle=False, pinned=pinned)
+
+    def _pinned(self) -> bool:
+        return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
 
     def _labelled(self) -> Table:
         y = f"y_{self.owner}"

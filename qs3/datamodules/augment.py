@@ -87,7 +87,7 @@ class Augment:
         if self.shift > 0.0:
             points = points + self.shift * (2 * uniform(b, 1, 3) - 1)
         if self.lift > 0.0 and scale == "above_floor":
-            up = torch.tensor([0.0, 0.0, self.lift], device=points.device, dtype=points.dtype)
+            up = torch.arange(3, device=points.device).eq(2).to(points.dtype) * self.lift
             points = points + up * (2 * uniform(b, 1, 1) - 1)
         if self.jitter_sigma > 0.0:
             noise = torch.randn(points.shape, generator=generator, device=points.device)
@@ -206,7 +206,9 @@ def drop_regions(
     left = torch.ones(b, n, dtype=torch.bool, device=points.device)
     regions = 1 + (most * uniform()).long().clamp(max=most - 1)  # [B]
     for region in range(most):
-        centre = torch.multinomial(left.float(), 1, generator=generator)  # [B, 1]
+        # as `torch.multinomial` draws one, which asks the device whether it can
+        rate = torch.empty_like(points[..., 0]).exponential_(generator=generator)
+        centre = (left / rate).argmax(dim=1, keepdim=True)  # [B, 1]
         size = (n * (low + (high - low) * uniform())).long() * (region < regions)  # [B]
         distance = (points - points.take_along_dim(centre[..., None], dim=1)).square().sum(dim=2)
         order = distance.masked_fill(~left, torch.inf).argsort(dim=1, stable=True)

@@ -94,6 +94,7 @@ class Batches:
         rank, world: of `world` processes each takes every `world`-th cloud, as many as the others.
         piece: instead of one pass these batches, all of `batch_size`. Each cloud still comes once
             before any comes again.
+        pinned: lay batches where an NVIDIA GPU reads them by itself, while the CPU goes on.
     """
 
     def __init__(
@@ -107,11 +108,12 @@ class Batches:
         rank: int = 0,
         world: int = 1,
         piece: Piece | None = None,
+        pinned: bool = False,
     ) -> None:
         self.tables = dict(tables)
         self.seed, self.epoch, self.shuffle = seed, epoch, shuffle
         self.rank, self.world = rank, world
-        self.piece = piece
+        self.piece, self.pinned = piece, pinned
         first = next(iter(self.tables.values()))
         if piece is None:
             self.sizes = _sizes(-(-len(first) // world), batch_size)
@@ -126,7 +128,8 @@ class Batches:
         for i in range(len(self)):
             batch: dict[str, Any] = {"index": i, "epoch": self.epoch}
             for name, table in self.tables.items():
-                batch[name] = table.rows(*(part[i] for part in parts[name]))
+                rows = table.rows(*(part[i] for part in parts[name]))
+                batch[name] = {k: x.pin_memory() for k, x in rows.items()} if self.pinned else rows
             yield batch
 
     def _parts(self, name: str, table: Table) -> list[tuple[Tensor, ...]]:

@@ -5,14 +5,13 @@ Written here because torch-cluster is deprecated and pyg-lib is not on PyPI.
 
 from __future__ import annotations
 
-from typing import no_type_check
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from qs3.geometry.farthest_points import farthest_points, farthest_points_by_scan
 from qs3.geometry.matmul import matmul_t
 from qs3.geometry.sampling import farthest_point_sampling_np
 
@@ -107,7 +106,9 @@ def _smallest_on_cpu(values: Tensor, k: int) -> Tensor:
 def gather(x: Tensor, index: Int[Tensor, "b ..."]) -> Tensor:
     """Rows of each cloud: x [b, n, c], index [b, *rest] -> [b, *rest, c]."""
     flat = index.flatten(1)  # [b, r]
-    if exporting():  # runtimes take whole rows several times faster than value after value
+    if not takes_numpy(x):
+        # Runtimes take whole rows several times faster than value after value, and a device that
+        # must add up in order (`deterministic`) sorts the rows' numbers for it, not the values'.
         first = x.shape[1] * torch.arange(x.shape[0], device=x.device)
         rows = x.flatten(0, 1).index_select(0, (flat + first[:, None]).flatten())
         return rows.view(*index.shape, x.shape[2])
@@ -125,42 +126,19 @@ def farthest_point_sampling(
     With n > N the order of all N points starts over.
     """
     if not takes_numpy(x):
-        return _farthest_points(x, n, start)
+        b, total, _ = x.shape
+        if n > total:
+            index = torch.arange(n, device=x.device) % total
+            return farthest_point_sampling(x, total, start)[:, index]
+        x = x.detach().float()
+        x = x - x.mean(dim=1, keepdim=True)
+        if not isinstance(start, Tensor):
+            start = torch.full((b,), start, device=x.device)
+        return farthest_points_by_scan(x, n, start) if exporting() else farthest_points(x, n, start)
     starts = torch.as_tensor(start).expand(len(x)).tolist()
     clouds = zip(x.detach().float().numpy(), starts, strict=True)
     orders = [farthest_point_sampling_np(cloud, n, first) for cloud, first in clouds]
     return torch.from_numpy(np.stack(orders))
-
-
-def _farthest_points(x: Tensor, n: int, start: Int[Tensor, " b"] | int = 0) -> Tensor:
-    """All clouds at once, one step a point."""
-    b, total, _ = x.shape
-    if n > total:
-        index = torch.arange(n, device=x.device) % total
-        return _farthest_points(x, total, start)[:, index]
-    x = x.detach().float()
-    x = x - x.mean(dim=1, keepdim=True)
-    last = torch.as_tensor(start, device=x.device, dtype=torch.int64).expand(b)[:, None]  # [b, 1]
-    state = torch.full_like(x[:, :, 0], torch.inf), last.clone()  # squared distances, [b, total]
-
-    @no_type_check  # torch's compiler goes through it, and cannot through checks of shapes
-    def step(state, _=None):
-        nearest, last = state
-        taken = x.gather(1, last[:, :, None].expand(-1, -1, 3))
-        distance = (x - taken).square().sum(-1)
-        nearest = torch.minimum(nearest, distance).scatter(1, last, -1.0)  # never again
-        return (nearest, nearest.argmax(1, keepdim=True)), last.clone()
-
-    if exporting():
-        from torch._higher_order_ops.scan import scan  # a loop that a graph can hold
-
-        _, taken = scan(step, state, torch.arange(n, device=x.device))
-        return taken[:, :, 0].T  # [b, n]
-    out = torch.empty(b, n, dtype=torch.int64, device=x.device)
-    for i in range(n):
-        state, last = step(state)
-        out[:, i] = last[:, 0]
-    return out
 
 
 def takes_numpy(x: Tensor) -> bool:

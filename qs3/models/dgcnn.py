@@ -22,7 +22,7 @@ from qs3.geometry.neighbours import gather, knn
 from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.models.fast.edgeconv import edge_conv
-from qs3.models.fast.pointwise_max import max_over_rows, pooled_linear
+from qs3.models.fast.pointwise_max import max_over_members, max_over_rows, pooled_linear
 from qs3.models.norms import head_norm, make_norm, normed, uses_batch
 
 VARIANTS = ("uda", "simpleview", "defrec")
@@ -60,10 +60,10 @@ class EdgeConv(nn.Module):
         weight = self.linear.weight
         with torch.autocast(x.device.type, enabled=False):
             x = x.to(weight.dtype)
-            if fast.usable(traceable=not uses_batch(self.norm)):
+            if fast.usable(x, anywhere=True, traceable=not uses_batch(self.norm)):
                 return edge_conv(x, index, weight, self.norm, self.negative_slope)
             z = normed(self.norm, self.linear(edges_of(x, index)))  # [b, n, k, d]
-            return F.leaky_relu(z, self.negative_slope).max(2)[0]
+            return max_over_members(F.leaky_relu(z, self.negative_slope))
 
     def extra_repr(self) -> str:
         """Shown by print(model)."""
@@ -155,12 +155,12 @@ class DGCNN(Backbone):
             x = layer(x, knn(x, k))
             levels.append(x)
         per_point = torch.cat(levels, dim=2)  # [B, N, 512]
-        if self.norm5 is None and fast.usable():
+        if self.norm5 is None and fast.usable(x):
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
         y = linear(per_point, self.conv5.weight)  # [B, N, 1024]
         if self.norm5 is not None:
             y = F.leaky_relu(normed(self.norm5, y), 0.2)
-        most, _ = max_over_rows(y) if fast.usable() else y.max(1)
+        most, _ = max_over_rows(y) if fast.usable(x) else y.max(1)
         if self.variant == "defrec":
             return Features(most, per_point)
         return Features(torch.cat([most, y.mean(1)], dim=1), per_point)

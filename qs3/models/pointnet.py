@@ -55,8 +55,8 @@ class PointMLP(nn.Module):
 
     def maximum(self, x: Float[Tensor, "b n c"]) -> Float[Tensor, "b d"]:
         """`self(x).max(1)[0]`; on the CPU without the last layer's output at every point."""
-        plain = self.by_cloud or x.device.type != "cpu" or torch.is_autocast_enabled("cpu")
-        if plain or torch.compiler.is_compiling() or not fast.usable():
+        plain = self.by_cloud or torch.is_autocast_enabled("cpu") or not fast.usable(x)
+        if plain or torch.compiler.is_compiling():
             return self(x).max(1)[0]
         last_relu = isinstance(self.layers[-1], nn.ReLU)
         layers = list(self.layers)[: -1 if last_relu else None]

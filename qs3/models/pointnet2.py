@@ -22,6 +22,7 @@ from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.models.fast.grouped_mlp_max import grouped_mlp_max
+from qs3.models.fast.pointwise_max import max_over_members
 from qs3.models.norms import make_norm, normed
 
 
@@ -89,14 +90,14 @@ class GroupedMLP(nn.Module):
         with torch.autocast(xyz.device.type, enabled=False):
             xyz, centres = xyz.to(weights[0].dtype), centres.to(weights[0].dtype)
             features = None if features is None else features.to(weights[0].dtype)
-            if fast.usable():
+            if fast.usable(xyz):
                 return grouped_mlp_max(xyz, features, centres, index, weights, list(self.norms))
             x = gather(xyz, index) - centres[:, :, None]  # [b, m, k, 3]
             if features is not None:
                 x = torch.cat([x, gather(features, index)], dim=3)  # [b, m, k, 3 + c]
             for linear, norm in zip(self.linears, self.norms, strict=True):
                 x = normed(norm, linear(x)).relu()
-            return x.max(2)[0]
+            return max_over_members(x)
 
 
 class SetAbstraction(nn.Module):

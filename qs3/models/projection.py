@@ -69,8 +69,9 @@ def depth_images(
 
 
 def _draw(axes: Tensor, size: int, views: Sequence[int], pixel: str) -> Tensor:
-    table = torch.tensor([_TABLE[v] for v in views], device=axes.device)  # [v, 3, 2]
-    rows, columns, depth = (axes[table[:, :, 0]] * table[:, :, 1, None, None]).unbind(1)
+    signed = torch.stack([-axes, axes])  # views of it: a table would have to be carried there
+    entries = [signed[(sign + 1) // 2, axis] for v in views for axis, sign in _TABLE[v]]
+    rows, columns, depth = torch.stack(entries).unflatten(0, (len(views), 3)).unbind(1)
     depth = depth + CAMERA_DISTANCE  # [v, b, n]
     row = ((rows / (depth + _TINY) + 1) * size / 2 - 0.5).ceil()
     column = ((columns / (depth + _TINY) + 1) * size / 2 - 0.5).ceil()

@@ -91,7 +91,7 @@ class ResNet18(nn.Module):
 
     def forward(self, images: Float[Tensor, "i 1 h w"]) -> Float[Tensor, "i d"]:
         """Mean over the last maps."""
-        if fast.usable() and can_step(self, images):
+        if fast.usable(images) and can_step(self, images):
             return step(self, images)
         x = self.stem(images.contiguous(memory_format=torch.channels_last)).relu_()
         for block in self.blocks:

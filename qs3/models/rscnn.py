@@ -24,6 +24,7 @@ from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.models.fast.pointwise_max import max_over_members
 from qs3.models.fast.rsconv import relations, rs_conv
 from qs3.models.norms import make_norm, normed
 
@@ -73,7 +74,7 @@ class RSConv(nn.Module):
 
         With instance norms the kernel takes one cloud at a time.
         """
-        form = self._fast if fast.usable() else self._plain
+        form = self._fast if fast.usable(points) else self._plain
         best = form(points, features, centres, index)
         return normed(self.channel_norm, self.channel_raising(best)).relu()
 
@@ -94,7 +95,7 @@ class RSConv(nn.Module):
         else:
             assert features is not None
             x = torch.cat([d, gather(features, index)], dim=3)  # [b, m, k, 3 + c]
-        return normed(self.norm, w * x).relu().max(2)[0]
+        return max_over_members(normed(self.norm, w * x).relu())
 
     def _fast(
         self, points: Tensor, features: Tensor | None, centres: Tensor, index: Tensor
@@ -148,7 +149,7 @@ class RSCNN(Backbone):
         """Maximum over the 128 centres, in float32 at least."""
         with torch.autocast(points.device.type, enabled=False):
             points = points.detach().to(self.last.weight.dtype)
-            if self.norm == "instance" and fast.usable():
+            if self.norm == "instance" and fast.usable(points):
                 return Features(torch.cat([self._forward(cloud[None]) for cloud in points]), None)
             return Features(self._forward(points), None)
 

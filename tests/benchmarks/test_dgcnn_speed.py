@@ -14,14 +14,15 @@ from torch_geometric.nn import EdgeConv as PygEdgeConv
 
 from qs3.geometry.neighbours import knn
 from qs3.models.dgcnn import EdgeConv, dgcnn
+from tests.benchmarks.device import DEVICE, WHERE, finish
 from tests.models.reference import NaiveDGCNN
 
 
 def _edges(index: torch.Tensor) -> torch.Tensor:
     """[2, b * n * k] from neighbours [b, n, k]: source and target of all edges of a batch."""
     b, n, k = index.shape
-    offset = (torch.arange(b) * n)[:, None, None]
-    target = (torch.arange(n)[None, :, None] + offset).expand(b, n, k)
+    offset = (torch.arange(b, device=index.device) * n)[:, None, None]
+    target = (torch.arange(n, device=index.device)[None, :, None] + offset).expand(b, n, k)
     return torch.stack([(index + offset).reshape(-1), target.reshape(-1)])
 
 
@@ -29,6 +30,7 @@ def _step(model: nn.Module, points: torch.Tensor, labels: torch.Tensor) -> Calla
     def step() -> None:
         model.zero_grad()
         F.cross_entropy(model(points), labels).backward()
+        finish()
 
     return step
 
@@ -46,8 +48,8 @@ def test_training_step(
     variant: str, b: int, n: int, k: int, benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture
 ) -> None:
     torch.manual_seed(0)
-    model = dgcnn(10, k=k, variant=variant)
-    points, labels = torch.randn(b, n, 3) / 2, torch.randint(10, (b,))
+    model = dgcnn(10, k=k, variant=variant).to(DEVICE)
+    points, labels = torch.randn(b, n, 3).to(DEVICE) / 2, torch.randint(10, (b,)).to(DEVICE)
     step = _step(model, points, labels)
     benchmark.pedantic(step, rounds=4, warmup_rounds=1)
     if not benchmark.enabled:
@@ -64,7 +66,7 @@ def test_training_step(
         print(  # noqa: T201
             f"\nDGCNN {variant}, {b} x {n}, k {k}: {ours * 1e3:.1f} ms a cloud, "
             f"naive {theirs * 1e3:.1f}: {theirs / ours:.1f} times faster, "
-            f"{torch.get_num_threads()} threads"
+            f"{WHERE}"
         )
 
 
@@ -74,17 +76,23 @@ def test_layer_against_pyg(
 ) -> None:
     """One EdgeConv, forward and backward, on edges found beforehand."""
     torch.manual_seed(0)
-    ours = EdgeConv(c, d)
+    ours = EdgeConv(c, d).to(DEVICE)
     mlp = nn.Sequential(nn.Linear(2 * c, d, bias=False), nn.BatchNorm1d(d), nn.LeakyReLU(0.2))
-    theirs = PygEdgeConv(mlp, aggr="max")
-    x = torch.randn(2, 1024, c, requires_grad=True)
+    theirs = PygEdgeConv(mlp, aggr="max").to(DEVICE)
+    x = torch.randn(2, 1024, c).to(DEVICE).requires_grad_()
     index = knn(x.detach(), 20)
     pairs = _edges(index)
-    benchmark.pedantic(lambda: ours(x, index).sum().backward(), rounds=4, warmup_rounds=1)
+
+    def step() -> None:
+        ours(x, index).sum().backward()
+        finish()
+
+    benchmark.pedantic(step, rounds=4, warmup_rounds=1)
     times = []
     for _ in range(3 if benchmark.enabled else 1):
         begin = time.perf_counter()
         theirs(x.flatten(0, 1), pairs).sum().backward()
+        finish()
         times.append(time.perf_counter() - begin)
     if not benchmark.enabled:
         return

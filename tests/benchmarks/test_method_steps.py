@@ -17,10 +17,11 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from qs3.methods.source_only import SourceOnly
 from qs3.models.dgcnn import dgcnn
 from qs3.models.pointdan import pointdan
+from tests.benchmarks.device import DEVICE, WHERE, finish
 from tests.methods.cases import CASES, Case, batch_of, total
 
 ROUNDS = 3
-Row = tuple[float, float, str, str, int]  # ratio, CPU seconds, name, net, passes
+Row = tuple[float, float, str, str, int]  # ratio, seconds, name, net, passes
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +29,11 @@ def table(request: pytest.FixtureRequest) -> Iterator[list[Row]]:
     """Rows so far; printed, sorted, when the last method is done."""
     rows: list[Row] = []
     yield rows
-    lines = [f"{'method':<20}{'net':<10}{'CPU ms':>10}{'times source only':>19}{'passes':>8}"]
+    lines = [f"{'method':<20}{'net':<10}{'ms':>10}{'times source only':>19}{'passes':>8}"]
     for ratio, seconds, name, net, passes in sorted(rows):
         lines.append(f"{name:<20}{net:<10}{seconds * 1e3:>10.0f}{ratio:>19.2f}{passes:>8}")
     if rows:
+        lines.append(WHERE)
         with request.config.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled():
             print("", *lines, sep="\n")  # noqa: T201
 
@@ -40,13 +42,15 @@ def _step(case: Case, net: Any, b: int, n: int) -> Callable[[], None]:
     torch.manual_seed(0)
     method = case.make()
     method.prepare(net)
-    batch = batch_of(case, method, b, n, 10)
-    generator = torch.Generator().manual_seed(0)
+    net, method = net.to(DEVICE), method.to(DEVICE)
+    batch = batch_of(case, method, b, n, 10, DEVICE.type)
+    generator = torch.Generator(DEVICE).manual_seed(0)
 
     def step() -> None:
         net.zero_grad()
         method.zero_grad()
         total(method, net, batch, generator).backward()
+        finish()
 
     return step
 
@@ -67,11 +71,12 @@ def test_step(
     plain()
     times: dict[str, list[float]] = {"ours": [], "plain": []}
     # In turns, and in seconds of this process: others on a busy machine take time from both.
+    clock = time.process_time if DEVICE.type == "cpu" else time.perf_counter
     for _ in range(ROUNDS):
         for key, call in (("plain", plain), ("ours", step)):
-            begin = time.process_time()
+            begin = clock()
             call()
-            times[key].append(time.process_time() - begin)
+            times[key].append(clock() - begin)
     ours, theirs = min(times["ours"]), min(times["plain"])
     benchmark.extra_info["times_source_only"] = ours / theirs
     table.append((ours / theirs, ours, name, build.__name__, CASES[name].passes))

@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling
 from qs3.models.pointnet2 import pointnet2
+from tests.benchmarks.device import DEVICE, WHERE, finish
 from tests.models.reference_pointnet2 import StraightPointNet2
 
 
@@ -22,6 +23,7 @@ def _step(model: nn.Module, points: torch.Tensor, labels: torch.Tensor) -> Calla
     def step() -> None:
         model.zero_grad()
         F.cross_entropy(model(points), labels).backward()
+        finish()
 
     return step
 
@@ -41,9 +43,9 @@ def test_training_step(
 ) -> None:
     torch.manual_seed(0)
     n = 1024 if benchmark.enabled else 128
-    model = pointnet2(10, variant)
-    points = F.normalize(torch.randn(16, n, 3), dim=2)
-    labels = torch.randint(10, (16,))
+    model = pointnet2(10, variant).to(DEVICE)
+    points = F.normalize(torch.randn(16, n, 3), dim=2).to(DEVICE)
+    labels = torch.randint(10, (16,)).to(DEVICE)
     benchmark.pedantic(_step(model, points, labels), rounds=3, warmup_rounds=1)
     if not benchmark.enabled:
         return
@@ -56,7 +58,7 @@ def test_training_step(
         print(  # noqa: T201
             f"\nPointNet++ {variant} 16 x {n}: {ours * 1e3:.1f} ms a cloud, straight "
             f"{theirs * 1e3:.1f}: {theirs / ours:.1f} times faster, "
-            f"{torch.get_num_threads()} threads"
+            f"{WHERE}"
         )
 
 
@@ -77,16 +79,22 @@ def released_fps(points: np.ndarray, count: int, start: int) -> np.ndarray:
 def test_farthest_point_sampling(
     benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture
 ) -> None:
-    points = F.normalize(torch.randn(16, 2048, 3), dim=2)
-    found = benchmark.pedantic(farthest_point_sampling, (points, 1024), rounds=5, warmup_rounds=1)
+    points = F.normalize(torch.randn(16, 2048, 3), dim=2).to(DEVICE)
+
+    def sample() -> torch.Tensor:
+        found = farthest_point_sampling(points, 1024)
+        finish()
+        return found
+
+    found = benchmark.pedantic(sample, rounds=5, warmup_rounds=1)
     if not benchmark.enabled:
         return
-    cloud = points[0].numpy()
-    assert (released_fps(cloud, 1024, 0) == found[0].numpy()).mean() > 0.99
+    cloud = points[0].cpu().numpy()
+    assert (released_fps(cloud, 1024, 0) == found[0].cpu().numpy()).mean() > 0.99
     theirs = _seconds(lambda: released_fps(cloud, 1024, 0), 3)
     ours = benchmark.stats.stats.min / 16
     with capsys.disabled():
         print(  # noqa: T201
             f"\nFPS 2048 -> 1024: {ours * 1e3:.2f} ms a cloud, numpy loop {theirs * 1e3:.1f}: "
-            f"{theirs / ours:.0f} times faster"
+            f"{theirs / ours:.0f} times faster, {WHERE}"
         )

@@ -11,6 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from qs3.models.pointnet import pointnet
+from tests.benchmarks.device import DEVICE, WHERE, finish
 from tests.benchmarks.test_simpleview_speed import boxes
 from tests.models.reference_pointnet import NaivePointNet
 
@@ -18,12 +19,13 @@ from tests.models.reference_pointnet import NaivePointNet
 def test_training_step(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
     torch.manual_seed(0)
     b = 16 if benchmark.enabled else 2
-    model = pointnet(10)
-    points, labels = boxes(b), torch.arange(b) % 10
+    model = pointnet(10).to(DEVICE)
+    points, labels = boxes(b).to(DEVICE), torch.arange(b, device=DEVICE) % 10
 
     def step(net: nn.Module) -> None:
         net.zero_grad()
         F.cross_entropy(net(points), labels).backward()
+        finish()
 
     benchmark.pedantic(step, (model,), rounds=6, warmup_rounds=1)
     if not benchmark.enabled:
@@ -40,5 +42,5 @@ def test_training_step(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixtur
     with capsys.disabled():
         print(  # noqa: T201
             f"\nPointNet {b} x 1024: {ours * 1e3:.1f} ms a cloud, straight {theirs * 1e3:.1f}: "
-            f"{theirs / ours:.1f} times faster, {torch.get_num_threads()} threads"
+            f"{theirs / ours:.1f} times faster, {WHERE}"
         )

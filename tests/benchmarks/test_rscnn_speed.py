@@ -11,6 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from qs3.models.rscnn import rscnn
+from tests.benchmarks.device import DEVICE, WHERE, finish
 from tests.benchmarks.test_simpleview_speed import boxes
 from tests.models.reference_rscnn import NaiveRSCNN
 
@@ -21,12 +22,13 @@ def test_training_step(
 ) -> None:
     torch.manual_seed(0)
     b = 16 if benchmark.enabled else 2
-    model = rscnn(10, relation=relation)
-    points, labels = boxes(b), torch.arange(b) % 10
+    model = rscnn(10, relation=relation).to(DEVICE)
+    points, labels = boxes(b).to(DEVICE), torch.arange(b, device=DEVICE) % 10
 
     def step(net: nn.Module) -> None:
         net.zero_grad()
         F.cross_entropy(net(points), labels).backward()
+        finish()
 
     benchmark.pedantic(step, (model,), rounds=5, warmup_rounds=1)
     if not benchmark.enabled:
@@ -43,5 +45,5 @@ def test_training_step(
         print(  # noqa: T201
             f"\nRS-CNN {relation} {b} x 1024: {ours * 1e3:.1f} ms a cloud, straight "
             f"{theirs * 1e3:.1f}: {theirs / ours:.1f} times faster, "
-            f"{torch.get_num_threads()} threads"
+            f"{WHERE}"
         )

@@ -11,6 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from qs3.models.simpleview import simpleview
+from tests.benchmarks.device import DEVICE, WHERE, finish
 from tests.models.reference_simpleview import NaiveSimpleView
 
 
@@ -32,25 +33,26 @@ def boxes(b: int, n: int = 1024, seed: int = 0) -> torch.Tensor:
 def test_step(training: bool, benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
     torch.manual_seed(0)
     b = 18 if benchmark.enabled else 2  # as published
-    model = simpleview(10).train(training)
-    labels = torch.arange(b) % 10
+    model = simpleview(10).train(training).to(DEVICE)
+    labels = torch.arange(b, device=DEVICE) % 10
     # each round other clouds, and so other sizes of windows, the same for both sides
-    rounds = iter(boxes(b, seed=seed) for seed in range(20))
+    rounds = iter(boxes(b, seed=seed).to(DEVICE) for seed in range(20))
 
     def step(net: nn.Module, points: torch.Tensor) -> None:
         if not training:
             with torch.no_grad():
                 net(points)
-            return
-        net.zero_grad()
-        F.cross_entropy(net(points), labels).backward()
+        else:
+            net.zero_grad()
+            F.cross_entropy(net(points), labels).backward()
+        finish()
 
     benchmark.pedantic(step, setup=lambda: ((model, next(rounds)), {}), rounds=6, warmup_rounds=1)
     if not benchmark.enabled:
         return
     naive, theirs = NaiveSimpleView(model).train(training), torch.inf
     for seed in range(7):
-        points = boxes(b, seed=seed)
+        points = boxes(b, seed=seed).to(DEVICE)
         begin = time.perf_counter()
         step(naive, points)
         if seed:  # after a warm-up
@@ -62,5 +64,5 @@ def test_step(training: bool, benchmark: BenchmarkFixture, capsys: pytest.Captur
         print(  # noqa: T201
             f"\nSimpleView {'training' if training else 'inference'} {b} x 1024: "
             f"{ours * 1e3:.1f} ms a cloud, straight {theirs * 1e3:.1f}: "
-            f"{theirs / ours:.2f} times faster, {torch.get_num_threads()} threads"
+            f"{theirs / ours:.2f} times faster, {WHERE}"
         )

@@ -16,6 +16,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from torch.nn import functional as F
 
 from qs3.models.base import PointClassifier
+from tests.benchmarks.device import DEVICE, WHERE, finish
 from tests.benchmarks.test_simpleview_speed import boxes
 from tests.models.test_all_nets import NETS, build
 
@@ -48,36 +49,33 @@ def _inference(net: PointClassifier, points: torch.Tensor) -> Callable[[], None]
     return step
 
 
-def _seconds(step: Callable[[], None], device: torch.device) -> float:
+def _seconds(step: Callable[[], None]) -> float:
     """The best of some rounds, after one to warm up."""
     best = float("inf")
     for turn in range(1 + ROUNDS):
         begin = time.perf_counter()
         step()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
+        finish()
         if turn:
             best = min(best, time.perf_counter() - begin)
     return best
 
 
 def test_clouds_a_second(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
-    """On a GPU if there is one. The benchmark's own time is that of PointNet's inference."""
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    """The benchmark's own time is that of PointNet's inference."""
     if not benchmark.enabled:
         for name in NETS:  # the table can be made of each
             assert _net(name)
         benchmark(_inference(_net("pointnet"), boxes(2, 64)))
         return
-    points = boxes(BATCH, POINTS).to(device)
-    benchmark.pedantic(_inference(_net("pointnet").to(device), points), rounds=3, warmup_rounds=1)
-    where = f"{device.type}, {torch.get_num_threads()} threads" if device.type == "cpu" else "cuda"
-    rows = [f"\n{BATCH} x {POINTS}, {where}", "| net | training | inference | published, V100 |"]
+    points = boxes(BATCH, POINTS).to(DEVICE)
+    benchmark.pedantic(_inference(_net("pointnet").to(DEVICE), points), rounds=3, warmup_rounds=1)
+    rows = [f"\n{BATCH} x {POINTS}, {WHERE}", "| net | training | inference | published, V100 |"]
     rows.append("|---|---|---|---|")
     for name in NETS:
-        net = _net(name).to(device)
-        training = BATCH / _seconds(_training(net, points), device)
-        inference = BATCH / _seconds(_inference(net, points), device)
+        net = _net(name).to(DEVICE)
+        training = BATCH / _seconds(_training(net, points))
+        inference = BATCH / _seconds(_inference(net, points))
         benchmark.extra_info[name] = {"training": training, "inference": inference}
         published = f"{PUBLISHED[name]:,}" if name in PUBLISHED else "-"
         rows.append(f"| {name} | {training:,.1f} | {inference:,.1f} | {published} |")

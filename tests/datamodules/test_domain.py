@@ -395,6 +395,17 @@ def test_the_targets_training_clouds_are_what_the_adaptation_predicts(data_dir):
     assert torch.equal(found, target.train.points)
 
 
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # Lightning's on trainers without a loader
+def test_batches_are_pinned_for_a_gpu_alone(data_dir):
+    data, gpu = adaptation(data_dir), torch.cuda.is_available()
+    data.trainer = Trainer(accelerator="auto", devices=1, logger=False, barebones=True)
+    for loader, name in (
+        (data.train_dataloader(), "source"),
+        (data.predict_dataloader(), "target"),
+    ):
+        assert next(iter(loader))[name]["points"].is_pinned() == gpu
+
+
 def test_the_adaptation_has_the_source_s_labels_and_no_test_clouds(data_dir):
     data = adaptation(data_dir)
     source = made(data_dir)

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -5,6 +7,7 @@ from hypothesis import strategies as st
 
 from qs3.geometry import neighbours
 from qs3.geometry.neighbours import farthest_point_sampling, gather, knn
+from tests.device import as_on_device
 from tests.geometry.test_sampling import assert_farthest
 
 
@@ -99,7 +102,12 @@ def test_gather() -> None:
     assert gather(x, index[:, 0]).shape == (2, 2, 2)
 
 
-@pytest.mark.parametrize("sample", [farthest_point_sampling, neighbours._farthest_points])
+def _on_device(*args: Any) -> torch.Tensor:
+    with as_on_device():
+        return farthest_point_sampling(*args)
+
+
+@pytest.mark.parametrize("sample", [farthest_point_sampling, _on_device])
 def test_fps_batched(sample: object) -> None:
     torch.manual_seed(0)
     x = torch.randn(3, 120, 3)
@@ -118,4 +126,4 @@ def test_fps_batched(sample: object) -> None:
 
 def test_fps_paths_agree() -> None:
     x = torch.randn(2, 150, 3)
-    assert torch.equal(farthest_point_sampling(x, 80, 3), neighbours._farthest_points(x, 80, 3))
+    assert torch.equal(farthest_point_sampling(x, 80, 3), _on_device(x, 80, 3))

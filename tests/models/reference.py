@@ -44,11 +44,11 @@ class NaiveEdgeConv(nn.Module):
         self.weight = nn.Parameter(twin.linear.weight.detach().clone())
         self.bn: nn.Module
         if isinstance(twin.norm, nn.BatchNorm1d):
-            self.bn = nn.BatchNorm2d(d, dtype=self.weight.dtype)
+            self.bn = nn.BatchNorm2d(d).to(self.weight)
             self.bn.running_mean.copy_(twin.norm.running_mean)
             self.bn.running_var.copy_(twin.norm.running_var)
         else:
-            self.bn = nn.InstanceNorm2d(d, affine=True, dtype=self.weight.dtype)
+            self.bn = nn.InstanceNorm2d(d, affine=True).to(self.weight)
         with torch.no_grad():
             self.bn.weight.copy_(twin.norm.weight)
             self.bn.bias.copy_(twin.norm.bias)

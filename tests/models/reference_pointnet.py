@@ -23,7 +23,9 @@ def _mlp(mlp: PointMLP, x: Tensor) -> Tensor:
 def _tnet(tnet: TNet, x: Tensor) -> Tensor:
     """[b, c, n] to [b, c, c]."""
     flat = tnet.cloud(_mlp(tnet.points, x).max(2)[0])
-    return flat.view(-1, tnet.channels, tnet.channels) + torch.eye(tnet.channels, dtype=x.dtype)
+    return flat.view(-1, tnet.channels, tnet.channels) + torch.eye(
+        tnet.channels, dtype=x.dtype, device=x.device
+    )
 
 
 class NaivePointNet(nn.Module):

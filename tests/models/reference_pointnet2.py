@@ -13,7 +13,7 @@ from qs3.models.pointnet2 import GroupedMLP
 
 def take(x: Tensor, index: Tensor) -> Tensor:
     """Rows of each cloud, by one advanced indexing: [b, n, c], [b, ...] -> [b, ..., c]."""
-    batch = torch.arange(len(x)).view(-1, *[1] * (index.ndim - 1)).expand_as(index)
+    batch = torch.arange(len(x), device=x.device).view(-1, *[1] * (index.ndim - 1)).expand_as(index)
     return x[batch, index]
 
 
@@ -22,7 +22,7 @@ def ball_query_reference(x: Tensor, centres: Tensor, radius: float, count: int) 
     n = x.shape[1]
     squares = (centres[:, :, None] - x[:, None]).square()
     squares = squares[..., 0] + squares[..., 1] + squares[..., 2]
-    index = torch.arange(n).expand_as(squares).clone()
+    index = torch.arange(n, device=x.device).expand_as(squares).clone()
     index[squares >= radius**2] = n
     index = index.sort(dim=2)[0][:, :, :count]
     first = index[:, :, :1].expand_as(index)
@@ -49,8 +49,8 @@ class StraightMLP(nn.Module):
                 copy = nn.InstanceNorm2d(o, affine=True, dtype=dtype)
                 copy.weight.data.copy_(norm.weight)
                 copy.bias.data.copy_(norm.bias)
-            self.convolutions.append(convolution)
-            self.norms.append(copy)
+            self.convolutions.append(convolution.to(linear.weight))
+            self.norms.append(copy.to(linear.weight))
 
     def forward(
         self, xyz: Tensor, features: Tensor | None, centres: Tensor, index: Tensor
@@ -90,5 +90,5 @@ class StraightPointNet2(nn.Module):
             parts = [m(xyz, features, centres, ball) for m, ball in zip(mlps, balls, strict=True)]
             xyz, features = centres, torch.cat(parts, dim=2)
         b, m, _ = xyz.shape
-        everything = torch.arange(m).expand(b, 1, m)
+        everything = torch.arange(m, device=xyz.device).expand(b, 1, m)
         return self.head(self.last(xyz, features, xyz.new_zeros(b, 1, 3), everything).squeeze(1))

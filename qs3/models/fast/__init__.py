@@ -1,7 +1,9 @@
 """Kernels derived from the layers of the nets: the same sums, faster and in less memory.
 
 A layer in `qs3.models` has its paper's formula in `forward` and takes the kernel where `usable()`:
-not while a net is exported (most kernels cannot be traced), and not inside `plain()`.
+not while a net is exported (most kernels cannot be traced), not inside `plain()`, and off the CPU
+only where the kernel saves what an accelerator lacks, too: most are made for a CPU's caches, in
+many small parts, of which each would be started there by itself.
 """
 
 from __future__ import annotations
@@ -9,14 +11,27 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from torch import Tensor
+
 from qs3.geometry.neighbours import exporting
 
 _plain = False
 
 
-def usable(*, traceable: bool = False) -> bool:
-    """Whether a layer may take its kernel now; a `traceable` one may be exported as well."""
-    return not _plain and (traceable or not exporting())
+def on_cpu(x: Tensor) -> bool:
+    """Whether `x` lies on the CPU, which kernels are made for."""
+    return x.device.type == "cpu"
+
+
+def usable(x: Tensor, *, anywhere: bool = False, traceable: bool = False) -> bool:
+    """Whether a layer may take its kernel for `x` now.
+
+    Args:
+        x: the layer's input.
+        anywhere: the kernel serves on every device, not on the CPU alone.
+        traceable: it may be exported as well.
+    """
+    return (anywhere or on_cpu(x)) and not _plain and (traceable or not exporting())
 
 
 @contextmanager

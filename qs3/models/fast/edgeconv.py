@@ -15,6 +15,9 @@ moments of the *inputs*: with A the adjacency (A_ij = 1 if j is a neighbour of i
 
     sum_ij z_ij   = W1 X'd + k E X'1
     sum_ij z_ij^2 = diag(W1 X' diag(d) X W1' + 2 E X'(A X) W1' + k E X'X E').
+
+That is for the CPU. To an accelerator these are 150 small kernels a layer, each started by itself;
+there z_ij is written out where its statistics are asked for, in 27 (forward and backward).
 """
 
 from __future__ import annotations
@@ -29,10 +32,12 @@ from torch.nn import functional as F
 
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import exporting
-from qs3.models.fast.pointwise_max import max_over_rows
-from qs3.models.norms import active, track, uses_batch
+from qs3.models import fast
+from qs3.models.fast.pointwise_max import max_over_members, max_over_rows
+from qs3.models.norms import active, normed, track, uses_batch
 
-_GATHERED = 1 << 20  # values gathered at once: 4 MB in float32
+_GATHERED = 1 << 20  # values gathered at once on the CPU: 4 MB in float32
+_ON_DEVICE = 1 << 28  # elsewhere: 1 GB, so that a batch is mostly one kernel
 
 
 class _NeighbourMax(torch.autograd.Function):
@@ -44,7 +49,7 @@ class _NeighbourMax(torch.autograd.Function):
         channels = x.shape[1]
         out = torch.empty(rows, channels, dtype=x.dtype, device=x.device)
         where = torch.empty(rows, channels, dtype=torch.int64, device=x.device)
-        block = max(64, _GATHERED // (k * channels)) if x.device.type == "cpu" else 1 << 14
+        block = max(64, (_GATHERED if fast.on_cpu(x) else _ON_DEVICE) // (k * channels))
         for i in range(0, rows, block):
             part = index[i : i + block]
             best, j = max_over_rows(x.index_select(0, part.reshape(-1)).view(-1, k, channels))
@@ -115,7 +120,9 @@ def edge_conv(
     norm: nn.Module,
     negative_slope: float,
 ) -> Float[Tensor, "b n d"]:
-    """The layer's output; traceable unless the norm `uses_batch`. It is `track`ed, never called.
+    """The layer's output; traceable unless the norm `uses_batch`.
+
+    On the CPU the norm is `track`ed, never called.
 
     Args:
         x: features of the points, in the dtype of `weight`.
@@ -131,6 +138,11 @@ def edge_conv(
     w1, w2 = weight.split(c, dim=1)  # [d, c] each
     e = w2 - w1
     norm = active(norm)
+    if uses_batch(norm) and not fast.on_cpu(x):
+        points = x.reshape(b * n, c)
+        p, q = points @ w1.T, points @ e.T
+        z = p.index_select(0, flat.flatten()).view(b, n, k, -1) + q.view(b, n, 1, -1)
+        return F.leaky_relu(max_over_members(normed(norm, z)), negative_slope)
     rows = x.reshape(b if isinstance(norm, nn.InstanceNorm1d) else 1, -1, c)  # [g, r, c]
     if uses_batch(norm):
         # about the mean, lest E[z^2] - E[z]^2 cancel; z only changes by W2 centre

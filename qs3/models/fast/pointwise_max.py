@@ -21,6 +21,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.geometry.matmul import matmul_t
+from qs3.geometry.neighbours import exporting
+from qs3.models import fast
 from qs3.models.norms import active, statistics, uses_batch
 
 _AT_ONCE = 1 << 20  # values of z worked on at once: 4 MB in float32
@@ -30,11 +32,38 @@ def max_over_rows(x: Float[Tensor, "b n c"]) -> tuple[Float[Tensor, "b c"], Int[
     """`x.max(1)`: values and the first rows that have them, about ten times faster on the CPU.
 
     Pooling of an image in channels-last layout is the only maximum of torch on the CPU that is
-    vectorised and tells where it was.
+    vectorised and tells where it was. On other devices it is any row that has the value.
     """
+    if not fast.on_cpu(x):
+        return x.max(1)
     image = x[:, :, None].permute(0, 3, 1, 2)  # [b, c, n, 1]
     best, where = F.max_pool2d(image, (x.shape[1], 1), return_indices=True)
     return best.flatten(1), where.flatten(1)
+
+
+class _MaxOverMembers(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        best, where = x.max(-2, keepdim=True)
+        ctx.save_for_backward(where)
+        ctx.members = x.shape[-2]
+        return best.squeeze(-2)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (where,) = ctx.saved_tensors
+        members = torch.arange(ctx.members, device=grad.device)[:, None]
+        return grad.unsqueeze(-2) * (members == where)
+
+
+def max_over_members(x: Float[Tensor, "*b k c"]) -> Float[Tensor, "*b c"]:
+    """`x.max(-2)[0]`; its gradient is written, not scattered.
+
+    For a scatter torch's deterministic algorithms sort all places on a GPU: here as many as there
+    are values of the result, though no two of them are the same.
+    """
+    return x.max(-2)[0] if exporting() else _MaxOverMembers.apply(x)
 
 
 def relu_gradient(grad: Tensor, out: Tensor) -> Tensor:

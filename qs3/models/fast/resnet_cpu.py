@@ -335,13 +335,13 @@ def _modules(net: Any) -> list[Any]:
 
 
 def can_step(net: nn.Module, images: Tensor) -> bool:
-    """Whether `step` gives what the plain net does: batch norms in training, on the CPU."""
+    """Whether `step` gives what the plain net does: batch norms in training."""
     norms = [active(module.norm) for module in _modules(net)]
     plain = all(
         type(n) is nn.BatchNorm2d and n.training and n.affine and n.track_running_stats
         for n in norms
     )  # fmt: skip
-    same = images.device.type == "cpu" and images.dtype == norms[0].weight.dtype
+    same = images.dtype == norms[0].weight.dtype
     return plain and same and not torch.is_autocast_enabled("cpu") and not images.requires_grad
 
 

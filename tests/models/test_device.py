@@ -1,0 +1,122 @@
+"""What a training step of each net asks of an accelerator: few kernels, and no value.
+
+16 clouds of 1,024 points, forward and backward, without the optimiser; see `tests.device`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from qs3.geometry.farthest_points import farthest_points
+from qs3.models import fast
+from qs3.models.base import PointClassifier
+from qs3.models.norms import KINDS, use_domain
+from tests.device import Watch, as_on_device
+from tests.models.test_all_nets import NETS, build, clouds
+
+# Kernels of a step. The authors' DGCNN has 167.
+BARS = {
+    "dgcnn": 250,
+    "pointdan": 350,
+    "pointnet": 180,
+    "pointnet2": 450,
+    "pointnet2_ssg": 250,
+    "rscnn": 250,
+    "simpleview": 230,
+}
+
+
+def _step(net: PointClassifier, points: torch.Tensor) -> Watch:
+    labels = torch.arange(len(points), device=points.device) % 5
+    with Watch() as watch, use_domain(net, "target"):
+        F.cross_entropy(net(points), labels).backward()
+    return watch
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_kernels_of_a_step(name: str) -> None:
+    net = build(name).float().train().to("meta")
+    watch = _step(net, torch.empty(16, 1024, 3, device="meta"))
+    assert watch.carried == []
+    assert 100 < watch.kernels.total() <= BARS[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("norm", KINDS)
+@pytest.mark.parametrize("name", NETS)
+def test_no_norm_asks_for_a_value(name: str, norm: str) -> None:
+    net = build(name, norm=norm).float().to("meta")
+    for training in (True, False):
+        watch = _step(net.train(training), torch.empty(2, 640, 3, device="meta"))
+        assert watch.carried == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["simpleview", "defrec"])
+def test_kernels_of_dgcnn_s_variants(variant: str) -> None:
+    net = build("dgcnn", variant=variant).float().train().to("meta")
+    watch = _step(net, torch.empty(16, 1024, 3, device="meta"))
+    assert watch.carried == []
+    assert watch.kernels.total() <= 300
+
+
+@pytest.mark.parametrize(
+    "name", ["dgcnn", *(pytest.param(n, marks=pytest.mark.slow) for n in NETS if n != "dgcnn")]
+)
+@pytest.mark.parametrize("training", [True, False])
+def test_the_way_of_a_device_is_that_of_the_cpu(name: str, training: bool) -> None:
+    settings: dict[str, Any] = {} if name == "pointdan" else {"dropout": 0.0}
+    if name == "simpleview":
+        settings["image_size"] = 24
+    net, points = build(name, **settings), clouds(2, 40 if name == "dgcnn" else 600)
+    torch.manual_seed(1)
+    net.train(training)
+    for part in net.modules():
+        if hasattr(part, "eps"):  # two clouds that agree would magnify rounding 300 times
+            part.eps = 0.1
+    state = {key: value.clone() for key, value in net.state_dict().items()}
+    found = []
+    for on_device in (False, True):
+        net.load_state_dict(state)
+        net.zero_grad()
+        torch.manual_seed(2)
+        if on_device:
+            with as_on_device():
+                out = net(points)
+        else:
+            out = net(points)
+        F.cross_entropy(out, torch.arange(2)).backward()
+        grads = [p.grad.clone() for p in net.parameters() if p.grad is not None]
+        buffers = [value.clone() for value in net.buffers()]
+        found.append((out.detach(), grads, buffers))
+    for mine, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
+
+
+def test_kernels_are_of_the_cpu() -> None:
+    here, there = torch.empty(1), torch.empty(1, device="meta")
+    assert fast.usable(here)
+    assert not fast.usable(there)
+    assert fast.usable(there, anywhere=True)
+    with fast.plain():
+        assert not fast.usable(there, anywhere=True)
+
+
+def test_farthest_points_are_one_operation() -> None:
+    x, start = (
+        torch.empty(2, 20, 3, device="meta"),
+        torch.empty(2, dtype=torch.int64, device="meta"),
+    )
+    with Watch() as watch:
+        taken = farthest_points(x, 7, start)
+    assert watch.kernels == {"qs3.farthest_points.default": 1}
+    assert taken.shape == (2, 7)
+
+
+@pytest.mark.slow
+def test_farthest_points_as_torch_wants_operations() -> None:
+    torch.library.opcheck(farthest_points, (torch.rand(2, 20, 3), 7, torch.tensor([3, 19])))
