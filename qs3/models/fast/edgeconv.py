@@ -16,8 +16,8 @@ moments of the *inputs*: with A the adjacency (A_ij = 1 if j is a neighbour of i
     sum_ij z_ij   = W1 X'd + k E X'1
     sum_ij z_ij^2 = diag(W1 X' diag(d) X W1' + 2 E X'(A X) W1' + k E X'X E').
 
-That is for the CPU. To an accelerator these are 150 small kernels a layer, each started by itself;
-there z_ij is written out where its statistics are asked for, in 27 (forward and backward).
+That is for the CPU. To an accelerator these are 164 kernels a layer, forward and backward, each
+started by itself; there z_ij is written out where its statistics are asked for, in 30.
 """
 
 from __future__ import annotations
