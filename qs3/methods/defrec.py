@@ -35,7 +35,7 @@ class DefRec(Method):
             the paper chose it for each pair of domains.
         scale: 20 in the released code; QS3's code has 8.
         min_points: of a voxel that may be deformed: 40 in the released code, 20 in QS3's; of
-            clouds of 1024 points.
+            clouds of 1024 points, in proportion of others (see `deform`).
         pcm: mix source clouds: DefRec+PCM.
         on_source: reconstruct source clouds, too (a switch of the released code).
         dropout: of the reconstruction head, after its first two layers.

@@ -30,6 +30,7 @@ from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import predict
+from qs3.models.norms import begin_target_norms
 from qs3.runs.checkpoints import copy_weights, load, save
 from qs3.runs.pseudo_labels import path_of, write_pseudo_labels
 from qs3.selftraining.selectors import TeacherPredictions, check_selection, keep_all
@@ -112,6 +113,7 @@ class SelfTraining(Callback):
         if phase > 0 and self.phases.starts(trainer.current_epoch):
             goes_on = self.scheme.init == "persistent" and phase > 1
             pl_module.start_phase(self._first_weights(pl_module, phase), keep_moments=goes_on)
+            begin_target_norms(pl_module.net)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """In the last epoch of a phase: label the target and choose the next training set."""
