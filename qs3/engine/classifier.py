@@ -66,15 +66,15 @@ class Classifier(LightningModule):
         method.metres = student.metres = metres
         self._plateau: Plateau | None = None
         self._loaded_plateau: dict[str, Any] | None = None
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive(seed, "heads"))
+            method.prepare(self.net)  # before the hooks: a method may copy the net
         self.regulariser_weight = regulariser_weight
         self._regularisers: list[Tensor] = []  # of the passes of a step
         if regulariser_weight:
             for module in self.net.modules():
                 if isinstance(module, Backbone):
                     module.register_forward_hook(self._keep_regulariser)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derive(seed, "heads"))
-            method.prepare(self.net)
         self._hits: list[Tensor] = []
 
     def fresh_net(self, phase: int) -> nn.Module:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.splits import Unlabelled
+from qs3.errors import ConfigError
 from qs3.evaluation.calibration import calibration_error
 from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
 from qs3.runs.metrics import PseudoLabelScores, Scores
@@ -44,6 +45,35 @@ def predict(
         with use_domain(net, norms_for(net, domain)):
             parts = [
                 net(points[i : i + batch_size].to(device)).double().softmax(dim=1).cpu()
+                for i in range(0, len(points), batch_size)
+            ]
+    finally:
+        net.train(training)
+    return torch.cat(parts).numpy()
+
+
+@torch.no_grad()
+def global_features(
+    net: Any,
+    points: Float[Tensor, "n p 3"],
+    batch_size: int,
+    device: Any = "cpu",
+    *,
+    domain: str = "target",
+) -> Float[np.ndarray, "n d"]:
+    """What the backbone says about each cloud: as `predict`.
+
+    Raises:
+        ConfigError: the model is not a backbone with a head.
+    """
+    if not hasattr(net, "features"):
+        raise ConfigError(f"{type(net).__name__} has no features; choose e.g. model=dgcnn")
+    training = net.training
+    net.eval()
+    try:
+        with use_domain(net, norms_for(net, domain)):
+            parts = [
+                net.features(points[i : i + batch_size].to(device)).global_.double().cpu()
                 for i in range(0, len(points), batch_size)
             ]
     finally:

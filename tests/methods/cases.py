@@ -15,6 +15,7 @@ from qs3.methods.defrec import DefRec
 from qs3.methods.gast import Gast
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
+from qs3.methods.sd import Sd
 from qs3.methods.source_only import SourceOnly
 from qs3.methods.supervised import Supervised
 from qs3.selftraining.student_loss import Student
@@ -26,7 +27,8 @@ class Case:
 
     Attributes:
         make: the method.
-        passes: how often a batch passes through the net (PointDAN's through its generator).
+        passes: how often a batch passes through the net (PointDAN's through its generator). SD's
+            two more are its teacher's, and have no way back.
         source: whether its batches have labelled source clouds.
         pseudo: pseudo-labels of its target clouds: "hard", "soft", or "" for none.
     """
@@ -51,6 +53,8 @@ CASES = {
     "gast": Case(lambda: Gast(min_points=2), 5),
     "gast_no_rotation": Case(lambda: Gast(min_points=2, rot_weight=0.0), 3),
     "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),
+    "sd": Case(Sd, 2),
+    "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
     "student": Case(Student, 1, source=False, pseudo="hard"),
     "student_pcm": Case(lambda: Student(pcm=True), 1, source=False, pseudo="hard"),
     "student_source": Case(lambda: Student(weight_step=0.005), 2, pseudo="hard"),
