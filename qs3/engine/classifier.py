@@ -152,7 +152,13 @@ class Classifier(LightningModule):
             self._plateau.start_phase()
 
     def on_train_epoch_start(self) -> None:
-        """Reseed torch (dropout draws from it): an epoch is a function of (seed, epoch)."""
+        """Reseed torch (dropout draws from it): an epoch is a function of (seed, epoch).
+
+        In the warm-up the method prepares its epoch.
+        """
+        if self.phases.phase(self.current_epoch) == 0:
+            data = self.trainer.datamodule  # type: ignore[attr-defined]
+            self.method.start_epoch(self.net, data, self.current_epoch, self.phases.warmup)
         torch.manual_seed(derive(self.seed, "dropout", self.current_epoch, self.global_rank))
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:

@@ -18,6 +18,7 @@ from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
 from qs3.methods.source_only import SourceOnly
 from qs3.methods.supervised import Supervised
+from qs3.selftraining.pcfea import Pcfea
 from qs3.selftraining.student_loss import Student
 
 
@@ -39,6 +40,13 @@ class Case:
     pseudo: str = ""
 
 
+def _styled() -> Pcfea:
+    """As it is once there is a pool."""
+    method = Pcfea()
+    method.styled = True
+    return method
+
+
 # A voxel of a toy cloud holds few points.
 CASES = {
     "source_only": Case(SourceOnly, 1),
@@ -55,6 +63,8 @@ CASES = {
     "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),
     "sd": Case(Sd, 2),
     "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
+    "pcfea": Case(Pcfea, 1),  # until there is a pool
+    "pcfea_styled": Case(_styled, 2),
     "student": Case(Student, 1, source=False, pseudo="hard"),
     "student_pcm": Case(lambda: Student(pcm=True), 1, source=False, pseudo="hard"),
     "student_source": Case(lambda: Student(weight_step=0.005), 2, pseudo="hard"),

@@ -43,6 +43,8 @@ METHODS = {
     "gast": ("method=gast", "method.min_points=2", FEATURED),
     "pointdan": ("method=pointdan", NODES),
     "sd": ("method=sd", FEATURED),
+    "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
+    "pcfea_qbst": ("method=pcfea_qbst", FEATURED),
     "supervised": ("method=supervised",),
 }
 
@@ -74,9 +76,10 @@ def test_every_scheme_goes_on_in_the_middle_of_a_round(toy, tmp_path, name):
     check(toy, tmp_path, (*SHORT, *SCHEMES[name]), FIRST, LAST)
 
 
-@pytest.mark.parametrize("name", fast_are({"gast", "pointdan", "sd"}, METHODS))
+@pytest.mark.parametrize("name", fast_are({"gast", "pointdan", "pcfea"}, METHODS))
 def test_every_method_goes_on_in_the_middle_of_the_warmup(toy, tmp_path, name):
-    check(toy, tmp_path, ("protocol.epochs=3", "selftraining=none", *METHODS[name]), 1)
+    epochs = (1, 2) if name == "pcfea" else (1,)
+    check(toy, tmp_path, ("protocol.epochs=3", "selftraining=none", *METHODS[name]), *epochs)
 
 
 def test_every_config_of_both_groups_is_tried():
