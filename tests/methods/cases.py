@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from qs3.methods.base import Method
+from qs3.methods.cpcm import Cpcm
 from qs3.methods.dann import Dann
 from qs3.methods.defrec import DefRec
 from qs3.methods.gast import Gast
@@ -61,6 +62,7 @@ CASES = {
     "gast": Case(lambda: Gast(min_points=2), 5),
     "gast_no_rotation": Case(lambda: Gast(min_points=2, rot_weight=0.0), 3),
     "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),
+    "cpcm": Case(Cpcm, 3),
     "sd": Case(Sd, 2),
     "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool

@@ -153,8 +153,8 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         # heads of its own; the teacher goes on, with the source; soft labels
         (("method=gast", "selftraining=spst", FEATURED), WARMUP + 1),
         # a teacher and a pool of the warm-up, in buffers; the pool is of epoch 1
-        (("method=sd", FEATURED), 2),
-        (("method=pcfea", "method.every=1.0", FEATURED), 3),
+        (("method=sd", "selftraining=spst", FEATURED), 2),
+        (("method=pcfea", "method.every=1.0", "selftraining=spst", FEATURED), 3),
         (("method=dann", "selftraining=crst_lrent", "selftraining.theta=0", FEATURED), 2),
     ],
 )

@@ -43,6 +43,7 @@ METHODS = {
     "gast": ("method=gast", "method.min_points=2", FEATURED),
     "pointdan": ("method=pointdan", NODES),
     "sd": ("method=sd", FEATURED),
+    "cpcm": ("method=cpcm",),
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
     "pcfea_qbst": ("method=pcfea_qbst", FEATURED),
     "supervised": ("method=supervised",),
