@@ -6,7 +6,7 @@ Nothing here is read by training: no model is chosen and no threshold set by the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,10 +93,18 @@ def adapt_norms(
     One pass in random order (a dataset is sorted by class, and a batch should look like the
     whole), in batches of about `batch_size`, as equal as they can be. The weights stay.
     """
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
-    batches = torch.tensor_split(order, max(1, round(len(points) / batch_size)))
+    batches = even_batches(points, batch_size, seed)
     with use_domain(net, norms_for(net, "target")):
-        adapt_batchnorm(net, (points[index].to(device) for index in batches))
+        adapt_batchnorm(net, (batch.to(device) for batch in batches))
+
+
+def even_batches(
+    points: Float[Tensor, "n p 3"], batch_size: int, seed: int
+) -> Iterator[Float[Tensor, "b p 3"]]:
+    """All clouds in random order, in batches of about `batch_size`, as equal as they can be."""
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
+    for index in torch.tensor_split(order, max(1, round(len(points) / batch_size))):
+        yield points[index]
 
 
 def predict_rotated(

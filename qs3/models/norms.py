@@ -230,7 +230,7 @@ def adapt_batchnorm(
         ConfigError: a norm takes no statistics in a pass, so there are none to store.
         DataError: there are no batches.
     """
-    norms = _running(net)
+    norms = running_norms(net)
     modes = {module: module.training for module in net.modules()}
     momenta = [norm.momentum for norm in norms]
     try:
@@ -247,7 +247,7 @@ def adapt_batchnorm(
     return list(norms)
 
 
-def _running(net: nn.Module) -> list[_BatchNorm]:
+def running_norms(net: nn.Module) -> list[_BatchNorm]:
     """Norms with running statistics that a pass would use now."""
     asleep = {
         norm.source if norm.domain == "target" else norm.target

@@ -193,7 +193,7 @@ def _check_settings(cfg: DictConfig) -> None:
         raise ConfigError(
             "force=true begins the run anew and ckpt_path goes on with one; give one of them"
         )
-    check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
+    check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
     if not 0 <= check_float("protocol.smoothing", cfg.protocol.smoothing) <= highest:
