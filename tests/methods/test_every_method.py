@@ -20,7 +20,7 @@ from tests.methods.cases import Case, batch_of, total
 
 NAMES = [
     *("source_only", "pcm", "dann", "defrec_on_source", "defrec_pcm", "gast", "gast_pcm"),
-    *("pointdan", "cpcm", "sd", "pcfea_styled", "student_all"),
+    *("pointdan", "cpcm", "mlsp", "sd", "pcfea_styled", "student_all"),
 ]
 CASES = {**cases.CASES, "student_all": Case(lambda: Student(True, 0.01, 0.1, 1), 2, pseudo="soft")}
 parametrize = pytest.mark.parametrize("name", NAMES)
