@@ -35,7 +35,7 @@ def _net(kind: str) -> nn.Module:
     return PointClassifier(backbone, ClassHead(64, 4, hidden=(16,), dropout=0.5, norm=kind))
 
 
-@pytest.mark.parametrize("kind", ["tiny", "batch", "domain"])
+@pytest.mark.parametrize("kind", ["tiny", "domain"])
 def test_only_norms_change_and_entropy_falls(kind: str) -> None:
     net, clouds = _net(kind), torch.randn(64, 24, 3, generator=torch.Generator().manual_seed(0))
     net.train()

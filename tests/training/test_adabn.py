@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from qs3.config import hashing
@@ -31,6 +32,7 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
     torch.testing.assert_close(after["norm.running_var"], x.var(0), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_tent_changes_the_norm_s_weights_too(toy):
     settings = ("method=source_only", "selftraining=none", "protocol.epochs=2")
     weights = {}

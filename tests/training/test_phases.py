@@ -113,6 +113,7 @@ def test_continued_students_begin_with_their_teacher(continued: Kept) -> None:
     assert not same(selected, continued.net(3))
 
 
+@pytest.mark.slow
 def test_target_norms_go_on_from_the_source_s(tmp_path: Path, toy_data: Path) -> None:
     """Of a teacher that never saw the target: by its batches, the source's statistics count."""
     net = "model._target_=tests.training.nets.domained"
