@@ -39,6 +39,7 @@ UNIT_BALL_ONLY = {
 CENTRED_ONLY = {
     "qs3.methods.gast.Gast": "it turns parts of clouds about their middle",
     "qs3.methods.defrec.DefRec": "it deforms parts of clouds in a cube about their middle",
+    "qs3.methods.mlsp.Mlsp": "it masks parts of clouds in a cube about their middle",
 }
 """Parts that cannot see heights, likewise."""
 

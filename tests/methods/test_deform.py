@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from qs3.methods.deform import VOXELS, cloud_size, deform, voxel_centre, voxel_of
 from qs3.methods.defrec import DefRec
 from qs3.methods.gast import Gast
+from qs3.methods.mlsp import Mlsp
 from tests.methods.shapes import tiny_net
 
 
@@ -83,6 +84,7 @@ def test_all_randomness_is_the_generator_s() -> None:
     [
         (Gast(min_points=2, rot_weight=0.0), ("def_source", "def_target")),
         (DefRec(min_points=2, dropout=0.0), ("defrec",)),
+        (Mlsp(min_points=2, dropout=0.0, pcm=False), ("position", "normal", "cardinality")),
     ],
 )
 def test_a_cloud_s_size_changes_nothing_but_what_the_net_sees(method, terms) -> None:
