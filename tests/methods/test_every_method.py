@@ -116,7 +116,7 @@ def test_a_step_lowers_the_loss(name: str) -> None:
     before.backward()
     parameters = [*net.parameters(), *method.parameters()]
     squares = sum(float(p.grad.square().sum()) for p in parameters if p.grad is not None)
-    rate = 1e-4 / squares**0.5  # a step of length 0.0001: edges of a graph change with longer ones
+    rate = 1e-5 / squares**0.5  # a step of this length: edges of a graph change with longer ones
     with torch.no_grad():
         for p in parameters:
             if p.grad is not None:
