@@ -66,15 +66,15 @@ class Classifier(LightningModule):
         method.metres = student.metres = metres
         self._plateau: Plateau | None = None
         self._loaded_plateau: dict[str, Any] | None = None
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive(seed, "heads"))
+            method.prepare(self.net)  # before the hooks: a method may copy the net
         self.regulariser_weight = regulariser_weight
         self._regularisers: list[Tensor] = []  # of the passes of a step
         if regulariser_weight:
             for module in self.net.modules():
                 if isinstance(module, Backbone):
                     module.register_forward_hook(self._keep_regulariser)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(derive(seed, "heads"))
-            method.prepare(self.net)
         self._hits: list[Tensor] = []
 
     def fresh_net(self, phase: int) -> nn.Module:
@@ -152,7 +152,13 @@ class Classifier(LightningModule):
             self._plateau.start_phase()
 
     def on_train_epoch_start(self) -> None:
-        """Reseed torch (dropout draws from it): an epoch is a function of (seed, epoch)."""
+        """Reseed torch (dropout draws from it): an epoch is a function of (seed, epoch).
+
+        In the warm-up the method prepares its epoch.
+        """
+        if self.phases.phase(self.current_epoch) == 0:
+            data = self.trainer.datamodule  # type: ignore[attr-defined]
+            self.method.start_epoch(self.net, data, self.current_epoch, self.phases.warmup)
         torch.manual_seed(derive(self.seed, "dropout", self.current_epoch, self.global_rank))
 
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:

@@ -6,7 +6,7 @@ Nothing here is read by training: no model is chosen and no threshold set by the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.splits import Unlabelled
+from qs3.errors import ConfigError
 from qs3.evaluation.calibration import calibration_error
 from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
 from qs3.runs.metrics import PseudoLabelScores, Scores
@@ -51,6 +52,35 @@ def predict(
     return torch.cat(parts).numpy()
 
 
+@torch.no_grad()
+def global_features(
+    net: Any,
+    points: Float[Tensor, "n p 3"],
+    batch_size: int,
+    device: Any = "cpu",
+    *,
+    domain: str = "target",
+) -> Float[np.ndarray, "n d"]:
+    """What the backbone says about each cloud: as `predict`.
+
+    Raises:
+        ConfigError: the model is not a backbone with a head.
+    """
+    if not hasattr(net, "features"):
+        raise ConfigError(f"{type(net).__name__} has no features; choose e.g. model=dgcnn")
+    training = net.training
+    net.eval()
+    try:
+        with use_domain(net, norms_for(net, domain)):
+            parts = [
+                net.features(points[i : i + batch_size].to(device)).global_.double().cpu()
+                for i in range(0, len(points), batch_size)
+            ]
+    finally:
+        net.train(training)
+    return torch.cat(parts).numpy()
+
+
 def adapt_norms(
     net: nn.Module,
     points: Float[Tensor, "n p 3"],
@@ -63,10 +93,18 @@ def adapt_norms(
     One pass in random order (a dataset is sorted by class, and a batch should look like the
     whole), in batches of about `batch_size`, as equal as they can be. The weights stay.
     """
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
-    batches = torch.tensor_split(order, max(1, round(len(points) / batch_size)))
+    batches = even_batches(points, batch_size, seed)
     with use_domain(net, norms_for(net, "target")):
-        adapt_batchnorm(net, (points[index].to(device) for index in batches))
+        adapt_batchnorm(net, (batch.to(device) for batch in batches))
+
+
+def even_batches(
+    points: Float[Tensor, "n p 3"], batch_size: int, seed: int
+) -> Iterator[Float[Tensor, "b p 3"]]:
+    """All clouds in random order, in batches of about `batch_size`, as equal as they can be."""
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
+    for index in torch.tensor_split(order, max(1, round(len(points) / batch_size))):
+        yield points[index]
 
 
 def predict_rotated(

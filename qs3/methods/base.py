@@ -9,7 +9,7 @@ that is done after this step: 1 in its last one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -18,6 +18,9 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_float
 from qs3.errors import ConfigError
+
+if TYPE_CHECKING:
+    from qs3.datamodules.adaptation import AdaptationData
 
 
 class Method(nn.Module):
@@ -43,6 +46,13 @@ class Method(nn.Module):
 
         Raises:
             ConfigError: the model does not offer what the method needs.
+        """
+
+    def start_epoch(self, net: nn.Module, data: AdaptationData, epoch: int, epochs: int) -> None:
+        """What is done before an epoch of the warm-up (of `epochs`), with the clouds as they are.
+
+        What it leaves for later epochs must lie in buffers: a checkpoint holds them, and of several
+        processes the first one's count.
         """
 
     def learning_rates(self, net: nn.Module) -> Sequence[tuple[nn.Module, float]]:

@@ -27,14 +27,14 @@ def masked_chamfer(
     """
     with torch.autocast(a.device.type, enabled=False):
         a, b = (x.float() if x.dtype in (torch.float16, torch.bfloat16) else x for x in (a, b))
-        to_b, to_a = _nearest(a.detach(), b.detach(), mask_a, mask_b)
+        to_b, to_a = nearest(a.detach(), b.detach(), mask_a, mask_b)
         forth = (a - gather(b, to_b)).square().sum(2)  # [b, n]
         back = (b - gather(a, to_a)).square().sum(2)  # [b, m]
         both = mask_a.any(1, keepdim=True) & mask_b.any(1, keepdim=True)
-        return _masked_mean(forth, mask_a & both) + _masked_mean(back, mask_b & both)
+        return masked_mean(forth, mask_a & both) + masked_mean(back, mask_b & both)
 
 
-def _nearest(a: Tensor, b: Tensor, mask_a: Tensor, mask_b: Tensor) -> tuple[Tensor, Tensor]:
+def nearest(a: Tensor, b: Tensor, mask_a: Tensor, mask_b: Tensor) -> tuple[Tensor, Tensor]:
     """For each a the nearest marked b [b, n], for each b the nearest marked a [b, m]."""
     squares = -2 * a @ b.transpose(1, 2)  # [b, n, m]
     squares += a.square().sum(2)[:, :, None]
@@ -43,6 +43,6 @@ def _nearest(a: Tensor, b: Tensor, mask_a: Tensor, mask_b: Tensor) -> tuple[Tens
     return squares.argmin(2), squares.argmin(1)
 
 
-def _masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Mean of the marked values of each row, 0 without any: [b, n] -> [b]."""
     return torch.where(mask, values, 0.0).sum(1) / mask.sum(1).clamp_min(1)

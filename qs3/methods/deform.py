@@ -15,6 +15,7 @@ from torch import Tensor
 GRID = 3
 VOXELS = GRID**3
 _STD = 0.001**0.5  # of the blob: the covariance is 0.001 I
+_OF = 1024  # points of the clouds for which `min_points` are stated
 
 
 class Deformed(NamedTuple):
@@ -57,8 +58,9 @@ def deform(points: Float[Tensor, "b n 3"], generator: torch.Generator, min_point
     """Deform one voxel of each cloud.
 
     The voxel is the first, in a random order that the batch shares, which holds at least
-    `min_points` points of the cloud. Its points become draws from N(centre, 0.001 I). The input
-    is left alone.
+    `min_points` points in 1,024 of the cloud's: papers and codes say how many for clouds of that
+    size, and a cloud of a quarter of the points has a quarter of them in each voxel. Its points
+    become draws from N(centre, 0.001 I). The input is left alone.
     """
     b, n, _ = points.shape
     device = points.device
@@ -67,7 +69,7 @@ def deform(points: Float[Tensor, "b n 3"], generator: torch.Generator, min_point
     of = voxel_of(points)  # [b, n]
     counts = torch.zeros(b, VOXELS, dtype=torch.int64, device=device)
     counts.scatter_add_(1, of, torch.ones_like(of))
-    enough = counts[:, order] >= min_points  # [b, 27], in the random order
+    enough = _OF * counts[:, order] >= n * min_points  # [b, 27], in the random order
     voxel = order[enough.int().argmax(1)]  # the first True
     mask = (of == voxel[:, None]) & enough.any(1, keepdim=True)
     blob = voxel_centre(voxel).to(points.dtype)[:, None] + _STD * noise  # [b, n, 3]

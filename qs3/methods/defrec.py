@@ -35,7 +35,7 @@ class DefRec(Method):
             the paper chose it for each pair of domains.
         scale: 20 in the released code; QS3's code has 8.
         min_points: of a voxel that may be deformed: 40 in the released code, 20 in QS3's; of
-            clouds of 1024 points.
+            clouds of 1024 points, in proportion of others (see `deform`).
         pcm: mix source clouds: DefRec+PCM.
         on_source: reconstruct source clouds, too (a switch of the released code).
         dropout: of the reconstruction head, after its first two layers.
@@ -96,7 +96,7 @@ class DefRec(Method):
 
 
 class ReconstructionHead(nn.Module):
-    """A place for each point: C + D to 256, 256, 128, 3, batch norm and ReLU between, no biases.
+    """A place for each point: C + D to 256, 256, 128, out, batch norm and ReLU between, no biases.
 
     The first layer is split in two: what it makes of the cloud's vector is the same for all of
     its points and computed once.
@@ -105,9 +105,10 @@ class ReconstructionHead(nn.Module):
         cloud_dim: D, of the cloud's vector.
         point_dim: C, of a point's.
         dropout: after the first two layers.
+        out: 3, or more where more is told of a point.
     """
 
-    def __init__(self, cloud_dim: int, point_dim: int, dropout: float) -> None:
+    def __init__(self, cloud_dim: int, point_dim: int, dropout: float, out: int = 3) -> None:
         super().__init__()
         both = nn.Linear(point_dim + cloud_dim, 256, bias=False)  # drawn for both at once
         self.of_point = nn.Parameter(both.weight.detach()[:, :point_dim].clone())
@@ -115,11 +116,11 @@ class ReconstructionHead(nn.Module):
         self.rest = nn.Sequential(
             *(nn.BatchNorm1d(256), nn.ReLU(), nn.Dropout(dropout), nn.Linear(256, 256, bias=False)),
             *(nn.BatchNorm1d(256), nn.ReLU(), nn.Dropout(dropout), nn.Linear(256, 128, bias=False)),
-            *(nn.BatchNorm1d(128), nn.ReLU(), nn.Linear(128, 3, bias=False)),
+            *(nn.BatchNorm1d(128), nn.ReLU(), nn.Linear(128, out, bias=False)),
         )
 
-    def forward(self, features: Features) -> Float[Tensor, "b n 3"]:
-        """[B, N, C] and [B, D] to [B, N, 3]."""
+    def forward(self, features: Features) -> Float[Tensor, "b n out"]:
+        """[B, N, C] and [B, D] to [B, N, out]."""
         assert features.per_point is not None
         of_cloud = nn.functional.linear(features.global_, self.of_cloud)[:, None]  # [b, 1, 256]
         x = nn.functional.linear(features.per_point, self.of_point) + of_cloud  # [b, n, 256]

@@ -36,7 +36,8 @@ class Gast(Method):
         def_weight: w_d; 0.5, in the logs 0.2 to 1; 0 leaves it out.
         rot_weight: w_r; 0.2, in the logs 0.1 to 1; 0 leaves it out, as the released code does
             unless asked (RotCls_on_src, RotCls_on_trgt), although the paper has it.
-        min_points: of a voxel that may be deformed: 20, of clouds of 1024 points.
+        min_points: of a voxel that may be deformed: 20, of clouds of 1024 points, in
+            proportion of others (see `deform`).
         pcm: mix source clouds for L_s (a switch of the released code).
 
     Not taken over from the released code: one tensor for both rotation labels, so that both heads

@@ -21,11 +21,13 @@ Labels = Int[Tensor, " b"] | Float[Tensor, "b c"]  # classes, or their probabili
 def mix(
     points: Float[Tensor, "b n 3"], labels: Labels, generator: torch.Generator
 ) -> tuple[Float[Tensor, "b n 3"], Labels, Labels, Float[Tensor, ""]]:
-    """Each cloud with its partner, another cloud of the batch (or itself, by chance).
+    """Each cloud with its partner, another cloud of the batch; or as it is, if that is itself.
 
     λ ~ Beta(1, 1), one a batch; round(λN) farthest points of the cloud and N - round(λN) of its
     partner, in random order. As the order of farthest point sampling does not depend on how
-    many points are taken, each cloud is sampled once, from a random point, for both roles.
+    many points are taken, each cloud is sampled once, from a random point, for both roles. On
+    average one cloud of a batch is its own partner: both roles would take the same first points,
+    and half of the cloud would be gone, so it stays whole.
 
     Returns:
         Mixed clouds, labels of the clouds, labels of their partners, λ.
@@ -36,7 +38,9 @@ def mix(
     start = torch.randint(n, (b,), generator=generator, device=generator.device).to(points.device)
     shuffle = torch.randperm(n, generator=generator, device=generator.device).to(points.device)
     ordered = gather(points, farthest_point_sampling(points, n, start))
-    mixed = join(ordered, ordered[partner], lam)[:, shuffle]
+    alone = partner == torch.arange(b, device=points.device)
+    mixed = torch.where(alone[:, None, None], ordered, join(ordered, ordered[partner], lam))
+    mixed = mixed[:, shuffle]
     return mixed, labels, labels[partner], lam
 
 

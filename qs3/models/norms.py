@@ -164,6 +164,17 @@ def norms_for(net: nn.Module, domain: str) -> str:
     return domain if seen else "source"
 
 
+def begin_target_norms(net: nn.Module) -> None:
+    """Give target norms that were never trained the source's weights and statistics.
+
+    A student that goes on with a teacher which never saw the target would otherwise leave it in
+    its first step: the teacher spoke with the source's norms (`norms_for`).
+    """
+    for norm in net.modules():
+        if isinstance(norm, DomainNorm) and not norm.target.num_batches_tracked:
+            norm.target.load_state_dict(norm.source.state_dict())
+
+
 class _Pooled:
     """Mean and biased variance of a norm's input over all batches (Chan et al., 1979), float64."""
 
@@ -219,7 +230,7 @@ def adapt_batchnorm(
         ConfigError: a norm takes no statistics in a pass, so there are none to store.
         DataError: there are no batches.
     """
-    norms = _running(net)
+    norms = running_norms(net)
     modes = {module: module.training for module in net.modules()}
     momenta = [norm.momentum for norm in norms]
     try:
@@ -236,7 +247,7 @@ def adapt_batchnorm(
     return list(norms)
 
 
-def _running(net: nn.Module) -> list[_BatchNorm]:
+def running_norms(net: nn.Module) -> list[_BatchNorm]:
     """Norms with running statistics that a pass would use now."""
     asleep = {
         norm.source if norm.domain == "target" else norm.target

@@ -89,7 +89,7 @@ class Evaluated:
         split: "test"; "train" where there is no other.
         labels: whether anybody knows the clouds' classes.
         rotations: rotations about the up axis over which the further scores average; 0: none.
-        norms: "trained" or "adabn".
+        norms: "trained", "adabn" or "tent".
         final_over_rotations, warmup_over_rotations: those scores.
     """
 

@@ -29,7 +29,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.engine.classifier import Classifier
-from qs3.evaluation.metrics import predict
+from qs3.evaluation.metrics import global_features, predict
+from qs3.models.norms import begin_target_norms
 from qs3.runs.checkpoints import copy_weights, load, save
 from qs3.runs.pseudo_labels import path_of, write_pseudo_labels
 from qs3.selftraining.selectors import TeacherPredictions, check_selection, keep_all
@@ -112,6 +113,7 @@ class SelfTraining(Callback):
         if phase > 0 and self.phases.starts(trainer.current_epoch):
             goes_on = self.scheme.init == "persistent" and phase > 1
             pl_module.start_phase(self._first_weights(pl_module, phase), keep_moments=goes_on)
+            begin_target_norms(pl_module.net)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """In the last epoch of a phase: label the target and choose the next training set."""
@@ -139,7 +141,12 @@ class SelfTraining(Callback):
         probabilities = trainer.strategy.broadcast(
             predict(teacher, data.target.points, data.eval_batch_size, pl_module.device)
         )
-        said = TeacherPredictions.of(probabilities, data.target.ids)
+        features = None
+        if getattr(self.scheme.selector, "needs_features", False):
+            features = trainer.strategy.broadcast(
+                global_features(teacher, data.target.points, data.eval_batch_size, pl_module.device)
+            )
+        said = TeacherPredictions.of(probabilities, data.target.ids, features)
         selection = self.scheme.selector.select(said, self.scheme.theta_of(round_), round_)
         if selection.labels is not None:  # a selector may name another class than the most probable
             said = said.relabelled(selection.labels)

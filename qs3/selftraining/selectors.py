@@ -28,6 +28,7 @@ class TeacherPredictions:
         predicted: [n] that class.
         classes: K.
         probabilities: [n, K] of all classes; only some selectors look at them.
+        features: [n, D] of a selector that says `needs_features`.
     """
 
     ids: Sequence[str]
@@ -35,13 +36,19 @@ class TeacherPredictions:
     predicted: Int[np.ndarray, " n"]
     classes: int
     probabilities: Float[np.ndarray, "n k"] | None = None
+    features: Float[np.ndarray, "n d"] | None = None
 
     @classmethod
-    def of(cls, probabilities: Float[np.ndarray, "n k"], ids: Sequence[str]) -> TeacherPredictions:
+    def of(
+        cls,
+        probabilities: Float[np.ndarray, "n k"],
+        ids: Sequence[str],
+        features: Float[np.ndarray, "n d"] | None = None,
+    ) -> TeacherPredictions:
         """Those of the most probable classes; the lowest on ties."""
         predicted = probabilities.argmax(axis=1)
         confidence = probabilities.max(axis=1).astype(np.float64)
-        return cls(ids, confidence, predicted, probabilities.shape[1], probabilities)
+        return cls(ids, confidence, predicted, probabilities.shape[1], probabilities, features)
 
     def relabelled(self, labels: Int[np.ndarray, " n"]) -> TeacherPredictions:
         """The same with other classes named, and the probabilities of those."""

@@ -39,6 +39,7 @@ UNIT_BALL_ONLY = {
 CENTRED_ONLY = {
     "qs3.methods.gast.Gast": "it turns parts of clouds about their middle",
     "qs3.methods.defrec.DefRec": "it deforms parts of clouds in a cube about their middle",
+    "qs3.methods.mlsp.Mlsp": "it masks parts of clouds in a cube about their middle",
 }
 """Parts that cannot see heights, likewise."""
 
@@ -193,7 +194,7 @@ def _check_settings(cfg: DictConfig) -> None:
         raise ConfigError(
             "force=true begins the run anew and ckpt_path goes on with one; give one of them"
         )
-    check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn"))
+    check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
     if not 0 <= check_float("protocol.smoothing", cfg.protocol.smoothing) <= highest:

@@ -15,6 +15,7 @@ from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.evaluation.accuracy_estimates import estimate_accuracy
 from qs3.evaluation.metrics import adapt_norms, predict
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
+from qs3.evaluation.tent import minimise_entropy
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
@@ -70,11 +71,12 @@ class SavedNets:
         self.classifier, self.device = built.classifier, built.classifier.device
 
     def __call__(self, file: Path) -> nn.Module:
-        """As it is evaluated: with the target's norms if `evaluation.norms=adabn`."""
+        """As it is evaluated: with norms of the target if `evaluation.norms` says so."""
         net, cfg = self.as_trained(file), self.run.cfg
-        if cfg.evaluation.norms == "adabn":
-            seed = derive(self.run.seed, "adabn")
-            adapt_norms(net, self.target.points, cfg.protocol.batch_size, seed, self.device)
+        if cfg.evaluation.norms != "trained":
+            adapt = adapt_norms if cfg.evaluation.norms == "adabn" else minimise_entropy
+            seed = derive(self.run.seed, cfg.evaluation.norms)
+            adapt(net, self.target.points, cfg.protocol.batch_size, seed, self.device)
         return net
 
     def as_trained(self, file: Path) -> nn.Module:
@@ -127,7 +129,7 @@ def _quality(
 ) -> AccuracyEstimates:
     taught = run.folder / WARMUP_SELECTED if run.scheme.rounds else None
     unadapted = None
-    if run.cfg.evaluation.norms == "adabn":
+    if run.cfg.evaluation.norms != "trained":
         unadapted = nets.as_trained(file), nets.as_trained(taught) if taught else None
     data = loaded.data
     more: dict[str, Any] = {"batch_size": data.eval_batch_size, "device": nets.device}

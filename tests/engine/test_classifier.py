@@ -13,6 +13,7 @@ from qs3.engine.classifier import Classifier
 from qs3.methods.dann import Dann
 from qs3.methods.gast import Gast
 from qs3.methods.pointdan import PointDan
+from qs3.methods.sd import Sd
 from qs3.methods.source_only import SourceOnly
 from qs3.models.pointdan import pointdan
 from qs3.selftraining.student_loss import Student
@@ -45,6 +46,21 @@ def test_heads_change_neither_the_net_nor_torch_s_generator() -> None:
     headed = _classifier(Dann()).net.state_dict()
     assert torch.equal(torch.get_rng_state(), state)
     assert all(torch.equal(plain[key], headed[key]) for key in plain)
+
+
+def test_a_method_s_copy_of_the_net_has_no_hooks_and_does_not_learn() -> None:
+    """Or the copy's passes would be in the regulariser; and the hook would take all else along."""
+    classifier = _classifier(Sd(), regulariser_weight=0.1)
+    teacher = classifier.method.teacher
+    assert classifier.net.backbone._forward_hooks
+    assert not any(module._forward_hooks for module in teacher.modules())
+    optimizer = classifier.configure_optimizers()["optimizer"]
+    before = {key: value.clone() for key, value in teacher.state_dict().items()}
+    classifier.net(torch.randn(4, 16, 3)).sum().backward()
+    optimizer.step()
+    assert all(torch.equal(value, before[key]) for key, value in teacher.state_dict().items())
+    names = classifier.state_dict().keys()  # a checkpoint holds it
+    assert {"method.steps", "method.teacher.head.0.weight"} <= names
 
 
 def test_heads_are_optimised() -> None:

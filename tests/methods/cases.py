@@ -10,13 +10,17 @@ import torch
 from torch import nn
 
 from qs3.methods.base import Method
+from qs3.methods.cpcm import Cpcm
 from qs3.methods.dann import Dann
 from qs3.methods.defrec import DefRec
 from qs3.methods.gast import Gast
+from qs3.methods.mlsp import Mlsp
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
+from qs3.methods.sd import Sd
 from qs3.methods.source_only import SourceOnly
 from qs3.methods.supervised import Supervised
+from qs3.selftraining.pcfea import Pcfea
 from qs3.selftraining.student_loss import Student
 
 
@@ -26,7 +30,8 @@ class Case:
 
     Attributes:
         make: the method.
-        passes: how often a batch passes through the net (PointDAN's through its generator).
+        passes: how often a batch passes through the net (PointDAN's through its generator). SD's
+            two more are its teacher's, and have no way back.
         source: whether its batches have labelled source clouds.
         pseudo: pseudo-labels of its target clouds: "hard", "soft", or "" for none.
     """
@@ -35,6 +40,13 @@ class Case:
     passes: int
     source: bool = True
     pseudo: str = ""
+
+
+def _styled() -> Pcfea:
+    """As it is once there is a pool."""
+    method = Pcfea()
+    method.styled = True
+    return method
 
 
 # A voxel of a toy cloud holds few points.
@@ -51,6 +63,12 @@ CASES = {
     "gast": Case(lambda: Gast(min_points=2), 5),
     "gast_no_rotation": Case(lambda: Gast(min_points=2, rot_weight=0.0), 3),
     "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),
+    "cpcm": Case(Cpcm, 3),
+    "mlsp": Case(lambda: Mlsp(min_points=2), 2),
+    "sd": Case(Sd, 2),
+    "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
+    "pcfea": Case(Pcfea, 1),  # until there is a pool
+    "pcfea_styled": Case(_styled, 2),
     "student": Case(Student, 1, source=False, pseudo="hard"),
     "student_pcm": Case(lambda: Student(pcm=True), 1, source=False, pseudo="hard"),
     "student_source": Case(lambda: Student(weight_step=0.005), 2, pseudo="hard"),

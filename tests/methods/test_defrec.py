@@ -69,7 +69,7 @@ def test_pcm_takes_the_place_of_the_plain_loss() -> None:
 
 
 def test_no_voxel_to_deform_is_no_loss_and_no_nan() -> None:
-    method, net = DefRec(min_points=65), tiny_net()
+    method, net = DefRec(min_points=1025), tiny_net()
     method.prepare(net)
     terms = method.loss(net, _batch(), torch.Generator().manual_seed(0))
     assert terms["defrec"].item() == 0.0

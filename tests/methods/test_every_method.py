@@ -20,7 +20,7 @@ from tests.methods.cases import Case, batch_of, total
 
 NAMES = [
     *("source_only", "pcm", "dann", "defrec_on_source", "defrec_pcm", "gast", "gast_pcm"),
-    *("pointdan", "student_all"),
+    *("pointdan", "cpcm", "mlsp", "sd", "pcfea_styled", "student_all"),
 ]
 CASES = {**cases.CASES, "student_all": Case(lambda: Student(True, 0.01, 0.1, 1), 2, pseudo="soft")}
 parametrize = pytest.mark.parametrize("name", NAMES)
@@ -49,6 +49,9 @@ def test_gradients_reach_every_weight(name: str) -> None:
     _total(net, method, batch).backward()
     for part in (net, method):
         for key, p in part.named_parameters():
+            if not p.requires_grad:  # a teacher's
+                assert p.grad is None, key
+                continue
             assert p.grad is not None, key
             assert torch.isfinite(p.grad).all(), key
     assert net.backbone.get_parameter(next(iter(dict(net.backbone.named_parameters())))).grad.any()
@@ -63,7 +66,12 @@ def test_a_step_is_a_function_of_the_generator(name: str) -> None:
         for seed in (0, 0, 1)
     ]
     assert torch.equal(values[0], values[1])
-    if name not in ("source_only", "dann", "pointdan"):  # these draw nothing of their own
+    if name not in (
+        "source_only",
+        "dann",
+        "pointdan",
+        "pcfea_styled",
+    ):  # these draw nothing of their own
         assert not torch.equal(values[0], values[2])
     torch.set_rng_state(state)
 
@@ -108,7 +116,7 @@ def test_a_step_lowers_the_loss(name: str) -> None:
     before.backward()
     parameters = [*net.parameters(), *method.parameters()]
     squares = sum(float(p.grad.square().sum()) for p in parameters if p.grad is not None)
-    rate = 1e-4 / squares**0.5  # a step of length 0.0001: edges of a graph change with longer ones
+    rate = 1e-5 / squares**0.5  # a step of this length: edges of a graph change with longer ones
     with torch.no_grad():
         for p in parameters:
             if p.grad is not None:

@@ -107,8 +107,8 @@ def test_pcm_withstands_clutter() -> None:
 def test_gast_s_questions_carry_over_to_a_target_elsewhere() -> None:
     """Features that answer them for both domains serve the classifier in both."""
     off = 1e-9  # 0 would leave out the passes, and what batch norm learns from them
-    on = lambda: Gast(def_weight=0.1, rot_weight=0.1, min_points=3)  # noqa: E731
-    copy = lambda: Gast(def_weight=off, rot_weight=off, min_points=3)  # noqa: E731
+    on = lambda: Gast(def_weight=0.1, rot_weight=0.1, min_points=48)  # noqa: E731
+    copy = lambda: Gast(def_weight=off, rot_weight=off, min_points=48)  # noqa: E731
     assert gain(compare((on, copy), aside)) > 0.02
 
 
@@ -164,10 +164,10 @@ def test_defrec_rebuilds_regions_of_target_clouds_it_has_not_seen() -> None:
     source = boxes(labels, POINTS, generator)
     target, held_out = (noisy(boxes(labels, POINTS, generator), generator) for _ in range(2))
     error = {}
-    deformed = deform(held_out, generator, 3)
+    deformed = deform(held_out, generator, 48)
     mask = deformed.mask
     for scale in (20.0, 0.0):
-        method, net = DefRec(min_points=3, dropout=0.0, scale=scale), tiny_net()
+        method, net = DefRec(min_points=48, dropout=0.0, scale=scale), tiny_net()
         train(method, net, (source, labels), target, steps=150, seed=0, batch_size=16)
         net.eval()
         method.eval()

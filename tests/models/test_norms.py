@@ -12,6 +12,7 @@ from qs3.models.norms import (
     DomainNorm,
     active,
     adapt_batchnorm,
+    begin_target_norms,
     norms_for,
     track,
     use_domain,
@@ -40,6 +41,23 @@ def test_domain_comes_back_after_an_error_and_nested() -> None:
     assert [m.domain for m in net] == ["source", "source"]
     with pytest.raises(ConfigError, match="'source' or 'target'"), use_domain(net, "s"):
         pass
+
+
+def test_target_norms_begin_with_the_source_s_once() -> None:
+    """So the net says of the target with the target's norms what it said with the source's."""
+    torch.manual_seed(0)
+    net = pointnet(4, norm="domain").double()
+    for seed in range(3):
+        net(_clouds(6, seed))
+    before = torch.from_numpy(predict(net, _clouds(5, 9), 5))  # target norms: never trained
+    begin_target_norms(net)
+    assert norms_for(net, "target") == "target"
+    assert torch.equal(torch.from_numpy(predict(net, _clouds(5, 9), 5)), before)
+    with use_domain(net, "target"):
+        net(_clouds(6, 7))
+    trained = copy.deepcopy(net.state_dict())
+    begin_target_norms(net)
+    assert all(torch.equal(value, trained[key]) for key, value in net.state_dict().items())
 
 
 @pytest.mark.parametrize("momentum", [0.1, None])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -27,6 +28,7 @@ NAMES = sorted(p.stem for p in (CONF / "selftraining").glob("*.yaml") if p.stem 
 _COMPOSED = compose("train", [f"+selftraining@schemes.{name}={name}" for name in NAMES]).schemes
 SCHEMES: dict[str, SelfTrainingConfig] = {name: build(_COMPOSED[name]) for name in NAMES}
 SELECTORS = {name: scheme.selector for name, scheme in SCHEMES.items()} | {
+    "sd": replace(SCHEMES["sd"].selector, graph=False),  # the graph needs features: test_sd
     "qbst ascending": Qbst(order="ascending"),
     "qbst of all": Qbst(counts="all", order="ascending"),
     "cbst half": Cbst(portion=0.5),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from qs3.models.base import ClassHead, PointClassifier
+from qs3.models.norms import DomainNorm
 from qs3.models.pointdan import TwoHeads
 from tests.methods.shapes import TinyBackbone, TinyNodes
+from tests.training.toy import TinyNet
 
 
 def featured(num_classes: int) -> PointClassifier:
@@ -12,6 +14,13 @@ def featured(num_classes: int) -> PointClassifier:
     backbone = TinyBackbone()
     head = ClassHead(backbone.feature_dim, num_classes, hidden=(16,), dropout=0.3)
     return PointClassifier(backbone, head)
+
+
+def domained(num_classes: int) -> TinyNet:
+    """A norm for each domain."""
+    net = TinyNet(num_classes)
+    net.norm = DomainNorm(16)
+    return net
 
 
 def with_nodes(num_classes: int) -> PointClassifier:

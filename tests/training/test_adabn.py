@@ -1,7 +1,8 @@
-"""`evaluation.norms=adabn`: the result's norms hold the target's statistics, its weights stay."""
+"""`evaluation.norms`: with adabn the result's norms hold the target's statistics, weights stay."""
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from qs3.config import hashing
@@ -29,6 +30,22 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
     x = torch.relu(target.points @ after["lift.weight"].T + after["lift.bias"]).amax(1)  # [n, 16]
     torch.testing.assert_close(after["norm.running_mean"], x.mean(0), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(after["norm.running_var"], x.var(0), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_tent_changes_the_norm_s_weights_too(toy):
+    settings = ("method=source_only", "selftraining=none", "protocol.epochs=2")
+    weights = {}
+    for norms in ("trained", "tent"):
+        cfg = toy(*settings, f"evaluation.norms={norms}")
+        assert train(cfg).evaluation.norms == norms
+        weights[norms] = load(hashing.run_folder(cfg) / "result.pt")["weights"]
+    changed = {
+        k for k in weights["tent"] if not torch.equal(weights["tent"][k], weights["trained"][k])
+    }
+    figures = ("weight", "bias", "running_mean", "running_var")
+    assert {f"norm.{name}" for name in figures} <= changed
+    assert changed <= {f"norm.{name}" for name in (*figures, "num_batches_tracked")}
 
 
 def test_order_of_clouds_is_mixed_and_batches_are_even():

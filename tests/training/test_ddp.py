@@ -152,6 +152,9 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         ((), WARMUP + EPOCHS + 1),  # in round 1
         # heads of its own; the teacher goes on, with the source; soft labels
         (("method=gast", "selftraining=spst", FEATURED), WARMUP + 1),
+        # a teacher and a pool of the warm-up, in buffers; the pool is of epoch 1
+        (("method=sd", "selftraining=spst", FEATURED), 2),
+        (("method=pcfea", "method.every=1.0", "selftraining=spst", FEATURED), 3),
         (("method=dann", "selftraining=crst_lrent", "selftraining.theta=0", FEATURED), 2),
     ],
 )

@@ -185,6 +185,11 @@ def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
             r"method=defrec: it deforms parts .*; set data\.scale=metres, or choose",
         ),
         (
+            "data.scale=above_floor data.source.unit=metres data.source.floor_m=0 "
+            "data.target.floor_m=0 method=mlsp",
+            r"method=mlsp: it masks parts .*; set data\.scale=metres, or choose",
+        ),
+        (
             "data.scale=metres data.source.unit=metres data.target.unit=none",
             r"domain kinectsim10 are not in metres",
         ),

@@ -31,6 +31,7 @@ SCHEMES = {
     "crst_lrent": ("selftraining=crst_lrent", FREE),
     "crst_mrkld": ("selftraining=crst_mrkld", FREE),
     "random": ("selftraining=random",),
+    "sd": ("selftraining=sd", FREE, "selftraining.selector.steps=3", FEATURED),
     "confident": ("selftraining=confident",),
     "steps": ("selftraining=qbst", "protocol.steps=8", "selftraining.steps=5"),
     "continued_alone": ("selftraining=qbst", "selftraining.init=continue", "selftraining.pcm=true"),
@@ -41,6 +42,11 @@ METHODS = {
     "defrec_pcm": ("method=defrec_pcm", "method.min_points=2", FEATURED),
     "gast": ("method=gast", "method.min_points=2", FEATURED),
     "pointdan": ("method=pointdan", NODES),
+    "sd": ("method=sd", FEATURED),
+    "cpcm": ("method=cpcm",),
+    "mlsp": ("method=mlsp", FEATURED),
+    "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
+    "pcfea_qbst": ("method=pcfea_qbst", FEATURED),
     "supervised": ("method=supervised",),
 }
 
@@ -74,7 +80,8 @@ def test_every_scheme_goes_on_in_the_middle_of_a_round(toy, tmp_path, name):
 
 @pytest.mark.parametrize("name", fast_are({"gast", "pointdan"}, METHODS))
 def test_every_method_goes_on_in_the_middle_of_the_warmup(toy, tmp_path, name):
-    check(toy, tmp_path, ("protocol.epochs=3", "selftraining=none", *METHODS[name]), 1)
+    epochs = (1, 2) if name == "pcfea" else (1,)
+    check(toy, tmp_path, ("protocol.epochs=3", "selftraining=none", *METHODS[name]), *epochs)
 
 
 def test_every_config_of_both_groups_is_tried():

@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor, nn
 
 from qs3.data.store import PointSet
 from qs3.datamodules.splits import load_clouds
 from qs3.errors import Qs3Error
+from qs3.evaluation.metrics import global_features
 from qs3.inference.model_file import build_net, read_result
-from qs3.models.norms import norms_for, use_domain
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
 from qs3.report.runs.data import RunFiles
@@ -71,7 +68,7 @@ def draw_embedding(
     places = {}
     for title, net in nets.items():
         features = [
-            global_features(net, part, role)
+            global_features(net, part, _BATCH, domain=role)
             for role, part in zip(("source", "target"), parts, strict=True)
         ]
         places[title] = tsne(np.concatenate(features))
@@ -89,20 +86,6 @@ def draw_embedding(
 def sample(n: int, most: int, seed: int) -> np.ndarray:
     """[min(n, most)] different positions below n, ascending; all of them if there are few."""
     return np.sort(np.random.default_rng(seed).permutation(n)[:most])
-
-
-@torch.no_grad()
-def global_features(
-    net: nn.Module, points: Float[Tensor, "n p 3"], domain: str
-) -> Float[np.ndarray, "n d"]:
-    """What the backbone says about each cloud, in eval mode with the norms of its domain."""
-    net.eval()
-    with use_domain(net, norms_for(net, domain)):
-        parts = [
-            net.features(points[i : i + _BATCH]).global_  # type: ignore[operator]
-            for i in range(0, len(points), _BATCH)
-        ]
-    return torch.cat(parts).double().numpy()
 
 
 def _labels(data: PointSet, split: str) -> np.ndarray:

@@ -1,0 +1,197 @@
+"""SD's second step: labels of the target refined by a graph net over its clouds.
+
+Cardace et al., "Self-Distillation for Unsupervised 3D Domain Adaptation", WACV 2023; what the paper
+leaves open is as in its released code. Its first step is `qs3.methods.sd`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from qs3.config.checks import check_bool, check_int, check_ranges
+from qs3.errors import ConfigError
+from qs3.selftraining.selectors import Selection, TeacherPredictions
+from qs3.utils.seeding import derive
+
+_KEY = "selftraining.selector"
+WIDTH = 128  # of the graph net, and the principal components of the features that it sees
+_BLOCK = 1024  # rows of the correlations that are held at once
+
+
+@dataclass(frozen=True)
+class GraphRefined:
+    """All target clouds, those of which a graph net is surest with its labels and full weight.
+
+    Two clouds are joined if their features' correlation exceeds `correlation` and one is among the
+    `neighbours` most correlated of the other. A graph net (`GraphNet`) learns to say, from features
+    and the teacher's probabilities, a fifth of them hidden in each step, what the teacher says; of
+    each class that it then predicts, the share `growth` x round of the clouds of which it is surest
+    (rounded, one at least) get its label. The others keep the teacher's and weigh `unsure`:
+    their row of `soft` sums to that, as a cross-entropy is linear in its label (exactly, where
+    `protocol.smoothing` is 0). In round 0 that are all, as in the first epochs there.
+
+    Differences to the released code: the graph is undirected, features are reduced to their
+    `WIDTH` principal components, who is sure is decided anew each round, and the others' labels are
+    those of the present teacher, not of the first one.
+
+    Attributes:
+        graph: False refines nothing: the teacher's own probabilities decide (a control).
+        growth: of the share, each round, in (0, 1]; 0.05 for rounds of 5 epochs of 100.
+        unsure: weight in [0, 1].
+        correlation: in [-1, 1).
+        neighbours: of a cloud, itself not counted.
+        steps: of Adam (1e-3, weight decay 5e-4).
+        seed: of the run.
+    """
+
+    own_thresholds = True
+
+    graph: bool = True
+    growth: float = 0.05
+    unsure: float = 0.2
+    correlation: float = 0.95
+    neighbours: int = 10
+    steps: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bool(f"{_KEY}.graph", self.graph)
+        check_ranges(self, f"{_KEY}.", growth="(0, 1]", unsure="[0, 1]", correlation="[-1, 1)")
+        for key in ("neighbours", "steps"):
+            check_int(f"{_KEY}.{key}", getattr(self, key), 1)
+
+    @property
+    def needs_features(self) -> bool:
+        """Whether the table must have features."""
+        return self.graph
+
+    def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
+        """As `Selector.select`; chooses all above theta (0 as a rule), with weights in `soft`."""
+        assert teacher.probabilities is not None
+        n, classes = teacher.probabilities.shape
+        sure, labels = np.zeros(n, dtype=bool), teacher.predicted
+        if round_:
+            scores = self._scores(teacher, round_) if self.graph else teacher.probabilities
+            sure = surest(scores, teacher.ids, min(self.growth * round_, 1.0))
+            labels = np.where(sure, scores.argmax(axis=1), labels)
+        soft = np.eye(classes)[labels] * np.where(sure, 1.0, self.unsure)[:, None]
+        selected = teacher.relabelled(labels).confidence > theta
+        return Selection(
+            selected=selected,
+            theta=theta,
+            mu=np.full(classes, min(self.growth * round_, 1.0)),
+            confident=np.bincount(teacher.predicted[teacher.confidence > theta], minlength=classes),
+            kept=np.bincount(labels[selected], minlength=classes),
+            labels=labels,
+            soft=soft,
+        )
+
+    def _scores(self, teacher: TeacherPredictions, round_: int) -> Float[np.ndarray, "n k"]:
+        if teacher.features is None:
+            raise ConfigError(
+                f"{_KEY}.graph=true needs a model's features; choose e.g. model=dgcnn, or set it "
+                "to false"
+            )
+        assert teacher.probabilities is not None
+        order = np.argsort(np.asarray(teacher.ids), kind="stable")  # whatever that of the rows
+        features = torch.from_numpy(teacher.features[order]).double()
+        edges = neighbours_of(features, self.correlation, self.neighbours)
+        said = torch.from_numpy(teacher.probabilities[order]).float()
+        seed = derive(self.seed, "graph", round_)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            refined = _refined(principal(features, WIDTH).float(), said, edges, self.steps)
+        scores = np.empty_like(teacher.probabilities)
+        scores[order] = refined.numpy()
+        return scores
+
+
+def surest(scores: Float[np.ndarray, "n k"], ids: object, share: float) -> Bool[np.ndarray, " n"]:
+    """Of each predicted class the round(share n_k) of highest score, one at least; ties by id."""
+    predicted, confidence = scores.argmax(axis=1), scores.max(axis=1)
+    ranked = np.lexsort((np.asarray(ids), -confidence))
+    sure = np.zeros(len(scores), dtype=bool)
+    for k in np.unique(predicted):
+        of_class = ranked[predicted[ranked] == k]
+        sure[of_class[: max(1, round(share * len(of_class)))]] = True
+    return sure
+
+
+def neighbours_of(features: Float[Tensor, "n d"], least: float, most: int) -> Float[Tensor, "n n"]:
+    r"""D^{-1/2} (A + I) D^{-1/2}, sparse, of the undirected graph of `GraphRefined`.
+
+    Correlation as of two rows of numbers: over the features, about each cloud's own mean.
+    """
+    n = len(features)
+    centred = features - features.mean(dim=1, keepdim=True)
+    unit = centred / centred.norm(dim=1, keepdim=True).clamp_min(1e-12)
+    pairs = [torch.arange(n).expand(2, n)]
+    for begin in range(0, n, _BLOCK):
+        rows = torch.arange(begin, min(begin + _BLOCK, n))
+        close = unit[rows] @ unit.T
+        close[torch.arange(len(rows)), rows] = -2.0
+        value, column = close.topk(min(most, n - 1), dim=1)
+        row = rows[:, None].expand_as(column)[value > least]
+        column = column[value > least]
+        pairs += [torch.stack([row, column]), torch.stack([column, row])]
+    index: Int[Tensor, "2 e"] = torch.cat(pairs, dim=1).unique(dim=1)
+    degree = torch.bincount(index[0], minlength=n).float()
+    value = (degree[index[0]] * degree[index[1]]).rsqrt()
+    return torch.sparse_coo_tensor(index, value, (n, n), check_invariants=True, is_coalesced=True)
+
+
+def principal(features: Float[Tensor, "n d"], most: int) -> Float[Tensor, "n m"]:
+    """The first min(most, D) principal components, at a mean square of 1."""
+    centred = features - features.mean(dim=0)
+    _, vectors = torch.linalg.eigh(centred.T @ centred)  # ascending
+    found = centred @ vectors.flip(1)[:, :most]
+    return found / found.square().mean().sqrt().clamp_min(1e-12)
+
+
+class GraphNet(nn.Module):
+    """Three graph convolutions (Kipf and Welling, ICLR 2017, eq. 2), ReLU and dropout 0.5 between.
+
+    Args:
+        width: of features and hidden layers.
+        classes: K; a linear map of the probabilities is added to the features.
+    """
+
+    def __init__(self, width: int, classes: int) -> None:
+        super().__init__()
+        self.of_scores = nn.Linear(classes, width)
+        self.layers = nn.ModuleList(nn.Linear(width, d) for d in (width, width, classes))
+
+    def forward(
+        self, x: Float[Tensor, "n d"], scores: Float[Tensor, "n k"], edges: Tensor
+    ) -> Float[Tensor, "n k"]:
+        """Logits."""
+        x = x + self.of_scores(scores)
+        for i, layer in enumerate(self.layers):
+            if i:
+                x = F.dropout(x.relu(), training=self.training)
+            x = torch.sparse.mm(edges, layer(x))
+        return x
+
+
+def _refined(
+    features: Float[Tensor, "n d"], said: Float[Tensor, "n k"], edges: Tensor, steps: int
+) -> Float[Tensor, "n k"]:
+    """What a graph net says of each cloud, that has learned what the teacher says."""
+    net = GraphNet(features.shape[1], said.shape[1])
+    optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, weight_decay=5e-4)
+    labels = said.argmax(dim=1)
+    with torch.enable_grad():
+        for _ in range(steps):
+            shown = said * (torch.rand(len(said), 1) >= 0.2)
+            loss = F.cross_entropy(net(features, shown, edges), labels)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    with torch.no_grad():
+        return net.eval()(features, said, edges).softmax(dim=1)

@@ -1,0 +1,171 @@
+"""MLSP: its labels by loops, the loss pair by pair, and what the target teaches."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from qs3.errors import ConfigError
+from qs3.methods.deform import deform
+from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of
+from qs3.models.base import Features
+from tests.methods.shapes import CLASSES, boxes, tiny_net, train, unit_ball
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 2), st.sampled_from([8, 64, 256]), st.integers(0, 10_000))
+def test_cardinalities_by_loops(b: int, n: int, seed: int) -> None:
+    points = 0.3 * torch.rand(b, n, 3, generator=torch.Generator().manual_seed(seed))
+    found = cardinalities(points)
+    for i in range(b):
+        for j in range(0, n, 7):
+            distance = (points[i] - points[i, j]).norm(dim=1)
+            if (distance - RADIUS).abs().min() < 1e-6:  # rounding decides
+                continue
+            count = int((distance <= RADIUS).sum())
+            assert found[i, j] == min(math.floor(count * 1024 / n / 2), 15)
+
+
+def test_the_same_surface_with_fewer_points_has_the_same_cardinalities() -> None:
+    points = torch.rand(1, 1024, 3, generator=torch.Generator().manual_seed(0))
+    points = points * torch.tensor([0.7, 0.7, 0.0])
+    dense, few = cardinalities(points), cardinalities(points[:, :512])
+    assert dense.float().mean().item() == pytest.approx(few.float().mean().item(), rel=0.1)
+
+
+def test_normals_are_those_of_eigenvectors() -> None:
+    points = torch.randn(2, 40, 3, generator=torch.Generator().manual_seed(0)).double()
+    found = normals_of(points)
+    for i in range(2):
+        for j in range(40):
+            near = (points[i] - points[i, j]).norm(dim=1).topk(NEIGHBOURS, largest=False).indices
+            around = points[i, near] - points[i, near].mean(0)
+            value, vector = torch.linalg.eigh(around.T @ around)
+            if value[1] > 2 * value[0]:  # else any direction between will do
+                assert abs(found[i, j].double() @ vector[:, 0]) > 0.999
+
+
+def test_normals_of_a_plane() -> None:
+    points = torch.rand(1, 200, 3, generator=torch.Generator().manual_seed(0))
+    points[..., 2] = 0.5 * points[..., 0]
+    expected = torch.tensor([-0.5, 0.0, 1.0]) / math.sqrt(1.25)
+    torch.testing.assert_close(
+        (normals_of(points) @ expected).abs(), torch.ones(1, 200), rtol=1e-3, atol=1e-3
+    )
+
+
+def _clouds(b: int = 3, n: int = 64) -> Tensor:
+    return torch.rand(b, n, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+def test_the_loss_pair_by_pair() -> None:
+    """Told at a position against the nearest original's truth, and the other way round."""
+    net, clouds = tiny_net(), _clouds()
+    method = Mlsp(0.5, 0.3, 0.1, min_points=48, pcm=False, dropout=0.0)
+    method.prepare(net)
+    assert method.head is not None
+    net.eval()
+    method.eval()
+    source = {"points": clouds, "y_source": torch.arange(3)}
+    batch = {"source": source, "target": {"points": clouds}}
+    terms = method.loss(net, batch, torch.Generator().manual_seed(2))
+    masked = deform(clouds, torch.Generator().manual_seed(2), 48)
+    with torch.no_grad():
+        told = method.head(net.features(masked.points))
+    normals, counts = normals_of(clouds), cardinalities(clouds)
+    sums = {"position": 0.0, "normal": 0.0, "cardinality": 0.0}
+    for i in range(3):
+        region = masked.mask[i].nonzero()[:, 0].tolist()
+        pairs = []
+        for j in region:
+            gaps = [float((told[i, j, :3] - clouds[i, k]).norm()) for k in region]
+            pairs.append((j, region[gaps.index(min(gaps))]))
+            gaps = [float((told[i, k, :3] - clouds[i, j]).norm()) for k in region]
+            pairs.append((region[gaps.index(min(gaps))], j))
+        for at, original in pairs:
+            position, normal, logits = told[i, at].split([3, 3, 16])
+            cosine = torch.cosine_similarity(normal, normals[i, original], dim=0)
+            values = (
+                (position - clouds[i, original]).square().sum(),
+                1 - cosine.abs(),
+                -logits.log_softmax(0)[counts[i, original]],
+            )
+            for name, value in zip(sums, values, strict=True):
+                sums[name] += float(value) / len(region) / 3
+    for name, w in (("position", 10.0), ("normal", 0.3), ("cardinality", 0.1)):
+        assert terms[name].item() == pytest.approx(w * sums[name], rel=1e-4), name
+    ce = torch.nn.functional.cross_entropy(net(clouds), torch.arange(3))
+    torch.testing.assert_close(terms["ce"], 0.5 * ce)
+
+
+def test_a_head_that_knows_nothing_pays_2_ln_16() -> None:
+    net, method = tiny_net(), Mlsp(min_points=2)
+    method.prepare(net)
+    for p in method.parameters():
+        torch.nn.init.zeros_(p)
+    source = {"points": _clouds(), "y_source": torch.arange(3)}
+    batch = {"source": source, "target": {"points": _clouds()}}
+    terms = method.loss(net, batch, torch.Generator().manual_seed(0))
+    assert set(terms) == {"pcm", "position", "normal", "cardinality"}
+    assert terms["cardinality"].item() == pytest.approx(0.05 * 2 * math.log(16), rel=1e-5)
+    assert terms["normal"].item() == pytest.approx(0.5 * 2, rel=1e-5)
+
+
+def test_no_voxel_to_mask_is_no_loss_and_no_nan() -> None:
+    method, net = Mlsp(min_points=1025), tiny_net()
+    method.prepare(net)
+    source = {"points": _clouds(), "y_source": torch.arange(3)}
+    batch = {"source": source, "target": {"points": _clouds()}}
+    terms = method.loss(net, batch, torch.Generator().manual_seed(0))
+    assert all(terms[name].item() == 0.0 for name in ("position", "normal", "cardinality"))
+    torch.stack(list(terms.values())).sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
+
+
+def test_a_model_without_features_per_point_is_refused() -> None:
+    net = tiny_net()
+    per_cloud = net.backbone.forward
+    net.backbone.forward = lambda points: Features(per_cloud(points).global_, None)
+    with pytest.raises(ConfigError, match="method=mlsp needs features of every point"):
+        Mlsp().prepare(net)
+    with pytest.raises(ConfigError, match=r"method.position_weight must be in \[0, 1\]"):
+        Mlsp(position_weight=2.0)
+
+
+def thin(points: Tensor) -> Tensor:
+    """Clouds pressed to three tenths of their depth."""
+    return unit_ball(points * torch.tensor([1.0, 0.3, 1.0]))
+
+
+@pytest.mark.slow
+def test_mlsp_learns_the_target_s_surfaces() -> None:
+    """Of thin target clouds not seen it tells normals and places that its copy does not know.
+
+    The copy does the same task on the source's clouds. This is what its loss asks for: normals 0.72
+    (1 by chance) against 1.10, places 0.57 against 0.75; cardinalities are the same. Of three
+    shifts tried, a tilt gave less and noise nothing. That accuracy follows could not be shown here:
+    thin clouds -1 point, moved ones -4 (two seeds each).
+    """
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.arange(64) % CLASSES
+    source = boxes(labels, 256, generator)
+    target, held_out = (thin(boxes(labels, 256, generator)) for _ in range(2))
+    found = []
+    for seen in (target, source):
+        method, net = Mlsp(0.5, 0.5, 0.5, dropout=0.0, pcm=False), tiny_net()
+        train(method, net, (source, labels), seen, steps=150, seed=0, batch_size=8)
+        net.eval()
+        method.eval()
+        with torch.no_grad():
+            batch = {
+                "source": {"points": source, "y_source": labels},
+                "target": {"points": held_out},
+            }
+            found.append(method.loss(net, batch, torch.Generator().manual_seed(5)))
+    assert found[0]["normal"] < 0.8 * found[1]["normal"]
+    assert found[0]["position"] < 0.9 * found[1]["position"]
