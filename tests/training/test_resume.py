@@ -142,12 +142,13 @@ def test_sigterm_is_status_143_also_in_a_worker_of_a_sweep(toy, monkeypatch):
 @pytest.mark.parametrize(
     "more", [["seed=0"], ["seed=0,1", "-m"], ["seed=0,1", "hydra/launcher=joblib", "-m"]], ids=str
 )
-def test_a_training_that_is_ended_says_so_and_goes_on(how, more, toy_data, tmp_path):
+def test_a_training_that_is_ended_says_so(how, more, toy_data, tmp_path):
     words = overrides(tmp_path, f"paths.data_dir={toy_data}", "protocol.epochs=2000")
     words = [word for word in words if not word.startswith("seed=")]
     process = subprocess.Popen(
         [sys.executable, str(ROOT / "train.py"), *words, *more],
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, cwd=tmp_path,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     while not list(tmp_path.glob("logs/*/seed*/last.ckpt")) and process.poll() is None:
