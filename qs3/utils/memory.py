@@ -31,12 +31,12 @@ def memory_limit() -> int:
     return int(limit * 1e9)
 
 
-def check_memory(needed: int, where: object, kind: type[DataError] = DataError) -> None:
+def check_memory(needed: float, where: object, kind: type[DataError] = DataError) -> None:
     """Refuse what takes too much.
 
     Args:
         needed: bytes at the peak, as far as it is known before reading.
-        where: begins the message: the file, and what in it.
+        where: begins the message: the file, and what in it; "" where it is added later.
         kind: of the error.
 
     Raises:
@@ -45,5 +45,5 @@ def check_memory(needed: int, where: object, kind: type[DataError] = DataError) 
     if needed > (limit := memory_limit()):
         raise kind(
             f"{where} takes {needed / 1e9:.3g} GB of memory, more than {limit / 1e9:.3g} GB: "
-            f"refused; if the file is to be trusted, set {VARIABLE}={math.ceil(needed / 1e9)}"
+            f"refused; if it is to be trusted, set {VARIABLE}={math.ceil(needed / 1e9)}".lstrip()
         )
