@@ -24,6 +24,7 @@ from qs3.runs.metrics import METRICS, RoundRecord, RunMetrics, Scores, read_metr
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.runs.pseudo_labels import PseudoLabel, path_of, read_pseudo_labels
+from qs3.utils.yamls import check_yaml
 
 HISTORY = "history.csv"
 
@@ -236,7 +237,8 @@ def _yaml(path: Path, kind: type) -> Any:
     if not path.is_file():
         return None
     try:
-        found: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+        check_yaml(text := path.read_text("utf-8"), "its text")
+        found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
     except Exception as error:  # yaml's and omegaconf's kinds have nothing else in common
         raise _damaged(path, error) from error
     return found if isinstance(found, kind) else None
