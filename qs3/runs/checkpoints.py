@@ -24,9 +24,18 @@ LAST = "last.ckpt"
 
 
 def save(value: Any, path: str | os.PathLike[str]) -> None:
-    """Save tensors and plain values to `path`, atomically."""
-    with atomic_path(path) as temporary:
-        torch.save(value, temporary)
+    """Save tensors and plain values to `path`, atomically.
+
+    Raises:
+        Qs3Error: the file cannot be written (permission, full disk).
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        try:
+            torch.save(value, file)
+        except RuntimeError as error:  # torch complains of the half file, not of the full disk
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from error
+            raise
 
 
 def load(

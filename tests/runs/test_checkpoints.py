@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import resource
+import signal
 import zipfile
 
 import pytest
 import torch
 
-from qs3.errors import DataError
+from qs3.errors import DataError, Qs3Error
 from qs3.runs.checkpoints import check, load, save
 from tests.training.conftest import finished, toy_data  # noqa: F401 (fixtures)
 
@@ -69,6 +71,23 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
         with pytest.raises(DataError, match=r"checksum of .*data/0 does not match\); get another"):
             check(file, "get another")
     assert blind == 24  # or torch has learnt it, and ours can go
+
+
+def test_a_full_disk_is_told_in_words(tmp_path):
+    """The kernel refuses files of more than 50 kB."""
+    path = tmp_path / "a.pt"
+    save({"w": torch.zeros(9)}, path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+        with pytest.raises(Qs3Error, match=r"cannot write .*a\.pt: .*too large; free some space"):
+            save({"w": torch.zeros(100_000)}, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert len(load(path)["w"]) == 9  # the old file
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_file_of_more_than_the_limit_is_refused(tmp_path, monkeypatch):

@@ -18,6 +18,7 @@ import qs3.selftraining.callback
 import qs3.training.command
 from qs3.config import hashing
 from qs3.engine.classifier import Classifier
+from qs3.errors import DataError
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
@@ -25,6 +26,10 @@ from tests.training.toy import overrides
 from tests.training.watching import Stop, interrupt
 
 ROOT = Path(__file__).parents[2]
+
+
+def slow(*values: str):
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 # 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1; 4 batches an epoch of the warm-up
@@ -78,7 +83,7 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
         nonlocal calls
         calls += 1
         if calls == call:
-            Path(file).write_bytes(b"half")
+            file.write(b"half")
             raise Stop
         return real(value, file)
 
@@ -119,6 +124,29 @@ def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, cal
             train(cfg)
     train(cfg)
     assert result_of(hashing.run_folder(cfg)) == result_of(finished)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (
+            "round_00/pseudo_labels.csv",
+            "id,label,confidence,selected\nx,ball,0.5,1\n",
+            "called 'x'",
+        ),
+        slow("round_00/pseudo_labels.csv", "id,label\n", "it has other columns"),
+        slow("round_00/pseudo_labels.csv", "", "not enough values"),
+        ("history.csv", "a,b\n1,2\n", "delete it, and the same command goes on"),
+        slow("history.csv", "epoch\nfive\n", "delete it, and the same command goes on"),
+    ],
+)
+def test_damaged_tables_are_named(toy, name, text, message):
+    """As if it had been killed two epochs before its end, and its tables damaged since."""
+    cfg = toy()
+    interrupt(cfg, "on_train_epoch_start", 9)
+    (hashing.run_folder(cfg) / name).write_text(text)
+    with pytest.raises(DataError, match=rf"{name} is damaged \(.*{message}"):
+        train(cfg)
 
 
 def test_sigterm_is_status_143_also_in_a_worker_of_a_sweep(toy, monkeypatch):
