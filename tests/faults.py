@@ -193,6 +193,13 @@ COMMANDS = {"training": (training, trained), "generation": (generation, generate
 
 def main(name: str, how: str, first: str, step: str) -> None:
     """Print what `tried` says, as JSON."""
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        tempfile.tempdir = folder
+        said = _tried(name, how, int(first), int(step))
+    sys.stdout.write(json.dumps(said) + "\n")
+
+
+def _tried(name: str, how: str, first: int, step: int) -> dict[str, Any]:
     torch.set_num_threads(1)
     command, result = COMMANDS[name]
     if name == "training":
@@ -203,8 +210,7 @@ def main(name: str, how: str, first: str, step: str) -> None:
         write_toy(data)
         short = ("protocol.epochs=3", "selftraining.rounds=1", "selftraining.epochs=1")
         _TOY.append(toy_config(data, f"paths.data_dir={data}", *short))
-    said = tried(command, result, how, int(first), int(step))
-    sys.stdout.write(json.dumps(said) + "\n")
+    return tried(command, result, how, first, step)
 
 
 if __name__ == "__main__":
