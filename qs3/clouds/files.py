@@ -9,17 +9,20 @@
     .h5 .hdf5   the dataset `data` or `points` as in .npy; perhaps `label`
 
 Only x y z are read. Points that are NaN or infinite, as depth cameras write them, are left out and
-counted. Pickled arrays are refused unopened, sizes are checked before memory is taken.
+counted. Pickled arrays are refused unopened, and what takes more memory than `qs3.utils.memory`
+allows, before it is taken. Whatever is wrong with a file, the error is a DataError.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
+import math
 import re
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,9 +30,8 @@ from typing import Any
 import numpy as np
 
 from qs3.clouds.pcd import read_pcd
-from qs3.errors import DataError, MeshError
-
-MAX_BYTES = 4 << 30  # of a file, and of what it unpacks to
+from qs3.errors import DataError, MeshError, Qs3Error
+from qs3.utils.memory import check_memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +123,16 @@ def parse_clouds(path: str | Path) -> CloudFile:
     if reader is None:
         raise DataError(f"{path}: unknown format; known are {', '.join(SUFFIXES)}")
     try:
-        size = path.stat().st_size
-        if not 0 < size <= MAX_BYTES:
-            raise DataError(f"{path}: {size} bytes, expected 1 to {MAX_BYTES}")
+        if not (size := path.stat().st_size):
+            raise DataError(f"{path}: 0 bytes, there are no points")
+        check_memory(2 * size, path)
         found = reader(path)
+    except Qs3Error:
+        raise
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # what damaged bytes do to a reader cannot be listed
+        raise DataError(f"{path} cannot be read ({type(error).__name__}: {error})") from error
     if not found.clouds:
         raise DataError(f"{path}: there are no clouds")
     return found
@@ -149,8 +155,12 @@ def _only(path: str | Path, found: CloudFile) -> np.ndarray:
 
 def _text(path: Path) -> CloudFile:
     data = path.read_bytes()
+    # Copies and numbers, eight bytes from two letters; and each line is an object.
+    check_memory(8 * len(data) + 48 * (data.count(b"\n") + data.count(b"\r")), path)
     rows = data.replace(b"//", b"#")
-    if b"," in rows or b";" in rows:
+    if _decimal_commas(rows):
+        rows = rows.replace(b",", b".").replace(b";", b" ")
+    elif b"," in rows or b";" in rows:
         rows = rows.translate(bytes.maketrans(b",;", b"  "))
     lines = rows.splitlines()
     try:
@@ -164,6 +174,18 @@ def _text(path: Path) -> CloudFile:
     if table.size == 0:
         raise DataError(f"{path}: there are no points")
     return CloudFile((table[:, :3],))
+
+
+def _decimal_commas(rows: bytes) -> bool:
+    """Whether the first row is as "0,5;1,25;2,75" or "0,5 1,25 2,75": commas within numbers."""
+    first = re.search(rb"^[ \t]*[^\s#][^\r\n]*", rows, re.MULTILINE)
+    words = re.split(rb"[;\s]+", first[0].split(b"#")[0].strip()) if first else []
+    if not any(b"," in word for word in words):
+        return first is not None and b";" in first[0]  # between numbers there is something else
+    within = [
+        re.fullmatch(rb"[-+]?(\d+,\d+|\d*\.?\d*)([eE][-+]?\d+)?", word) for word in words if word
+    ]
+    return all(within) and len(within) > 1
 
 
 def _bad_line(path: Path, lines: list[bytes]) -> str:
@@ -198,15 +220,15 @@ def npy_clouds(path: Path) -> int | None:
         DataError: as `read_clouds`, but for the numbers themselves.
     """
     with _readable(path, ".npy file"), open(path, "rb") as file:
-        shape, dtype = _npy_header(path, file)
+        shape, dtype = _npy_header(path, file, path.stat().st_size)
     _check_array(path, shape, dtype)
     if len(shape) == 3 and not shape[0]:
         raise DataError(f"{path}: there are no clouds")
     return shape[0] if len(shape) == 3 else None
 
 
-def _npy_header(path: Path, file: Any) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type of numbers, after comparing them with the file's size."""
+def _npy_header(where: object, file: Any, size: int) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of numbers, after comparing them with the size of the whole in bytes."""
     version = np.lib.format.read_magic(file)
     read: Callable[..., Any] | None = {
         (1, 0): np.lib.format.read_array_header_1_0,
@@ -216,11 +238,10 @@ def _npy_header(path: Path, file: Any) -> tuple[tuple[int, ...], np.dtype]:
         raise ValueError(f"version {version} of the .npy format")
     shape, _, dtype = read(file)
     if dtype.hasobject:
-        raise DataError(f"{path}: a pickled array, refused; save it as plain numbers")
-    size = path.stat().st_size
-    expected = file.tell() + dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-    if size != expected:
-        raise DataError(f"{path}: {size} bytes, expected {expected} for shape {shape}")
+        raise DataError(f"{where}: a pickled array, refused; save it as plain numbers")
+    expected = file.tell() + dtype.itemsize * math.prod(shape)
+    if size != expected or min(shape, default=0) < 0:
+        raise DataError(f"{where}: {size} bytes, expected {expected} for shape {shape}")
     return shape, dtype
 
 
@@ -241,7 +262,9 @@ def read_npy(
         DataError: damaged, pickled, or of another size than its header says; what `check` raises.
     """
     with _readable(path, ".npy file"), open(path, "rb") as file:
-        shape, dtype = _npy_header(path, file)
+        size = path.stat().st_size
+        check_memory(2 * size, path)
+        shape, dtype = _npy_header(path, file, size)
         if check:
             check(shape, dtype)
         file.seek(0)
@@ -250,20 +273,37 @@ def read_npy(
 
 
 def _npz(path: Path) -> CloudFile:
-    with _readable(path, ".npz of plain arrays"):
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-        if size > MAX_BYTES:
-            raise DataError(f"{path} unpacks to {size} bytes, more than {MAX_BYTES}")
-        with np.load(path, allow_pickle=False) as file:
-            names = file.files
-            key = "points" if "points" in names else names[0] if len(names) == 1 else None
-            if key is None:
-                raise DataError(f"{path} has no array 'points'; it has {', '.join(names)}")
-            array = file[key]
-            label = next((name for name in ("cls", "label", "labels") if name in names), None)
-            labels = None if label is None else file[label]
-    return _of_array(path, array, labels)
+    def choose(names: list[str]) -> list[str]:
+        key = "points" if "points" in names else names[0] if len(names) == 1 else None
+        if key is None:
+            raise DataError(f"{path} has no array 'points'; it has {', '.join(names)}")
+        return [key, *[name for name in ("cls", "label", "labels") if name in names][:1]]
+
+    array, *labels = read_npz(path, choose).values()
+    return _of_array(path, array, labels[0] if labels else None)
+
+
+def read_npz(path: Path, choose: Callable[[list[str]], Sequence[str]]) -> dict[str, np.ndarray]:
+    """Some arrays of an .npz, of any shape and type but objects.
+
+    Args:
+        path: of the file.
+        choose: which, of the names of all; may raise DataError.
+
+    Raises:
+        DataError: damaged, pickled, or larger than `qs3.utils.memory` allows or its parts are.
+    """
+    arrays, needed = {}, 0
+    with _readable(path, ".npz of plain arrays"), zipfile.ZipFile(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        for name in choose(list(members)):
+            info = members[name]
+            check_memory(needed := needed + 2 * info.file_size, path)
+            # Whole: of a stream numpy would make the array that the header promises.
+            data = archive.read(info)
+            _npy_header(f"{path}, {name}", io.BytesIO(data), len(data))
+            arrays[name] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    return arrays
 
 
 @contextlib.contextmanager
@@ -304,14 +344,30 @@ def _hdf5(path: Path) -> CloudFile:
             data = own_dataset(file, ("data", "points"), path)
             if data is None:
                 raise DataError(f"{path} has no dataset 'data' or 'points'")
-            if data.size * data.dtype.itemsize > MAX_BYTES:
-                raise DataError(f"{path}: data {data.shape} is larger than {MAX_BYTES} bytes")
+            _check_array(path, data.shape, data.dtype)
             label = own_dataset(file, ("label", "labels"), path)
+            check_memory(2 * data.size * data.dtype.itemsize, path)
+            labels = None if label is None else _h5_labels(label, path)
             array = np.asarray(data[...])
-            labels = None if label is None else np.asarray(label[...]).reshape(-1)
     except (OSError, RuntimeError, ValueError, KeyError, MemoryError) as error:
         raise DataError(f"{path}: not a readable HDF5 file ({error})") from error
     return _of_array(path, array, labels)
+
+
+def _h5_labels(label: Any, path: Path) -> np.ndarray:
+    """[n] of a dataset of n numbers or words."""
+    if label.shape is None:
+        raise DataError(f"{path}: the dataset of labels is empty")
+    check_memory(label.size * (label.dtype.itemsize + 50), path)
+    if not label.dtype.hasobject:
+        return np.asarray(label[...]).reshape(-1)
+    words, size = [], 0  # of any length, and the same one may stand at many places
+    for place in np.ndindex(label.shape):
+        words.append(label[place])
+        check_memory(size := size + len(words[-1]), path)
+    found = np.empty(len(words), dtype=object)
+    found[:] = words
+    return found
 
 
 def own_dataset(file: Any, names: tuple[str, ...], path: Path) -> Any:
@@ -347,7 +403,9 @@ def _of_array(path: Path, array: np.ndarray, labels: np.ndarray | None = None) -
     return CloudFile(tuple(clouds), words, many=many)
 
 
-def _check_array(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
+def _check_array(path: Path, shape: tuple[int, ...] | None, dtype: np.dtype) -> None:
+    if shape is None:  # of HDF5
+        raise DataError(f"{path}: the dataset is empty")
     if dtype.kind not in "fiu":
         raise DataError(f"{path}: the array holds {dtype}, not numbers")
     if len(shape) not in (2, 3) or shape[-1] < 3:

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from qs3.errors import DataError, MissingDataError
+from qs3.utils.memory import check_memory
 
 _MAX_HEADER_BYTES = 1 << 16
-_MAX_BYTES = 1 << 31  # of a file, and of what it expands to
 _MAX_WORD_BYTES = 64  # of one number in a text file
 # A back reference of three bytes stands for at most 264 bytes.
 _MAX_EXPANSION = 88
@@ -105,9 +105,7 @@ def read_pcd(path: str | os.PathLike[str]) -> PcdCloud:
     try:
         if not path.is_file():
             raise MissingDataError(f"{path}: there is no such file")
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise DataError(f"{path} has {size} bytes, more than the {_MAX_BYTES} that are read")
+        check_memory(2 * path.stat().st_size, path)
         data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
@@ -125,8 +123,6 @@ def parse_pcd(data: bytes) -> PcdCloud:
     """
     header, start = _parse_header(data)
     total = header.points * header.point_bytes
-    if total > _MAX_BYTES:
-        raise DataError(f"promises {total} bytes of points, more than the {_MAX_BYTES} allowed")
     body = memoryview(data)[start:]
     if header.data == "ascii":
         fields = _from_text(header, bytes(body))
@@ -205,6 +201,8 @@ def _from_text(header: _Header, body: bytes) -> dict[str, np.ndarray]:
     wanted = header.points * header.numbers
     if wanted > (len(body) + 1) // 2:  # a digit and a space each
         raise DataError(f"is cut: {wanted} numbers do not fit into {len(body)} bytes of text")
+    # A word is an object of 40 bytes; those of a field become rows as long as the longest.
+    check_memory(48 * wanted + (_MAX_WORD_BYTES + 16) * header.points, "")
     words = body.split()
     if len(words) != wanted:
         raise DataError(f"has {len(words)} numbers where its header promises {wanted}")
@@ -259,6 +257,7 @@ def _decompressed(body: memoryview, needed: int) -> bytes:
         raise DataError(f"is cut: it has {len(body) - 8} of {packed} compressed bytes")
     if full > packed * _MAX_EXPANSION:
         raise DataError(f"claims that {packed} bytes decompress to {full}, more than LZF can")
+    check_memory(3 * full, "")  # unpacked, joined, by field
     return lzf_decompress(bytes(body[8 : 8 + packed]), full)
 
 

@@ -38,6 +38,8 @@ _UNHASHED = (
 # Keys that came later, with the value at which they do nothing: left out there, so that runs from
 # before them keep their names.
 _OFF = {"protocol.augment.lift": 0.0, "protocol.augment.plate": 0.0}
+# What was hashed from the beginning and does not matter to given data: hashed as if it were so.
+_AS = {"data.source.published.on_error": "stop", "data.target.published.on_error": "stop"}
 _FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
@@ -53,6 +55,10 @@ def config_sha256(cfg: DictConfig) -> str:
         _leave_out(plain, key)
     for key, off in _OFF.items():
         _leave_out(plain, key, off)
+    for key, value in _AS.items():
+        node, leaf = _node(plain, key), key.rpartition(".")[2]
+        if isinstance(node, dict) and leaf in node:
+            node[leaf] = value
     if (plain.get("data") or {}).get("scale") != "above_floor":
         for key in _FLOORS:
             _leave_out(plain, key)
@@ -68,12 +74,16 @@ def config_sha256(cfg: DictConfig) -> str:
 
 def _leave_out(plain: Any, key: str, value: Any = ...) -> None:
     """Take a key out of nested dicts if it is there, and with `value` if it has that one."""
-    *parents, leaf = key.split(".")
-    node = plain
-    for parent in parents:
-        node = node.get(parent) if isinstance(node, dict) else None
+    node, leaf = _node(plain, key), key.rpartition(".")[2]
     if isinstance(node, dict) and (value is ... or node.get(leaf) == value):
         node.pop(leaf, None)
+
+
+def _node(plain: Any, key: str) -> Any:
+    """The dict in which the last part of a key stands; None if it is not there."""
+    for parent in key.split(".")[:-1]:
+        plain = plain.get(parent) if isinstance(plain, dict) else None
+    return plain
 
 
 def config_hash(cfg: DictConfig) -> str:

@@ -265,6 +265,8 @@ class Domain:
         now = importer.settings()
         if not importer.is_there():  # the published files were put away after the import
             now.update({key: imported.get(key) for key in ("folder", "files") if key in now})
+        if imported.get("on_error") == "stop":  # nothing was wrong, so nothing was left out
+            now["on_error"] = "stop"
         changed = {key for key in {*now, *imported} if now.get(key) != imported.get(key)}
         if not changed:
             return

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import shutil
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -98,7 +97,7 @@ class PartFiles:
             with np.load(path, allow_pickle=False) as file:
                 note = json.loads(file["note"].tobytes())
                 return note, {key: file[key] for key in file.files if key != "note"}
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
             raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
 
     def has(self, name: str) -> bool:

@@ -17,7 +17,8 @@ import dataclasses
 import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -270,7 +271,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     folder = Path(folder)
     meta = _meta_of_finished(folder)
     classes, hashes = tuple(meta["classes"]), meta["sha256"]
-    have = sorted(set(hashes) - {"manifest", *meta.get("tables", {})})
+    have = sorted(set(hashes) - {"manifest", *(meta.get("tables") or {})})
     if variant not in have:
         raise DataError(
             f"{folder} holds the arrays {have}, not {variant!r}; generate the dataset again with "
@@ -311,7 +312,7 @@ def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray
     """
     folder = Path(folder)
     meta = _meta_of_finished(folder)
-    tables = meta.get("tables", {})
+    tables = meta.get("tables") or {}
     if name not in tables:
         raise DataError(
             f"{folder} holds the tables {sorted(tables)}, not {name!r}; generate the dataset again "
@@ -338,7 +339,7 @@ def _open_array(
     """[N, P, columns] float32 memmap; its header, size and hash must be what they were."""
     path, shape = folder / f"{name}.npy", (meta["clouds"], meta["points"], columns)
     header = _header(shape)
-    expected = len(header) + 4 * int(np.prod(shape))
+    expected = len(header) + 4 * math.prod(shape)
     try:
         with open(path, "rb") as file:
             found = file.read(len(header))
@@ -368,13 +369,39 @@ def read_meta(folder: str | Path) -> dict[str, Any]:
     body, mark, checksum = text.rpartition(_CHECKSUM)
     if not mark or checksum != _sha256(body) + "\n":
         raise DataError(f"{path} is damaged or was edited (its checksum is wrong); {AGAIN}")
-    meta = yaml.load(body, _LOADER)
-    if meta.get("format_version") != FORMAT_VERSION:
+    try:
+        meta = yaml.load(body, _LOADER)
+        version = meta.get("format_version")
+    except (yaml.YAMLError, AttributeError, ValueError, RecursionError) as error:
+        raise DataError(f"{path} was written by something else ({error}); {AGAIN}") from error
+    if version != FORMAT_VERSION:
         raise DataError(
-            f"{path} has format version {meta.get('format_version')}, this qs3 reads "
+            f"{path} has format version {version}, this qs3 reads "
             f"{FORMAT_VERSION}; use the qs3 that wrote it ({meta.get('created_by')}) or {AGAIN}"
         )
+    if odd := next((key for key, fits in _META_FITS.items() if not fits(meta.get(key))), ""):
+        raise DataError(f"{path} has no {odd} as `write_pointset` writes it; {AGAIN}")
     return meta
+
+
+def _words(value: Any) -> bool:
+    """A list of different words."""
+    words = isinstance(value, list) and all(isinstance(one, str) for one in value)
+    return words and len({*value}) == len(value)
+
+
+_META_FITS: dict[str, Callable[[Any], bool]] = {
+    "name": lambda value: isinstance(value, str),
+    "classes": lambda value: _words(value) and len(value) > 0,
+    "clouds": lambda value: type(value) is int and value >= 0,
+    "points": lambda value: type(value) is int and value >= 0,
+    "sha256": lambda value: (
+        isinstance(value, dict) and "manifest" in value and _words(sorted(map(str, value)))
+    ),
+    "tables": lambda value: (
+        value is None or (isinstance(value, dict) and all(map(_words, value.values())))
+    ),
+}
 
 
 def _sha256(text: str) -> str:

@@ -19,6 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
+from qs3.errors import DataError
 from qs3.utils.files import write_text
 
 
@@ -89,5 +90,14 @@ class CsvHistory(Logger):
     def _rows(self) -> list[dict[str, str]]:
         if not self.path.is_file():
             return []
-        with open(self.path, encoding="utf-8", newline="") as file:
-            return list(csv.DictReader(file))
+        try:
+            with open(self.path, encoding="utf-8", newline="") as file:
+                rows = list(csv.DictReader(file, strict=True))
+            if not all(row["epoch"].isdecimal() and None not in row for row in rows):
+                raise ValueError("a row that is not of an epoch")
+        except (OSError, ValueError, KeyError, AttributeError, csv.Error) as error:
+            raise DataError(
+                f"{self.path} is damaged ({error}); delete it, and the same command goes on "
+                "without the rows of earlier epochs"
+            ) from error
+        return rows

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.splits import Unlabelled
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
 from qs3.evaluation.calibration import calibration_error
 from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
 from qs3.runs.metrics import PseudoLabelScores, Scores
@@ -234,6 +234,10 @@ class Evaluation:
         if self._train is None:
             return None
         rows = read_pseudo_labels(path)
+        if odd := next((row.id for row in rows if row.id not in self._train), ""):
+            raise DataError(
+                f"{path} is damaged (no cloud is called {odd!r}); repeat the run with force=true"
+            )
         right = np.array([self.classes[self._train[row.id]] == row.label for row in rows])
         kept = np.array([row.selected for row in rows])
         return PseudoLabelScores(

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.utils.yamls import check_yaml
 
 LISTS = (".csv", ".json", ".yaml", ".yml")
 IMAGES = (".png", ".npy")
@@ -182,6 +183,7 @@ def _table(text: str, path: Path) -> list[Mapping[str, Any]]:
 def _mappings(text: str, path: Path) -> list[Mapping[str, Any]]:
     import yaml  # type: ignore[import-untyped,unused-ignore]
 
+    check_yaml(text, path)
     try:
         found = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError) as error:

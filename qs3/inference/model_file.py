@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -21,7 +22,8 @@ from torch import Tensor, nn
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.ood import ALL as MEASURES_OF_CLOUDS
 from qs3.inference.model_folder import CONFIG, WEIGHTS, read_folder
-from qs3.runs.checkpoints import save
+from qs3.runs.checkpoints import load, save
+from qs3.utils.memory import check_memory
 from qs3.utils.version import VERSION
 
 FILE = "result.pt"
@@ -31,17 +33,33 @@ PACKAGES = ("qs3.models",)
 _TARGET = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
 
 
-def _plain(value: Any) -> bool:
-    """Numbers, words, None, and lists of them: what a net's arguments are."""
-    if isinstance(value, list):
-        return all(_plain(each) for each in value)
-    return value is None or isinstance(value, bool | int | float | str)
+_MOST_VALUES = 10_000  # among a net's arguments
+_ADVICE = (
+    "it is damaged, or holds more than weights and plain values, and nothing in it was run; copy "
+    "it again from where it comes from, or delete metrics.json in its run's folder and repeat the "
+    "run's command, which trains nothing again"
+)
+
+
+def _plain(values: list[Any]) -> bool:
+    """Numbers, words, None, and lists of them, not too many: what a net's arguments are."""
+    waiting, seen = [values], 0
+    while waiting:  # lists in a file may hold each other, or themselves
+        some = waiting.pop()
+        seen += len(some)
+        lists = [one for one in some if isinstance(one, list)]
+        if seen > _MOST_VALUES or not all(
+            one is None or isinstance(one, bool | int | float | str | list) for one in some
+        ):
+            return False
+        waiting += lists
+    return True
 
 
 def _model(value: dict[str, Any]) -> dict[str, Any]:
     """A `_target_` and arguments that are plain values; no other key of Hydra's."""
     target, odd = str(value.get("_target_")), [key for key in value if key.startswith("_")]
-    plain = all(_plain(one) for one in value.values())
+    plain = _plain(list(value.values()))
     if odd != ["_target_"] or not plain or not _TARGET.fullmatch(target):
         raise ValueError("should be a dict with a `_target_` and plain arguments")
     return value
@@ -143,14 +161,7 @@ def read_result(path: str | Path) -> Result:
     file = find_result(path)
     if file.name == WEIGHTS:
         return _checked(file.parent / CONFIG, read_folder(file.parent))
-    try:
-        found = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds for damaged and for malicious files
-        raise DataError(
-            f"{file} is damaged, or holds more than weights and plain values "
-            f"({type(error).__name__}); nothing in it was run"
-        ) from error
-    return _checked(file, found)
+    return _checked(file, load(file, advice=_ADVICE))
 
 
 def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
@@ -164,10 +175,28 @@ def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
     settings = dict(result.model)
     target = settings.pop("_target_")
     make = _maker(target, packages)
+    if target.startswith(f"{PACKAGES[0]}."):  # one's own is trusted with any arguments
+        with torch.device("meta"), warnings.catch_warnings():  # takes no memory
+            warnings.simplefilter("ignore", UserWarning)  # nothing is copied there: as is meant
+            net = _filled(make, settings, result, target)
+        values = net.state_dict().values()
+        check_memory(sum(x.numel() * x.element_size() for x in values), f"the file's {target}")
+    with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and replaced
+        return _filled(make, settings, result, target).eval()
+
+
+def _filled(make: Any, settings: dict[str, Any], result: Result, target: str) -> nn.Module:
+    """The net with its weights; DataError as of `build_net`."""
     try:
-        with torch.random.fork_rng(devices=[]):  # its first weights are drawn, and replaced
-            net = make(**settings)
-    except (TypeError, ValueError, ConfigError) as error:
+        net = make(**settings)
+    except (
+        TypeError,
+        LookupError,
+        ValueError,
+        ArithmeticError,
+        RuntimeError,
+        ConfigError,
+    ) as error:
         raise DataError(f"{target} cannot be built as the file says: {error}") from error
     if not isinstance(net, nn.Module):
         raise DataError(f"the file's model {target} is not a net; refused")
@@ -178,7 +207,7 @@ def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
         raise DataError(f"the file's weights are not those of {target}: {first[0].strip()}") from (
             error
         )
-    return net.eval()
+    return net
 
 
 def _maker(target: str, packages: Sequence[str]) -> Any:

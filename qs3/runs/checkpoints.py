@@ -1,42 +1,82 @@
 """Checkpoints that survive a kill at any moment: written to another file, flushed, renamed.
 
-They hold weights and plain values only and are read with `weights_only=True`.
+They hold weights and plain values only and are read with `weights_only=True`. torch writes a zip
+with a checksum (CRC-32) of each tensor and never looks at it, so that a flipped bit would become
+another weight; here it is compared whenever a file is read.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
-from typing import Any
+import zipfile
+from collections.abc import Iterator
+from typing import Any, BinaryIO
 
 import torch
 from torch import nn
 
 from qs3.errors import DataError
 from qs3.utils.files import atomic_path
+from qs3.utils.memory import check_memory
 
 LAST = "last.ckpt"
 
 
 def save(value: Any, path: str | os.PathLike[str]) -> None:
-    """Save tensors and plain values to `path`, atomically."""
-    with atomic_path(path) as temporary:
-        torch.save(value, temporary)
-
-
-def load(path: str | os.PathLike[str], device: Any = "cpu") -> Any:
-    """Read what `save` wrote.
+    """Save tensors and plain values to `path`, atomically.
 
     Raises:
-        DataError: the file is missing or damaged.
+        Qs3Error: the file cannot be written (permission, full disk).
     """
-    try:
-        return torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file
-        raise DataError(
-            f"{path} cannot be read ({type(error).__name__}); start again with force=true"
-        ) from error
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        try:
+            torch.save(value, file)
+        except RuntimeError as error:  # torch complains of the half file, not of the full disk
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from error
+            raise
+
+
+def load(
+    path: str | os.PathLike[str], device: Any = "cpu", advice: str = "start again with force=true"
+) -> Any:
+    """Read what `save` wrote; the disk is read once.
+
+    Raises:
+        DataError: the file is missing, damaged, or takes too much memory; ends with the advice.
+    """
+    with _intact(path, advice) as file:
+        return torch.load(file, map_location=device, weights_only=True)
+
+
+def check(path: str | os.PathLike[str], advice: str) -> None:
+    """Raise DataError, which ends with the advice, if a file of `save` is missing or damaged."""
+    with _intact(path, advice):
+        pass
 
 
 def copy_weights(net: nn.Module) -> dict[str, torch.Tensor]:
     """The net's parameters and buffers, copied to the CPU."""
     return {name: value.detach().cpu().clone() for name, value in net.state_dict().items()}
+
+
+@contextlib.contextmanager
+def _intact(path: str | os.PathLike[str], advice: str) -> Iterator[BinaryIO]:
+    """The open file, after every checksum was compared; all that is raised becomes a DataError."""
+    try:
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            check_memory(size, path)
+            with zipfile.ZipFile(file) as archive:
+                if sum(info.file_size for info in archive.infolist()) > size:  # none is compressed
+                    raise zipfile.BadZipFile("it promises more than it holds")
+                if (damaged := archive.testzip()) is not None:
+                    raise zipfile.BadZipFile(f"the checksum of {damaged} does not match")
+            file.seek(0)
+            yield file
+    except DataError:
+        raise
+    except Exception as error:  # zipfile and torch raise many kinds for a damaged file
+        why = ": ".join([type(error).__name__, *str(error).splitlines()[:1]])
+        raise DataError(f"{path} cannot be read ({why}); {advice}") from error

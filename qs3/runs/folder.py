@@ -40,7 +40,10 @@ def read_started(folder: str | Path) -> dict[str, Any] | None:
     """What `write_started` saved; None if the run never got that far."""
     path = Path(folder) / STARTED
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        started = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(started, dict):
+            raise ValueError("no JSON object")
+        return started
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.errors import DataError
 from qs3.utils.files import write_text
 from qs3.utils.text_table import csv_text
 
@@ -45,9 +46,19 @@ def write_pseudo_labels(
 
 
 def read_pseudo_labels(path: Path) -> list[PseudoLabel]:
-    """Read the table."""
-    with open(path, encoding="utf-8", newline="") as file:
+    """Read the table.
+
+    Raises:
+        DataError: it is not there, or not as `write_pseudo_labels` writes it.
+    """
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            header, *rows = csv.reader(file, strict=True)
+        if tuple(header) != _COLUMNS or not rows:
+            raise ValueError("it has other columns, or no rows")
         return [
-            PseudoLabel(row["id"], row["label"], float(row["confidence"]), row["selected"] == "1")
-            for row in csv.DictReader(file)
+            PseudoLabel(id_, label, float(confidence), {"0": False, "1": True}[selected])
+            for id_, label, confidence, selected in rows
         ]
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise DataError(f"{path} is damaged ({error}); repeat the run with force=true") from error

@@ -10,6 +10,7 @@ import os
 import time
 
 import torch
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from qs3.config.hydra import build
 from qs3.engine.trainer import quieten
@@ -22,6 +23,7 @@ from qs3.training.load import Loaded, load_data
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
+from qs3.utils.cli import TERMINATED
 
 log = logging.getLogger(__name__)
 
@@ -58,12 +60,15 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     log.info(
         "%s, %d epochs", "fitting, continued" if last.is_file() else "fitting", run.phases.total
     )
-    built.trainer.fit(
-        built.classifier,
-        loaded.data,
-        ckpt_path=last if last.is_file() else None,
-        weights_only=True,
-    )
+    try:
+        built.trainer.fit(
+            built.classifier,
+            loaded.data,
+            ckpt_path=last if last.is_file() else None,
+            weights_only=True,
+        )
+    except SIGTERMException as error:  # of a worker of a sweep; by itself it would be status 0
+        raise SystemExit(TERMINATED) from error
     if built.trainer.is_global_zero:
         save(copy_weights(built.classifier.net), run.folder / STUDENT)
     built.trainer.strategy.barrier("student saved")

@@ -10,7 +10,7 @@ from typing import Any
 
 from qs3.errors import ConfigError, MissingDataError
 from qs3.runs import folder as runs
-from qs3.runs.checkpoints import LAST
+from qs3.runs.checkpoints import LAST, check
 from qs3.runs.metrics import METRICS
 from qs3.training.provenance import warn_of_versions
 from qs3.training.run import Run
@@ -39,7 +39,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
     Raises:
         MissingDataError: there is no such checkpoint.
         ConfigError: it is another run's.
-        DataError: it was trained on other data.
+        DataError: it was trained on other data, or is damaged.
         Qs3Error: it is still being trained.
     """
     where = run.cfg.ckpt_path
@@ -71,6 +71,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
     warn_of_versions(begun["versions"], started["versions"])
     for role in ("source", "target"):
         runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])
+    check(path, "copy it again from where it comes from, or leave ckpt_path out to begin anew")
     log.info("going on from %s", path)
     for file in sorted(file for file in other.rglob("*") if file.is_file()):
         part = file.relative_to(other)

@@ -7,6 +7,8 @@ When a run is one epoch away from the end of its warm-up, its checkpoint is copi
 The hash covers everything that the warm-up depends on, datasets and versions included. A new run
 of the same hash begins from that copy as if it had been interrupted there: it trains the last
 epoch itself, so teacher, pseudo-labels and result are the same, to the bit, as without it.
+`started.json` is written last and has the hashes of the other two: a copy that has changed since is
+as good as none, and replaced.
 """
 
 from __future__ import annotations
@@ -26,11 +28,12 @@ from qs3.config import hashing
 from qs3.errors import DataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
-from qs3.utils.files import copy_file, write_json
+from qs3.utils.files import copy_file, sha256_file, write_json
 
 log = logging.getLogger(__name__)
 
 HISTORY = "history.csv"
+_FILES = (HISTORY, LAST)
 # Not `selection`: the checkpoint holds the teacher chosen so far.
 _AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_name")
 
@@ -66,10 +69,14 @@ class SharedWarmup(Checkpoint):
 
     def take(self) -> bool:
         """Begin from a shared warm-up, if there is one and the run has no checkpoint yet."""
-        if self.shared is None or (self.folder / LAST).exists() or not self._is_there():
+        if self.shared is None or (self.folder / LAST).exists():
+            return False
+        if not self._is_there():
+            if (self.shared / runs.STARTED).exists():
+                log.warning("the warm-up in %s is damaged: it is trained again", self.shared)
             return False
         log.info("the warm-up was trained before: going on from %s", self.shared)
-        for name in (HISTORY, LAST):  # the checkpoint last: with it a run counts as begun
+        for name in _FILES:  # the checkpoint last: with it a run counts as begun
             copy_file(self.shared / name, self.folder / name)
         return True
 
@@ -80,17 +87,23 @@ class SharedWarmup(Checkpoint):
         if self.shared is None or self._is_there():
             return
         try:
-            for name in (HISTORY, LAST):
+            for name in _FILES:
                 copy_file(self.folder / name, self.shared / name)
-            write_json(self.shared / runs.STARTED, {"warmup_sha256": self.sha256})
+            write_json(self.shared / runs.STARTED, _mark(self.sha256, self.folder))
         except Exception as error:  # a full disk, say: sharing is a convenience
             log.warning("the warm-up cannot be shared (%s); training goes on", error)
 
     def _is_there(self) -> bool:
-        """Whether a complete one of this hash lies there; the mark is written last."""
+        """Whether a complete one of this hash lies there, as it was written."""
         assert self.shared is not None
         try:
             mark = runs.read_started(self.shared)
-        except DataError:  # damaged: as good as not there
+            return mark == _mark(self.sha256, self.shared) if mark else False
+        except (DataError, OSError):  # damaged: as good as not there
             return False
-        return mark is not None and mark.get("warmup_sha256") == self.sha256
+
+
+def _mark(sha256: str, folder: Path) -> dict[str, Any]:
+    """What says that the files in a folder are the warm-up of this hash."""
+    files = {name: sha256_file(folder / name) for name in _FILES}
+    return {"warmup_sha256": sha256, "files": files}

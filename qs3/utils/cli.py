@@ -17,11 +17,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from types import FrameType
 from typing import Any, NamedTuple
 
 from qs3.errors import ConfigError, Qs3Error
 
-INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE  # exit status, as shells say
+# Exit status, as shells say it.
+INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
+TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help")
 _WIDTH = 100
 # Of Hydra: what shows something and ends.
@@ -293,7 +296,7 @@ def run(command: Command | Group, argv: Sequence[str]) -> int:
 
 
 def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
-    """`main` of Hydra with the same manners: `help`, Ctrl-C, and `--help | head`."""
+    """`main` of Hydra with the same manners: `help`, Ctrl-C, SIGTERM, and `--help | head`."""
 
     @functools.wraps(main)
     def command() -> None:
@@ -301,18 +304,29 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
             sys.argv[1] = "--help"
         if any(word.split("=")[0] in _SHOWS for word in sys.argv[1:]):
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, _terminate)
         try:
             main()
         except (KeyboardInterrupt, SystemExit) as error:
-            if isinstance(error, SystemExit) and not isinstance(
+            if isinstance(error, SystemExit) and error.code == TERMINATED:
+                what, status = "terminated", TERMINATED
+            elif isinstance(error, KeyboardInterrupt) or isinstance(
                 error.__context__,
                 KeyboardInterrupt,  # Lightning's way to end
             ):
+                what, status = "interrupted", INTERRUPTED
+            else:
                 raise
-            print("\ninterrupted; run the same command again and it continues", file=sys.stderr)
-            sys.exit(INTERRUPTED)
+            print(f"\n{what}; run the same command again and it continues", file=sys.stderr)
+            sys.exit(status)
 
     return command
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    """End as after Ctrl-C, with all that is to be put away; a second SIGTERM ends at once."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    raise SystemExit(TERMINATED)
 
 
 def _near(word: str, known: Iterable[str]) -> str:

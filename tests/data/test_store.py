@@ -191,6 +191,32 @@ def test_the_number_of_clouds_is_checked_against_the_manifest(tmp_path):
             open_pointset(folder)
 
 
+@pytest.mark.parametrize(
+    ("line", "other", "message"),
+    [
+        ("clouds: 6", "clouds: -6", "has no clouds as"),
+        ("clouds: 6", "clouds: six", "has no clouds as"),
+        ("points: 5", "points: [5]", "has no points as"),
+        ("name: tiny", "named: tiny", "has no name as"),
+        ("classes:", "classes: 3\nkinds:", "has no classes as"),
+        ("sha256:", "sha256: all\nhashes:", "has no sha256 as"),
+        ("clouds: 6", "clouds: 6\ntables: [a]", "has no tables as"),
+        ("clouds: 6", "clouds: [6", "was written by something else"),
+        (None, "- 1\n", "was written by something else"),
+        (None, "", "was written by something else"),
+    ],
+)
+def test_a_description_of_something_else_with_a_valid_checksum(tmp_path, line, other, message):
+    make(tmp_path / "d")
+    path = tmp_path / "d" / "meta.yaml"
+    body = path.read_text().rpartition(store._CHECKSUM)[0]
+    assert line is None or line in body
+    body = other if line is None else body.replace(line, other, 1)
+    path.write_text(body + store._CHECKSUM + store._sha256(body) + "\n")
+    with pytest.raises(DataError, match=rf"(?s)meta\.yaml {message}.*generate or import"):
+        open_pointset(tmp_path / "d")
+
+
 def test_same_input_same_bytes_wherever_it_lies(tmp_path):
     a, b = make(tmp_path / "a"), make(tmp_path / "b")
     assert a.sha256 == b.sha256

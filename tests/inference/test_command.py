@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -143,6 +144,12 @@ def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, ca
     np.save(folder / "e.npy", np.array([{}], dtype=object), allow_pickle=True)
     (folder / "f.txt").write_text("")
     write(folder / "g.pcd", clouds[3])
+    header = "element vertex 1\nproperty list uchar float x\nproperty float y\nproperty float z\n"
+    (folder / "i.ply").write_text(f"ply\nformat ascii 1.0\n{header}end_header\n1 1 2 3\n")
+    with h5py.File(folder / "j.h5", "w") as file:
+        file["data"] = h5py.Empty("f4")
+    with zipfile.ZipFile(folder / "k.npz", "w") as file:
+        file.writestr("points.txt", "1 2 3")
     large = clouds[0].astype("f8")
     large[4] = 1e300
     np.save(folder / "h.npy", large)
@@ -153,7 +160,7 @@ def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, ca
     good = {"a.xyz", "d.npy[0]", "d.npy[2]", "g.pcd"}
     assert {file for file, word in status.items() if word == "ok"} == good
     assert {file for file, word in status.items() if word == "failed"} == {
-        *("b.xyz", "c.ply", "d.npy[1]", "e.npy", "f.txt", "h.npy")
+        *("b.xyz", "c.ply", "d.npy[1]", "e.npy", "f.txt", "h.npy", "i.ply", "j.h5", "k.npz")
     }
     assert list(status) == sorted(status)
     reasons = {row["file"]: row["reason"] for row in rows}
@@ -174,7 +181,7 @@ def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, ca
     assert records["clouds"][1]["probabilities"] is None
     said = capsys.readouterr().out
     assert "4 clouds, " in said
-    assert "6 failed:" in said
+    assert "9 failed:" in said
     assert "e.npy" in said
 
 

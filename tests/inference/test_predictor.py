@@ -26,6 +26,7 @@ from qs3.inference.predictor import load
 from qs3.models.dgcnn import dgcnn
 from qs3.runs.predictions import read_predictions
 from tests.inference.conftest import over_the_floor
+from tests.limits import memory_of_at_most, time_of_at_most
 
 
 @pytest.fixture(scope="module")
@@ -258,6 +259,7 @@ def test_pickles_are_refused_unopened(run, tmp_path):
         {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "k": -1},
         {"_target_": "tests.training.toy.TinyNet", "num_classes": 3},
         {"_target_": 7},
+        {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": -1},
         {},
     ],
     ids=str,
@@ -310,6 +312,30 @@ def test_a_net_of_ones_own_is_asked_for_by_package(run, tmp_path):
 def test_damaged_values_are_named(run, tmp_path, key, value):
     with pytest.raises(DataError, match=key):
         qs3.load(changed(run, tmp_path, **{key: value}))
+
+
+def test_lists_within_lists_are_not_followed_for_ever(run, tmp_path):
+    """Two to the power of 60 words in a kilobyte: a list twice in a list twice ..."""
+    inner: list[Any] = ["a"]
+    for _ in range(60):
+        inner = [inner, inner]
+    file = changed(run, tmp_path, model={"_target_": "qs3.models.dgcnn.dgcnn", "k": inner})
+    with time_of_at_most(20), pytest.raises(DataError) as told:
+        qs3.load(file)
+    assert "plain arguments" in str(told.value)
+
+
+def test_a_net_that_needs_too_much_memory_is_refused_unbuilt(run, tmp_path):
+    """4,000,000 classes take 4 GB; of the right shapes they fit into a small file."""
+    model = {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 4_000_000, "k": 6}
+    weights = plain(run)["weights"]
+    last = [name for name, value in weights.items() if len(value.shape) and value.shape[0] == 3]
+    many = {name: weights[name][:1].expand(4_000_000, *weights[name].shape[1:]) for name in last}
+    with memory_of_at_most(1 << 29):
+        with pytest.raises(DataError, match="weights are not those of"):
+            qs3.load(changed(run, tmp_path, model=model))
+        with pytest.raises(DataError, match=r"dgcnn takes 4\.1\d GB of memory, more than 2 GB"):
+            qs3.load(changed(run, tmp_path, model=model, weights={**weights, **many}))
 
 
 def test_a_wrong_number_of_classes_is_noticed(run, tmp_path):

@@ -67,6 +67,10 @@ def test_off_polygons_and_colours(tmp_path, content):
         ("OFF\n1 2 0\n5 5 5\n3 0 0 0\n3 0 0 0\n", "zero area"),
         ("OFF\n4 200000000 0\n", "limits"),
         ("OFF\n999999999999 1 0\n", "limits"),
+        (  # the fifth vertex could pass for a polygon of one corner
+            SQUARE_OFF.replace("0 1 0\n", "0 1 0\n1 1 1\n"),
+            "7 lines behind its header, which promises 4 vertices and 2 faces",
+        ),
         ("", "is empty"),
         (b"\0" * 100, "does not begin"),
     ],

@@ -6,7 +6,6 @@ import zipfile
 import numpy as np
 import pytest
 
-from qs3.meshes.formats import threemf
 from qs3.meshes.io import load_mesh
 from tests.meshes.written import corners, refused, save
 
@@ -74,5 +73,5 @@ def test_broken_archives_are_refused_with_the_reason(tmp_path, content, reason):
 
 
 def test_archives_that_unpack_to_too_much(tmp_path, monkeypatch):
-    monkeypatch.setattr(threemf, "MAX_UNPACKED_BYTES", 10_000)
-    refused(tmp_path, "a.3mf", archive(model() + " " * 20_000), "unpacks to more")
+    monkeypatch.setenv("QS3_MEMORY_GB", "0.0002")
+    refused(tmp_path, "a.3mf", archive(model() + " " * 20_000), "GB of memory, more than 0.0002")

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import resource
+import signal
+import zipfile
+
+import pytest
 import torch
 
+from qs3.errors import DataError, Qs3Error
+from qs3.runs.checkpoints import check, load, save
 from tests.training.conftest import finished, toy_data  # noqa: F401 (fixtures)
 
 KINDS = {"last.ckpt", "result.pt", "student.pt", "warmup_last.pt", "warmup_selected.pt"}
@@ -29,3 +36,69 @@ def test_student_result_and_checkpoint_have_the_same_weights(finished):  # noqa:
     for name, value in student.items():
         assert torch.equal(result[name], value)
         assert torch.equal(last[f"net.{name}"], value)
+
+
+def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
+    """Of all bytes a sixth; torch alone takes flips in the weights for other weights."""
+    file = tmp_path / "a.pt"
+    value = {"epoch": 3, "w": torch.arange(6.0)}
+    save(value, file)
+    data, read, blind = file.read_bytes(), 0, 0
+    said: list[str] = []
+    for place in range(1, len(data), 6):
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << place % 8
+        file.write_bytes(flipped)
+        try:
+            found = load(file)
+        except DataError as error:
+            said.append(str(error))
+            continue
+        read += 1
+        assert found.keys() == value.keys()
+        assert found["epoch"] == 3
+        assert torch.equal(found["w"], value["w"])
+    assert 0 < read < len(data) / 12  # times, padding
+    assert {one.startswith(f"{file} cannot be read (") for one in said} == {True}
+    assert {one.endswith("; start again with force=true") for one in said} == {True}
+    assert not any("\n" in one for one in said)
+    weights = data.index(value["w"].numpy().tobytes())
+    for place in range(weights, weights + 24):
+        flipped = bytearray(data)
+        flipped[place] ^= 1
+        file.write_bytes(flipped)
+        blind += not torch.equal(torch.load(file, weights_only=True)["w"], value["w"])
+        with pytest.raises(DataError, match=r"checksum of .*data/0 does not match\); get another"):
+            check(file, "get another")
+    assert blind == 24  # or torch has learnt it, and ours can go
+
+
+def test_a_full_disk_is_told_in_words(tmp_path):
+    """The kernel refuses files of more than 50 kB."""
+    path = tmp_path / "a.pt"
+    save({"w": torch.zeros(9)}, path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+        with pytest.raises(Qs3Error, match=r"cannot write .*a\.pt: .*too large; free some space"):
+            save({"w": torch.zeros(100_000)}, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert len(load(path)["w"]) == 9  # the old file
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_of_more_than_the_limit_is_refused(tmp_path, monkeypatch):
+    file = tmp_path / "a.pt"
+    save({"w": torch.zeros(1000)}, file)
+    monkeypatch.setenv("QS3_MEMORY_GB", "4e-6")  # 4000 bytes
+    with pytest.raises(DataError, match=r"a\.pt takes .* of memory, more than 4e-06 GB.*GB=1"):
+        load(file)
+    monkeypatch.setenv("QS3_MEMORY_GB", "8e-6")
+    assert len(load(file)["w"]) == 1000
+    with zipfile.ZipFile(file, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/zeros", bytes(1 << 20))
+    with pytest.raises(DataError, match="promises more than it holds"):
+        load(file)

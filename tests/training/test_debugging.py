@@ -144,6 +144,20 @@ def test_ckpt_path_of_another_run(toy, toy_data, begun, tmp_path):
         train(toy(f"ckpt_path={begun}"))
 
 
+def test_a_checkpoint_with_a_flipped_bit_is_refused(toy, begun):
+    data = bytearray((begun / "last.ckpt").read_bytes())
+    data[len(data) // 2] ^= 1
+    (begun / "last.ckpt").write_bytes(data)
+    alone = "paths.warmup_dir=null"
+    with pytest.raises(DataError, match=r"last\.ckpt cannot be read .*checksum.*copy it again"):
+        train(toy(f"ckpt_path={begun}", alone))
+    own = hashing.run_folder(toy(alone)) / "last.ckpt"
+    assert not own.exists()
+    shutil.copy(begun / "last.ckpt", own)
+    with pytest.raises(DataError, match=r"last\.ckpt cannot be read .*checksum.*force=true"):
+        train(toy(alone))
+
+
 def test_ckpt_path_of_a_run_that_is_being_trained(toy, begun):
     with owned(begun), pytest.raises(Qs3Error, match="another process is training in"):
         train(toy(f"ckpt_path={begun}", "paths.warmup_dir=null"))

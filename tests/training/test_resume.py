@@ -17,11 +17,19 @@ import qs3.runs.checkpoints
 import qs3.selftraining.callback
 import qs3.training.command
 from qs3.config import hashing
+from qs3.engine.classifier import Classifier
+from qs3.errors import DataError
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from tests.training.conftest import result_of
 from tests.training.toy import overrides
 from tests.training.watching import Stop, interrupt
+
+ROOT = Path(__file__).parents[2]
+
+
+def slow(*values: str):
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 # 10 epochs: 0-3 warm-up, 4-6 round 0, 7-9 round 1; 4 batches an epoch of the warm-up
@@ -75,7 +83,7 @@ def test_interrupted_while_a_checkpoint_is_written(toy, finished, monkeypatch, c
         nonlocal calls
         calls += 1
         if calls == call:
-            Path(file).write_bytes(b"half")
+            file.write(b"half")
             raise Stop
         return real(value, file)
 
@@ -118,14 +126,75 @@ def test_interrupted_in_a_function(toy, finished, monkeypatch, module, name, cal
     assert result_of(hashing.run_folder(cfg)) == result_of(finished)
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        (
+            "round_00/pseudo_labels.csv",
+            "id,label,confidence,selected\nx,ball,0.5,1\n",
+            "called 'x'",
+        ),
+        slow("round_00/pseudo_labels.csv", "id,label\n", "it has other columns"),
+        slow("round_00/pseudo_labels.csv", "", "not enough values"),
+        ("history.csv", "a,b\n1,2\n", "delete it, and the same command goes on"),
+        slow("history.csv", "epoch\nfive\n", "delete it, and the same command goes on"),
+    ],
+)
+def test_damaged_tables_are_named(toy, name, text, message):
+    """As if it had been killed two epochs before its end, and its tables damaged since."""
+    cfg = toy()
+    interrupt(cfg, "on_train_epoch_start", 9)
+    (hashing.run_folder(cfg) / name).write_text(text)
+    with pytest.raises(DataError, match=rf"{name} is damaged \(.*{message}"):
+        train(cfg)
+
+
+def test_sigterm_is_status_143_also_in_a_worker_of_a_sweep(toy, monkeypatch):
+    """Lightning ends with status 0; who called it would think that the run is finished."""
+    cfg = toy()
+
+    def terminate(self, real=Classifier.on_train_epoch_start):
+        real(self)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Classifier, "on_train_epoch_start", terminate)
+        with pytest.raises(SystemExit) as ended:
+            train(cfg)
+    assert ended.value.code == 143
+    assert not (hashing.run_folder(cfg) / "metrics.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT], ids=lambda how: how.name)
+@pytest.mark.parametrize(
+    "more", [["seed=0"], ["seed=0,1", "-m"], ["seed=0,1", "hydra/launcher=joblib", "-m"]], ids=str
+)
+def test_a_training_that_is_ended_says_so(how, more, toy_data, tmp_path):
+    words = overrides(tmp_path, f"paths.data_dir={toy_data}", "protocol.epochs=2000")
+    words = [word for word in words if not word.startswith("seed=")]
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "train.py"), *words, *more],
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, cwd=tmp_path,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    while not list(tmp_path.glob("logs/*/seed*/last.ckpt")) and process.poll() is None:
+        time.sleep(0.1)
+    process.send_signal(how)
+    out, said = process.communicate(timeout=120)
+    assert process.returncode == 128 + how, said
+    assert "Traceback" not in out + said
+    assert said.endswith("ed; run the same command again and it continues\n")
+
+
 @pytest.mark.slow
 def test_killed_at_random_instants(toy_data, tmp_path):
     """SIGKILL 24 times, at instants spread over the whole fit and the final evaluation."""
-    root = Path(__file__).parents[2]
     longer = ("protocol.epochs=40", "selftraining.epochs=15", "selftraining.rounds=3")
-    command = [sys.executable, str(root / "train.py")]
+    command = [sys.executable, str(ROOT / "train.py")]
     command += overrides(tmp_path, f"paths.data_dir={toy_data}", *longer)
-    environment = {**os.environ, "PYTHONPATH": str(root)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
 
     def start(name: str) -> tuple[subprocess.Popen, Path]:
         """Start in a log folder of its own; return when the fit is about to begin."""

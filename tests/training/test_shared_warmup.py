@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 from pathlib import Path
@@ -11,7 +12,9 @@ import torch
 
 from qs3.config import hashing
 from qs3.runs.checkpoints import load
+from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
+from qs3.training.shared_warmup import SharedWarmup
 from tests.training.conftest import result_of
 
 
@@ -22,6 +25,12 @@ def _all_messages(caplog: pytest.LogCaptureFixture) -> None:
 
 def taken(caplog: pytest.LogCaptureFixture) -> bool:
     return "the warm-up was trained before" in caplog.text
+
+
+def flipped(data: bytes) -> bytes:
+    """One bit in the middle is another."""
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
 
 
 def shared_folders(folder: Path) -> list[Path]:
@@ -68,6 +77,30 @@ def test_a_damaged_mark_is_as_good_as_none(toy, tmp_path, caplog):
     assert not taken(caplog)
     train(toy("selftraining=none", "experiment_name=third"))  # it was repaired
     assert taken(caplog)
+
+
+def test_a_flipped_bit_is_trained_again(toy, tmp_path, caplog):
+    train(toy("selftraining=none"))
+    (folder,) = shared_folders(tmp_path)
+    sha256 = json.loads((folder / "started.json").read_text())["warmup_sha256"]
+
+    def take(name: str) -> bool:
+        return SharedWarmup(tmp_path / name, folder.parent, sha256, 0, 2).take()
+
+    assert take("whole")
+    for name in ("history.csv", "last.ckpt"):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(flipped(whole))
+        caplog.clear()
+        assert not take(name)
+        assert f"the warm-up in {folder} is damaged: it is trained again" in caplog.text
+        (folder / name).write_bytes(whole)
+    (folder / "last.ckpt").write_bytes(flipped(whole))
+    caplog.clear()
+    other = toy("selftraining=none", "experiment_name=other")
+    assert train(other).final == read_metrics(hashing.run_folder(toy("selftraining=none"))).final
+    assert not taken(caplog)
+    assert take("repaired")
 
 
 def test_force_trains_anew(toy, caplog):

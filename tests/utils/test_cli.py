@@ -192,7 +192,28 @@ def test_ctrl_c_ends_a_hydra_command(tmp_path):
         assert process.returncode == 130
 
 
-def test_ctrl_c_while_generating(tmp_path):
+def test_sigterm_ends_a_hydra_command(tmp_path):
+    """Status 143 and one line, after what is to be put away was put away; a second one at once."""
+    code = (
+        "import os, signal, sys\nfrom qs3.utils.cli import hydra_command\n"
+        "@hydra_command\ndef main():\n"
+        " try:\n  os.kill(os.getpid(), signal.SIGTERM)\n"
+        " finally:\n  print('put away', flush=True)\n  {more}\nmain()"
+    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "cwd": tmp_path}
+    process = start(["-c", code.format(more="pass")], **pipes)
+    said = "\nterminated; run the same command again and it continues\n"
+    assert process.communicate() == ("put away\n", said)
+    assert process.returncode == 143
+    process = start(["-c", code.format(more="os.kill(os.getpid(), signal.SIGTERM)")], **pipes)
+    assert process.communicate() == ("put away\n", "")
+    assert process.returncode == -signal.SIGTERM
+
+
+@pytest.mark.parametrize(
+    "how", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
+def test_ctrl_c_while_generating(how, tmp_path):
     process = start(
         ["generate.py", "domain=modelnet10", "workers=1", f"paths.data_dir={tmp_path}"],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -200,8 +221,8 @@ def test_ctrl_c_while_generating(tmp_path):
     )  # fmt: skip
     while not list(tmp_path.glob("modelnet10/*")) and process.poll() is None:
         time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(how)
     said = process.communicate(timeout=120)[1]
-    assert process.returncode == 130, said
+    assert process.returncode == 128 + how, said
     assert "Traceback" not in said
-    assert said.endswith("interrupted; run the same command again and it continues\n")
+    assert said.endswith("ed; run the same command again and it continues\n")

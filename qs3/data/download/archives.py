@@ -7,13 +7,10 @@ owners, rights or dates.
 
 from __future__ import annotations
 
-import lzma
 import re
 import shutil
 import stat
-import tarfile
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
@@ -22,21 +19,15 @@ from typing import IO, NamedTuple
 from tqdm import tqdm
 
 from qs3.errors import DataError, Qs3Error
+from qs3.utils.tars import DAMAGE, members_of, open_tar
 
 MAX_MEMBERS = 2_000_000
 MAX_BYTES = 200 << 30
 MAX_RATIO = 100  # of what comes out to what goes in, from 64 MiB on: text packs to a tenth
 
-_DAMAGE = (  # RuntimeError: zipfile wants a password; NotImplementedError: another compression
-    EOFError,
-    RuntimeError,
-    NotImplementedError,
-    ValueError,
-    lzma.LZMAError,
-    tarfile.TarError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+# RuntimeError: zipfile wants a password; NotImplementedError: another compression; LookupError: a
+# name that begins with NUL.
+_DAMAGE = (*DAMAGE, RuntimeError, NotImplementedError, LookupError, zipfile.BadZipFile)
 
 
 class _Member(NamedTuple):
@@ -85,7 +76,7 @@ def unpack(archive: Path, into: Path) -> list[str]:
             files.append(str(path))
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
         raise DataError(f"{archive}: two members have the name {error.filename}") from error
-    except (*_DAMAGE, OSError) as error:
+    except _DAMAGE as error:
         if getattr(error, "errno", None):  # the packers' own errors, also OSError, have none
             raise Qs3Error(f"cannot unpack {archive}: {error}; free some space") from error
         why = str(error).partition("\n")[0].rstrip(":")
@@ -116,15 +107,12 @@ def _zip_members(archive: Path) -> Iterator[_Member]:
 
 
 def _tar_members(archive: Path) -> Iterator[_Member]:
-    with tarfile.open(archive) as file:
-        while (info := file.next()) is not None:
-            file.members.clear()  # type: ignore[attr-defined]  # or millions pile up
+    with open_tar(archive) as file:
+        for info in members_of(file):
             if info.isdir():
                 continue
             plain = info.isreg() and not info.issparse()
             yield _Member(info.name, info.size, plain, lambda i=info: file.extractfile(i))  # type: ignore[misc]
-        while file.fileobj.read(1 << 20):
-            pass  # to where the checksum of what was packed is compared
 
 
 def find_folder(files: Iterable[str], holds: str, named: str = "", at_least: int = 10) -> str:

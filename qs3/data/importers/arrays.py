@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from qs3.clouds.files import read_npz
 from qs3.data.importers.base import Importer, Item, by_class, class_of, cloud_id, split_of
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
@@ -47,7 +47,7 @@ class NamedArrays(Importer):
 
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`; reads the file. Sorted by split, class and name."""
-        arrays = read_npz(self.path)
+        arrays = named_arrays(self.path)
         found = []
         for i, name in enumerate(arrays["name"].tolist()):
             where = f"{self.path}, cloud {i} ({name})"
@@ -59,32 +59,26 @@ class NamedArrays(Importer):
 
 
 def plain_arrays(
-    path: Path, required: Sequence[str], optional: Sequence[str] = (), most_bytes: int = 8 << 30
+    path: Path, required: Sequence[str], optional: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
     """Some arrays of an .npz; nothing in it is unpickled.
 
     Raises:
         DataError: damaged, pickled, too large, an array missing, or a single value for one.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-        if size > most_bytes:
-            raise DataError(f"{path} unpacks to {size} bytes, more than {most_bytes}")
-        with np.load(path, allow_pickle=False) as file:
-            if missing := [key for key in required if key not in file.files]:
-                raise DataError(f"{path} has no arrays {missing}; it has {file.files}")
-            arrays = {key: file[key] for key in (*required, *optional) if key in file.files}
-    except DataError:
-        raise
-    except Exception as error:  # BadZipFile, zlib.error, pickled content, unknown compression ...
-        raise DataError(f"{path}: not a readable .npz of plain arrays ({error})") from error
+
+    def choose(names: list[str]) -> list[str]:
+        if missing := [key for key in required if key not in names]:
+            raise DataError(f"{path} has no arrays {missing}; it has {names}")
+        return [key for key in (*required, *optional) if key in names]
+
+    arrays = read_npz(path, choose)
     if single := [key for key, array in arrays.items() if array.ndim == 0]:
         raise DataError(f"{path}: {', '.join(single)} is a single value, not an array")
     return arrays
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
+def named_arrays(path: Path) -> dict[str, np.ndarray]:
     """The four arrays; DataError if damaged, pickled, too large, missing or of another shape."""
     arrays = plain_arrays(path, _KEYS)
     points = arrays["points"]

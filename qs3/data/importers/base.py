@@ -26,6 +26,8 @@ from qs3.utils.progress import shown
 
 log = logging.getLogger(__name__)
 
+_SHOWN = 5  # reasons, in the log
+
 _UP = {
     "z": ((0, 1, 2), (1, 1, 1)),
     "-z": ((0, 1, 2), (1, -1, -1)),
@@ -343,4 +345,6 @@ def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
     if short:
         log.warning("%s: %d clouds have under %d points and repeat some", where, short, points)
     if skipped:
+        for row in [row for row in rows if row.status != "ok"][:_SHOWN]:
+            log.warning("left out: %s", row.reason)
         log.warning("%s: %d clouds left out; manifest.csv says why", where, skipped)

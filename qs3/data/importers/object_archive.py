@@ -43,7 +43,6 @@ log = logging.getLogger(__name__)
 TIERS = ("clean", "hard")
 
 _METRES = 1e-4
-_MAX_BYTES = 4 << 30
 _KINDS = {
     "xyz_tenth_mm": ("i", "[P, 3] of int16"),
     "centre_m": ("f", "[N, 3] of numbers"),
@@ -263,7 +262,7 @@ def read_archive(path: Path) -> Archive:
     """
     if not path.is_file():
         raise MissingDataError(f"there is no {path}")
-    found = plain_arrays(path, _REQUIRED, _OPTIONAL, _MAX_BYTES)
+    found = plain_arrays(path, _REQUIRED, _OPTIONAL)
     n, p = len(found["cls"]), len(found["xyz_tenth_mm"])
     shapes = {"xyz_tenth_mm": (p, 3), "centre_m": (n, 3), "start": (n + 1,), "inlier": (p,)}
     for key, array in found.items():

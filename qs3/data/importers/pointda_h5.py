@@ -21,10 +21,10 @@ from qs3.data.importers.base import Importer, Item, cloud_id, inside, turned
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
+from qs3.utils.memory import check_memory
 
 _NAME = re.compile(r"(train|test)_(\d+)\.h5")
 _MIRROR = np.array([1, -1, 1], dtype=np.float32)
-_MAX_BYTES = 4 << 30  # of one file's clouds; the published ones have 100 MB
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,8 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
             for key, found in (("data", data), ("label", label)):
                 if found is None:
                     raise DataError(f"{path}: there is no dataset {key!r}")
+            if data.shape is None or label.shape is None:
+                raise DataError(f"{path}: a dataset is empty")
             if data.ndim != 3 or data.shape[2] not in (3, 6) or data.dtype.kind != "f":
                 raise DataError(
                     f"{path}: data is {data.dtype} {data.shape}, expected floats [n, P, 3 or 6]"
@@ -112,8 +114,7 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
                 raise DataError(
                     f"{path}: label is {label.dtype} {label.shape}, expected integers [{n}]"
                 )
-            if data.size * data.dtype.itemsize > _MAX_BYTES:
-                raise DataError(f"{path}: data {data.shape} is larger than {_MAX_BYTES} bytes")
+            check_memory(2 * data.size * data.dtype.itemsize, path)
             points = np.asarray(data[..., :3], dtype=np.float32)
             labels = np.asarray(label[...], dtype=np.int64).reshape(n)
     except (OSError, RuntimeError, ValueError, KeyError, MemoryError) as error:

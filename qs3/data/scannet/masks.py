@@ -32,6 +32,7 @@ _GREY = 0
 _BROKEN = (
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error,
     OSError, EOFError, NotImplementedError, RuntimeError, ValueError, OverflowError,
+    LookupError,  # a name that begins with NUL
 )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from qs3.errors import DataError
 
 MAX_BYTES = 1 << 20
+_MOST_SIDES = 32  # of an array: numpy's own limit
 _NAMES = (  # instructions of protocols 3 and 4 for plain values, and calls
     "PROTO FRAME STOP MARK MEMOIZE BINPUT LONG_BINPUT BINGET LONG_BINGET NONE NEWTRUE NEWFALSE "
     "BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE SHORT_BINUNICODE BINBYTES SHORT_BINBYTES "
@@ -47,7 +48,7 @@ def load_npy_object(data: bytes, name: str) -> Any:
         if np.lib.format.read_magic(file) != (1, 0):
             raise ValueError("another version of the format")
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    except ValueError as error:
+    except Exception as error:  # numpy's parser of headers raises whatever Python's does
         raise DataError(f"{name} is not a .npy file: {error}") from error
     if shape != () or not dtype.hasobject:
         raise DataError(f"{name} holds an array of {dtype} {shape}, not one pickled object")
@@ -81,6 +82,8 @@ class _Type:
 class _Array(np.ndarray):
     def __setstate__(self, state: tuple) -> None:
         _, shape, kind, column_major, content = state
+        if len(shape) > _MOST_SIDES or any(type(n) is not int or n > MAX_BYTES for n in shape):
+            raise DataError("an array of no such shape")
         dtype, sides = kind.dtype, [*shape, 1]
         if dtype.hasobject:
             whole = shape == () and type(content) is list and len(content) == 1
@@ -119,6 +122,14 @@ class _Unpickler(_PythonUnpickler):
             return _Type if name == "dtype" else name
         raise DataError(f"{module}.{name}")
 
+    def load_setitem(self) -> None:
+        _check_keys(self.stack[-2:-1])
+        super().load_setitem()
+
+    def load_setitems(self) -> None:
+        _check_keys(self.stack[::2])
+        super().load_setitems()
+
     def load_build(self) -> None:
         if not isinstance(self.stack[-2], _Type | _Array):
             raise DataError("a state for what has none")
@@ -126,3 +137,11 @@ class _Unpickler(_PythonUnpickler):
 
     dispatch = {code: _PythonUnpickler.dispatch[code] for code in _CODES}  # noqa: RUF012
     dispatch[pickle.BUILD[0]] = load_build
+    dispatch[pickle.SETITEM[0]] = load_setitem
+    dispatch[pickle.SETITEMS[0]] = load_setitems
+
+
+def _check_keys(keys: list[Any]) -> None:
+    """Texts only: to find a tuple of tuples, all of it is looked through."""
+    if any(type(key) is not str for key in keys):
+        raise DataError("a key that is no text")

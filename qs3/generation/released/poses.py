@@ -8,8 +8,6 @@ without unpacking it to the disk, by a reader that runs nothing (qs3.generation.
 from __future__ import annotations
 
 import hashlib
-import tarfile
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -22,6 +20,7 @@ from qs3.classes import ALIASES, CLASSES
 from qs3.errors import DataError, MissingDataError
 from qs3.generation.released.pickles import load_npy_object
 from qs3.geometry.cameras import rotation_xyz
+from qs3.utils.tars import DAMAGE, is_whole, members_of, open_tar
 
 SPLITS = ("train", "test")
 _MAX_SHAPES = 200_000
@@ -138,9 +137,8 @@ def read_poses(path: Path) -> PoseTable:
 
 def _archive(path: Path) -> Iterator[tuple[str, bytes]]:
     try:
-        # A stream: each byte is unpacked once, and nothing is written.
-        with tarfile.open(path, mode="r|*") as archive:
-            for count, member in enumerate(archive):
+        with open_tar(path) as archive:  # nothing is written
+            for count, member in enumerate(members_of(archive)):
                 _check_name(member.name, f"{path}: {member.name}")
                 if count > 2 * _MAX_SHAPES:
                     raise DataError(f"{path} has more than {2 * _MAX_SHAPES} members: not read")
@@ -158,7 +156,9 @@ def _archive(path: Path) -> Iterator[tuple[str, bytes]]:
                 file = archive.extractfile(member)
                 assert file is not None  # a regular file
                 yield member.name, file.read()
-    except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
+            if not is_whole(archive):
+                raise DataError(f"{path} is cut: its end is missing; fetch it again")
+    except DAMAGE as error:
         raise DataError(f"{path} is not an archive that can be read: {error}") from error
 
 
@@ -205,8 +205,10 @@ def _row(value: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
     if np.abs(turn[:2]).max() > 1e-6:
         raise DataError(f"{where}: the object is tilted ({turn}); only turns about z are known")
     for key, known in _CAMERA.items():
-        if value.get(key, known) != known:
-            raise DataError(f"{where}: {key} is {value[key]!r}; only the released {known} is known")
+        said = value.get(key, known)
+        if not isinstance(said, int | float | np.number) or said != known:
+            shown = said if isinstance(said, float) else f"a {type(said).__name__}"
+            raise DataError(f"{where}: {key} is {shown}; only the released {known} is known")
     return np.array([scale.mean(), turn[2], *location]), np.concatenate([eyes, angles], axis=1)
 
 

@@ -66,6 +66,11 @@ def _by_lines(body: bytes, vertex_count: int, face_count: int) -> Triangles:
             f"is truncated: {vertex_count} vertices and {face_count} faces were promised, "
             f"{len(rows)} lines are there"
         )
+    if len(rows) > vertex_count + face_count:  # of what? A vertex could pass for a face
+        raise MeshError(
+            f"has {len(rows)} lines behind its header, which promises {vertex_count} vertices and "
+            f"{face_count} faces"
+        )
     columns = [row.split(None, 3)[:3] for row in rows[:vertex_count]]
     coordinates = numbers(b" ".join(token for row in columns for token in row))
     if len(coordinates) != 3 * vertex_count:

@@ -15,6 +15,7 @@ import numpy as np
 
 from qs3.errors import MeshError
 from qs3.meshes.formats.arrays import Triangles, check_counts, fan, numbers, whole
+from qs3.utils.memory import check_memory
 
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -80,6 +81,8 @@ def _elements(data: bytes) -> Iterator[tuple[str, dict]]:
 def _vertices(columns: dict) -> np.ndarray:
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise MeshError(f"has vertices without {', '.join(missing)}")
+    if lists := [axis for axis in "xyz" if isinstance(columns[axis], tuple)]:
+        raise MeshError(f"has vertices with lists of {', '.join(lists)}")
     return np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
 
 
@@ -155,6 +158,11 @@ def _read_element(element: _Element, body: bytes, offset: int) -> tuple[dict, in
 
 def _read_ragged(element: _Element, body: bytes, offset: int) -> tuple[dict, int]:
     """Row by row; only lists are kept: the scalars next to them are not needed."""
+    least = sum((p.count_dtype or p.dtype).itemsize for p in element.properties)
+    if offset + element.count * least > len(body):
+        raise _truncated(element)
+    lists = sum(p.count_dtype is not None for p in element.properties)
+    check_memory(120 * element.count * lists + 30 * len(body), "", MeshError)
     starts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_dtype}
     sizes: dict[str, list[int]] = {name: [] for name in starts}
     for _ in range(element.count):

@@ -14,8 +14,9 @@ from qs3.errors import MeshError
 from qs3.meshes.formats.arrays import Triangles
 from qs3.meshes.formats.by_trimesh import assembled, check_instances, loaded
 from qs3.meshes.formats.colliders import Colliders
+from qs3.utils.memory import check_memory
 
-MAX_UNPACKED_BYTES = 1 << 31
+_PEAK = 18  # of memory to what the archive unpacks to; measured with 330,000 triangles
 
 _METRES = {
     **{"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "meter": 1.0},
@@ -27,8 +28,7 @@ def read(data: bytes, colliders: Colliders) -> Triangles:
     """Read the model; one that is spread over several files of the archive is refused."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(info.file_size for info in archive.infolist()) > MAX_UNPACKED_BYTES:
-                raise MeshError(f"unpacks to more than {MAX_UNPACKED_BYTES >> 30} GiB")
+            check_memory(_PEAK * sum(info.file_size for info in archive.infolist()), "", MeshError)
             names = [n for n in archive.namelist() if "3d/3dmodel.model" in n.lower()]
             if len(names) != 1:
                 raise MeshError("is not a 3MF file: its archive holds no 3D/3dmodel.model")

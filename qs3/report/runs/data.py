@@ -24,6 +24,7 @@ from qs3.runs.metrics import METRICS, RoundRecord, RunMetrics, Scores, read_metr
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.runs.pseudo_labels import PseudoLabel, path_of, read_pseudo_labels
+from qs3.utils.yamls import check_yaml
 
 HISTORY = "history.csv"
 
@@ -211,12 +212,7 @@ def _rounds(folder: Path, metrics: RunMetrics | None, notes: list[str]) -> tuple
     for number in sorted({*records, *there}):
         path, labels = path_of(folder, number), None
         if number in there:
-            try:
-                labels = read_pseudo_labels(path)
-                if not labels:
-                    raise ValueError("it has no rows")
-            except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-                raise _damaged(path, error) from error
+            labels = read_pseudo_labels(path)
         else:
             notes.append(f"{path.relative_to(folder)} is gone: counts are those of {METRICS}")
         found.append(Round(number, records.get(number), labels))
@@ -241,7 +237,8 @@ def _yaml(path: Path, kind: type) -> Any:
     if not path.is_file():
         return None
     try:
-        found: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+        check_yaml(text := path.read_text("utf-8"), "its text")
+        found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
     except Exception as error:  # yaml's and omegaconf's kinds have nothing else in common
         raise _damaged(path, error) from error
     return found if isinstance(found, kind) else None

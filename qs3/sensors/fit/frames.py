@@ -10,6 +10,7 @@ import numpy as np
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.cameras import Intrinsics
+from qs3.utils.pictures import check_picture
 
 _MAX_PIXELS = 1 << 26
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
@@ -175,6 +176,7 @@ def _resolution(depth_m: np.ndarray) -> float:
 def _png(path: Path) -> np.ndarray:
     import cv2
 
+    check_picture(path, _MAX_PIXELS)
     try:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -192,7 +194,7 @@ def _png(path: Path) -> np.ndarray:
 def _npy(path: Path) -> np.ndarray:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # numpy's parser of headers raises whatever Python's does
         raise DataError(f"{path} is not a .npy array, or damaged: {error}") from error
     if not isinstance(array, np.ndarray):
         raise DataError(f"{path} is not a .npy array but an archive of several")

@@ -17,6 +17,7 @@ import numpy as np
 
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError, DataError
+from qs3.utils.pictures import check_picture
 
 _MAX_PICTURE_PX = 64_000_000
 
@@ -49,11 +50,10 @@ class PictureSlide:
         path = Path(self.path).expanduser()
         if not path.is_file():
             raise DataError(f"pattern.path: there is no file {path}")
+        check_picture(path, _MAX_PICTURE_PX, "pattern.path: ")
         image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
         if image is None:
             raise DataError(f"pattern.path: {path} is not an image that OpenCV can read")
-        if image.size > _MAX_PICTURE_PX:
-            raise DataError(f"pattern.path: {path} has {image.size} pixels, 64 million at most")
         white = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65_535}.get(image.dtype)
         if white is None:
             raise DataError(f"pattern.path: {path} has {image.dtype} values, 8 or 16 bits expected")

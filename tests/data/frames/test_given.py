@@ -185,7 +185,7 @@ def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, name, content,
         ("1 2 3 4 5 6 7 8 9", "is no matrix fx 0 cx"),
         ("- 1\n- 2\n", "no fx, fy, cx, cy and no matrix K"),
         ("K: [[a, b]]", "not a readable file of intrinsics"),
-        ("{", "not a readable file of intrinsics"),
+        ("{", r"camera\.yaml is not readable"),
         ("a: &a [1,1,1,1]\nb: &b [*a,*a,*a,*a]\nc: &c [*b,*b,*b]\nK: [*c,*c,*c]", "not a readable"),
     ],
 )

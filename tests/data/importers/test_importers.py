@@ -262,7 +262,7 @@ def test_named_arrays(tmp_path):
         ({"cls": np.array(["bed", "chair", "cat", "bed"])}, r"cloud 2 \(c\): unknown class 'cat'"),
         ({"split": np.array(["x", "test", "test", "test"])}, "unknown split 'x'"),
         ({"points": np.zeros((4, 2, 2))}, r"not floats \[N, P, 3\]"),
-        ({"points": np.array([Trap()] * 4)}, "not a readable"),
+        ({"points": np.array([Trap()] * 4)}, "pickled array, refused"),
     ],
 )
 def test_named_arrays_of_other_things(tmp_path, changes, message, monkeypatch):

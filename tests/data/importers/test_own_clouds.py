@@ -7,6 +7,7 @@ import pickle
 import re
 import struct
 import tracemalloc
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,8 @@ import numpy as np
 import pytest
 
 from qs3.clouds.files import read_cloud, read_clouds
+from qs3.config.compose import composed
+from qs3.config.hashing import config_hash
 from qs3.data.domain import Domain
 from qs3.data.importers import CloudFolder, Importer, XyzTree, import_into
 from qs3.data.store import open_pointset, read_manifest
@@ -420,6 +423,36 @@ def test_a_wrong_label_can_be_skipped(tmp_path: Path, suffix: str) -> None:
     assert sorted(left_out) == [f"a{suffix}[1]", f"a{suffix}[2]"]
     assert "label 7" in left_out[f"a{suffix}[1]"]
     assert "not finite" in left_out[f"a{suffix}[2]"]
+
+
+def test_damaged_files_are_named_and_the_others_go_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "in"
+    write(folder / "a.xyz")
+    header = "element vertex 1\nproperty list uchar float x\nproperty float y\nproperty float z\n"
+    (folder / "b.ply").write_text(f"ply\nformat ascii 1.0\n{header}end_header\n1 1 2 3\n")
+    with h5py.File(folder / "c.h5", "w") as file:
+        file["data"] = h5py.Empty("f4")
+    with zipfile.ZipFile(folder / "d.npz", "w") as file:
+        file.writestr("points.txt", "1 2 3")
+    data = own(tmp_path, layout="none", on_error="skip").open()
+    assert data.ids == ("train/a",)
+    for name in ("b.ply", "c.h5", "d.npz"):
+        assert re.search(rf"left out: \S*{re.escape(name)}", caplog.text)
+    assert "3 clouds left out" in caplog.text
+    cfg = composed("train", "experiment=own_scans")
+    assert cfg.data.target.published.on_error == "skip"
+    stops = composed("train", "experiment=own_scans", "data.target.published.on_error=stop")
+    assert config_hash(cfg) == config_hash(stops)  # data have hashes of their own
+
+
+def test_a_store_without_damage_may_be_used_where_damage_is_left_out(tmp_path: Path) -> None:
+    write(tmp_path / "in" / "bed" / "a.xyz")
+    own(tmp_path, test_every=0).open()
+    own(tmp_path, test_every=0, on_error="skip").open()
+    with pytest.raises(DataError, match="was imported with"):
+        own(tmp_path, test_every=0, up="x", on_error="skip").open()
 
 
 def test_ids_of_splits_without_labels(tmp_path: Path) -> None:

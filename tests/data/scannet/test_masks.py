@@ -128,6 +128,15 @@ def test_a_garbled_zip_is_read_or_refused_and_nothing_else(tmp_path_factory, cha
     assert told is None or "a.zip" in told
 
 
+def test_a_name_of_nothing_is_told(tmp_path):
+    file = tmp_path / "masks.zip"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("xnstance-filt/0.png", b"")
+    file.write_bytes(file.read_bytes().replace(b"xnstance", b"\0nstance"))
+    with pytest.raises(DataError, match=r"masks\.zip"):
+        MaskArchive(file, INSTANCES)
+
+
 def test_an_encrypted_mask_is_told(tmp_path):
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as made:

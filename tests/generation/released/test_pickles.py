@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from qs3.errors import DataError
 from qs3.generation.released.pickles import MAX_BYTES, load_npy_object
+from tests.limits import time_of_at_most
 
 
 def npy(value, protocol=3) -> bytes:
@@ -173,6 +174,29 @@ def test_values_that_multiply_or_hold_themselves_are_refused():
     refused(npy(value), "two places")
     array = np.zeros(1000)
     refused(npy([array] * 1000), "two places")
+
+
+def test_keys_and_shapes_take_no_time():
+    """A kilobyte or some: numbers and tuples that Python would compute with for minutes."""
+    one = pickle.LONG1 + b"\xff" + b"\x7f" * 255 + pickle.BINPUT + b"\x63"
+    many = (pickle.BINGET + b"\x63") * 60_000
+    shape = pickle.MARK + one + many + pickle.TUPLE
+    array = np.zeros(3)
+    data = npy(array)
+    place = data.index(b"K\x03\x85")  # the tuple of its shape
+    with time_of_at_most(20):
+        refused(data[:place] + shape + data[place + 3 :], "no such shape")
+        for depth in (100, 200_000):
+            data = npy({"a": 1})
+            place = data.index(b"X\x01\x00\x00\x00a")
+            key = pickle.EMPTY_TUPLE + pickle.TUPLE1 * depth
+            refused(data[:place] + key + data[place + 6 :], "a key that is no text")
+
+
+@pytest.mark.parametrize("header", ["(" * 4000, "{'descr': '|O', 'shape': (", "\0", "[{}]"])
+def test_headers_that_numpy_cannot_parse(header):
+    words = header.encode("latin-1") + b"\n"
+    refused(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(words)) + words, r"not a \.npy file")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The authors' pose files: read safely, and followed exactly."""
 
+import gzip
 import io
 import os
 import pickle
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qs3.data.download.archives import unpack
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.command import generate
 from qs3.generation.plan import settings
@@ -23,6 +25,7 @@ from qs3.sensors.renderers.base import Body, Scene
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.generation.generating import composed as config
 from tests.generation.released.test_pickles import Run
+from tests.limits import memory_of_at_most
 
 RELEASED = Path(__file__).parents[4] / "shared/data/qs3_release/pose_params.tar.gz"
 needs_release = pytest.mark.skipif(
@@ -257,6 +260,16 @@ def test_damaged_and_missing_files_are_told(tmp_path, poses):
     cut.write_bytes(poses.read_bytes()[:-200])
     with pytest.raises(DataError, match=r"cut\.tar\.gz is not an archive that can be read"):
         read_poses(cut)
+    raw = gzip.decompress(poses.read_bytes())
+    at_a_member = tmp_path / "at_a_member.tar"
+    at_a_member.write_bytes(raw.rstrip(b"\0").ljust(512 * -(-len(raw.rstrip(b"\0")) // 512), b"\0"))
+    with pytest.raises(DataError, match=r"at_a_member\.tar is cut: its end is missing"):
+        read_poses(at_a_member)
+    data = bytearray(poses.read_bytes())
+    data[-6] ^= 1  # of the checksum
+    (tmp_path / "crc.tar.gz").write_bytes(data)
+    with pytest.raises(DataError, match=r"crc\.tar\.gz is not an archive .* CRC"):
+        read_poses(tmp_path / "crc.tar.gz")
     (tmp_path / "text.tar.gz").write_text("hello")
     with pytest.raises(DataError, match="is not an archive"):
         read_poses(tmp_path / "text.tar.gz")
@@ -265,6 +278,28 @@ def test_damaged_and_missing_files_are_told(tmp_path, poses):
     with pytest.raises(ConfigError, match="poses must name a file"):
         pose_file("")
     assert pose_file(None) is None
+
+
+def test_a_name_that_would_fill_the_memory_is_refused(tmp_path):
+    """A header may say that the name of the next member has gigabytes, packed to nothing."""
+    info = tarfile.TarInfo("././@LongLink")
+    info.type, info.size = tarfile.GNUTYPE_LONGNAME, 5_000_000_000
+    path = tmp_path / "name.tar.gz"
+    with gzip.open(path, "wb") as file:
+        file.write(info.tobuf(tarfile.GNU_FORMAT) + bytes(1 << 21))
+    for read in (read_poses, lambda path: unpack(path, tmp_path / "out")):
+        refused = pytest.raises(DataError, match=r"name\.tar\.gz: a name of 5000\d* bytes")
+        with memory_of_at_most(1 << 28), refused:
+            read(path)
+
+
+def test_an_odd_camera_is_told_without_all_of_it(tmp_path):
+    for lens, shown in ((["a" * 30_000] * 1000, "a list"), (np.zeros(3), "an? _Array")):
+        value = {**released(sofa()), "camera_lens": lens}
+        path = archive(tmp_path / "poses.tar.gz", {NAME: npy(value)})
+        with pytest.raises(DataError, match=f"camera_lens is {shown}; only"):
+            read_poses(path)
+        read_poses.cache_clear()
 
 
 def test_links_out_of_a_folder_are_refused(tmp_path):

@@ -31,6 +31,7 @@ from tests.commands import main
 from tests.report.made_runs import change, not_blank, table
 from tests.report.wandb_files import read
 from tests.training.toy import CLASSES
+from tests.utils.test_yamls import laughs
 
 ALL = [
     *("curves", "confusion", "pseudo_labels", "classes", "calibration"),
@@ -236,6 +237,7 @@ def test_unfinished_run(run):
         ("metrics.json", "{"),
         ("metrics.json", "{}"),
         (".hydra/config.yaml", "a: [1"),
+        (".hydra/config.yaml", laughs(9)),
     ],
 )
 def test_damaged_files_are_named(run, name, text, capsys):

@@ -1,0 +1,49 @@
+"""How much memory reading one file may take: one limit for all readers, asked before they take it.
+
+A file is not trusted: a few bytes can promise gigabytes. `QS3_MEMORY_GB` in the environment moves
+the limit, for files that are known to be large.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+
+from qs3.errors import ConfigError, DataError
+
+VARIABLE = "QS3_MEMORY_GB"
+DEFAULT_GB = 2.0
+
+
+def memory_limit() -> int:
+    """Bytes that reading one file may take.
+
+    Raises:
+        ConfigError: the variable is no positive number.
+    """
+    words = os.environ.get(VARIABLE, "")
+    try:
+        limit = float(words) if words else DEFAULT_GB
+    except ValueError:
+        limit = math.nan
+    if not 0 < limit < math.inf:
+        raise ConfigError(f"{VARIABLE}={words}: expected gigabytes, a number above 0")
+    return int(limit * 1e9)
+
+
+def check_memory(needed: float, where: object, kind: type[DataError] = DataError) -> None:
+    """Refuse what takes too much.
+
+    Args:
+        needed: bytes at the peak, as far as it is known before reading.
+        where: begins the message: the file, and what in it; "" where it is added later.
+        kind: of the error.
+
+    Raises:
+        DataError: of `kind`.
+    """
+    if needed > (limit := memory_limit()):
+        raise kind(
+            f"{where} takes {needed / 1e9:.3g} GB of memory, more than {limit / 1e9:.3g} GB: "
+            f"refused; if it is to be trusted, set {VARIABLE}={math.ceil(needed / 1e9)}".lstrip()
+        )
