@@ -144,8 +144,11 @@ def test_sd_learns_a_part_that_only_the_target_has() -> None:
     """The source's left side says nothing of the class, the target's does, and test clouds are cut.
 
     The teacher knows whole target clouds by their right side; a cut one, of which the left is left,
-    is to have the same features. The copy without the loss has no way to know. Temperatures and
-    momentum suit a net of 64 features and 300 steps; three settings of them were tried.
+    is to have the same features. The copy without the loss has no way to know.
+
+    Nine settings of temperature, momentum and weight were tried, with batch norm and without: with
+    the paper's temperatures, or with batch norm, these 64 features did not learn it. Before, on
+    boxes that were cut, cluttered, tilted or noisy, it gained -1 to 3 points over its copy.
     """
     result = torch.zeros(3, 2)
     for seed in range(3):
