@@ -1,7 +1,7 @@
 """The main job on embedded data, one command after the other: `qs3 quickstart`.
 
 Prints every command that it runs, so that they can be run and changed one by one. Sizes are
-chosen to fit into 20 minutes on 2 cores; the paper's are in conf/experiment/qs3_s2d.yaml.
+chosen to fit into half an hour on 2 cores; the paper's are in conf/experiment/qs3_s2d.yaml.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _run(command: str) -> int:
 
 QUICKSTART = Command(
     "qs3 quickstart",
-    "the main job on embedded data, about a quarter of an hour on 2 cores",
+    "the main job on embedded data, about half an hour on 2 cores",
     _quickstart,
     (Option("out", text("FOLDER"), "where it all goes", "out/quickstart"),),
     ("qs3 quickstart", "make quickstart     the same, in a checkout"),
