@@ -6,7 +6,7 @@ Nothing here is read by training: no model is chosen and no threshold set by the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from qs3.runs.predictions import Predictions
 from qs3.runs.pseudo_labels import read_pseudo_labels
 
 
-@torch.no_grad()
 def predict(
     net: nn.Module,
     points: Float[Tensor, "n p 3"],
@@ -34,25 +33,11 @@ def predict(
     *,
     domain: str = "target",
 ) -> Float[np.ndarray, "n c"]:
-    """Class probabilities in eval mode, unaugmented, in the order given: nothing is random.
-
-    A net with norms for each domain uses those of `domain`, the clouds' own, if it was trained on
-    that domain at all.
-    """
-    training = net.training
-    net.eval()
-    try:
-        with use_domain(net, norms_for(net, domain)):
-            parts = [
-                net(points[i : i + batch_size].to(device)).double().softmax(dim=1).cpu()
-                for i in range(0, len(points), batch_size)
-            ]
-    finally:
-        net.train(training)
-    return torch.cat(parts).numpy()
+    """Class probabilities of `said_of`, float64."""
+    (logits,) = said_of(net, lambda x: (net(x),), points, batch_size, device, domain=domain)
+    return logits.softmax(dim=1).numpy()
 
 
-@torch.no_grad()
 def global_features(
     net: Any,
     points: Float[Tensor, "n p 3"],
@@ -61,24 +46,47 @@ def global_features(
     *,
     domain: str = "target",
 ) -> Float[np.ndarray, "n d"]:
-    """What the backbone says about each cloud: as `predict`.
+    """What the backbone says about each cloud, float64: as `said_of`.
 
     Raises:
         ConfigError: the model is not a backbone with a head.
     """
     if not hasattr(net, "features"):
         raise ConfigError(f"{type(net).__name__} has no features; choose e.g. model=dgcnn")
+
+    def of_batch(x: Tensor) -> tuple[Tensor]:
+        return (net.features(x).global_,)
+
+    (features,) = said_of(net, of_batch, points, batch_size, device, domain=domain)
+    return features.numpy()
+
+
+@torch.no_grad()
+def said_of(
+    net: nn.Module,
+    of_batch: Callable[[Tensor], tuple[Tensor, ...]],
+    points: Float[Tensor, "n p 3"],
+    batch_size: int,
+    device: Any = "cpu",
+    *,
+    domain: str = "target",
+) -> tuple[Float[Tensor, "n d"], ...]:
+    """What `of_batch` makes of all clouds, by a net in eval mode, unaugmented, in the order given.
+
+    Nothing is random. A net with norms for each domain uses those of `domain`, the clouds' own, if
+    it was trained on that domain at all. Float64, on the CPU.
+    """
     training = net.training
     net.eval()
     try:
         with use_domain(net, norms_for(net, domain)):
             parts = [
-                net.features(points[i : i + batch_size].to(device)).global_.double().cpu()
-                for i in range(0, len(points), batch_size)
+                tuple(x.double().cpu() for x in of_batch(batch.to(device)))
+                for batch in points.split(batch_size)
             ]
     finally:
         net.train(training)
-    return torch.cat(parts).numpy()
+    return tuple(torch.cat(each) for each in zip(*parts, strict=True))
 
 
 def adapt_norms(

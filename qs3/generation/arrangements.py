@@ -107,10 +107,9 @@ class Arrangement:
             top = float(support.bounds[1, 2])
             found += self._on(merge([support, mesh]), most("support", 0), rng, top)
         found += self._on(mesh, most(cls, 0), rng)
-        for _ in range(int(rng.integers(0, self.seats.get(cls, 0) + 1))):
-            seat = self._chair(mesh, rng)
-            if mesh.bounds[1, 2] > _SEAT_M[1] + 0.15:
-                found.append(seat)
+        room = mesh.bounds[1, 2] > _SEAT_M[1] + 0.15
+        most_seats = self.seats.get(cls, 0) if room else 0
+        found += [self._chair(mesh, rng) for _ in range(int(rng.integers(0, most_seats + 1)))]
         return found
 
     def _chair(self, mesh: Mesh, rng: np.random.Generator) -> Mesh:

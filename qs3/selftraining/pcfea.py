@@ -19,8 +19,9 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
 from qs3.errors import ConfigError
+from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, class_loss, weight
-from qs3.models.norms import norms_for, use_domain
+from qs3.models.norms import use_domain
 from qs3.selftraining.selectors import Selector, TeacherPredictions
 
 if TYPE_CHECKING:
@@ -201,17 +202,9 @@ def most_probable(
     return chosen
 
 
-@torch.no_grad()
 def _features(
     net: nn.Module, points: Tensor, size: int, domain: str, device: Any
 ) -> tuple[Float[Tensor, "n d"], Float[np.ndarray, "n c"]]:
     """`penultimate` of all clouds in eval mode, float64 on the CPU, and class probabilities."""
-    training = net.training
-    net.eval()
-    try:
-        with use_domain(net, norms_for(net, domain)):
-            parts = [penultimate(net, part.to(device)) for part in points.split(size)]
-    finally:
-        net.train(training)
-    f, z = (torch.cat(both).double().cpu() for both in zip(*parts, strict=True))
+    f, z = said_of(net, lambda x: penultimate(net, x), points, size, device, domain=domain)
     return f, z.softmax(dim=1).numpy()

@@ -12,11 +12,12 @@ import numpy as np
 from qs3.clouds.files import SUFFIXES, checked, measured, parse_clouds, printable
 from qs3.config.checks import check_choice
 from qs3.config.compose import choices
+from qs3.data.contact_sheets import drawn
 from qs3.data.importers.base import turned
 from qs3.data.importers.folders import UP_AXES
 from qs3.data.importers.object_archive import read_archive
 from qs3.data.inspection.open_dataset import open_named
-from qs3.data.inspection.viewed import chosen, drawn, part_of
+from qs3.data.inspection.viewed import chosen, part_of
 from qs3.data.store import is_finished
 from qs3.data.viewer import MOST_POINTS
 from qs3.data.viewer.page import Part, Shown, page, points_each, thinned, told
