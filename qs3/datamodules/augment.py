@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from qs3.config.checks import check_int, check_ranges
@@ -14,17 +14,12 @@ from qs3.config.checks import check_int, check_ranges
 REGION_SHARE = (0.1, 0.25)
 """Of a cloud's points, from which and up to which share a dropped region takes."""
 
-PLATE = 0.03
-"""What stays near a surface is twice as thick: in metres, or in radii of the unit ball."""
-
 
 @dataclass(frozen=True)
 class Augment:
-    """Plates, cut, holes, turn about z, anisotropic scale, shift, lift and jitter, in this order.
+    """Cut, holes, turn about z, anisotropic scale, shift, lift and jitter, in this order.
 
     Attributes:
-        plate: probability that of a cloud only what lies near one of its surfaces stays (see
-            `plates`): a chair's back, a table's top, a cabinet's front.
         crop: the smallest share of a cloud that stays when a plane cuts it (see `crop`), as the
             picture's border and nearer things cut real objects; 1 leaves it whole.
         drop_regions: empty one to so many regions of each cloud, at most 3 (see `drop_regions`);
@@ -39,7 +34,6 @@ class Augment:
             the paper's descends from 0.02.
     """
 
-    plate: float = 0.0
     crop: float = 1.0
     drop_regions: int = 0
     rotate_z: bool = True
@@ -52,7 +46,7 @@ class Augment:
     def __post_init__(self) -> None:
         noise = dict.fromkeys(("shift", "lift", "jitter_sigma", "jitter_clip"), ">= 0")
         check_ranges(self, "protocol.augment.", scale=">= 1", drop_regions="[0, 3]", **noise)
-        check_ranges(self, "protocol.augment.", crop="(0, 1]", plate="[0, 1]")
+        check_ranges(self, "protocol.augment.", crop="(0, 1]")
         check_int("protocol.augment.drop_regions", self.drop_regions, 0)
 
     def __call__(
@@ -73,8 +67,6 @@ class Augment:
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
 
-        if self.plate > 0.0:
-            points = plates(points, self.plate, generator, scale)
         if self.crop < 1.0:
             points = crop(points, self.crop, generator, scale)
         if self.drop_regions:
@@ -119,62 +111,6 @@ def crop(
     order = (points @ normal)[..., 0].argsort(dim=1, stable=True)  # [B, N]
     first = torch.arange(n, device=device) < (share * n).ceil().clamp(min=1)[:, None]
     left = torch.zeros_like(first).scatter(1, order, first)  # [B, N]
-    return _kept(points, left, generator, scale)
-
-
-def plates(
-    points: Float[Tensor, "b n 3"], chance: float, generator: torch.Generator, scale: str
-) -> Float[Tensor, "b n 3"]:
-    """Of some clouds leave what lies near one of their surfaces, as `crop` leaves a part.
-
-    The surface is the plane through a random point and the eighth of the cloud that is nearest to
-    it; what lies within `PLATE` of it stays, wherever along it. So masks that are split where the
-    depth jumps leave a chair's back without its seat, and labels leave a cabinet's front without
-    the top that is called a counter. A point with few others near its plane has none to show: where
-    less than a tenth of the cloud would stay, all of it does.
-    """
-    b, n = points.shape[:2]
-    device = points.device
-    picked = torch.rand(b, generator=generator, device=device) < chance
-    first = torch.randint(n, (b, 1, 1), generator=generator, device=device)
-    away = points - points.take_along_dim(first, dim=1)  # [B, N, 3]
-    near = away.square().sum(dim=2).topk(max(3, n // 8), dim=1, largest=False).indices
-    around = away.take_along_dim(near[..., None], dim=1)  # [B, K, 3]
-    middle = around.mean(dim=1, keepdim=True)
-    normal = thinnest(torch.einsum("bki,bkj->bij", around - middle, around - middle))
-    distance = torch.einsum("bni,bi->bn", away - middle, normal).abs()
-    left = distance <= PLATE
-    left |= ~picked[:, None] | (left.sum(dim=1, keepdim=True) < n / 10)
-    kept = _kept(points, left, generator, scale)
-    return torch.where(left.all(dim=1)[:, None, None], points, kept)  # whole ones bit by bit
-
-
-def thinnest(scatter: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3"]:
-    """Unit eigenvector of the smallest eigenvalue of symmetric, positive semidefinite matrices.
-
-    By powers of the adjugate, whose largest eigenvalue is of that vector: unlike an eigenvalue
-    routine it never waits for an accelerator. Where two are equally small, any vector of theirs.
-    """
-    size = scatter.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(1e-12)
-    a = scatter / size[:, None, None] + 1e-4 * torch.eye(3, device=scatter.device).to(scatter)
-    rows = [torch.linalg.cross(a[:, i], a[:, (i + 1) % 3], dim=1) for i in (1, 2, 0)]
-    power = torch.stack(rows, dim=1)  # the adjugate: cross products of rows
-    for _ in range(6):
-        power = power / power.flatten(1).norm(dim=1)[:, None, None]
-        power = power @ power
-    longest = power.norm(dim=2).argmax(dim=1)[:, None, None]
-    vector = power.take_along_dim(longest, dim=1)[:, 0]
-    return vector / vector.norm(dim=1, keepdim=True)
-
-
-def _kept(
-    points: Float[Tensor, "b n 3"],
-    left: Bool[Tensor, "b n"],
-    generator: torch.Generator,
-    scale: str,
-) -> Float[Tensor, "b n 3"]:
-    """Clouds of the points that are left, some of them twice, put where `scale` has clouds."""
-    n = points.shape[1]
     other = torch.multinomial(left.float(), n, replacement=True, generator=generator)  # [B, N]
     centre = (points * left[..., None]).sum(dim=1) / left.sum(dim=1, keepdim=True)  # [B, 3]
     if scale == "above_floor":

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.config.checks import check_float, check_int
-from qs3.datamodules.augment import thinnest
 from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather, knn
 from qs3.methods.base import Method, feature_dims, weight
@@ -150,6 +149,24 @@ def normals_of(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
     around = gather(points, knn(points, NEIGHBOURS))  # [b, n, k, 3]
     around = (around - around.mean(dim=2, keepdim=True)).flatten(0, 1).float()
     return thinnest(around.transpose(1, 2) @ around).view(b, n, 3)
+
+
+def thinnest(scatter: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3"]:
+    """Unit eigenvector of the smallest eigenvalue of symmetric, positive semidefinite matrices.
+
+    By powers of the adjugate, whose largest eigenvalue is of that vector: unlike an eigenvalue
+    routine it never waits for an accelerator. Where two are equally small, any vector of theirs.
+    """
+    size = scatter.diagonal(dim1=1, dim2=2).sum(dim=1).clamp_min(1e-12)
+    a = scatter / size[:, None, None] + 1e-4 * torch.eye(3, device=scatter.device).to(scatter)
+    rows = [torch.linalg.cross(a[:, i], a[:, (i + 1) % 3], dim=1) for i in (1, 2, 0)]
+    power = torch.stack(rows, dim=1)  # the adjugate: cross products of rows
+    for _ in range(6):
+        power = power / power.flatten(1).norm(dim=1)[:, None, None]
+        power = power @ power
+    longest = power.norm(dim=2).argmax(dim=1)[:, None, None]
+    vector = power.take_along_dim(longest, dim=1)[:, 0]
+    return vector / vector.norm(dim=1, keepdim=True)
 
 
 def cardinalities(points: Float[Tensor, "b n 3"]) -> Int[Tensor, "b n"]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -22,7 +22,7 @@ from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, class_loss, weight
 from qs3.models.norms import use_domain
-from qs3.selftraining.selectors import Selector, TeacherPredictions
+from qs3.selftraining.selectors import Selector, TeacherPredictions, surest
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
@@ -132,12 +132,12 @@ class Pcfea(Method):
         size, classes = data.eval_batch_size, len(self.mean)
         labels = data.labelled.labels.numpy()
         f, p = _features(net, data.labelled.clouds.all(), size, "source", self.mean.device)
-        of_source = most_probable(p[np.arange(len(p)), labels], labels, 1 - progress)
+        of_source = surest(p[np.arange(len(p)), labels], labels, 1 - progress)
         g, q = _features(net, data.target.points, size, "target", self.mean.device)
         said = TeacherPredictions.of(q, data.target.ids)
         named = said.predicted
         if self.selector is None:
-            of_target = most_probable(said.confidence, named, progress)
+            of_target = surest(said.confidence, named, progress)
         else:
             chosen = self.selector.select(said, self.theta)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels
@@ -188,18 +188,6 @@ def moments(
         centred = of_class - mean[k]
         covariance[k] = centred.T @ centred / len(of_class)
     return mean, covariance
-
-
-def most_probable(
-    probability: Float[np.ndarray, " n"], labels: Int[np.ndarray, " n"], share: float
-) -> Bool[np.ndarray, " n"]:
-    """Of each of n_k labelled k the round(share n_k) of highest probability; ties by position."""
-    ranked = np.argsort(-probability, kind="stable")
-    chosen = np.zeros(len(labels), dtype=bool)
-    for k in np.unique(labels):
-        of_class = ranked[labels[ranked] == k]
-        chosen[of_class[: round(share * len(of_class))]] = True
-    return chosen
 
 
 def _features(

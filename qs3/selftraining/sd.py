@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.config.checks import check_bool, check_int, check_ranges
 from qs3.errors import ConfigError
-from qs3.selftraining.selectors import Selection, TeacherPredictions
+from qs3.selftraining.selectors import Selection, TeacherPredictions, surest
 from qs3.utils.seeding import derive
 
 _KEY = "selftraining.selector"
@@ -78,7 +78,8 @@ class GraphRefined:
         sure, labels = np.zeros(n, dtype=bool), teacher.predicted
         if round_:
             scores = self._scores(teacher, round_) if self.graph else teacher.probabilities
-            sure = surest(scores, teacher.ids, min(self.growth * round_, 1.0))
+            share = min(self.growth * round_, 1.0)
+            sure = surest(scores.max(axis=1), scores.argmax(axis=1), share, teacher.ids, least=1)
             labels = np.where(sure, scores.argmax(axis=1), labels)
         soft = np.eye(classes)[labels] * np.where(sure, 1.0, self.unsure)[:, None]
         selected = teacher.relabelled(labels).confidence > theta
@@ -110,17 +111,6 @@ class GraphRefined:
         scores = np.empty_like(teacher.probabilities)
         scores[order] = refined.numpy()
         return scores
-
-
-def surest(scores: Float[np.ndarray, "n k"], ids: object, share: float) -> Bool[np.ndarray, " n"]:
-    """Of each predicted class the round(share n_k) of highest score, one at least; ties by id."""
-    predicted, confidence = scores.argmax(axis=1), scores.max(axis=1)
-    ranked = np.lexsort((np.asarray(ids), -confidence))
-    sure = np.zeros(len(scores), dtype=bool)
-    for k in np.unique(predicted):
-        of_class = ranked[predicted[ranked] == k]
-        sure[of_class[: max(1, round(share * len(of_class)))]] = True
-    return sure
 
 
 def neighbours_of(features: Float[Tensor, "n d"], least: float, most: int) -> Float[Tensor, "n n"]:

@@ -163,6 +163,25 @@ class Spst:
         return Selection(selected, theta, mu=np.ones(len(kept)), confident=kept, kept=kept)
 
 
+def surest(
+    confidence: Float[np.ndarray, " n"],
+    labels: Int[np.ndarray, " n"],
+    share: float,
+    ids: Sequence[str] | None = None,
+    least: int = 0,
+) -> Bool[np.ndarray, " n"]:
+    """Of each of n_k samples labelled k the max(least, round(share n_k)) of highest confidence.
+
+    Ties go by id, or by position where there are none.
+    """
+    ranked = np.lexsort((np.arange(len(labels)) if ids is None else np.asarray(ids), -confidence))
+    chosen = np.zeros(len(labels), dtype=bool)
+    for k in np.unique(labels):
+        of_class = ranked[labels[ranked] == k]
+        chosen[of_class[: max(least, round(share * len(of_class)))]] = True
+    return chosen
+
+
 def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
     """The same with every sample selected."""
     kept = np.bincount(labels, minlength=len(selection.kept))

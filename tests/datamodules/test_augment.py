@@ -3,15 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from qs3.datamodules.augment import (
-    REGION_SHARE,
-    Augment,
-    crop,
-    drop_regions,
-    plates,
-    rotate_z,
-    thinnest,
-)
+from qs3.datamodules.augment import REGION_SHARE, Augment, crop, drop_regions, rotate_z
 from qs3.errors import ConfigError
 
 
@@ -63,7 +55,7 @@ def test_all_off_changes_nothing():
     "settings",
     [
         *({"scale": 0.5}, {"shift": -1.0}, {"jitter_clip": -0.1}),
-        *({"crop": 0.0}, {"crop": 1.1}, {"crop": float("nan")}, {"plate": 1.1}, {"plate": -0.1}),
+        *({"crop": 0.0}, {"crop": 1.1}, {"crop": float("nan")}),
         *({"drop_regions": 4}, {"drop_regions": -1}, {"drop_regions": True}),
     ],
 )
@@ -165,68 +157,6 @@ def test_a_cut_over_the_floor_leaves_heights_alone():
         assert set(after[:, 2].tolist()) <= set(before[:, 2].tolist())
     assert torch.equal(centred[..., :2], over[..., :2])
     assert not torch.equal(centred[..., 2], over[..., 2])
-
-
-def seat_and_back(count: int, n: int) -> torch.Tensor:
-    """Two plates that meet at a right angle: z = 0 (half of the points) and y = 0."""
-    along = torch.rand(count, n, 2, generator=generator())
-    none = torch.zeros(count, n // 2)
-    seat = torch.stack([*along[:, : n // 2].unbind(2), none], dim=2)
-    back = torch.stack([along[:, n // 2 :, 0], none, along[:, n // 2 :, 1]], dim=2)
-    return torch.cat([seat, back], dim=1)
-
-
-def test_a_plate_is_what_lies_near_one_surface_of_the_cloud():
-    points = seat_and_back(200, 128).double()
-    moved = plates(points, 1.0, generator(1), "metres")
-    thin = torch.stack([cloud.std(dim=0).min() for cloud in moved])
-    seats = torch.stack([cloud[:, 2].std() < cloud[:, 1].std() for cloud in moved])
-    # Near the corner the nearest eighth has points of both, and the plane lies across.
-    assert (thin < 0.02).float().mean() > 0.7
-    assert 60 < int(seats.sum()) < 140
-    for before, after in zip(points[:20], moved[:20], strict=True):
-        move = (before[:, None] - after[None]).reshape(-1, 3).mul(1e4).round()
-        steps, counts = move.unique(dim=0, return_counts=True)
-        assert (torch.cdist(after + steps[counts.argmax()] / 1e4, before).amin(dim=1) < 2e-4).all()
-
-
-def test_plates_are_as_frequent_as_is_said_and_the_others_stay_as_they_are():
-    points = seat_and_back(1000, 64)
-    moved = plates(points, 0.3, generator(1), "above_floor")
-    same = (moved == points).flatten(1).all(dim=1)
-    assert 0.65 < float(same.float().mean()) < 0.78
-    for before, after in zip(points[~same][:20], moved[~same][:20], strict=True):
-        assert set(after[:, 2].tolist()) <= set(before[:, 2].tolist())
-    assert torch.equal(moved, plates(points, 0.3, generator(1), "above_floor"))
-    assert torch.equal(plates(points, 0.0, generator(1), "metres"), points)
-    ball = plates(points, 1.0, generator(1), "unit_ball")
-    cut = (ball != points).flatten(1).any(dim=1)
-    assert torch.allclose(ball[cut].norm(dim=2).amax(dim=1), torch.ones(int(cut.sum())), atol=1e-5)
-
-
-def test_a_cloud_without_surfaces_stays_whole():
-    sparse = torch.randn(40, 60, 3, generator=generator())
-    sparse = 50 * sparse / sparse.norm(dim=2, keepdim=True)  # metres apart
-    assert torch.equal(plates(sparse, 1.0, generator(1), "metres"), sparse)
-    one = torch.ones(2, 8, 3)
-    assert torch.equal(plates(one, 1.0, generator(1), "metres"), one)
-
-
-@pytest.mark.parametrize(
-    "flat", [(1.0, 0.5, 0.1), (1.0, 1.0, 0.0), (1.0, 0.9, 0.8), (1e-3, 1e-3, 0)]
-)
-def test_the_thinnest_direction_is_an_eigenvector(flat):
-    x = torch.randn(300, 40, 3, generator=generator(), dtype=torch.float64)
-    x = x * torch.tensor(flat, dtype=torch.float64)
-    turn, _ = torch.linalg.qr(torch.randn(300, 3, 3, generator=generator(1), dtype=torch.float64))
-    scatter = (x @ turn).mT @ (x @ turn)
-    values, vectors = torch.linalg.eigh(scatter)
-    found = thinnest(scatter)
-    clear = values[:, 0] < 0.8 * values[:, 1]
-    assert clear.float().mean() > 0.2
-    agree = (found * vectors[:, :, 0]).sum(dim=1).abs()
-    assert agree[clear].min() > 0.999
-    assert torch.allclose(found.norm(dim=1), torch.ones(300).double())
 
 
 def test_a_lift_moves_each_cloud_up_or_down_as_a_whole():

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from qs3.errors import ConfigError
 from qs3.methods.deform import deform
-from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of
+from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of, thinnest
 from qs3.models.base import Features
 from tests.methods.shapes import CLASSES, boxes, tiny_net, train, unit_ball
 
@@ -169,3 +169,22 @@ def test_mlsp_learns_the_target_s_surfaces() -> None:
             found.append(method.loss(net, batch, torch.Generator().manual_seed(5)))
     assert found[0]["normal"] < 0.8 * found[1]["normal"]
     assert found[0]["position"] < 0.9 * found[1]["position"]
+
+
+@pytest.mark.parametrize(
+    "flat", [(1.0, 0.5, 0.1), (1.0, 1.0, 0.0), (1.0, 0.9, 0.8), (1e-3, 1e-3, 0)]
+)
+def test_the_thinnest_direction_is_an_eigenvector(flat: tuple[float, ...]) -> None:
+    x = torch.randn(300, 40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = x * torch.tensor(flat, dtype=torch.float64)
+    turn, _ = torch.linalg.qr(
+        torch.randn(300, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    )
+    scatter = (x @ turn).mT @ (x @ turn)
+    values, vectors = torch.linalg.eigh(scatter)
+    found = thinnest(scatter)
+    clear = values[:, 0] < 0.8 * values[:, 1]
+    assert clear.float().mean() > 0.2
+    agree = (found * vectors[:, :, 0]).sum(dim=1).abs()
+    assert agree[clear].min() > 0.999
+    assert torch.allclose(found.norm(dim=1), torch.ones(300).double())

@@ -113,7 +113,7 @@ def test_as_many_passes_as_stated(name: str) -> None:
 
 @pytest.mark.parametrize(
     "augment",
-    [Augment(scale=1.2, shift=0.1), Augment(plate=0.5, crop=0.5, drop_regions=2, lift=0.1)],
+    [Augment(scale=1.2, shift=0.1), Augment(crop=0.5, drop_regions=2, lift=0.1)],
 )
 def test_augmentation_is_part_of_a_step(augment: Augment) -> None:
     """On the CPU, as its generator must be where its clouds are."""

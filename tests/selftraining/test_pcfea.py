@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from qs3.errors import ConfigError
 from qs3.methods.base import Method
 from qs3.models.base import PointClassifier
-from qs3.selftraining.pcfea import Pcfea, moments, most_probable, penultimate, style
+from qs3.selftraining.pcfea import Pcfea, moments, penultimate, style
 from qs3.selftraining.selectors import Qbst
 from tests.methods.shapes import CLASSES, accuracy, tiny_net
 from tests.methods.test_learning import OneLayer
@@ -73,12 +73,6 @@ def test_moments_are_numpy_s_and_empty_classes_zero() -> None:
         np.testing.assert_allclose(covariance[k], np.cov(of_class.T, bias=True), atol=1e-12)
     assert not mean[[1, 3, 5]].any()
     assert not covariance[[1, 3, 5]].any()
-
-
-def test_the_most_probable_worked_by_hand() -> None:
-    p, labels = np.array([0.9, 0.5, 0.7, 0.6, 0.8, 0.8]), np.array([0, 0, 0, 0, 1, 1])
-    for share, chosen in ((0.0, []), (0.5, [0, 2, 4]), (0.76, [0, 2, 3, 4, 5]), (1.0, range(6))):
-        assert most_probable(p, labels, share).nonzero()[0].tolist() == list(chosen)
 
 
 def _data(b: int = 40) -> Any:

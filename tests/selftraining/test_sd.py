@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.errors import ConfigError
-from qs3.selftraining.sd import GraphNet, GraphRefined, neighbours_of, principal, surest
+from qs3.selftraining.sd import GraphNet, GraphRefined, neighbours_of, principal
 from qs3.selftraining.selectors import TeacherPredictions
 
 
@@ -50,16 +50,6 @@ def test_principal_components_keep_distances() -> None:
     scale = torch.cdist(features, features)[0, 1] / torch.cdist(found, found)[0, 1]
     torch.testing.assert_close(torch.cdist(found, found) * scale, torch.cdist(features, features))
     assert found.square().mean().item() == pytest.approx(1)
-
-
-def test_the_surest_worked_by_hand() -> None:
-    # of class 0: a .9, b .8, c .7, d .6; of class 1: e .9, f .9, g .6
-    first = np.array([0.9, 0.8, 0.7, 0.6, 0.1, 0.1, 0.4])
-    scores = np.stack([first, 1 - first], axis=1)
-    for share, kept in ((0.5, "abef"), (0.01, "ae"), (1.0, "abcdefg"), (0.74, "abcef")):
-        assert "".join(np.array(list("abcdefg"))[surest(scores, list("abcdefg"), share)]) == kept
-    ids = ["a", "b", "c", "d", "z", "f", "g"]  # ties by id
-    assert surest(scores, ids, 0.3).tolist() == [True, False, False, False, False, True, False]
 
 
 def _two_groups(wrong: float) -> tuple[TeacherPredictions, np.ndarray]:

@@ -14,6 +14,7 @@ from qs3.selftraining.selectors import (
     Spst,
     TeacherPredictions,
     check_selection,
+    surest,
 )
 
 # Worked by hand for theta = 0.8. Confident: class 0: a b c d e (5), class 1: g h (2),
@@ -132,3 +133,16 @@ def test_wrong_setting_names_the_key(settings):
     (key,) = settings
     with pytest.raises(ConfigError, match=f"selftraining.selector.{key}"):
         Qbst(**settings)
+
+
+def test_the_surest_worked_by_hand():
+    confidence = np.array([0.9, 0.8, 0.7, 0.6, 0.9, 0.9, 0.6])  # a b c d are 0, e f g are 1
+    labels = np.array([0, 0, 0, 0, 1, 1, 1])
+
+    def kept(share, ids=None, least=0):
+        return "".join(np.array(list("abcdefg"))[surest(confidence, labels, share, ids, least)])
+
+    for share, expected in ((0.0, ""), (0.5, "abef"), (0.74, "abcef"), (1.0, "abcdefg")):
+        assert kept(share) == expected
+    assert [kept(0.01), kept(0.01, least=1), kept(0.5, least=3)] == ["", "ae", "abcefg"]
+    assert [kept(0.3), kept(0.3, ids=list("abcdzfg"))] == ["ae", "af"]  # ties
