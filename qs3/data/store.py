@@ -6,25 +6,23 @@ r"""Point clouds on disk: one folder a dataset, written atomically, checked when
     manifest.csv       one row an object; those with status "ok" are the N clouds, in order
     meta.yaml          name, classes, hashes, and how it was made; written last
 
-`meta.yaml` is the marker of a finished dataset: a folder without it is refused. Its last line
-is a checksum of the lines above, and it holds the SHA-256 of every other file. No file holds a
-date, so the same clouds give the same bytes.
+`meta.yaml` is the marker of a finished dataset: a folder without it is refused (see
+`qs3.data.meta`). It holds the SHA-256 of every other file. No file holds a date, so the same clouds
+give the same bytes.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml  # type: ignore[import-untyped,unused-ignore]
 
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import (
@@ -38,7 +36,15 @@ from qs3.data.manifest import (
     read_manifest,
     to_csv,
 )
-from qs3.errors import DataError, MissingDataError
+from qs3.data.meta import (
+    META,
+    is_finished,
+    meta_of_finished,
+    read_meta,
+    sha256_of,
+    write_meta,
+)
+from qs3.errors import DataError
 from qs3.utils import text_table
 from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
 from qs3.utils.version import VERSION
@@ -58,11 +64,6 @@ __all__ = [
     "write_pointset",
 ]
 
-FORMAT_VERSION = 1
-_META = "meta.yaml"
-_CHECKSUM = "# sha256 of the lines above: "
-# A run opens its datasets some ten times, and libyaml is ten times as fast.
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _CHUNK_CLOUDS = 512
 
 
@@ -171,11 +172,6 @@ def counts_text(data: PointSet, without: str, missing: Mapping[str, int]) -> lis
     return text_table.aligned([*rows, ["all", *total]], numbers=True, rule=False)
 
 
-def is_finished(folder: str | Path) -> bool:
-    """Whether `folder` holds a dataset whose writing came to its end."""
-    return (Path(folder) / _META).is_file()
-
-
 def is_begun(folder: str | Path) -> bool:
     """Whether something was begun in `folder` and not finished (an empty lock is nothing)."""
     folder = Path(folder)
@@ -224,7 +220,7 @@ def write_pointset(
     shape = _check_arrays(name, stacked, clouds, tables)
 
     make_folder(folder)
-    (folder / _META).unlink(missing_ok=True)
+    (folder / META).unlink(missing_ok=True)
     remove_leftovers(folder)
     hashes = {}
     for key, array in stacked.items():
@@ -234,8 +230,6 @@ def write_pointset(
         hashes[key] = sha256_file(folder / f"{key}.npy")
     write_text(folder / MANIFEST, to_csv(rows))
     document = {
-        "format": "qs3 point clouds",
-        "format_version": FORMAT_VERSION,
         "created_by": f"qs3 {VERSION}",
         "name": name,
         "classes": list(classes),
@@ -248,10 +242,7 @@ def write_pointset(
         document["labelled"] = False
     if tables:
         document["tables"] = {key: list(columns) for key, columns in tables.items()}
-    if clash := sorted(set(document) & set(meta)):
-        raise DataError(f"meta of dataset {name!r} may not use the keys {clash}")
-    text = yaml.safe_dump({**document, **meta}, sort_keys=False, allow_unicode=True, width=100)
-    write_text(folder / _META, text + _CHECKSUM + _sha256(text) + "\n")
+    write_meta(folder, document, meta)
     return open_pointset(folder, verify=False)
 
 
@@ -269,7 +260,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         DataError: a file is damaged or does not fit the others; names file and row.
     """
     folder = Path(folder)
-    meta = _meta_of_finished(folder)
+    meta = meta_of_finished(folder)
     classes, hashes = tuple(meta["classes"]), meta["sha256"]
     have = sorted(set(hashes) - {"manifest", *(meta.get("tables") or {})})
     if variant not in have:
@@ -281,7 +272,7 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     kept = [row for row in rows if row.status == OK]
     if len(kept) != meta["clouds"]:
         raise DataError(
-            f"{folder / MANIFEST} has {len(kept)} rows with status ok, but {_META} promises "
+            f"{folder / MANIFEST} has {len(kept)} rows with status ok, but {META} promises "
             f"{meta['clouds']} clouds; generate or import the dataset again"
         )
     points = _open_array(folder, variant, meta, 3, verify)
@@ -311,7 +302,7 @@ def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray
         DataError: the dataset has no such table, or its file is damaged.
     """
     folder = Path(folder)
-    meta = _meta_of_finished(folder)
+    meta = meta_of_finished(folder)
     tables = meta.get("tables") or {}
     if name not in tables:
         raise DataError(
@@ -320,17 +311,6 @@ def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray
         )
     columns = tuple(tables[name])
     return _open_array(folder, name, meta, len(columns), verify=True), columns
-
-
-def _meta_of_finished(folder: Path) -> dict[str, Any]:
-    if not folder.is_dir():
-        raise MissingDataError(f"there is no dataset folder {folder}")
-    if not is_finished(folder):
-        raise MissingDataError(
-            f"{folder} has no {_META}: the generation or import was not finished; "
-            "run the same command again and it continues"
-        )
-    return read_meta(folder)
 
 
 def _open_array(
@@ -351,67 +331,14 @@ def _open_array(
     if found != header:
         raise DataError(f"{path} does not have the header of a float32 array {shape}; {AGAIN}")
     if verify and sha256_file(path) != meta["sha256"][name]:
-        raise DataError(f"{path} is damaged (its SHA-256 is not the one in {_META}); {AGAIN}")
+        raise DataError(f"{path} is damaged (its SHA-256 is not the one in {META}); {AGAIN}")
     return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)
-
-
-def read_meta(folder: str | Path) -> dict[str, Any]:
-    """The contents of a finished dataset's meta.yaml, checked against its last line.
-
-    Raises:
-        DataError: damaged, edited, or of another version of the format.
-    """
-    path = Path(folder) / _META
-    try:
-        text = path.read_bytes().decode()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
-    body, mark, checksum = text.rpartition(_CHECKSUM)
-    if not mark or checksum != _sha256(body) + "\n":
-        raise DataError(f"{path} is damaged or was edited (its checksum is wrong); {AGAIN}")
-    try:
-        meta = yaml.load(body, _LOADER)
-        version = meta.get("format_version")
-    except (yaml.YAMLError, AttributeError, ValueError, RecursionError) as error:
-        raise DataError(f"{path} was written by something else ({error}); {AGAIN}") from error
-    if version != FORMAT_VERSION:
-        raise DataError(
-            f"{path} has format version {version}, this qs3 reads "
-            f"{FORMAT_VERSION}; use the qs3 that wrote it ({meta.get('created_by')}) or {AGAIN}"
-        )
-    if odd := next((key for key, fits in _META_FITS.items() if not fits(meta.get(key))), ""):
-        raise DataError(f"{path} has no {odd} as `write_pointset` writes it; {AGAIN}")
-    return meta
-
-
-def _words(value: Any) -> bool:
-    """A list of different words."""
-    words = isinstance(value, list) and all(isinstance(one, str) for one in value)
-    return words and len({*value}) == len(value)
-
-
-_META_FITS: dict[str, Callable[[Any], bool]] = {
-    "name": lambda value: isinstance(value, str),
-    "classes": lambda value: _words(value) and len(value) > 0,
-    "clouds": lambda value: type(value) is int and value >= 0,
-    "points": lambda value: type(value) is int and value >= 0,
-    "sha256": lambda value: (
-        isinstance(value, dict) and "manifest" in value and _words(sorted(map(str, value)))
-    ),
-    "tables": lambda value: (
-        value is None or (isinstance(value, dict) and all(map(_words, value.values())))
-    ),
-}
-
-
-def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _content_hash(array: str, classes: Sequence[str], rows: Sequence[ManifestRow]) -> str:
     """Hash of what training sees: the array's bytes, and ids, classes and splits in order."""
     seen = [array, list(classes), [[row.id, row.cls, row.split] for row in rows]]
-    return _sha256(json.dumps(seen, ensure_ascii=True))
+    return sha256_of(json.dumps(seen, ensure_ascii=True))
 
 
 def _stack(name: str, key: str, value: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:

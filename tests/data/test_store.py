@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from qs3.data import meta as described
 from qs3.data import store
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.errors import DataError, MissingDataError, Qs3Error
@@ -182,9 +183,9 @@ def test_the_number_of_clouds_is_checked_against_the_manifest(tmp_path):
         folder = tmp_path / str(clouds)
         make(folder)
         path = folder / "meta.yaml"
-        body = path.read_text().rpartition(store._CHECKSUM)[0]
+        body = path.read_text().rpartition(described._CHECKSUM)[0]
         body = body.replace("clouds: 6", f"clouds: {clouds}")
-        path.write_text(body + store._CHECKSUM + store._sha256(body) + "\n")
+        path.write_text(body + described._CHECKSUM + described.sha256_of(body) + "\n")
         with pytest.raises(
             DataError, match=rf"manifest\.csv has 6 rows .* promises {clouds} clouds"
         ):
@@ -209,10 +210,10 @@ def test_the_number_of_clouds_is_checked_against_the_manifest(tmp_path):
 def test_a_description_of_something_else_with_a_valid_checksum(tmp_path, line, other, message):
     make(tmp_path / "d")
     path = tmp_path / "d" / "meta.yaml"
-    body = path.read_text().rpartition(store._CHECKSUM)[0]
+    body = path.read_text().rpartition(described._CHECKSUM)[0]
     assert line is None or line in body
     body = other if line is None else body.replace(line, other, 1)
-    path.write_text(body + store._CHECKSUM + store._sha256(body) + "\n")
+    path.write_text(body + described._CHECKSUM + described.sha256_of(body) + "\n")
     with pytest.raises(DataError, match=rf"(?s)meta\.yaml {message}.*generate or import"):
         open_pointset(tmp_path / "d")
 
@@ -387,12 +388,12 @@ def test_manifest_errors_name_the_line(tmp_path):
 
 def test_another_version_of_the_format(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(store, "FORMAT_VERSION", 2)
+        patch.setattr(described, "FORMAT_VERSION", 2)
         make(tmp_path / "d")
     with pytest.raises(DataError, match="format version 2, this qs3 reads 1"):
         open_pointset(tmp_path / "d")
     with monkeypatch.context() as patch:
-        patch.setattr(store, "FORMAT_VERSION", 0)
+        patch.setattr(described, "FORMAT_VERSION", 0)
         make(tmp_path / "d")
     with pytest.raises(DataError, match="format version 0, this qs3 reads 1"):
         open_pointset(tmp_path / "d")

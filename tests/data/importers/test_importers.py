@@ -14,7 +14,7 @@ from qs3.data.importers import NamedArrays, NpyTree, PointDAH5, XyzTree, import_
 from qs3.data.importers.base import check_cloud
 from qs3.data.store import open_pointset
 from qs3.errors import ConfigError, DataError
-from tests.data.importers.test_own_clouds import Trap
+from tests.data.importers.test_damaged_clouds import Trap
 
 TWO = ("bed", "chair")
 

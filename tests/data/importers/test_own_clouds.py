@@ -1,13 +1,9 @@
-"""Folders of one's own clouds: formats, layouts, damage, and sets without labels."""
+"""Folders of one's own clouds: formats, layouts, and sets without labels."""
 
 from __future__ import annotations
 
 import os
-import pickle
-import re
-import struct
 import tracemalloc
-import zipfile
 from pathlib import Path
 
 import h5py
@@ -15,48 +11,10 @@ import numpy as np
 import pytest
 
 from qs3.clouds.files import read_cloud, read_clouds
-from qs3.config.compose import composed
-from qs3.config.hashing import config_hash
-from qs3.data.domain import Domain
 from qs3.data.importers import CloudFolder, Importer, XyzTree, import_into
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError
-
-TWO = ("bed", "chair")
-CLOUD = np.arange(12, dtype=np.float64).reshape(4, 3) / 8  # exact in float32 and in text
-
-
-def write(path: Path, cloud: np.ndarray = CLOUD) -> Path:
-    """One cloud in the format of the path's extension."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    kind = path.suffix.lower()
-    if kind == ".xyz":
-        np.savetxt(path, cloud)
-    elif kind == ".txt":  # with normals, commas and a header
-        lines = [",".join(map(str, [*row, 0, 0, 1])) for row in cloud.tolist()]
-        path.write_text("\n".join(["# x,y,z,nx,ny,nz", *lines, "// the end"]) + "\n")
-    elif kind == ".npy":
-        np.save(path, cloud.astype("f4"))
-    elif kind == ".npz":
-        np.savez(path, points=cloud, colours=np.zeros((len(cloud), 3)))
-    elif kind == ".ply":
-        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n"
-        head += "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
-        rows = b"".join(struct.pack("<fffB", *row, 7) for row in cloud.tolist())
-        path.write_bytes((head + "end_header\n").encode() + rows)
-    elif kind == ".pcd":  # an image of two rows, one pixel more without a measurement
-        rows = [*cloud.tolist(), *[[np.nan] * 3] * (len(cloud) % 2 or 2)]
-        head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-        head += f"WIDTH {len(rows) // 2}\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\n"
-        body = "\n".join(" ".join(map(str, row)) for row in rows)
-        path.write_text(f"{head}POINTS {len(rows)}\nDATA ascii\n{body}\n")
-    elif kind == ".h5":
-        with h5py.File(path, "w") as file:
-            file["data"] = cloud
-    return path
-
-
-FORMATS = (".xyz", ".txt", ".npy", ".npz", ".ply", ".pcd", ".h5")
+from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, write
 
 
 @pytest.mark.parametrize("suffix", [*FORMATS, ".XYZ", ".Ply"])
@@ -64,82 +22,6 @@ def test_every_format_gives_the_same_points(tmp_path: Path, suffix: str) -> None
     found = read_cloud(write(tmp_path / f"a{suffix}"))
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, CLOUD)
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_truncated_files_never_give_other_points(tmp_path: Path, suffix: str) -> None:
-    path = write(tmp_path / f"a{suffix}")
-    data = path.read_bytes()
-    for size in range(0, len(data) - 1, max(1, len(data) // 60)):
-        path.write_bytes(data[:size])
-        found = complaint = None
-        try:
-            found = read_cloud(path)
-        except DataError as error:
-            complaint = str(error)
-        if found is None:
-            assert str(path) in str(complaint)
-            continue
-        # text may end after whole rows; and HDF5 and zip may be cut in their padding
-        assert suffix in (".xyz", ".txt", ".h5"), (suffix, size)
-        rows = len(found) - (suffix in (".xyz", ".txt"))  # a number may be cut in its digits
-        np.testing.assert_array_equal(found[:rows], CLOUD[:rows])
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("a.xyz", "1 2 3\n1 2\n", "line 2: '1 2' has 2 numbers, not 3"),
-        ("a.xyz", "1 2\n", "line 1: '1 2' has 2 numbers, not 3"),
-        ("a.txt", "1,2,3\na,b,c\n", "line 2: 'a b c' is not a row of numbers"),
-        ("a.xyz", "1 2 3\n\n4 5 6 7\n", "line 3: '4 5 6 7' has 4 numbers, not 3"),
-        ("a.xyz", "\xff\0", "line 1"),
-        ("a.xyz", "\n\n", "there are no points"),
-        ("a.xyz", "1 2 nan\n4 nan 6\n", r"a\.xyz: all 2 points are not finite"),
-        ("a.xyz", "1 2 3\n4 1e39 6\n", r"point 2: .*not finite in float32; leave such"),
-        ("a.xyz", "# only a comment\n", "there are no points"),
-        ("a.xyz", "", "0 bytes"),
-        ("a.pcd", "nonsense", r"a\.pcd"),
-        ("a.stl", "solid", "unknown format; known are .xyz"),
-    ],
-)
-def test_damaged_files_say_where(tmp_path: Path, name: str, text: str, message: str) -> None:
-    (tmp_path / name).write_text(text)
-    with pytest.raises(DataError, match=message):
-        read_cloud(tmp_path / name)
-
-
-class Trap:
-    """Unpickling it would leave a trace."""
-
-    def __reduce__(self):
-        return (open, (os.environ["QS3_TRAP"], "w"))
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".npz"])
-def test_pickles_are_refused_unopened(
-    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("QS3_TRAP", str(tmp_path / "trap"))
-    path, array = tmp_path / f"a{suffix}", np.array([Trap()], dtype=object)
-    if suffix == ".npy":
-        np.save(path, array, allow_pickle=True)
-    else:
-        np.savez(path, points=array)
-    with pytest.raises(DataError, match=r"a\.np. ?.*(pickled array, refused|not a readable)"):
-        read_cloud(path)
-    path.write_bytes(pickle.dumps(Trap()))
-    with pytest.raises(DataError, match="not a readable"):
-        read_cloud(path)
-    assert not (tmp_path / "trap").exists()
-
-
-def test_hdf5_may_not_point_elsewhere(tmp_path: Path) -> None:
-    write(tmp_path / "there.h5")
-    with h5py.File(tmp_path / "here.h5", "w") as file:
-        file["data"] = h5py.ExternalLink("there.h5", "/data")
-    with pytest.raises(DataError, match="is a link; refused"):
-        read_cloud(tmp_path / "here.h5")
 
 
 def test_files_of_several_clouds(tmp_path: Path) -> None:
@@ -261,22 +143,6 @@ def test_wrong_folders_and_names(tmp_path: Path) -> None:
     assert not CloudFolder(tmp_path / "e").is_there()
 
 
-def test_damage_can_be_skipped_and_is_recorded(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    write(tmp_path / "bed" / "a.xyz")
-    (tmp_path / "bed" / "b.npz").write_bytes(b"PK")
-    (tmp_path / "bed" / "c.xyz").write_text("1 2 inf\n")
-    importer = CloudFolder(tmp_path, points=4, test_every=0, on_error="skip")
-    clouds, rows = importer.read(TWO)
-    assert len(clouds) == 1
-    states = {"bed/train/a": "ok", "bed/train/b": "skipped", "bed/train/c": "skipped"}
-    assert {r.id: r.status for r in rows} == states
-    assert "has no clouds of chair" in caplog.text  # a warning
-    with pytest.raises(DataError, match=r"b\.npz"):
-        CloudFolder(tmp_path, points=4, test_every=0).read(TWO)
-
-
 @pytest.mark.parametrize(
     "settings", [{"layout": "tree"}, {"up": "w"}, {"test_every": 1}, {"test_every": -1}]
 )
@@ -298,12 +164,6 @@ def test_own_classes_are_found_as_they_are_written(tmp_path: Path) -> None:
     write(tmp_path / "coffee mug" / "a.xyz")
     _, rows = CloudFolder(tmp_path, points=4, test_every=0).read(("Box", "coffee-mug"))
     assert [row.cls for row in rows] == ["Box", "coffee-mug"]
-
-
-def own(tmp_path: Path, **settings) -> Domain:
-    """The domain of tmp_path/in."""
-    published = CloudFolder(tmp_path / "in", points=4, **settings)
-    return Domain("own", "O", "own clouds", tmp_path / "store", published=published, classes=TWO)
 
 
 def test_changed_files_are_noticed(tmp_path: Path) -> None:
@@ -385,74 +245,6 @@ def test_names_equal_but_for_case(tmp_path: Path, importer: type[Importer]) -> N
     write(tmp_path / "bed" / "train" / "A.XYZ")
     with pytest.raises(DataError, match=r"a\.xyz and .*A\.XYZ have one name"):
         importer(tmp_path, points=4).items(("bed",))
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_points_that_are_not_finite_are_left_out(
-    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    rng = np.random.default_rng(0)
-    cloud = rng.standard_normal((12, 3)).astype(np.float32)
-    left = np.delete(cloud, [0, 5], axis=0)
-    cloud[0], cloud[5, 1] = np.nan, np.inf
-    write(tmp_path / "bed" / f"a{suffix}", cloud)
-    with caplog.at_level("INFO"):
-        (read,), (row,) = CloudFolder(tmp_path, points=10, test_every=0).read(("bed",))
-    np.testing.assert_array_equal(read, left)
-    assert row.valid_points == 10
-    assert re.search(rf"a{suffix}\S*: \d points that are NaN or infinite left out", caplog.text)
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".h5"])
-def test_a_wrong_label_can_be_skipped(tmp_path: Path, suffix: str) -> None:
-    many, labels = np.stack([CLOUD, CLOUD + 1, CLOUD * np.nan, CLOUD]), np.array([1, 7, 0, 0])
-    if suffix == ".npz":
-        np.savez(tmp_path / "a.npz", points=many, label=labels)
-    else:
-        with h5py.File(tmp_path / "a.h5", "w") as file:
-            file["data"], file["label"] = many, labels
-    with pytest.raises(DataError, match=r"cloud 1: label 7 is not 0\.\.1"):
-        CloudFolder(tmp_path, points=4).read(TWO)
-    store = tmp_path.with_name(f"{tmp_path.name}_store")
-    importer = CloudFolder(tmp_path, points=4, on_error="skip")
-    import_into(store, importer, name="mine", classes=TWO)
-    data = open_pointset(store)
-    assert data.ids == ("bed/train/a_0003", "chair/train/a_0000")
-    assert "labelled" not in data.meta
-    left_out = {r.origin: r.reason for r in read_manifest(store, TWO) if r.status == "skipped"}
-    assert sorted(left_out) == [f"a{suffix}[1]", f"a{suffix}[2]"]
-    assert "label 7" in left_out[f"a{suffix}[1]"]
-    assert "not finite" in left_out[f"a{suffix}[2]"]
-
-
-def test_damaged_files_are_named_and_the_others_go_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    folder = tmp_path / "in"
-    write(folder / "a.xyz")
-    header = "element vertex 1\nproperty list uchar float x\nproperty float y\nproperty float z\n"
-    (folder / "b.ply").write_text(f"ply\nformat ascii 1.0\n{header}end_header\n1 1 2 3\n")
-    with h5py.File(folder / "c.h5", "w") as file:
-        file["data"] = h5py.Empty("f4")
-    with zipfile.ZipFile(folder / "d.npz", "w") as file:
-        file.writestr("points.txt", "1 2 3")
-    data = own(tmp_path, layout="none", on_error="skip").open()
-    assert data.ids == ("train/a",)
-    for name in ("b.ply", "c.h5", "d.npz"):
-        assert re.search(rf"left out: \S*{re.escape(name)}", caplog.text)
-    assert "3 clouds left out" in caplog.text
-    cfg = composed("train", "experiment=own_scans")
-    assert cfg.data.target.published.on_error == "skip"
-    stops = composed("train", "experiment=own_scans", "data.target.published.on_error=stop")
-    assert config_hash(cfg) == config_hash(stops)  # data have hashes of their own
-
-
-def test_a_store_without_damage_may_be_used_where_damage_is_left_out(tmp_path: Path) -> None:
-    write(tmp_path / "in" / "bed" / "a.xyz")
-    own(tmp_path, test_every=0).open()
-    own(tmp_path, test_every=0, on_error="skip").open()
-    with pytest.raises(DataError, match="was imported with"):
-        own(tmp_path, test_every=0, up="x", on_error="skip").open()
 
 
 def test_ids_of_splits_without_labels(tmp_path: Path) -> None:
