@@ -37,7 +37,7 @@ _UNHASHED = (
 )
 # Keys that came later, with the value at which they do nothing: left out there, so that runs from
 # before them keep their names.
-_OFF = {"protocol.augment.lift": 0.0}
+_OFF = {"protocol.augment.lift": 0.0, "selftraining.share": None}
 # What was hashed from the beginning and does not matter to given data: hashed as if it were so.
 _AS = {"data.source.published.on_error": "stop", "data.target.published.on_error": "stop"}
 _FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from qs3.config.checks import check_choice, check_float, check_int
 from qs3.errors import ConfigError
 
@@ -106,6 +109,8 @@ class SelfTrainingConfig:
         theta: confidence that a pseudo-label must exceed, in round 0; 0 is for selectors that have
             thresholds of their own (CBST), and for them alone.
         epsilon: added to theta in each further round.
+        share: instead of theta and epsilon, of each round's predictions the share that exceeds its
+            threshold: where nets are unsure of everything, 0.8 says nothing. None: theta.
         init: "scratch" draws new weights each round; "continue" begins round 0 with the weights of
             the teacher that labelled it, and each further round with the student before;
             "persistent" draws new weights in round 0 alone, and keeps them and the optimiser's
@@ -126,6 +131,7 @@ class SelfTrainingConfig:
     batch_size: int = 32
     theta: float = 0.8
     epsilon: float = 0.0
+    share: float | None = None
     init: str = "scratch"
     use_source: bool = False
     pcm: bool = False
@@ -147,6 +153,13 @@ class SelfTrainingConfig:
         check_float("selftraining.epsilon", self.epsilon)
         free = bool(getattr(self.selector, "own_thresholds", False)) and self.theta == 0
         check_float("selftraining.theta", self.theta, "" if free else "(0, 1)")
+        if self.share is not None:
+            check_float("selftraining.share", self.share, "(0, 1)")
+            if free:
+                raise ConfigError(
+                    "selftraining.share sets a threshold for all classes, and this selector has "
+                    "its own; leave it at null"
+                )
         check_float("selftraining.mrkld", self.mrkld, ">= 0")
         epochs = self.rounds * self.epochs
         step = check_float("selftraining.weight_step", self.weight_step)
@@ -162,8 +175,15 @@ class SelfTrainingConfig:
                 f"(theta={self.theta}, epsilon={self.epsilon}, rounds={self.rounds})"
             )
 
-    def theta_of(self, round_: int) -> float:
-        """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly."""
+    def theta_of(self, round_: int, confidence: Float[np.ndarray, " n"] | None = None) -> float:
+        """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly.
+
+        With `share` it is a quantile of the round's `confidence`, and the highest ones exceed it
+        even where more than that share of them are equal.
+        """
+        if self.share is not None and confidence is not None:
+            quantile = np.quantile(confidence, 1 - self.share)
+            return float(min(quantile, np.nextafter(confidence.max(), 0)))
         return float(Decimal(repr(self.theta)) + round_ * Decimal(repr(self.epsilon)))
 
 

@@ -147,7 +147,8 @@ class SelfTraining(Callback):
                 global_features(teacher, data.target.points, data.eval_batch_size, pl_module.device)
             )
         said = TeacherPredictions.of(probabilities, data.target.ids, features)
-        selection = self.scheme.selector.select(said, self.scheme.theta_of(round_), round_)
+        theta = self.scheme.theta_of(round_, said.confidence)
+        selection = self.scheme.selector.select(said, theta, round_)
         if selection.labels is not None:  # a selector may name another class than the most probable
             said = said.relabelled(selection.labels)
         if self.scheme.rehearsal:

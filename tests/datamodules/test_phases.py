@@ -3,7 +3,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -65,6 +67,7 @@ def test_what_is_not_said_is_the_paper_s():
         "batch_size": 32,
         "theta": 0.8,
         "epsilon": 0.0,
+        "share": None,
         "init": "scratch",
         "use_source": False,
         "pcm": False,
@@ -106,11 +109,27 @@ def test_theta_grows_without_rounding_error():
         ({"init": "warm"}, "selftraining.init"),
         ({"missing_class": "ignore"}, "selftraining.missing_class"),
         ({"selector": None}, "needs a selector"),
+        ({"share": 0.0}, r"selftraining\.share must be in \(0, 1\), got 0.0"),
+        ({"share": 1.0}, r"selftraining\.share must be in"),
+        ({"share": 0.5, "selector": Cbst(), "theta": 0.0}, r"share .* its own; leave it at null"),
     ],
 )
 def test_wrong_settings_name_the_key(settings, message):
     with pytest.raises(ConfigError, match=message):
         SelfTrainingConfig(**{"selector": Qbst(), "rounds": 2, **settings})
+
+
+def test_a_share_is_of_those_above_the_round_s_threshold():
+    scheme = SelfTrainingConfig(Qbst(), rounds=2, share=0.25)
+    confidence = np.random.default_rng(0).random(101)
+    for round_ in (0, 1):  # whatever epsilon says
+        theta = scheme.theta_of(round_, confidence)
+        assert (confidence > theta).sum() == 25
+        assert theta == np.sort(confidence)[75]
+    for equal in (np.ones(5), np.array([0.3, 1, 1, 1, 1])):
+        assert ((equal > scheme.theta_of(0, equal)) == (equal == 1)).all()
+    assert replace(scheme, share=None).theta_of(1, confidence) == 0.8
+    assert SelfTrainingConfig(Cbst(), rounds=2, theta=0.8, share=0.5).share == 0.5
 
 
 def test_the_smallest_settings_are_allowed():

@@ -17,7 +17,7 @@ from qs3.datamodules.splits import Unlabelled, load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import RunMetrics
-from qs3.runs.pseudo_labels import read_pseudo_labels
+from qs3.runs.pseudo_labels import path_of, read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
 from qs3.training.command import train
 from qs3.utils.seeding import derive
@@ -70,7 +70,7 @@ def scratch(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
 @pytest.fixture(scope="module")
 def continued(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept:
     root = tmp_path_factory.mktemp("continued")
-    return kept_run(root, toy_data, "selftraining=spst", "selftraining.theta=0.35")
+    return kept_run(root, toy_data, "selftraining=spst", "selftraining.share=0.6")
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +111,17 @@ def test_continued_students_begin_with_their_teacher(continued: Kept) -> None:
     assert same(continued.before(4)["weights"], selected)
     assert same(continued.before(7)["weights"], continued.net(6))
     assert not same(selected, continued.net(3))
+
+
+def test_a_share_of_the_target_exceeds_each_round_s_threshold(continued: Kept) -> None:
+    """`selftraining.share`: theta by the predictions of the round, whatever they are."""
+    for record in continued.metrics.rounds:
+        table = read_pseudo_labels(path_of(continued.folder, record.round))
+        said = torch.tensor([row.confidence for row in table], dtype=torch.float64)
+        assert record.theta == pytest.approx(said.quantile(0.4).item())
+        assert record.total_selected == (said > record.theta).sum() == round(0.6 * len(said))
+    first, second = continued.metrics.rounds
+    assert first.theta != second.theta
 
 
 @pytest.mark.slow
