@@ -67,10 +67,13 @@ def test_hash_sees_what_changes_the_result_and_nothing_else(key):
     assert same == (key in IGNORED)
 
 
-@pytest.mark.parametrize("key", ["lift", "plate"])
-def test_what_came_later_is_hashed_where_it_does_something(key):
+@pytest.mark.parametrize(
+    ("key", "nothing", "something"),
+    [("protocol.augment.lift", 0.0, 0.1), ("selftraining.share", "null", 0.5)],
+)
+def test_what_came_later_is_hashed_where_it_does_something(key, nothing, something):
     others = {"protocol.augment.crop": 0.5}
-    off, on = ({**others, f"protocol.augment.{key}": value} for value in (0.0, 0.1))
+    off, on = ({**others, key: value} for value in (nothing, something))
     assert hashing.config_hash(config(**off)) == hashing.config_hash(config(**others))
     assert hashing.config_hash(config(**on)) != hashing.config_hash(config(**others))
 
