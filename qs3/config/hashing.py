@@ -30,16 +30,11 @@ _UNHASHED = (
         for domain in ("source", "target")
         for key in (
             *("path", "twin_of", "title", "symbol", "unit"),
-            *("published.folder", "published.file"),
+            *("published.folder", "published.file", "published.on_error"),
             *("synthesis", "how_to_get", "make", "stand_in"),
         )
     ),
 )
-# Keys that came later, with the value at which they do nothing: left out there, so that runs from
-# before them keep their names.
-_OFF = {"protocol.augment.lift": 0.0, "selftraining.share": None}
-# What was hashed from the beginning and does not matter to given data: hashed as if it were so.
-_AS = {"data.source.published.on_error": "stop", "data.target.published.on_error": "stop"}
 _FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
@@ -53,12 +48,6 @@ def config_sha256(cfg: DictConfig) -> str:
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
     for key in _UNHASHED:
         _leave_out(plain, key)
-    for key, off in _OFF.items():
-        _leave_out(plain, key, off)
-    for key, value in _AS.items():
-        node, leaf = _node(plain, key), key.rpartition(".")[2]
-        if isinstance(node, dict) and leaf in node:
-            node[leaf] = value
     if (plain.get("data") or {}).get("scale") != "above_floor":
         for key in _FLOORS:
             _leave_out(plain, key)
@@ -72,18 +61,13 @@ def config_sha256(cfg: DictConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _leave_out(plain: Any, key: str, value: Any = ...) -> None:
-    """Take a key out of nested dicts if it is there, and with `value` if it has that one."""
-    node, leaf = _node(plain, key), key.rpartition(".")[2]
-    if isinstance(node, dict) and (value is ... or node.get(leaf) == value):
-        node.pop(leaf, None)
-
-
-def _node(plain: Any, key: str) -> Any:
-    """The dict in which the last part of a key stands; None if it is not there."""
-    for parent in key.split(".")[:-1]:
+def _leave_out(plain: Any, key: str) -> None:
+    """Take a key out of nested dicts, if it is there."""
+    *parents, leaf = key.split(".")
+    for parent in parents:
         plain = plain.get(parent) if isinstance(plain, dict) else None
-    return plain
+    if isinstance(plain, dict):
+        plain.pop(leaf, None)
 
 
 def config_hash(cfg: DictConfig) -> str:

@@ -160,10 +160,8 @@ def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -
 
     A folder of meshes is described by the content of its files, not by where it lies.
     """
-    # Only what was asked for: a dataset without it is described as it always was.
-    kept = [key for key in ("provenance", "keep_views") if cfg[key]]
     return {
-        **({"kept": kept} if kept else {}),
+        "kept": [key for key in ("provenance", "keep_views") if cfg[key]],
         "settings": settings(cfg),
         "objects": [_name_and_content(item) for item in items],
         "versions": {
@@ -185,8 +183,8 @@ def settings(cfg: DictConfig) -> dict[str, Any]:
         "seed": plain["seed"],
         "recipe": _with_content_of_poses(plain["recipe"]),
         "meshes": "folder" if plain["meshes"] else plain["catalogue"],
-        **({"colliders": "keep"} if plain["colliders"] == "keep" else {}),
-        **({"up": "y"} if plain["meshes"] and plain["up"] == "y" else {}),
+        "colliders": plain["colliders"],
+        "up": "y" if plain["up"] == "y" else "z",
     }
     if plain["renderer"]:
         chosen["renderer"] = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}

@@ -63,7 +63,7 @@ def test_meshes_with_y_up_stand_upright_and_are_those_with_z_up(made, up):
     np.testing.assert_allclose(data.points, straight.points, atol=1e-6)
     assert data.meta["config"]["up"] == data.meta["settings"]["up"] == "y"
     assert straight.meta["config"]["up"] == "z"
-    assert "up" not in straight.meta["settings"]  # as before there was the key: the same plan
+    assert straight.meta["settings"]["up"] == "z"
 
 
 def test_said_to_have_z_up_they_lie(made):

@@ -78,8 +78,8 @@ def surfaces_of(meta: dict[str, Any], meshes: Path | None = None) -> tuple[Surfa
         keys: dict[str, Any] = {
             key: config[key] for key in ("test_fraction", "half") if key in config
         }
-        keys["keep_colliders"] = settings.get("colliders") == "keep"
-        keys["up"] = settings.get("up", "z")
+        keys["keep_colliders"] = settings["colliders"] == "keep"
+        keys["up"] = settings["up"]
         keys["classes"] = config.get("classes") or None
         items = MeshFolder(path=meshes, **keys).items()
     elif isinstance(source, dict) and source.get("_target_") == _CATALOGUE:
