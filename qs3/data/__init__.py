@@ -1,1 +1,1 @@
-"""Datasets: the store on disk, the domains, the importers of published files, the datamodule."""
+"""Datasets: the store on disk, the domains, the importers of published files."""

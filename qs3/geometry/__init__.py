@@ -1,1 +1,1 @@
-"""Cameras, neighbours, sampling: pure functions that know nothing of the rest of qs3."""
+"""Cameras, neighbours, sampling: pure functions that know nothing of data or nets."""

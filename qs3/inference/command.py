@@ -178,7 +178,7 @@ def _clouds(settings: Settings) -> Callable[[Predictor], Inputs]:
     if archive and settings.up not in ("", "z"):
         raise ConfigError(f"up={settings.up}: in an archive of objects z points up")
     if settings.part and not archive:
-        raise ConfigError(f"part={settings.part}: {settings.input} is no archive of objects")
+        raise ConfigError(f"part={settings.part}: {settings.input} is not an archive of objects")
 
     def find(predictor: Predictor) -> Inputs:
         if archive:

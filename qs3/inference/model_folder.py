@@ -72,7 +72,7 @@ def _config(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(_bytes(path, _MAX_CONFIG).decode())
         if not isinstance(values, dict):
-            raise ValueError("it is no object")
+            raise ValueError("it is not a JSON object")
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is damaged: not JSON as it should be ({error})") from error
     return values

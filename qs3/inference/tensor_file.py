@@ -80,12 +80,12 @@ def read_tensors(data: bytes, path: Path) -> dict[str, Tensor]:
     if not 2 <= length <= min(_MAX_HEADER, len(data) - 8):
         raise DataError(
             f"{path} has {len(data)} bytes and names a header of {length}: cut off, damaged, or "
-            "no safetensors file"
+            "not a safetensors file"
         )
     try:
         header = json.loads(data[8 : 8 + length].decode(), object_pairs_hook=_once)
         if not isinstance(header, dict):
-            raise ValueError("it is no object")
+            raise ValueError("it is not a JSON object")
     except (ValueError, RecursionError) as error:
         raise DataError(
             f"{path} is damaged: its header is not as it should be ({error})"

@@ -1,1 +1,1 @@
-"""From runs to tables and pictures. Reads metrics.json and datasets; writes neither."""
+"""From runs to tables and pictures. Reads results and datasets, and makes none."""

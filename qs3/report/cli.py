@@ -184,7 +184,7 @@ def _pipeline(
     from qs3.report.figures.pipeline_figure import save_pipeline
 
     if (domain is None) == (dataset is None):
-        raise ConfigError("of what? domain=NAME scans an object, dataset=FOLDER reads one")
+        raise ConfigError("missing argument: domain=NAME scans an object, dataset=FOLDER reads one")
     if dataset is not None:
         if wrong := [*(["mesh="] if mesh else []), *more]:
             raise ConfigError(f"{wrong[0]} goes with domain=; with dataset= nothing is scanned")

@@ -1,4 +1,4 @@
-"""The schema of `metrics.json`: what a finished run reports. Training writes it, all else reads it.
+"""The schema of `metrics.json`: what a finished run reports. Training makes it, all else reads it.
 
 Shares and accuracies are in [0, 1]. A figure that does not exist is null: without labels of the
 target there is no accuracy, and of a net that has diverged there is no finite score.

@@ -18,13 +18,17 @@ optimiser's moments.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Int
 from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
 
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
@@ -32,8 +36,14 @@ from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import global_features, predict
 from qs3.models.norms import begin_target_norms
 from qs3.runs.checkpoints import copy_weights, load, save
+from qs3.runs.metrics import RoundRecord
 from qs3.runs.pseudo_labels import path_of, write_pseudo_labels
-from qs3.selftraining.selectors import TeacherPredictions, check_selection, keep_all
+from qs3.selftraining.selectors import (
+    Selection,
+    TeacherPredictions,
+    check_selection,
+    keep_all,
+)
 
 log = logging.getLogger(__name__)
 
@@ -103,8 +113,8 @@ class SelfTraining(Callback):
     ) -> None:
         self.folder, self.phases, self.scheme = folder, phases, scheme
         self.classes = tuple(classes)
-        self.records: list[dict[str, Any]] = []
-        self._previous: torch.Tensor | None = None  # [n] predicted labels of the round before
+        self.records: list[RoundRecord] = []
+        self._previous: Int[Tensor, " n"] | None = None  # [n] predicted labels of the round before
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """In the first epoch of a round: new optimiser state, and the weights to begin with."""
@@ -131,22 +141,10 @@ class SelfTraining(Callback):
         return None
 
     def _select(self, trainer: Trainer, pl_module: Classifier, round_: int) -> None:
+        """Label the target, choose, keep the table, and hand the next training set to the data."""
         data = trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(data, AdaptationData)
-        teacher = pl_module.net
-        if round_ == 0:  # the warm-up's selected weights, not its last ones
-            teacher = pl_module.fresh_net(phase=0).to(pl_module.device)
-            teacher.load_state_dict(load(self.folder / WARMUP_SELECTED, pl_module.device))
-        # One process predicts for all: batch norm's statistics differ between processes.
-        probabilities = trainer.strategy.broadcast(
-            predict(teacher, data.target.points, data.eval_batch_size, pl_module.device)
-        )
-        features = None
-        if getattr(self.scheme.selector, "needs_features", False):
-            features = trainer.strategy.broadcast(
-                global_features(teacher, data.target.points, data.eval_batch_size, pl_module.device)
-            )
-        said = TeacherPredictions.of(probabilities, data.target.ids, features)
+        said = self._predictions(trainer, pl_module, data, round_)
         theta = self.scheme.theta_of(round_, said.confidence)
         selection = self.scheme.selector.select(said, theta, round_)
         if selection.labels is not None:  # a selector may name another class than the most probable
@@ -170,47 +168,71 @@ class SelfTraining(Callback):
             data.set_pseudo_labels(index, labels[index])
         else:
             data.set_pseudo_labels(index, torch.from_numpy(selection.soft).float()[index])
-        by_class = {
-            name: {key: value.item() for key, value in zip(self.classes, values, strict=True)}
-            for name, values in (
-                ("mu", selection.mu),
-                ("confident", selection.confident),
-                ("selected", selection.kept),
-                ("thresholds", selection.thresholds),
-            )
-            if values is not None
-        }
-        same = None if self._previous is None else float((labels == self._previous).double().mean())
+        self.records.append(self._record(round_, selection, labels, missing))
         self._previous = labels
-        self.records.append(
-            {
-                "round": round_,
-                "theta": selection.theta,
-                **by_class,
-                "total_confident": int(selection.confident.sum()),
-                "total_selected": len(index),
-                "missing_classes": missing,
-                "agreement": same,
-            }
+        if trainer.is_global_zero:
+            _log(self.records[-1], len(labels))
+
+    def _predictions(
+        self, trainer: Trainer, pl_module: Classifier, data: AdaptationData, round_: int
+    ) -> TeacherPredictions:
+        """Of the warm-up's selected weights (not its last ones), later of the student."""
+        teacher = pl_module.net
+        if round_ == 0:
+            teacher = pl_module.fresh_net(phase=0).to(pl_module.device)
+            teacher.load_state_dict(load(self.folder / WARMUP_SELECTED, pl_module.device))
+        clouds = (data.target.points, data.eval_batch_size, pl_module.device)
+        # One process predicts for all: batch norm's statistics differ between processes.
+        probabilities = trainer.strategy.broadcast(predict(teacher, *clouds))
+        features = None
+        if getattr(self.scheme.selector, "needs_features", False):
+            features = trainer.strategy.broadcast(global_features(teacher, *clouds))
+        return TeacherPredictions.of(probabilities, data.target.ids, features)
+
+    def _record(
+        self, round_: int, selection: Selection, labels: Int[Tensor, " n"], missing: list[str]
+    ) -> RoundRecord:
+        def by_class(values: np.ndarray) -> dict[str, Any]:
+            return dict(zip(self.classes, values.tolist(), strict=True))
+
+        own, before = selection.thresholds, self._previous
+        return RoundRecord(
+            round=round_,
+            theta=selection.theta,
+            confident=by_class(selection.confident),
+            selected=by_class(selection.kept),
+            mu=by_class(selection.mu),
+            thresholds=None if own is None else by_class(own),
+            total_confident=int(selection.confident.sum()),
+            total_selected=int(selection.selected.sum()),
+            missing_classes=missing,
+            agreement=None if before is None else float((labels == before).double().mean()),
         )
-        if not trainer.is_global_zero:
-            return
-        log.info(
-            "round %d: theta %.3f, %d of %d target samples confident, %d selected%s",
-            round_,
-            selection.theta,
-            int(selection.confident.sum()),
-            len(labels),
-            len(index),
-            "" if same is None else f", {same:.1%} of all labels as in the round before",
-        )
-        if missing:
-            log.warning("round %d: no pseudo-label for %s", round_, ", ".join(missing))
 
     def state_dict(self) -> dict[str, Any]:
         """Records so far and the last labels; the selected set is the datamodule's state."""
-        return {"records": self.records, "previous": self._previous}
+        records = [dataclasses.asdict(record) for record in self.records]
+        return {"records": records, "previous": self._previous}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore `state_dict`."""
-        self.records, self._previous = list(state_dict["records"]), state_dict["previous"]
+        self.records = [RoundRecord(**record) for record in state_dict["records"]]
+        self._previous = state_dict["previous"]
+
+
+def _log(record: RoundRecord, clouds: int) -> None:
+    log.info(
+        "round %d: theta %.3f, %d of %d target samples confident, %d selected%s",
+        record.round,
+        record.theta,
+        record.total_confident,
+        clouds,
+        record.total_selected,
+        ""
+        if record.agreement is None
+        else f", {record.agreement:.1%} of all labels as in the round before",
+    )
+    if record.missing_classes:
+        log.warning(
+            "round %d: no pseudo-label for %s", record.round, ", ".join(record.missing_classes)
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -20,7 +21,6 @@ from qs3.runs.metrics import (
     EpochScores,
     Evaluated,
     Loading,
-    RoundRecord,
     RunMetrics,
     Selection,
     StudentChoice,
@@ -85,9 +85,9 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
             last=EpochScores(epoch=run.phases.warmup - 1, scores=outcome.scores["last"]),
         ),
         rounds=[
-            RoundRecord(
-                **record,
-                with_target_labels=evaluation.pseudo_labels(path_of(run.folder, record["round"])),
+            replace(
+                record,
+                with_target_labels=evaluation.pseudo_labels(path_of(run.folder, record.round)),
             )
             for record in built.rounds.records
         ],

@@ -122,7 +122,7 @@ def checked_mask(mask: np.ndarray, where: str) -> Int[np.ndarray, "h w"]:
     if count == 0:
         raise DataError(f"{where}: the mask marks no pixel")
     if count > MOST_OBJECTS:
-        raise DataError(f"{where}: {count} different numbers are no mask of objects")
+        raise DataError(f"{where}: {count} different numbers are not a mask of objects")
     return numbers
 
 
@@ -252,7 +252,7 @@ def _camera(values: list[float], where: str) -> Pinhole:
             values = [values[i] for i in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
         fx, skew, cx, zero, fy, cy, *last = values
         if skew or zero or last != [0, 0, 1]:
-            raise DataError(f"{where}: {values} is no matrix fx 0 cx, 0 fy cy, 0 0 1")
+            raise DataError(f"{where}: {values} is not a matrix fx 0 cx, 0 fy cy, 0 0 1")
         values = [fx, fy, cx, cy]
     if len(values) != 4:
         raise DataError(f"{where}: {len(values)} numbers; expected fx,fy,cx,cy or a 3 x 3 matrix")

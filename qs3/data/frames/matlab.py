@@ -43,7 +43,7 @@ def load_v5(path: Path) -> dict[str, Any]:
             "save it with -v7"
         ) from error
     except (MatReadError, ValueError, TypeError, KeyError, IndexError, OSError, EOFError) as error:
-        raise DataError(f"{path} is no readable MATLAB file ({error}); {AGAIN}") from error
+        raise DataError(f"{path} is not a readable MATLAB file ({error}); {AGAIN}") from error
     except (zlib.error, MemoryError, OverflowError, AttributeError) as error:
         raise DataError(f"{path} is damaged ({error}); {AGAIN}") from error
     return {key: value for key, value in found.items() if not key.startswith("__")}
@@ -97,11 +97,11 @@ def words(file: Any, name: str, path: Path) -> list[str]:
         text: Any = file[reference] if reference else None
         plain = isinstance(text, h5py.Dataset) and text.dtype.kind == "u"
         if not plain or text.size > _MOST_LETTERS or text.external or text.is_virtual:
-            raise DataError(f"{path}: {name}, number {i + 1}, is no text")
+            raise DataError(f"{path}: {name}, number {i + 1}, is not text")
         empty = text.attrs.get("MATLAB_empty", 0)  # its numbers are then the size, 0 by 0
         letters = [] if empty else text[...].ravel(order="F").tolist()
         try:
             found.append("".join(map(chr, letters)))
         except (ValueError, OverflowError) as error:
-            raise DataError(f"{path}: {name}, number {i + 1}, is no text") from error
+            raise DataError(f"{path}: {name}, number {i + 1}, is not text") from error
     return found

@@ -186,7 +186,7 @@ def _vertical(
         way = np.asarray(up, dtype=np.float64)
         length = float(np.linalg.norm(way))
         if way.shape != (3,) or not np.isfinite(length) or length < 1e-9:
-            raise DataError(f"up={list(up)} is no direction x,y,z in the camera's frame")
+            raise DataError(f"up={list(up)} is not a direction x,y,z in the camera's frame")
         tilt = angle_deg(way / length, CAMERA_UP)
         words = (
             f"up points {tilt:.0f}° away from up in the picture: is it where gravity pulls? In "
@@ -224,7 +224,7 @@ def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, i
     rows = max(int(np.floor(top)), 0), min(int(np.ceil(bottom)), height)
     columns = max(int(np.floor(left)), 0), min(int(np.ceil(right)), width)
     if rows[0] >= rows[1] or columns[0] >= columns[1]:
-        raise DataError(f"box={shown} lies beside the picture of {width} x {height} px")
+        raise DataError(f"box={shown} lies outside the image of {width} x {height} px")
     return *rows, *columns
 
 

@@ -1,4 +1,4 @@
-"""Published formats, read once into the store. One format, one file; none needs more than numpy.
+"""Published formats, read once into the store. One format, one file.
 
 An importer is a frozen dataclass (named by `_target_` in conf/domain) that knows where its files
 are and reads them to clouds and manifest rows. Clouds keep their published scale and order;

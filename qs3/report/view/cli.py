@@ -14,7 +14,7 @@ def _view(words: Sequence[str], **given: Any) -> int:
     from qs3.report.view.command import Settings, view_command
 
     if not words:
-        raise ConfigError("of what? qs3 view PATH (see qs3 view --help)")
+        raise ConfigError("missing argument: qs3 view PATH (see qs3 view --help)")
     said, failed = view_command(Settings(paths=tuple(words), **given))
     print(said)
     return 1 if failed else 0

@@ -120,7 +120,7 @@ def test_masks_of_all_kinds(tmp_path):
         (png(tmp_path / "f.png", np.ones((3, 3, 3), np.uint8)), "a picture in colours"),
         (npy(tmp_path / "g.npy", np.zeros((3, 3), int)), "marks no pixel"),
         (npy(tmp_path / "h.npy", np.ones((3, 3))), "whole numbers, one an object, or bool"),
-        (npy(tmp_path / "i.npy", np.arange(1600).reshape(40, 40)), "are no mask of objects"),
+        (npy(tmp_path / "i.npy", np.arange(1600).reshape(40, 40)), "are not a mask of objects"),
     ):
         with pytest.raises(DataError, match=message):
             read_mask(path)
@@ -182,7 +182,7 @@ def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, name, content,
         ("fx: 5\nfy: 5\n", "no cx, cy, and no matrix K"),
         ("1 2 3", "3 numbers; expected fx,fy,cx,cy"),
         ("0 5 5 5", "those of no camera"),
-        ("1 2 3 4 5 6 7 8 9", "is no matrix fx 0 cx"),
+        ("1 2 3 4 5 6 7 8 9", "is not a matrix fx 0 cx"),
         ("- 1\n- 2\n", "no fx, fy, cx, cy and no matrix K"),
         ("K: [[a, b]]", "not a readable file of intrinsics"),
         ("{", r"camera\.yaml is not readable"),

@@ -133,7 +133,7 @@ def test_damaged_tables(copy):
     path.write_bytes(whole[: len(whole) // 2])
     refused(copy, r"SUNRGBDMeta3DBB_v2\.mat")
     path.write_bytes(b"no table")
-    refused(copy, r"SUNRGBDMeta3DBB_v2\.mat.*no readable MATLAB")
+    refused(copy, r"SUNRGBDMeta3DBB_v2\.mat.*not a readable MATLAB")
 
 
 def test_a_box_that_is_none_costs_only_itself(copy):

@@ -140,7 +140,7 @@ def test_own_mesh(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "of what?"),
+        ([], "missing argument"),
         (["domain=nothing10"], "nothing10"),
         (["domain=depthscannet10"], "published, not generated"),
         (["domain=modelnet10", "object=chair/train/chair_9999"], "such as chair/"),

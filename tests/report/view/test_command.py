@@ -186,7 +186,7 @@ def test_runs_that_cannot_be_shown(view, run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "of what? qs3 view PATH"),
+        ([], "missing argument: qs3 view PATH"),
         (["nowhere"], "nowhere is not there: give a file or folder of clouds"),
         (["a.pdf"], "a.pdf: unknown format; known are .xyz"),
         (["."], ". holds no file of .xyz"),
