@@ -118,7 +118,8 @@ def chosen(root: Path, targets: dict[str, Any], names: list[str]) -> list[tuple[
                 if module in spec.get("except", []) or path.name == "__init__.py":
                     continue
                 first = f"tests/{path.parent.relative_to(root / 'qs3')}/test_{path.stem}.py"
-                order = [first] if (root / first).exists() else []
+                order = [test for test in tests if "*" not in test]
+                order += [first] if (root / first).exists() else []
                 for test in tests:
                     order += [str(p.relative_to(root)) for p in sorted(root.glob(test))]
                 found += [(m, list(dict.fromkeys(order))) for m in mutants(root, target, module)]
