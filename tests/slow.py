@@ -32,7 +32,7 @@ PATTERNS = (
     # Exports: one net in each format stays.
     r"inference/test_export\.py::test_onnxruntime_gives_the_net_s_logits\[(?!pointnet\])",
     r"inference/test_export\.py::test_torch_export_gives_the_net_s_logits\[(?!pointnet\])",
-    r"inference/test_export\.py::test_(the_command_and|the_example|one_cloud_to)",
+    r"inference/test_export\.py::test_(the_command_and|the_example)",
     r"test_notebooks\.py::test_0",
     r"test_experiments\.py::test_experiment_runs\[(?!qs3_s2d|supervised_d|own_scans)",
     r"data/inspection/test_measures\.py::test_inspect_says_and_saves",

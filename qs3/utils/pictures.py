@@ -8,11 +8,11 @@ from pathlib import Path
 from qs3.errors import DataError
 
 
-def check_picture(path: Path, most: int, key: str = "") -> None:
+def check_picture(path: Path, most: int) -> None:
     """Refuse a picture that cannot be opened, or of more than `most` pixels.
 
     Raises:
-        DataError: names the file, behind the `key` that gave it.
+        DataError: names the file.
     """
     from PIL import Image
 
@@ -24,6 +24,6 @@ def check_picture(path: Path, most: int, key: str = "") -> None:
     except Image.DecompressionBombError:
         width, height = most + 1, 1
     except Exception as error:  # of a dozen kinds, by format
-        raise DataError(f"{key}{path} is not an image, or damaged: {error}") from error
+        raise DataError(f"{path} is not an image, or damaged: {error}") from error
     if width * height > most:
-        raise DataError(f"{key}{path} has more than {most / 1e6:.3g} million pixels; refused")
+        raise DataError(f"{path} has more than {most / 1e6:.3g} million pixels; refused")
