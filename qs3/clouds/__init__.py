@@ -1,1 +1,1 @@
-"""Point clouds in files. Imports nothing of qs3 but its errors."""
+"""Point clouds in files. Nothing in them is trusted."""

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.clouds.files import read_npy
+from qs3.clouds.arrays import read_npy
 from qs3.data.frames.images import MAX_SIDE_PX, MOST_DEPTH_M, Pinhole
 from qs3.data.scannet.masks import png_header, read_png
 from qs3.errors import DataError, MissingDataError

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.clouds.files import printable
 from qs3.data.viewer import COLOURS, MOST_CLOUDS, MOST_IN_ALL, MOST_POINTS
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.orthographic import AZIMUTH_DEG, ELEVATION_DEG
+from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
 
 _USUAL = 50 * 2048  # points of a page, if nobody says how many
