@@ -47,7 +47,7 @@ def compose(command: str | None, words: Sequence[str]) -> DictConfig:
 
 
 def compose_domain(name: str, keys: Mapping[str, str]) -> Domain:
-    """What `qs3.data.inspection.open_dataset.compose_domain` makes of conf/domain/`name`.yaml."""
+    """What `qs3.data.domain.compose_domain` makes of conf/domain/`name`.yaml."""
     words = [f"{k if k.startswith('paths.') else f'domain.{k}'}={v}" for k, v in keys.items()]
     return build(compose(None, [f"+domain={name}", "+paths=default", *words]).domain)
 

@@ -4,7 +4,7 @@ import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from qs3.data.inspection import open_dataset
+from qs3.data import domain
 from tests.composing import by_hydra, compose, compose_domain
 from tests.generation.generating import QUICK
 from tests.training.toy import overrides
@@ -71,6 +71,6 @@ def test_what_hydra_refuses_is_refused(word):
 
 def test_a_domain_is_what_the_package_composes(tmp_path):
     keys = {"paths.data_dir": str(tmp_path), "path": str(tmp_path / "x"), "published.tiers": "[a]"}
-    ours, theirs = (made("nyuv2", keys) for made in (compose_domain, open_dataset.compose_domain))
+    ours, theirs = (made("nyuv2", keys) for made in (compose_domain, domain.compose_domain))
     assert ours == theirs
     assert ours.folder == tmp_path / "x"

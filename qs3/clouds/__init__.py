@@ -1,1 +1,1 @@
-"""Point clouds in files. Used by whatever reads or writes clouds; knows of no dataset."""
+"""Point clouds in files. Nothing in them is trusted."""

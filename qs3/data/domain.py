@@ -13,6 +13,7 @@ from typing import Any
 
 from qs3.classes import class_list
 from qs3.config.checks import check_choice, check_float
+from qs3.config.compose import choices, composed
 from qs3.config.location import typed
 from qs3.data.importers import Importer, import_into
 from qs3.data.made_of import MadeOf
@@ -295,3 +296,26 @@ def check_all(*domains: Domain) -> None:
             problems.append(str(error))
     if problems:
         raise MissingDataError("\n\n".join(problems))
+
+
+def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
+    """conf/domain/NAME.yaml with changes, instantiated.
+
+    Raises:
+        ConfigError: there is no such domain, or no such key.
+    """
+    known = choices("domain")
+    if name not in known:
+        raise ConfigError(
+            f"domain={name} is unknown; there are {', '.join(known)}, or give the folder of a "
+            "dataset (with a / in it)"
+        )
+    words = [
+        f"{key if key.startswith('paths.') else f'domain.{key}'}={value}"
+        for key, value in overrides.items()
+    ]
+    from qs3.config.hydra import build
+
+    cfg = composed(None, f"+domain={name}", "+paths=default", *words, place=f"domain={name}: ")
+    domain: Domain = build(cfg.domain)
+    return domain

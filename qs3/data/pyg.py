@@ -24,7 +24,7 @@ from torch import Tensor
 from torch_geometric.data import Data, Dataset, InMemoryDataset
 
 from qs3.classes import class_list
-from qs3.data.domain import Domain
+from qs3.data.domain import Domain, compose_domain
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.data.store import PointSet, is_begun, is_finished, write_pointset
@@ -75,8 +75,6 @@ def to_pyg(
         MissingDataError, DataError, ConfigError: as `Domain.open`; or there is no such split.
     """
     if isinstance(source, str):
-        from qs3.data.inspection.open_dataset import compose_domain
-
         source = compose_domain(source, {})
     clouds = source.open() if isinstance(source, Domain) else source
     return Clouds(clouds.split(split) if split else clouds, transform)

@@ -17,8 +17,7 @@ from typing import Any, ClassVar
 from lightning.pytorch import LightningDataModule
 
 from qs3.config.checks import check_choice
-from qs3.data.domain import Domain
-from qs3.data.inspection.open_dataset import compose_domain
+from qs3.data.domain import Domain, compose_domain
 from qs3.data.store import PointSet
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of

@@ -7,7 +7,7 @@ else training would see the validation shapes.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -19,7 +19,6 @@ from qs3.utils.seeding import derive
 STRATIFIED_SEED = 0
 STRATIFIED_SHARE = 0.2  # of each class's objects, as large as the lineage's part
 
-Rule = Callable[[Sequence[str], np.ndarray], tuple[np.ndarray, np.ndarray]]
 _FURTHER_SCAN = re.compile(r"~\d+$")
 
 

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
-from qs3.clouds.files import SUFFIXES, measured, parse_clouds, printable
+from qs3.clouds.files import SUFFIXES, parse_clouds
+from qs3.clouds.finite import measured
 from qs3.data.frames.cutting import Piece, faults
 from qs3.data.frames.given import check_intrinsics, read_depth, read_intrinsics, read_mask
 from qs3.data.frames.pointed import RULES, Caution, Pointed, point_out
@@ -25,6 +26,7 @@ from qs3.data.importers.object_archive import Archive, read_archive
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.inference.depth_list import Shown
 from qs3.inference.table import Row
+from qs3.utils.text_table import printable
 
 Z = "z"
 _KEY = "xyz_tenth_mm.npy"  # of an archive of cut objects

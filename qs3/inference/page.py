@@ -6,10 +6,9 @@ before the others; without, what is in doubt.
 
 from __future__ import annotations
 
-import base64
 import heapq
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
@@ -19,6 +18,7 @@ from qs3.inference.inputs import Sample
 from qs3.inference.scores import STRANGE, Count, Scores, kinds, right, scores
 from qs3.inference.table import Row
 from qs3.inference.thumbnails import cloud_png, depth_png
+from qs3.utils import html
 from qs3.utils.version import VERSION
 
 MOST_SHOWN = 300
@@ -103,7 +103,7 @@ def page(title: str, rows: Sequence[Row], gallery: Gallery, classes: Sequence[st
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
-    parts = [f"<h1>{escape(title)}</h1>", *_head(found, rows, failed, classes)]
+    parts = _head(found, rows, failed, classes)
     if found:
         parts.append(f'<div class="side">{_why(found)}{_matrix(found, classes)}</div>')
     shown = gallery.shown()
@@ -122,17 +122,9 @@ def page(title: str, rows: Sequence[Row], gallery: Gallery, classes: Sequence[st
             parts.append(f'<div class="cards">{"".join(cards)}</div>')
     if failed:
         parts.append(f"<h2>Not predicted: {len(failed)}</h2>")
-        parts.append(_table([[row.file, row.reason] for row in failed[:MOST_SHOWN]]))
+        parts.append(html.table([[row.file, row.reason] for row in failed[:MOST_SHOWN]]))
     parts.append(f'<p class="soft">qs3 {escape(VERSION)}</p>')
-    return "\n".join(
-        [
-            '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{escape(title)}</title><style>{_STYLE}</style></head><body>",
-            *parts,
-            "</body></html>\n",
-        ]
-    )
+    return html.document(title, _STYLE, parts)
 
 
 def _head(
@@ -160,7 +152,7 @@ def _head(
     if found.unknown:
         words = ", ".join(f"{escape(name)} {n}" for name, n in sorted(found.unknown.items()))
         parts.append(
-            f'<p class="soft">Labels that are no class of the net, not counted: {words}</p>'
+            f'<p class="soft">Labels that are not classes of the net, not counted: {words}</p>'
         )
     if found.unlabelled:
         parts.append(f'<p class="soft">Without a label, not counted: {found.unlabelled}</p>')
@@ -197,7 +189,7 @@ def _why(found: Scores) -> str:
         return ""
     lines = [["", "right with it", "right without"]]
     lines += [[kind, _of(has), _of(lacks)] for kind, (has, lacks) in found.kinds.items()]
-    return f"<div><h2>What was wrong with the clouds</h2>{_table(lines, head=True)}</div>"
+    return f"<div><h2>What was wrong with the clouds</h2>{html.table(lines, head='row')}</div>"
 
 
 def _matrix(found: Scores, classes: Sequence[str]) -> str:
@@ -228,9 +220,9 @@ def _card(row: Row, sample: Sample, classes: Sequence[str]) -> str:
     best, sure = classes[order[0]], float(row.probabilities[order[0]])
     correct = right(row, classes)
     style = {True: "right", False: "wrong", None: ""}[correct]
-    images = [_image(cloud_png(_z_up(sample)), "cloud")]
+    images = [html.image(cloud_png(_z_up(sample)), "cloud")]
     if sample.picture:
-        images.append(_image(depth_png(*sample.picture), "depth image"))
+        images.append(html.image(depth_png(*sample.picture), "depth image"))
     is_ = f" is {escape(row.label)}" if row.label and not correct else ""
     if row.label and row.label not in classes:
         is_ += " (no class of the net)"
@@ -265,16 +257,3 @@ def _z_up(sample: Sample) -> np.ndarray:
     from qs3.data.importers.base import turned
 
     return turned(np.asarray(sample.cloud, dtype=np.float64)[:, :3], sample.axis)
-
-
-def _image(png: bytes, words: str) -> str:
-    data = base64.b64encode(png).decode("ascii")
-    return f'<img alt="{words}" src="data:image/png;base64,{data}">'
-
-
-def _table(rows: Iterable[Sequence[str]], *, head: bool = False) -> str:
-    lines = []
-    for number, row in enumerate(rows):
-        kind = "th" if head and number == 0 else "td"
-        lines.append(f"<tr>{''.join(f'<{kind}>{escape(cell)}</{kind}>' for cell in row)}</tr>")
-    return f"<table>{''.join(lines)}</table>"

@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.clouds.files import checked
+from qs3.clouds.finite import checked
 from qs3.config.checks import check_float
 from qs3.data.frames.given import Intrinsics, check_intrinsics
 from qs3.data.frames.images import Pinhole

@@ -206,22 +206,17 @@ class _Pooled:
 
 
 @torch.no_grad()
-def adapt_batchnorm(
-    net: nn.Module, batches: Iterable[Tensor], *, exact: bool = False
-) -> list[nn.Module]:
+def adapt_batchnorm(net: nn.Module, batches: Iterable[Tensor]) -> list[nn.Module]:
     """AdaBN: give every batch norm the statistics of these clouds (Li et al., 2016, alg. 1).
 
-    No weight changes. Means and variances are pooled over all batches: neither the order of the
-    batches nor a smaller last one matters, and nothing is left of the former statistics.
+    No weight changes. One pass, in which a layer's input was normalised with the statistics of its
+    own batch. Means and variances are pooled over all batches: neither the order of the batches nor
+    a smaller last one matters, and nothing is left of the former statistics.
 
     Args:
         net: takes a batch of clouds. Of domain-specific norms those of the current domain are
             re-estimated: call it inside `use_domain(net, "target")`.
-        batches: of clouds [B, N, 3], of at least two each; gone through several times if `exact`.
-        exact: one norm after the other, in the order in which the net holds them, each after all
-            before it are adapted: then each holds mean and unbiased variance of what it is given in
-            eval over all clouds, for as many passes as there are norms. Otherwise one pass, in
-            which a layer's input was normalised with the statistics of its own batch.
+        batches: of clouds [B, N, 3], of at least two each.
 
     Returns:
         The adapted norms.
@@ -234,11 +229,10 @@ def adapt_batchnorm(
     modes = {module: module.training for module in net.modules()}
     momenta = [norm.momentum for norm in norms]
     try:
-        for group in [[norm] for norm in norms] if exact else [norms]:
-            net.eval()  # no dropout, and nothing else that is left to chance
-            for norm in group:
-                norm.training, norm.momentum = True, 1.0
-            _estimate(net, group, batches)
+        net.eval()  # no dropout, and nothing else that is left to chance
+        for norm in norms:
+            norm.training, norm.momentum = True, 1.0
+        _estimate(net, norms, batches)
     finally:
         for norm, momentum in zip(norms, momenta, strict=True):
             norm.momentum = momentum

@@ -1,18 +1,27 @@
-"""How large a picture is, by its header alone: unpacked, 91 bytes can be gigabytes."""
+"""Pictures whose size is judged by the header alone: unpacked, 91 bytes can be gigabytes."""
 
 from __future__ import annotations
 
+import struct
 import warnings
 from pathlib import Path
 
+import numpy as np
+
 from qs3.errors import DataError
 
+MAX_PNG_BYTES = 1 << 26
+_MAX_SIDE_PX = 4096  # of a PNG
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_HEADER = struct.Struct(">8sI4sIIBBBBB")
+_GREY = 0
 
-def check_picture(path: Path, most: int, key: str = "") -> None:
+
+def check_picture(path: Path, most: int) -> None:
     """Refuse a picture that cannot be opened, or of more than `most` pixels.
 
     Raises:
-        DataError: names the file, behind the `key` that gave it.
+        DataError: names the file.
     """
     from PIL import Image
 
@@ -24,6 +33,47 @@ def check_picture(path: Path, most: int, key: str = "") -> None:
     except Image.DecompressionBombError:
         width, height = most + 1, 1
     except Exception as error:  # of a dozen kinds, by format
-        raise DataError(f"{key}{path} is not an image, or damaged: {error}") from error
+        raise DataError(f"{path} is not an image, or damaged: {error}") from error
     if width * height > most:
-        raise DataError(f"{key}{path} has more than {most / 1e6:.3g} million pixels; refused")
+        raise DataError(f"{path} has more than {most / 1e6:.3g} million pixels; refused")
+
+
+def read_png(data: bytes, where: str) -> np.ndarray:
+    """[h, w] uint8 or uint16 from a grey PNG, its size judged before it is unpacked.
+
+    Raises:
+        DataError: another kind of picture, too large, or damaged; begins with `where`.
+    """
+    width, height, bits, colour = png_header(data, where)
+    if colour != _GREY or bits not in (8, 16):
+        raise DataError(f"{where}: expected grey with 8 or 16 bits, not type {colour}, {bits}")
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise DataError(f"{where}: the PNG cannot be read ({error})") from error
+    dtype = np.uint8 if bits == 8 else np.uint16
+    if image is None or image.shape != (height, width) or image.dtype != dtype:
+        raise DataError(f"{where}: the PNG cannot be read")
+    return image
+
+
+def png_header(data: bytes, where: str) -> tuple[int, int, int, int]:
+    """Width, height, bits and type of colour (0 grey, 2 RGB, 3 palette, 4 and 6 with alpha).
+
+    Raises:
+        DataError: no PNG, a broken one, or one with a side of more than 4096 px or none.
+    """
+    if len(data) > MAX_PNG_BYTES:
+        raise DataError(f"{where}: the PNG has more than {MAX_PNG_BYTES} bytes; refused")
+    if len(data) < _HEADER.size:
+        raise DataError(f"{where}: {len(data)} bytes are not PNG")
+    signature, length, kind, width, height, bits, colour, *_ = _HEADER.unpack_from(data)
+    if signature != _SIGNATURE or kind != b"IHDR" or length != 13:
+        raise DataError(f"{where}: not a PNG")
+    if not (1 <= width <= _MAX_SIDE_PX and 1 <= height <= _MAX_SIDE_PX):
+        raise DataError(f"{where}: a PNG of {width} x {height} px; refused")
+    if not data.endswith(b"IEND\xaeB`\x82"):
+        raise DataError(f"{where}: the PNG is broken off")
+    return width, height, bits, colour

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from qs3.clouds.files import SUFFIXES, parse_clouds, read_cloud
+from qs3.clouds.files import SUFFIXES, parse_cloud, parse_clouds
 from qs3.errors import ConfigError, DataError
 from tests.limits import memory_of_at_most, time_of_at_most
 
@@ -198,4 +198,4 @@ def test_the_limit_is_a_setting(tmp_path, monkeypatch):
 def test_decimal_commas(text, expected, tmp_path):
     path = tmp_path / "a.txt"
     path.write_text(text)
-    np.testing.assert_array_equal(read_cloud(path), np.float32(expected))
+    np.testing.assert_array_equal(parse_cloud(path), expected)

@@ -18,10 +18,10 @@ from qs3.data.inspection.gravity import (
     judge_set,
     turned,
 )
-from qs3.data.inspection.upright import learnt, seen_from_above, upright_examples
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.catalogue import Catalogue
 from tests.fixtures import published as fixtures
+from tests.fixtures.upright import learnt, seen_from_above, upright_examples
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "modelnet10_points.npz"
 SYMMETRIC = {"cabinet"}  # the fixtures' is a box with a small knob: it has no sign of up

@@ -79,7 +79,7 @@ def test_ours_to_pyg_and_back_bit_for_bit(ours, tmp_path):
 
 def test_a_domain_by_its_name(ours, monkeypatch, tmp_path):
     monkeypatch.setattr(
-        "qs3.data.inspection.open_dataset.compose_domain",
+        "qs3.data.pyg.compose_domain",
         lambda name, overrides: {"mine": domain(tmp_path / "ours")}[name],
     )
     assert len(to_pyg("mine")) == 12

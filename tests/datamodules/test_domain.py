@@ -11,8 +11,7 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
-from qs3.data.domain import Domain
-from qs3.data.inspection.open_dataset import compose_domain
+from qs3.data.domain import Domain, compose_domain
 from qs3.data.store import PointSet, open_pointset
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment

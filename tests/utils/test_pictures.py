@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 import zlib
 
 import cv2
@@ -11,8 +12,7 @@ import pytest
 
 from qs3.errors import DataError
 from qs3.sensors.fit.frames import _png
-from qs3.sensors.optics.patterns import PictureSlide
-from qs3.utils.pictures import check_picture
+from qs3.utils.pictures import check_picture, read_png
 from tests.limits import memory_of_at_most
 
 
@@ -29,14 +29,17 @@ def tiny_png(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + data
 
 
+def png(*shape: int) -> bytes:
+    return cv2.imencode(".png", np.zeros(shape, np.uint8))[1].tobytes()
+
+
 @pytest.mark.parametrize("side", [9_000, 12_000, 30_000, 100_000])
 def test_a_small_file_of_a_large_picture_is_refused(side, tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(tiny_png(side, side))
-    for read in (_png, lambda path: PictureSlide(str(path)).slide):
-        refused = pytest.raises(DataError, match=r"a\.png has more than 6\d.* million pixels")
-        with memory_of_at_most(1 << 27), refused:
-            read(path)
+    refused = pytest.raises(DataError, match=r"a\.png has more than 6\d.* million pixels")
+    with memory_of_at_most(1 << 27), refused:
+        _png(path)
 
 
 def test_pictures_of_a_usual_size_are_let_through(tmp_path):
@@ -45,3 +48,28 @@ def test_pictures_of_a_usual_size_are_let_through(tmp_path):
         check_picture(tmp_path / name, 600)
         with pytest.raises(DataError, match=r"more than 0\.000599 million"):
             check_picture(tmp_path / name, 599)
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (0, 5), (2**31 - 1, 1), (4097, 2)])
+def test_a_picture_too_large_is_refused_by_its_header(size):
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"here: a PNG of \d+ x \d+ px; refused"):
+            read_png(tiny_png(*size), "here")
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "are not PNG"),
+        (b"GIF89a" + bytes(100), "not a PNG"),
+        (png(4, 4, 3), "grey with 8 or 16 bits"),
+        (png(4, 4)[:-5], "broken off"),
+    ],
+)
+def test_what_is_no_grey_png_is_refused(data, message):
+    with pytest.raises(DataError, match=f"here: .*{message}"):
+        read_png(data, "here")

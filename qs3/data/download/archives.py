@@ -16,9 +16,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple
 
-from tqdm import tqdm
-
 from qs3.errors import DataError, Qs3Error
+from qs3.utils.progress import shown
 from qs3.utils.tars import DAMAGE, members_of, open_tar
 
 MAX_MEMBERS = 2_000_000
@@ -55,7 +54,7 @@ def unpack(archive: Path, into: Path) -> list[str]:
     members = _zip_members if zipfile.is_zipfile(archive) else _tar_members
     try:
         into.mkdir(parents=True)
-        for count, member in enumerate(tqdm(members(archive), archive.name, disable=None)):
+        for count, member in enumerate(shown(members(archive), archive.name)):
             where = f"{archive}, member {member.name!r}"
             path = _safe_path(member.name, where)
             if not member.plain:

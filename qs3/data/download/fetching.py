@@ -16,11 +16,11 @@ from typing import Any, ClassVar
 
 import pooch
 import requests
-from tqdm import tqdm
 
 from qs3.errors import Qs3Error
 from qs3.utils.files import write_json
 from qs3.utils.locks import locked
+from qs3.utils.progress import byte_bar
 
 log = logging.getLogger(__name__)
 
@@ -154,14 +154,13 @@ class Resuming:
             raise DownloadError(f"{url}: {wrong}", url)
 
     def _write(self, answer: requests.Response, start: int, total: int | None) -> None:
-        shown: dict[str, Any] = {"unit": "B", "unit_scale": True, "disable": None}  # no terminal
-        bar = tqdm(desc=self.part.stem, total=total, initial=start, **shown)
-        with bar, open(self.part, "r+b" if start else "wb") as file:
+        bar = byte_bar(self.part.stem, total, start)
+        with bar as advance, open(self.part, "r+b" if start else "wb") as file:
             file.seek(start)
             for chunk in answer.iter_content(_CHUNK):
                 file.write(chunk)
                 file.flush()
-                bar.update(len(chunk))
+                advance(len(chunk))
             done = file.tell()
         if total is not None and done != total:
             raise requests.ConnectionError(f"the connection ended after {done} of {total} bytes")

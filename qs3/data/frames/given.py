@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.clouds.files import read_npy
+from qs3.clouds.arrays import read_npy
 from qs3.data.frames.images import MAX_SIDE_PX, MOST_DEPTH_M, Pinhole
-from qs3.data.scannet.masks import png_header, read_png
 from qs3.errors import DataError, MissingDataError
+from qs3.utils.pictures import png_header, read_png
 from qs3.utils.yamls import check_yaml
 
 MILLIMETRE = 1e-3

@@ -73,7 +73,7 @@ def own_array(file: Any, name: str, path: Path) -> Any:
     Raises:
         DataError: there is none, or it lies elsewhere.
     """
-    from qs3.clouds.files import own_dataset
+    from qs3.clouds.hdf5 import own_dataset
 
     found = own_dataset(file, (name,), path)
     if found is None:

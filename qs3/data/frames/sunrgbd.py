@@ -31,8 +31,8 @@ import numpy as np
 from qs3.data.frames.cutting import Box
 from qs3.data.frames.images import DepthImage, Pinhole
 from qs3.data.frames.matlab import listed, load_v5, variable
-from qs3.data.scannet.masks import read_png
 from qs3.errors import DataError
+from qs3.utils.pictures import read_png
 
 META = "SUNRGBDMeta3DBB_v2.mat"
 SPLITS = "SUNRGBDtoolbox/traintestSUNRGBD/allsplit.mat"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.files import read_npz
+from qs3.clouds.arrays import read_npz
 from qs3.data.importers.base import Importer, Item, by_class, class_of, cloud_id, split_of
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow

@@ -26,15 +26,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from qs3.classes import known_as
-from qs3.clouds.files import (
-    SUFFIXES,
-    CloudFile,
-    checked,
-    measured,
-    npy_clouds,
-    parse_clouds,
-    split_prefix,
-)
+from qs3.clouds.files import SUFFIXES, CloudFile, npy_clouds, parse_clouds
+from qs3.clouds.finite import checked, measured
 from qs3.config.checks import check_choice, check_int
 from qs3.data.importers.base import (
     UP_AXES,
@@ -56,6 +49,7 @@ log = logging.getLogger(__name__)
 
 LAYOUTS = ("auto", "class/split", "split/class", "class", "none")
 _SPLIT_NAMES = ("train", "test", "val", "validation")
+_SPLIT_PREFIX = re.compile(rf"({'|'.join(_SPLIT_NAMES)})(?![a-z])", re.IGNORECASE)  # train_0.h5
 _MANY = (".npy", ".npz", ".h5", ".hdf5")
 _ENDS = tuple(suffix.encode() for suffix in SUFFIXES)
 _NUMBER = re.compile(r"\[\d+\]$")  # of the cloud in its file, at the end of an origin
@@ -209,8 +203,8 @@ class CloudFolder(Importer):
         except DataError as error:
             row = ManifestRow(cloud_id(cls, split, stem), cls, split, origin=origin)
             return [Item(row, str(path), functools.partial(_raise, error))]
-        if not cls and (prefix := split_prefix(path.stem)) and many:
-            split = split_of(prefix, path)
+        if not cls and (prefix := _SPLIT_PREFIX.match(path.stem)) and many:
+            split = split_of(prefix[1].lower(), path)
         found = []
         for i in range(number):
             where = f"{path}, cloud {i}" if many else str(path)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.files import own_dataset
+from qs3.clouds.hdf5 import own_dataset
 from qs3.data.importers.base import Importer, Item, cloud_id, inside, turned
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow

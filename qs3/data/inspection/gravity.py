@@ -5,7 +5,7 @@ from bottom to top hold. A ridge regression per class learns from shapes that ar
 upright which of the six descriptions is the right one. The descriptions do not change when the
 object turns about the vertical axis, and half of the shapes to learn from are seen from above
 only and noisy, so scans can be judged as well. What was learnt from the embedded catalogue lies
-beside this file; `qs3.data.inspection.upright` made it.
+beside this file; `tests/fixtures/upright.py` made it.
 
 Objects that lie and were then turned about z, each by its own angle, as meshes with y up are when
 they are scanned as they stand, have no axis in common that could be found. So each cloud is also
@@ -171,7 +171,7 @@ def judge_set(
 
 @cache
 def catalogue_model() -> UpModel:
-    """The model of the embedded catalogue, as `qs3.data.inspection.upright` learnt it."""
+    """The model of the embedded catalogue, as `tests/fixtures/upright.py` learnt it."""
     found = json.loads(LEARNT.read_text())
     parts = {part: {cls: np.array(of[part]) for cls, of in found.items()} for part in _PARTS}
     return UpModel(**parts)

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from qs3.config.compose import choices, composed
-from qs3.data.domain import Domain
+from qs3.data.domain import Domain, compose_domain
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow, read_manifest
 from qs3.data.store import PointSet, is_finished, open_pointset
@@ -75,26 +74,3 @@ def opened_domain(domain: Domain, data: PointSet) -> Opened:
     rows = tuple(read_manifest(domain.folder, data.classes))
     where = (domain.name, domain.label, domain.folder, domain.variant)
     return Opened(*where, data, rows, domain.made_of(data), unit)
-
-
-def compose_domain(name: str, overrides: Mapping[str, str]) -> Domain:
-    """conf/domain/NAME.yaml with changes, instantiated.
-
-    Raises:
-        ConfigError: there is no such domain, or no such key.
-    """
-    known = choices("domain")
-    if name not in known:
-        raise ConfigError(
-            f"domain={name} is unknown; there are {', '.join(known)}, or give the folder of a "
-            "dataset (with a / in it)"
-        )
-    words = [
-        f"{key if key.startswith('paths.') else f'domain.{key}'}={value}"
-        for key, value in overrides.items()
-    ]
-    from qs3.config.hydra import build
-
-    cfg = composed(None, f"+domain={name}", "+paths=default", *words, place=f"domain={name}: ")
-    domain: Domain = build(cfg.domain)
-    return domain

@@ -16,19 +16,14 @@ import zipfile
 import zlib
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from qs3.data.scannet.sens import MAX_SIDE_PX
 from qs3.errors import DataError
+from qs3.utils.pictures import MAX_PNG_BYTES, read_png
 
 INSTANCES, LABELS = "instance-filt", "label-filt"
 
 _MAX_MEMBERS = 1_000_000
-_MAX_PNG_BYTES = 1 << 26
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_HEADER = struct.Struct(">8sI4sIIBBBBB")
-_GREY = 0
 _BROKEN = (
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error,
     OSError, EOFError, NotImplementedError, RuntimeError, ValueError, OverflowError,
@@ -75,7 +70,7 @@ class MaskArchive:
             raise DataError(f"{where}: there is no mask")
         try:
             with self._zip.open(member) as file:
-                data = file.read(_MAX_PNG_BYTES + 1)  # whatever size the zip claims
+                data = file.read(MAX_PNG_BYTES + 1)  # whatever size the zip claims
         except _BROKEN as error:
             raise DataError(f"{where} cannot be unpacked ({error})") from error
         return read_png(data, where)
@@ -94,42 +89,3 @@ class MaskArchive:
         if not found:
             raise DataError(f"{self.path} holds no {folder}/<frame>.png")
         return found
-
-
-def read_png(data: bytes, where: str) -> np.ndarray:
-    """[h, w] uint8 or uint16 from a grey PNG, its size judged before it is unpacked.
-
-    Raises:
-        DataError: another kind of picture, too large, or damaged; begins with `where`.
-    """
-    width, height, bits, colour = png_header(data, where)
-    if colour != _GREY or bits not in (8, 16):
-        raise DataError(f"{where}: expected grey with 8 or 16 bits, not type {colour}, {bits}")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(f"{where}: the PNG cannot be read ({error})") from error
-    dtype = np.uint8 if bits == 8 else np.uint16
-    if image is None or image.shape != (height, width) or image.dtype != dtype:
-        raise DataError(f"{where}: the PNG cannot be read")
-    return image
-
-
-def png_header(data: bytes, where: str) -> tuple[int, int, int, int]:
-    """Width, height, bits and type of colour (0 grey, 2 RGB, 3 palette, 4 and 6 with alpha).
-
-    Raises:
-        DataError: no PNG, a broken one, or one with a side of more than 4096 px or none.
-    """
-    if len(data) > _MAX_PNG_BYTES:
-        raise DataError(f"{where}: the PNG has more than {_MAX_PNG_BYTES} bytes; refused")
-    if len(data) < _HEADER.size:
-        raise DataError(f"{where}: {len(data)} bytes are not PNG")
-    signature, length, kind, width, height, bits, colour, *_ = _HEADER.unpack_from(data)
-    if signature != _SIGNATURE or kind != b"IHDR" or length != 13:
-        raise DataError(f"{where}: not a PNG")
-    if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
-        raise DataError(f"{where}: a PNG of {width} x {height} px; refused")
-    if not data.endswith(b"IEND\xaeB`\x82"):
-        raise DataError(f"{where}: the PNG is broken off")
-    return width, height, bits, colour

@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.clouds.files import printable
 from qs3.data.viewer import COLOURS, MOST_CLOUDS, MOST_IN_ALL, MOST_POINTS
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.orthographic import AZIMUTH_DEG, ELEVATION_DEG
+from qs3.utils import html
+from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
 
 _USUAL = 50 * 2048  # points of a page, if nobody says how many
@@ -179,20 +180,15 @@ def page(title: str, parts: Sequence[Part], *, colour: str = "", points: int | N
     here = Path(__file__).parent
     script, style = ((here / f"viewer.{kind}").read_text("utf-8") for kind in ("js", "css"))
     lines = [
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{_policy(script, style)}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{_text(title)}</title><style>{style}</style></head><body>",
-        f"<h1>{_text(title)}</h1>",
         *(f'<p class="soft">{_text(line)}</p>' for line in about),
         *(f'<p class="note">{_text(line)}</p>' for line in notes),
         "<noscript><p>Clouds are drawn by JavaScript, which is off here.</p></noscript>",
         _BAR,
         f'<div id="grid"></div><p class="soft">qs3 {escape(VERSION)}</p>',
         f'<script type="application/json" id="clouds">{text}</script>',
-        f"<script>{script}</script></body></html>\n",
+        f"<script>{script}</script>",
     ]
-    return "\n".join(lines)
+    return html.document(printable(title), style, lines, policy=_policy(script, style))
 
 
 def _text(words: str) -> str:

@@ -3,12 +3,10 @@ r"""A share of right predictions with its interval: over seeds, and over blocks 
 Objects of one room are not independent: same furniture, same light, same distance. The share
 p = Σ_{s,i} w_i a_{s,i} / S (a is 1 if the run of seed s is right about object i; w_i is 1/n, or
 1/(C n_class) for balanced accuracy, C the classes that are there) therefore gets the variance of
-errors clustered by block and by seed (Cameron, Gelbach, Miller, J. Business & Economic Statistics
-2011, eq. 2.11), as differences do in `qs3.report.tables.paired`. What an object adds is its error
+errors clustered by block and by seed (`qs3.report.clustered`). What an object adds is its error
 about the mean, for balanced accuracy about the recall of its class.
 
-A half width is t(S - 1)² V_seeds + t(M - 1)² max(0, V_blocks - V_both) under the root, with
-Student's quantiles; of one seed V_blocks alone. It is no wider than [0, 1]. A class that was seen
+Of one seed the interval is over blocks alone. It is no wider than [0, 1]. A class that was seen
 in one block alone adds nothing to the variance of balanced accuracy, although nobody knows how it
 varies from room to room: with such classes that interval is too narrow.
 """
@@ -20,9 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import t as student_t
 
-LEVEL = 0.95
+from qs3.report.clustered import t2, variances, weights
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class Share:
     Attributes:
         mean: over seeds.
         sem: standard error over seeds; None for one.
-        low, high: its interval at `LEVEL`; None with a single block.
+        low, high: its interval at `clustered.LEVEL`; None with a single block.
     """
 
     mean: float
@@ -91,36 +88,19 @@ def _over(
 ) -> Share:
     """The weighted mean of each seed's and object's value, with its interval within `ends`."""
     seeds, n = values.shape
-    _, kind, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    weight = weights(labels, balanced)
+    expected = np.full(n, values.mean())
     if balanced:
-        weights = 1 / (len(counts) * counts[kind])
+        _, kind, counts = np.unique(labels, return_inverse=True, return_counts=True)
         expected = (np.bincount(kind, values.mean(axis=0)) / counts)[kind]
-    else:
-        weights = np.full(n, 1 / n)
-        expected = np.full(n, values.mean())
-    each = values @ weights
+    each = values @ weight
     mean = float(each.mean())
     sem = float(each.std(ddof=1) / math.sqrt(seeds)) if seeds > 1 else None
     _, block = np.unique(blocks, return_inverse=True)
     m = int(block.max()) + 1
     if m < 2:
         return Share(mean, sem, None, None)
-    cells = np.zeros((seeds, m))  # what each seed and block adds to the mean beyond its share
-    np.add.at(cells.T, block, ((values - expected) * weights).T)
-    cells /= seeds
-    half2 = _t2(m) * _variance(cells.sum(axis=0))
-    if seeds > 1:
-        of_blocks = max(0.0, _variance(cells.sum(axis=0)) - float((cells**2).sum()))
-        half2 = _t2(seeds) * _variance(cells.sum(axis=1)) + _t2(m) * of_blocks
+    of_seeds, of_blocks = variances((values - expected) * weight, block)
+    half2 = t2(m) * of_blocks + (t2(seeds) * of_seeds if seeds > 1 else 0.0)
     half = math.sqrt(half2)
     return Share(mean, sem, max(ends[0], mean - half), min(ends[1], mean + half))
-
-
-def _t2(clusters: int) -> float:
-    """Square of Student's quantile for the mean of so many clusters."""
-    return float(student_t.ppf(0.5 + LEVEL / 2, clusters - 1)) ** 2
-
-
-def _variance(sums: Float[np.ndarray, " c"]) -> float:
-    """Of the sum of independent clusters whose mean is 0, with the small-sample factor."""
-    return float((sums**2).sum()) * len(sums) / (len(sums) - 1)

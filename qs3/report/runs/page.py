@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
 from qs3.evaluation.estimates_text import table as quality_table
 from qs3.report.runs.data import RunFiles, settings_of
 from qs3.report.runs.figures import EVALUATION_ONLY
+from qs3.utils import html
 
 _TITLES = {
     "curves": "Training",
@@ -54,18 +54,17 @@ def page(
     link = f'<p><a href="{escape(clouds)}">Clouds to turn</a>, the most confident errors first.</p>'
     parts = [
         *(f'<p class="note">Note: {escape(note)}.</p>' for note in run.notes),
-        _table(key_figures(run).items()),
+        html.table(key_figures(run).items(), head="column"),
         *([link] if clouds else []),
     ]
     if run.metrics is not None:
-        parts += ["<h2>Quality without labels</h2>", _table(quality_table(run.metrics.quality))]
+        quality = quality_table(run.metrics.quality)
+        parts += ["<h2>Quality without labels</h2>", html.table(quality, head="column")]
     if run.command:
         parts += ["<h2>Command</h2>", f"<pre>{escape(run.command)}</pre>"]
     for name, path in pictures.items():
-        data = base64.b64encode(path.read_bytes()).decode("ascii")
         words = _TITLES.get(name, name)
-        parts.append(f"<h2>{words}</h2>")
-        parts.append(f'<img alt="{words}" src="data:image/png;base64,{data}">')
+        parts += [f"<h2>{words}</h2>", html.image(path.read_bytes(), words)]
     if skipped:
         parts.append("<h2>Not drawn</h2><ul>")
         parts += [
@@ -79,19 +78,7 @@ def page(
             f"<h2>Settings</h2><details><summary>all of them</summary>"
             f"<pre>{escape(settings)}</pre></details>"
         )
-    title = escape(run.title)
-    return "\n".join(
-        [
-            "<!doctype html>",
-            '<html lang="en"><head><meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{title}</title><style>{_STYLE}</style></head><body>",
-            f"<h1>{title}</h1>",
-            *parts,
-            "</body></html>",
-            "",
-        ]
-    )
+    return html.document(run.title, _STYLE, parts)
 
 
 def key_figures(run: RunFiles) -> dict[str, str]:
@@ -126,11 +113,3 @@ def key_figures(run: RunFiles) -> dict[str, str]:
     found["hash of the settings"] = m.hash
     found["versions"] = ", ".join(f"{k} {v}" for k, v in m.versions.items())
     return found
-
-
-def _table(rows: Iterable[Sequence[str]]) -> str:
-    lines = (
-        f"<tr><th>{escape(head)}</th>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
-        for head, *cells in rows
-    )
-    return f"<table>{''.join(lines)}</table>"

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from qs3.errors import ConfigError, DataError
+from qs3.report.clustered import LEVEL
 from qs3.report.tables.aggregate import data_lines
 from qs3.report.tables.cells import Cell, Table
 from qs3.report.tables.formats import SIMULATED, marks
 from qs3.report.tables.made_of import data_marks, results_of
-from qs3.report.tables.paired import LEVEL, Difference, compare_on_average
+from qs3.report.tables.paired import Difference, compare_on_average
 from qs3.runs.predictions import FILE, read_predictions
 from qs3.utils import text_table
 

@@ -5,11 +5,8 @@ pairs: d = Σ_{s,i} w_i (a_{s,i} - b_{s,i}) / S, where a and b are 1 if the row'
 right about cloud i, and w_i is 1/n for accuracy, 1/(C n_class) for balanced accuracy.
 
 Two things make d vary: other seeds, and other test meshes (scans of one mesh are not independent
-samples). Their variances are those of errors clustered two ways (Cameron, Gelbach, Miller, "Robust
-Inference with Multiway Clustering", J. Business & Economic Statistics 2011, eq. 2.11), V_seeds and
-V_meshes less V_(seed, mesh), which is in both. Few seeds say little about V_seeds, so each has its
-own quantile of Student's t: half² = t²(S - 1) V_seeds + t²(M - 1) max(0, V_meshes - V_(seed,mesh)).
-With three seeds intervals are wide, as they should be.
+samples). Their variances are those of errors clustered two ways (`qs3.report.clustered`). With
+three seeds intervals are wide, as they should be.
 """
 
 from __future__ import annotations
@@ -17,16 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import t as student_t
 
 from qs3.errors import DataError
+from qs3.report.clustered import t2, variances, weights
 from qs3.runs.predictions import Predictions
 
-LEVEL = 0.95
+_SEEDS = np.arange(2, 1001)
+_T2_OF_SEEDS = t2(_SEEDS)
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class Difference:
 
     Attributes:
         mean: in [-1, 1].
-        low, high: its interval at `LEVEL`.
+        low, high: its interval at `clustered.LEVEL`.
         seeds, meshes: numbers of each.
         seeds_needed: so many would make 0 fall outside the interval, if the difference stays as it
             is; None if no number of seeds would, because there are too few test meshes.
@@ -93,61 +90,33 @@ def compare_on_average(
         raise DataError("the clouds have no labels")
     differences = np.mean([_right(a) - _right(b) for a, b in pairs], axis=0)
     _, mesh = np.unique(first.meshes, return_inverse=True)
-    return interval(differences, _weights(first.labels, balanced), mesh)
+    return interval(differences, weights(first.labels, balanced), mesh)
 
 
 def _right(row: Sequence[Predictions]) -> Float[np.ndarray, "s n"]:
     return np.stack([one.predicted == one.labels for one in row]).astype(float)
 
 
-def _weights(labels: Int[np.ndarray, " n"], balanced: bool) -> Float[np.ndarray, " n"]:
-    if not balanced:
-        return np.full(len(labels), 1 / len(labels))
-    classes, index, counts = np.unique(labels, return_inverse=True, return_counts=True)
-    return 1 / (len(classes) * counts[index])
-
-
 def interval(
     differences: Float[np.ndarray, "s n"],
-    weights: Float[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"],
     mesh: Int[np.ndarray, " n"],
 ) -> Difference:
     """Mean and interval of weighted differences; see the module's text.
 
     Args:
         differences: of each seed and cloud, in [-1, 1].
-        weights: that sum to 1.
+        weight: that sum to 1.
         mesh: cluster of each cloud, 0 ... M - 1.
     """
     seeds, meshes = len(differences), int(mesh.max()) + 1
     if meshes < 2:
         raise DataError("a comparison needs test clouds of at least two meshes")
-    mean = float((differences @ weights).mean())
-    # [S, M]: what each (seed, mesh) adds to the mean beyond its share
-    cells = np.zeros((seeds, meshes))
-    np.add.at(cells.T, mesh, ((differences - mean) * weights).T)
-    cells /= seeds
-    of_seeds = _variance(cells.sum(1))
-    of_meshes = _variance(cells.sum(0))
-    of_meshes = max(0.0, of_meshes - float((cells**2).sum()))
-    half = math.sqrt(_t2(seeds) * of_seeds + _t2(meshes) * of_meshes)
+    mean = float((differences @ weight).mean())
+    of_seeds, of_meshes = variances((differences - mean) * weight, mesh)
+    half = math.sqrt(t2(seeds) * of_seeds + t2(meshes) * of_meshes)
     # with other numbers of seeds, each of which varies as these do
-    halves = np.sqrt(_T2_OF_SEEDS * of_seeds * seeds / _SEEDS + _t2(meshes) * of_meshes)
+    halves = np.sqrt(_T2_OF_SEEDS * of_seeds * seeds / _SEEDS + t2(meshes) * of_meshes)
     enough = _SEEDS[halves < abs(mean)]
     needed = int(enough[0]) if len(enough) else None
     return Difference(mean, mean - half, mean + half, seeds, meshes, needed)
-
-
-def _t2(clusters: Any) -> Any:
-    """Square of Student's quantile for the mean of so many clusters."""
-    return student_t.ppf(0.5 + LEVEL / 2, clusters - 1) ** 2
-
-
-_SEEDS = np.arange(2, 1001)
-_T2_OF_SEEDS = _t2(_SEEDS)
-
-
-def _variance(clusters: Float[np.ndarray, " c"]) -> float:
-    """The variance of a sum of c independent clusters of mean 0, with the small-sample factor."""
-    c = len(clusters)
-    return float((clusters**2).sum()) * c / (c - 1)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.files import SUFFIXES, checked, measured, parse_clouds, printable
+from qs3.clouds.files import SUFFIXES, parse_clouds
+from qs3.clouds.finite import checked, measured
 from qs3.config.checks import check_choice
 from qs3.config.compose import choices
 from qs3.data.contact_sheets import drawn
@@ -30,6 +31,7 @@ from qs3.report.runs.data import is_run, read_run
 from qs3.report.runs.viewed import part_of_run, worst_first
 from qs3.utils.files import write_text
 from qs3.utils.progress import progress_bar
+from qs3.utils.text_table import printable
 
 _KNOWN = tuple(dict.fromkeys((*SUFFIXES, *MESHES)))
 _HEADER = 1 << 16  # bytes of a PLY file that its header is looked for in

@@ -15,7 +15,7 @@ from qs3.sensors.bench.runner import fingerprint, read_cached
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.tabletop import Tabletop
 from qs3.sensors.renderers.base import Renderer
-from qs3.utils.files import write_json
+from qs3.utils.files import atomic_path, write_json
 
 FIGURE = "real.png"
 
@@ -83,8 +83,8 @@ def compare(
         depths = []
         for seed in range(scenes):
             depths.append(table.scan(subject, renderer, seed))
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(kept, depth_m=np.stack(depths))
+        with atomic_path(kept) as temporary:
+            np.savez_compressed(temporary, depth_m=np.stack(depths))
         write_json(path, {"scenes": scenes})
     with np.load(kept) as file:
         simulated = list(file["depth_m"])

@@ -110,11 +110,6 @@ class TimeOfFlight(DepthSensor):
         """A pixel."""
         return 1
 
-    @property
-    def ambiguity_m(self) -> float:
-        """Distances that differ by this look the same: c / (2 gcd of the frequencies)."""
-        return SPEED_OF_LIGHT / (2 * math.gcd(*(round(f) for f in self.frequencies_hz)))
-
     def distance_sigma_m(
         self, amplitude_e: float | np.ndarray, mean_e: float | np.ndarray
     ) -> float | np.ndarray:

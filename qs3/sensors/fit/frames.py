@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from qs3.clouds.arrays import read_npy
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.cameras import Intrinsics
 from qs3.utils.pictures import check_picture
@@ -192,12 +194,8 @@ def _png(path: Path) -> np.ndarray:
 
 
 def _npy(path: Path) -> np.ndarray:
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # numpy's parser of headers raises whatever Python's does
-        raise DataError(f"{path} is not a .npy array, or damaged: {error}") from error
-    if not isinstance(array, np.ndarray):
-        raise DataError(f"{path} is not a .npy array but an archive of several")
-    if array.size > _MAX_PIXELS:
-        raise DataError(f"{path} has {array.size} values; at most {_MAX_PIXELS} are read")
-    return np.array(array)
+    def check(shape: tuple[int, ...], dtype: np.dtype) -> None:
+        if (size := math.prod(shape)) > _MAX_PIXELS:
+            raise DataError(f"{path} has {size} values; at most {_MAX_PIXELS} are read")
+
+    return read_npy(path, check)

@@ -9,17 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from qs3.config.checks import check_ranges
-from qs3.errors import ConfigError, DataError
-from qs3.utils.pictures import check_picture
-
-_MAX_PICTURE_PX = 64_000_000
+from qs3.errors import ConfigError
 
 
 class Slide(Protocol):
@@ -28,38 +23,6 @@ class Slide(Protocol):
     @property
     def slide(self) -> np.ndarray:
         """[H, W] float32 in 0..1, row 0 at the top."""
-
-
-@dataclass(frozen=True)
-class PictureSlide:
-    """A pattern of one's own, from an image file.
-
-    Attributes:
-        path: PNG, JPEG or TIFF; colours are averaged, 8 or 16 bits scaled to 0..1.
-    """
-
-    path: str
-
-    @cached_property
-    def slide(self) -> np.ndarray:
-        """[H, W] float32 in 0..1.
-
-        Raises:
-            DataError: the file is not there, is not an image, or is larger than 64 megapixels.
-        """
-        path = Path(self.path).expanduser()
-        if not path.is_file():
-            raise DataError(f"pattern.path: there is no file {path}")
-        check_picture(path, _MAX_PICTURE_PX, "pattern.path: ")
-        image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
-        if image is None:
-            raise DataError(f"pattern.path: {path} is not an image that OpenCV can read")
-        white = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65_535}.get(image.dtype)
-        if white is None:
-            raise DataError(f"pattern.path: {path} has {image.dtype} values, 8 or 16 bits expected")
-        out = np.ascontiguousarray(image, dtype=np.float32) / np.float32(white)
-        out.flags.writeable = False
-        return out
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from qs3.clouds.files import parse_cloud
+from qs3.clouds.finite import checked, measured
 from qs3.data.domain import Domain
 from qs3.data.importers import CloudFolder
 
@@ -43,6 +45,11 @@ def write(path: Path, cloud: np.ndarray = CLOUD) -> Path:
         with h5py.File(path, "w") as file:
             file["data"] = cloud
     return path
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    """[n, 3] float32: the one cloud of a file, as importers and predictions read it."""
+    return checked(measured(parse_cloud(path), str(path))[0], str(path))
 
 
 FORMATS = (".xyz", ".txt", ".npy", ".npz", ".ply", ".pcd", ".h5")

@@ -12,13 +12,12 @@ import h5py
 import numpy as np
 import pytest
 
-from qs3.clouds.files import read_cloud
 from qs3.config.compose import composed
 from qs3.config.hashing import config_hash
 from qs3.data.importers import CloudFolder, import_into
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import DataError
-from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, write
+from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

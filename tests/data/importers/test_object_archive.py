@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from qs3.data.domain import compose_domain
 from qs3.data.importers.object_archive import read_archive
-from qs3.data.inspection.open_dataset import compose_domain
 from qs3.data.store import is_finished, read_manifest
 from qs3.errors import ConfigError, DataError, Qs3Error
 from tests.fixtures.frame_files import write_archive

@@ -10,11 +10,11 @@ import h5py
 import numpy as np
 import pytest
 
-from qs3.clouds.files import read_cloud, read_clouds
+from qs3.clouds.files import parse_clouds
 from qs3.data.importers import CloudFolder, Importer, XyzTree, import_into
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError
-from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, write
+from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write
 
 
 @pytest.mark.parametrize("suffix", [*FORMATS, ".XYZ", ".Ply"])
@@ -28,7 +28,7 @@ def test_files_of_several_clouds(tmp_path: Path) -> None:
     many = np.stack([CLOUD, CLOUD + 1])
     with h5py.File(tmp_path / "train_0.h5", "w") as file:
         file["data"], file["label"] = many, np.array([1, 0])
-    found = read_clouds(tmp_path / "train_0.h5")
+    found = parse_clouds(tmp_path / "train_0.h5")
     assert found.many
     assert found.labels == (1, 0)
     with pytest.raises(DataError, match="holds 2 clouds, expected one"):

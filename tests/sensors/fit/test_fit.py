@@ -1,5 +1,6 @@
 """`qs3 fit` must find what cameras hide."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -255,6 +256,20 @@ def test_errors_say_what_to_do(image, arguments, message, tmp_path, capsys):
     assert main(["fit", str(tmp_path / "a.npy"), *camera, *out, *arguments]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "x.yaml").exists()
+
+
+def test_damaged_and_large_arrays_are_refused_by_their_headers(tmp_path, capsys):
+    words = ["fit", str(tmp_path / "a.npy"), "focal=300", f"out={tmp_path / 'x.yaml'}"]
+    np.save(tmp_path / "a.npy", np.full((100, 100), 2.0))
+    os.truncate(tmp_path / "a.npy", 1000)
+    assert main(words) == 1
+    assert "1000 bytes, expected 80128 for shape (100, 100)" in capsys.readouterr().err
+    np.save(tmp_path / "a.npy", np.zeros((1, 0), np.uint8))
+    data = (tmp_path / "a.npy").read_bytes().replace(b"(1, 0)", b"(9000, 9000)")
+    (tmp_path / "a.npy").write_bytes(data.replace(b" " * 6 + b"\n", b"\n"))
+    os.truncate(tmp_path / "a.npy", 128 + 9000 * 9000)  # a hole, not on the disk
+    assert main(words) == 1
+    assert "has 81000000 values; at most 67108864 are read" in capsys.readouterr().err
 
 
 def test_a_file_that_is_missing_and_frames_of_two_sizes(tmp_path, capsys):

@@ -1,11 +1,9 @@
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import DataError
-from qs3.sensors.optics.patterns import PictureSlide, Speckle
+from qs3.sensors.optics.patterns import Speckle
 
 
 def test_the_default_slide_has_the_size_and_fill_of_the_released_one():
@@ -50,20 +48,3 @@ def test_dots_of_different_brightness_stand_where_the_equal_ones_do():
     assert lit.min() >= 0.5
     assert lit.max() <= 1
     assert lit.std() > 0.1
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_picture_becomes_a_slide(tmp_path, dtype):
-    picture = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (12, 20)).astype(dtype)
-    cv2.imwrite(str(tmp_path / "dots.png"), picture)
-    slide = PictureSlide(str(tmp_path / "dots.png")).slide
-    np.testing.assert_allclose(slide, picture / np.iinfo(dtype).max, rtol=1e-6)
-    assert slide.dtype == np.float32
-
-
-def test_a_slide_that_is_no_picture_is_refused(tmp_path):
-    (tmp_path / "text.png").write_text("not a picture")
-    with pytest.raises(DataError, match="is not an image"):
-        _ = PictureSlide(str(tmp_path / "text.png")).slide
-    with pytest.raises(DataError, match="there is no file"):
-        _ = PictureSlide(str(tmp_path / "missing.png")).slide

@@ -1,0 +1,76 @@
+"""Clouds as text: a row a point, in the dialects that programs write.
+
+Columns are x y z and perhaps more, by blanks, commas or semicolons, with decimal points or commas;
+# and // begin a comment.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from qs3.errors import DataError
+from qs3.utils.memory import check_memory
+from qs3.utils.text_table import printable
+
+
+def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Coordinates of all rows, float64.
+
+    Raises:
+        DataError: no rows of three numbers or more; names the line.
+    """
+    data = path.read_bytes()
+    # Copies and numbers, eight bytes from two letters; and each line is an object.
+    check_memory(8 * len(data) + 48 * (data.count(b"\n") + data.count(b"\r")), path)
+    rows = data.replace(b"//", b"#")
+    if _decimal_commas(rows):
+        rows = rows.replace(b",", b".").replace(b";", b" ")
+    elif b"," in rows or b";" in rows:
+        rows = rows.translate(bytes.maketrans(b",;", b"  "))
+    lines = rows.splitlines()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # no rows: reported below
+            table = np.loadtxt(lines, dtype=np.float64, ndmin=2, comments="#", encoding="latin-1")
+    except ValueError:
+        table = None
+    if table is None or (table.size and table.shape[1] < 3):
+        raise DataError(_bad_line(path, lines))
+    if table.size == 0:
+        raise DataError(f"{path}: there are no points")
+    return table[:, :3]
+
+
+def _decimal_commas(rows: bytes) -> bool:
+    """Whether the first row is as "0,5;1,25;2,75" or "0,5 1,25 2,75": commas within numbers."""
+    first = re.search(rb"^[ \t]*[^\s#][^\r\n]*", rows, re.MULTILINE)
+    words = re.split(rb"[;\s]+", first[0].split(b"#")[0].strip()) if first else []
+    if not any(b"," in word for word in words):
+        return first is not None and b";" in first[0]  # between numbers there is something else
+    within = [
+        re.fullmatch(rb"[-+]?(\d+,\d+|\d*\.?\d*)([eE][-+]?\d+)?", word) for word in words if word
+    ]
+    return all(within) and len(within) > 1
+
+
+def _bad_line(path: Path, lines: list[bytes]) -> str:
+    """Where and why a text file is not rows of numbers."""
+    width = None
+    for number, line in enumerate(lines, start=1):
+        words = line.split(b"#")[0].split()
+        if not words:
+            continue
+        shown = printable(line[:60].decode(errors="backslashreplace").strip())[:60]
+        try:
+            [float(word) for word in words]
+        except ValueError:
+            return f"{path}, line {number}: '{shown}' is not a row of numbers"
+        if len(words) < 3 or (width is not None and len(words) != width):
+            return f"{path}, line {number}: '{shown}' has {len(words)} numbers, not {width or 3}"
+        width = len(words)
+    return f"{path}: not a text file of rows with numbers"
