@@ -7,7 +7,8 @@
 The faults ("mutants") are those of cosmic-ray's operators: other comparisons, arithmetic, numbers
 and booleans, `and` for `or`, a removed `not`, decorator or loop, other exceptions. Those in type
 annotations change nothing and are left out. Each is judged by the tests named for its module
-alone, so a mutant that only a distant test would notice counts as alive.
+alone, and of these by those that execute its line (see `Tracer`), so a mutant that only a distant
+test would notice counts as alive.
 
 cosmic-ray's own runner starts Python and imports torch anew for every mutant. Here a worker has
 the large libraries loaded, works on a copy of the tracked files, and forks a child for each
@@ -23,6 +24,7 @@ import csv
 import gc
 import hashlib
 import importlib
+import json
 import os
 import random
 import shutil
@@ -30,6 +32,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import tomllib
 import traceback
@@ -129,7 +132,83 @@ def chosen(root: Path, targets: dict[str, Any], names: list[str]) -> list[tuple[
     return jobs
 
 
-def run_tests(copy: Path, tests: list[str], limit: float, log: Path) -> tuple[str, float]:
+class Tracer:
+    """Which tests execute which lines: a plugin for the run of the tests without a fault.
+
+    Lines of a test's set-up and tear-down are of all tests of its file, as its fixtures may be, and
+    lines that run while modules are imported, in other processes or not at all are of every test.
+    """
+
+    def __init__(self, root: Path, modules: list[str], out: Path) -> None:
+        self.files = {str(root / module): module for module in modules}
+        self.out, self.now = out, ""
+        self.seen: dict[str, dict[int, set[str]]] = {module: {} for module in modules}
+
+    def _enter(self, frame: Any, event: str, argument: Any) -> Any:
+        return self._line if frame.f_code.co_filename in self.files else None
+
+    def _line(self, frame: Any, event: str, argument: Any) -> Any:
+        lines = self.seen[self.files[frame.f_code.co_filename]]
+        lines.setdefault(frame.f_lineno, set()).add(self.now)
+        return self._line
+
+    def pytest_sessionstart(self) -> None:
+        """From before the modules are imported on."""
+        threading.settrace(self._enter)
+        sys.settrace(self._enter)
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A set-up comes."""
+        self.now = nodeid.split("::")[0]
+
+    def pytest_runtest_call(self, item: Any) -> None:
+        """The test itself; called before it runs, as no plugin of pytest's own asks for more."""
+        self.now = item.nodeid
+        sys.settrace(self._enter)  # another test may have set another
+
+    def pytest_runtest_teardown(self, item: Any) -> None:
+        """A tear-down comes, and the next set-up."""
+        self.now = item.nodeid.split("::")[0]
+
+    def pytest_sessionfinish(self) -> None:
+        """Write {module: {line: tests}}."""
+        sys.settrace(None)
+        plain = {m: {n: sorted(by) for n, by in lines.items()} for m, lines in self.seen.items()}
+        self.out.write_text(json.dumps(plain))
+
+
+def judges(tests: list[str], lines: dict[str, list[str]], source: str, line: int) -> list[str]:
+    """Of a module's tests those that execute a line; all where none is known to.
+
+    Args:
+        tests: files, in the order in which they run.
+        lines: of the module, by number: tests, files, or "" for what runs in no test.
+        source: of the module.
+        line: of the mutant. One without a trace of its own (of an expression over several lines)
+            is taken for all of the innermost function around it.
+    """
+    found = set(lines.get(str(line), ()))
+    if not found:
+        around = [
+            (node.lineno, node.end_lineno or 0)
+            for node in ast.walk(ast.parse(source))
+            if isinstance(node, ast.FunctionDef) and node.lineno < line <= (node.end_lineno or 0)
+        ]
+        if around:
+            first, last = max(around)
+            within = range(first + 1, last + 1)
+            found = {test for n in within for test in lines.get(str(n), ())}
+    if not found or "" in found:
+        return tests
+    whole = {name for name in found if "::" not in name}
+    single = sorted(name for name in found if name.split("::")[0] not in whole)
+    chosen = [*whole, *single]
+    return sorted(chosen, key=lambda name: tests.index(name.split("::")[0]))
+
+
+def run_tests(
+    copy: Path, tests: list[str], limit: float, log: Path, *plugins: Any
+) -> tuple[str, float]:
     """Fork, run the tests there, and say how it ended: killed, survived or timeout."""
     start = time.monotonic()
     child = os.fork()
@@ -142,7 +221,7 @@ def run_tests(copy: Path, tests: list[str], limit: float, log: Path) -> tuple[st
             os.chdir(copy)
             import pytest
 
-            rc = pytest.main([*OPTIONS, *tests])
+            rc = pytest.main([*OPTIONS, *tests], plugins=list(plugins))
         except BaseException:
             traceback.print_exc()
             rc = 3
@@ -167,8 +246,13 @@ def kill_group(leader: int) -> None:
         os.killpg(leader, signal.SIGKILL)
 
 
-def work(root: Path, number: int, jobs: Any, results: Any) -> None:
-    """A worker: its own copy of the files, the libraries loaded, a child for each mutant."""
+def work(
+    root: Path, number: int, modules: dict[frozenset[str], list[str]], jobs: Any, results: Any
+) -> None:
+    """A worker: its own copy of the files, the libraries loaded, a child for each mutant.
+
+    `modules`: of each set of tests those that it judges.
+    """
     copy = Path(tempfile.mkdtemp(prefix=f"mutants{number}-")) / "repo"
     files = subprocess.check_output(["git", "-C", str(root), "ls-files", "-z"], text=True)
     for name in filter(None, files.split("\0")):
@@ -190,20 +274,23 @@ def work(root: Path, number: int, jobs: Any, results: Any) -> None:
     )
     gc.collect()
     gc.freeze()  # a collection in a child would touch, and so copy, all of it: twice the time
-    limits: dict[tuple[str, ...], float] = {}
-    log = copy.parent / "log.txt"
+    limits: dict[frozenset[str], float] = {}
+    traced: dict[frozenset[str], dict[str, dict[str, list[str]]]] = {}
+    log, trace = copy.parent / "log.txt", copy.parent / "trace.json"
     while (job := jobs.get()) is not None:
         mutant, tests = job
         path = copy / mutant.module
         source = path.read_text()
-        if tuple(tests) not in limits:
+        if (which := frozenset(tests)) not in limits:
             sys.dont_write_bytecode = False
-            outcome, seconds = run_tests(copy, tests, 3600, log)
+            tracer = Tracer(copy, modules[which], trace)
+            outcome, seconds = run_tests(copy, tests, 3600, log, tracer)
             if outcome != ALIVE:
                 raise SystemExit(
                     f"The tests fail without a mutant: {tests}\n{log.read_text()[-3000:]}"
                 )
-            limits[tuple(tests)] = 3 * seconds + 15
+            limits[which] = 3 * seconds + 15
+            traced[which] = json.loads(trace.read_text())
         sys.dont_write_bytecode = True
         changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
         for cached in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
@@ -213,7 +300,8 @@ def work(root: Path, number: int, jobs: Any, results: Any) -> None:
             continue
         path.write_text(changed)
         try:
-            outcome, _ = run_tests(copy, tests, limits[tuple(tests)], log)
+            judged_by = judges(tests, traced[which][mutant.module], source, mutant.line)
+            outcome, _ = run_tests(copy, judged_by, limits[which], log)
         finally:
             path.write_text(source)
         before, after = source.splitlines(), changed.splitlines()
@@ -276,12 +364,16 @@ def main(targets_file: str, out: str, *names: str) -> None:
     rows = still_true(there, [mutant for mutant, _ in jobs], again="again" in names)
     done = {tuple(row[name] for name in KEY) for row in rows}
     wanted = [job for job in jobs if job[0].key not in done]
+    modules: dict[frozenset[str], list[str]] = defaultdict(list)
+    for mutant, tests in jobs:
+        if mutant.module not in modules[frozenset(tests)]:
+            modules[frozenset(tests)].append(mutant.module)
     context = get_context("fork")
     queue, results = context.Queue(), context.Queue()
     for job in [*wanted, *[None] * WORKERS]:
         queue.put(job)
     workers = [
-        context.Process(target=work, args=(root, number, queue, results))
+        context.Process(target=work, args=(root, number, dict(modules), queue, results))
         for number in range(WORKERS)
     ]
     for worker in workers:
