@@ -23,6 +23,7 @@ from qs3.training.load import Loaded, load_data
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
+from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.cli import TERMINATED
 
 log = logging.getLogger(__name__)
@@ -37,6 +38,7 @@ def fit(run: Run) -> RunMetrics:
     """
     began = time.time()
     quieten()
+    keep_freed_memory()
     torch.set_num_threads(run.cfg.trainer.threads or os.cpu_count() or 1)
     method: Method = build(run.cfg.method)
     loaded = load_data(run, method)
