@@ -1,4 +1,4 @@
-"""TENT: the affine weights of batch norm for which the net is surest of the target.
+"""TENT: the affine weights of batch norm for which the net is most confident of the target.
 
 Wang, Shelhamer, Liu, Olshausen, Darrell, "Tent: Fully Test-Time Adaptation by Entropy
 Minimization", ICLR 2021. A control: nothing else is trained, and no source cloud is needed.

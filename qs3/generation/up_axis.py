@@ -50,12 +50,12 @@ class Evidence:
     @property
     def axis(self) -> str | None:
         """The direction that is up in the collection, such as "+z"; None where nothing tells."""
-        return told(np.concatenate([*self.scores.values()])) if self.scores else None
+        return up_direction(np.concatenate([*self.scores.values()])) if self.scores else None
 
     @property
     def by_class(self) -> dict[str, str | None]:
         """The same of each class alone."""
-        return {cls: told(scores) for cls, scores in self.scores.items()}
+        return {cls: up_direction(scores) for cls, scores in self.scores.items()}
 
     def shares(self) -> str:
         """Of each class how many of its meshes look better with z up than with y up."""
@@ -65,7 +65,7 @@ class Evidence:
         )
 
 
-def told(scores: Float[np.ndarray, "n 6"]) -> str | None:
+def up_direction(scores: Float[np.ndarray, "n 6"]) -> str | None:
     """Which direction of `UPS` most meshes prefer, beyond chance, to +y (or +z); else None.
 
     One of the other four must beat both.

@@ -32,11 +32,11 @@ class Mlsp(Method):
     r"""L = (1 - w) L_s + w 20 Chamfer + w_n (1 - |cos|) + w_c CE, the last three of masked points.
 
     L_s is the cross-entropy of source clouds, or PCM's of mixed ones. One voxel of each target
-    cloud is masked as DefRec deforms it (`qs3.methods.deform`). One head tells for each of its
-    points a position, a normal and a cardinality (`cardinalities`). What is told at a position is
+    cloud is masked as DefRec deforms it (`qs3.methods.deform`). One head predicts for each of its
+    points a position, a normal and a cardinality (`cardinalities`). The prediction at a position is
     compared with what is true at the nearest original point, and the truth of each original point
-    with what is told at the nearest position; means over the points each way, and over the clouds
-    that have a voxel to mask. The sign of a normal does not matter.
+    with the prediction at the nearest position; means over the points each way, and over the
+    clouds that have a voxel to mask. The sign of a normal does not matter.
 
     Args:
         position_weight: w in [0, 1].
@@ -99,13 +99,13 @@ class Mlsp(Method):
         size = cloud_size(points) if self.metres else 1.0
         unit = points / size
         masked = deform(unit, generator, self.min_points)
-        told = self.head(net.features(masked.points * size)).float()  # [B, N, 22]
-        position, normal, logits = told.split([3, 3, CARDINALITIES], dim=2)
+        predicted = self.head(net.features(masked.points * size)).float()  # [B, N, 22]
+        position, normal, logits = predicted.split([3, 3, CARDINALITIES], dim=2)
         with torch.no_grad():
             there, home = nearest(position, unit.float(), masked.mask, masked.mask)  # [B, N] each
             normals, counts = normals_of(unit), cardinalities(unit)
         at = gather(unit, there)
-        pairs = {  # what is told at each position, and what is told of each original point
+        pairs = {  # from predicted positions to original points, and back
             "position": (
                 (position - at).square().sum(2),
                 (gather(position, home) - unit).square().sum(2),
@@ -133,9 +133,9 @@ class Mlsp(Method):
         }
 
 
-def _apart(told: Float[Tensor, "b n 3"], true: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
+def _apart(predicted: Float[Tensor, "b n 3"], true: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
     """1 - |cos|, in [0, 1]."""
-    return 1 - F.cosine_similarity(told, true, dim=2).abs()
+    return 1 - F.cosine_similarity(predicted, true, dim=2).abs()
 
 
 def _each(logits: Float[Tensor, "b n k"], labels: Int[Tensor, "b n"]) -> Float[Tensor, "b n"]:

@@ -22,7 +22,7 @@ from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, class_loss, weight
 from qs3.models.norms import use_domain
-from qs3.selftraining.selectors import Selector, TeacherPredictions, surest
+from qs3.selftraining.selectors import Selector, TeacherPredictions, most_confident
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
@@ -132,12 +132,12 @@ class Pcfea(Method):
         size, classes = data.eval_batch_size, len(self.mean)
         labels = data.labelled.labels.numpy()
         f, p = _features(net, data.labelled.clouds.all(), size, "source", self.mean.device)
-        of_source = surest(p[np.arange(len(p)), labels], labels, 1 - progress)
+        of_source = most_confident(p[np.arange(len(p)), labels], labels, 1 - progress)
         g, q = _features(net, data.target.points, size, "target", self.mean.device)
         said = TeacherPredictions.of(q, data.target.ids)
         named = said.predicted
         if self.selector is None:
-            of_target = surest(said.confidence, named, progress)
+            of_target = most_confident(said.confidence, named, progress)
         else:
             chosen = self.selector.select(said, self.theta)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_bool, check_int, check_ranges
 from qs3.errors import ConfigError
-from qs3.selftraining.selectors import Selection, TeacherPredictions, surest
+from qs3.selftraining.selectors import Selection, TeacherPredictions, most_confident
 from qs3.utils.seeding import derive
 
 _KEY = "selftraining.selector"
@@ -26,12 +26,12 @@ _BLOCK = 1024  # rows of the correlations that are held at once
 
 @dataclass(frozen=True)
 class GraphRefined:
-    """All target clouds, those of which a graph net is surest with its labels and full weight.
+    """All target clouds; those most confident by a graph net with its labels and full weight.
 
     Two clouds are joined if their features' correlation exceeds `correlation` and one is among the
     `neighbours` most correlated of the other. A graph net (`GraphNet`) learns to say, from features
     and the teacher's probabilities, a fifth of them hidden in each step, what the teacher says; of
-    each class that it then predicts, the share `growth` x round of the clouds of which it is surest
+    each class that it then predicts, the share `growth` x round of its most confident clouds
     (rounded, one at least) get its label. The others keep the teacher's and weigh `unsure`:
     their row of `soft` sums to that, as a cross-entropy is linear in its label (exactly, where
     `protocol.smoothing` is 0). In round 0 that are all, as in the first epochs there.
@@ -79,7 +79,9 @@ class GraphRefined:
         if round_:
             scores = self._scores(teacher, round_) if self.graph else teacher.probabilities
             share = min(self.growth * round_, 1.0)
-            sure = surest(scores.max(axis=1), scores.argmax(axis=1), share, teacher.ids, least=1)
+            sure = most_confident(
+                scores.max(axis=1), scores.argmax(axis=1), share, teacher.ids, least=1
+            )
             labels = np.where(sure, scores.argmax(axis=1), labels)
         soft = np.eye(classes)[labels] * np.where(sure, 1.0, self.unsure)[:, None]
         selected = teacher.relabelled(labels).confidence > theta

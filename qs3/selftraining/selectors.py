@@ -163,7 +163,7 @@ class Spst:
         return Selection(selected, theta, mu=np.ones(len(kept)), confident=kept, kept=kept)
 
 
-def surest(
+def most_confident(
     confidence: Float[np.ndarray, " n"],
     labels: Int[np.ndarray, " n"],
     share: float,

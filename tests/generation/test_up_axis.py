@@ -14,7 +14,7 @@ from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.errors import ConfigError
 from qs3.generation.command import generate
 from qs3.generation.plan import check, mesh_items
-from qs3.generation.up_axis import evidence, told, with_up_axis
+from qs3.generation.up_axis import evidence, up_direction, with_up_axis
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.folder import MeshFolder
 from tests.generation.generating import composed, config
@@ -141,12 +141,12 @@ def test_files_that_say_which_axis_is_up_are_not_asked(tmp_path, caplog):
 def test_another_direction_is_neither():
     """Scores of twelve meshes that all prefer one direction, and of such that prefer none."""
     scores = np.zeros((12, 6))
-    assert told(scores) is None
+    assert up_direction(scores) is None
     for column, direction in ((5, "-y"), (0, "+z"), (4, "+y")):
         scores[:] = 0
         scores[:, column] = 1
-        assert told(scores) == direction
-    assert told(scores[:1] * 0.5) is None  # one mesh does not make it certain
+        assert up_direction(scores) == direction
+    assert up_direction(scores[:1] * 0.5) is None  # one mesh does not make it certain
 
 
 def test_a_damaged_file_is_passed_over(tmp_path):

@@ -14,7 +14,7 @@ from qs3.selftraining.selectors import (
     Spst,
     TeacherPredictions,
     check_selection,
-    surest,
+    most_confident,
 )
 
 # Worked by hand for theta = 0.8. Confident: class 0: a b c d e (5), class 1: g h (2),
@@ -140,7 +140,9 @@ def test_the_surest_worked_by_hand():
     labels = np.array([0, 0, 0, 0, 1, 1, 1])
 
     def kept(share, ids=None, least=0):
-        return "".join(np.array(list("abcdefg"))[surest(confidence, labels, share, ids, least)])
+        return "".join(
+            np.array(list("abcdefg"))[most_confident(confidence, labels, share, ids, least)]
+        )
 
     for share, expected in ((0.0, ""), (0.5, "abef"), (0.74, "abcef"), (1.0, "abcdefg")):
         assert kept(share) == expected

@@ -44,7 +44,7 @@ class Piece:
         extent_m: along x, y and z.
         depth_m: median distance along the optical axis.
         tier: "clean" or "hard".
-        why: what makes it hard, in words; or with `refused`, what is wrong.
+        why: what makes it hard; or with `refused`, what is wrong.
         refused: it cannot be used.
     """
 

@@ -1,4 +1,4 @@
-"""Which way is up in a frame, in camera coordinates: three ways, from the surest on.
+"""Which way is up in a frame, in camera coordinates: three ways, the most reliable first.
 
 Floor: the plane of the pixels that are labelled so. 1/z of a plane's pixels is linear in their
 rays, and a triangulating sensor's noise is even in it, so that is what is fitted.

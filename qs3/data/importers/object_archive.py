@@ -189,8 +189,8 @@ class ObjectArchive(Importer):
             load = functools.partial(archive.cloud, i, self.inliers_only)
             found.append(Item(row, where, load))
         if left:
-            told = ", ".join(f"{name or 'in no part'} {n}" for name, n in sorted(left.items()))
-            log.info("%s: objects left out: %s", self.path, told)
+            counts = ", ".join(f"{name or 'in no part'} {n}" for name, n in sorted(left.items()))
+            log.info("%s: objects left out: %s", self.path, counts)
         return sorted(
             found, key=lambda f: (SPLITS.index(f.row.split), classes.index(f.row.cls), f.row.id)
         )

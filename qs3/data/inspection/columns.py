@@ -59,6 +59,6 @@ def text(facts: Mapping[str, Any]) -> list[str]:
         rows.append(["all", *map(str, totals)])
         lines += ["", *text_table.aligned(rows, numbers=True, rule=False)]
     if refused := facts["refused"]:
-        told = ", ".join(f"{cls} {count}" for cls, count in refused.items())
-        lines += ["", f"objects left out, for reasons that manifest.csv gives: {told}"]
+        counts = ", ".join(f"{cls} {count}" for cls, count in refused.items())
+        lines += ["", f"objects left out, for reasons that manifest.csv gives: {counts}"]
     return lines

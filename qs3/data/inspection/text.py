@@ -64,8 +64,8 @@ def of_pair(facts: Numbers) -> str:
         [cls, f"{p:.1%}", f"{q:.1%}", f"{100 * (q - p):+.1f}"]
         for cls, (p, q) in prior["by_class"].items()
     ]
-    told = [["by", "own domain"]]
-    told += [[by, f"{apart[by]:.1%}"] for by in ("all", "shape", "density")]
+    rows = [["by", "own domain"]]
+    rows += [[by, f"{apart[by]:.1%}"] for by in ("all", "shape", "density")]
     parts = [
         f"# A = {facts['a']}, B = {facts['b']}",
         f"A is made of: {facts['made_of_a']}.\nB is made of: {facts['made_of_b']}.",
@@ -80,7 +80,7 @@ def of_pair(facts: Numbers) -> str:
         *_truths(facts),
         *_floors(facts),
         "## Told apart by their nearest neighbours",
-        _markdown(told),
+        _markdown(rows),
         "Share of clouds whose most similar cloud is of their own domain (50 %: cannot be told "
         f"apart, 100 %: two worlds). {apart['clouds']} clouds of each, equally many a class.",
     ]

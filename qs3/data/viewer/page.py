@@ -119,7 +119,7 @@ def points_each(clouds: int, asked: int | None) -> int:
     return asked
 
 
-def told(parts: Sequence[Part], points: int | None = None) -> tuple[list[str], list[str]]:
+def captions(parts: Sequence[Part], points: int | None = None) -> tuple[list[str], list[str]]:
     """What is shown, a line each; and what is not, to be noticed. Also for a terminal."""
     most = points_each(sum(len(part.shown) for part in parts), points)
     about = [part.about for part in parts]
@@ -174,7 +174,7 @@ def page(title: str, parts: Sequence[Part], *, colour: str = "", points: int | N
         "unit": units.pop() if len(units) == 1 else "",
         "residual_of": "; ".join(dict.fromkeys(p.residual_of for p in parts if p.residual_of)),
     }
-    about, notes = told(parts, points)
+    about, notes = captions(parts, points)
     # "<" could end the element or begin a comment in it; JSON has another way to write it.
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     here = Path(__file__).parent

@@ -21,7 +21,7 @@ from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.viewed import chosen, part_of
 from qs3.data.store import is_finished
 from qs3.data.viewer import MOST_POINTS
-from qs3.data.viewer.page import Part, Shown, page, points_each, thinned, told
+from qs3.data.viewer.page import Part, Shown, captions, page, points_each, thinned
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.inputs import find_files, is_archive, reason_of
@@ -73,7 +73,7 @@ def view_command(settings: Settings) -> tuple[str, int]:
     parts = [_part(path, share, settings) for path in settings.paths]
     title = ", ".join(_title(Path(path).expanduser().absolute()) for path in settings.paths)
     text = page(title, parts, colour=settings.colour, points=settings.points)
-    about, notes = told(parts, settings.points)
+    about, notes = captions(parts, settings.points)
     out = Path(settings.out).expanduser()
     again = " (replaced what was there)" * out.exists()
     write_text(out, text)
