@@ -116,7 +116,7 @@ def test_what_is_written_is_read(tmp_path_factory, wanted):
         (file_of({"a": entry(offsets=(8,))}, bytes(8)), "data_offsets"),
         (file_of({"a": entry(offsets=(8, 0))}, bytes(8)), "expected"),
         (file_of({"a": []}), "data_offsets"),
-        (file_of(b"[1]"), "no object"),
+        (file_of(b"[1]"), "not a JSON object"),
         (file_of(b'{"a": 1, "a": 2}'), "occurs twice"),
         (file_of(b"[" * 100_000), "header is not as it should be"),
         (file_of(b'{"a": ' + b"1" * 10_000 + b"}"), "header is not as it should be"),

@@ -152,9 +152,9 @@ def test_a_fitted_vertical_is_right_or_not_sure(pitch_deg):
         ({"mask": np.ones((480, 640), int), "only": 3}, "no object 3"),
         ({"box": (5, 5, 5, 9)}, "left < right"),
         ({"box": (5, 5, 9)}, "not left,top,right,bottom"),
-        ({"box": (700, 5, 900, 9)}, "beside the picture of 640 x 480"),
-        ({"box": (5, 5, 90, 90), "up": (0, 0, 0)}, "no direction"),
-        ({"box": (5, 5, 90, 90), "up": (0, np.nan, 0)}, "no direction"),
+        ({"box": (700, 5, 900, 9)}, "outside the image of 640 x 480"),
+        ({"box": (5, 5, 90, 90), "up": (0, 0, 0)}, "not a direction"),
+        ({"box": (5, 5, 90, 90), "up": (0, np.nan, 0)}, "not a direction"),
     ],
 )
 def test_what_points_at_nothing_is_told_in_words(words, message):
