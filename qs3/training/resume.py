@@ -73,8 +73,16 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
         runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])
     check(path, "copy it again from where it comes from, or leave ckpt_path out to begin anew")
     log.info("going on from %s", path)
+    bring(other, run.folder)
+
+
+def bring(other: Path, folder: Path) -> None:
+    """Copy from a run's folder what going on takes: neither logs nor results, pictures or locks.
+
+    The checkpoint comes last: with it a run counts as begun.
+    """
     for file in sorted(file for file in other.rglob("*") if file.is_file()):
         part = file.relative_to(other)
         if part.parts[0] not in _STAYS and file.suffix != ".log" and part.name != LAST:
-            copy_file(file, run.folder / part)
-    copy_file(path, run.folder / LAST)  # the checkpoint last: with it a run counts as begun
+            copy_file(file, folder / part)
+    copy_file(other / LAST, folder / LAST)
