@@ -162,7 +162,7 @@ class Tracer:
         self.now = nodeid.split("::")[0]
 
     def pytest_runtest_call(self, item: Any) -> None:
-        """The test itself; called before it runs, as no plugin of pytest's own asks for more."""
+        """The test itself comes: of several plugins pytest asks the latest one first."""
         self.now = item.nodeid
         sys.settrace(self._enter)  # another test may have set another
 

@@ -158,7 +158,7 @@ class SelfTrainingConfig:
             if free:
                 raise ConfigError(
                     "selftraining.share sets a threshold for all classes, and this selector has "
-                    "its own; leave it at null"
+                    "its own; set selftraining.share=null"
                 )
         check_float("selftraining.mrkld", self.mrkld, ">= 0")
         epochs = self.rounds * self.epochs

@@ -111,7 +111,7 @@ def test_theta_grows_without_rounding_error():
         ({"selector": None}, "needs a selector"),
         ({"share": 0.0}, r"selftraining\.share must be in \(0, 1\), got 0.0"),
         ({"share": 1.0}, r"selftraining\.share must be in"),
-        ({"share": 0.5, "selector": Cbst(), "theta": 0.0}, r"share .* its own; leave it at null"),
+        ({"share": 0.5, "selector": Cbst(), "theta": 0.0}, r"share .* its own; set .*share=null"),
     ],
 )
 def test_wrong_settings_name_the_key(settings, message):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from qs3.errors import Qs3Error
 from qs3.training.resume import bring
 
 
@@ -24,10 +27,11 @@ def test_what_going_on_takes_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_the_checkpoint_comes_last(tmp_path: Path) -> None:
-    (tmp_path / "here").mkdir()
+    """What cannot be brought leaves a folder without a checkpoint: a run that has not begun."""
     (tmp_path / "there").mkdir()
     for name in ("last.ckpt", "z.pt"):
         (tmp_path / "there" / name).write_text(name)
-    bring(tmp_path / "there", tmp_path / "here")
-    written = sorted((tmp_path / "here").iterdir(), key=lambda path: path.stat().st_ctime_ns)
-    assert [path.name for path in written] == ["z.pt", "last.ckpt"]
+    (tmp_path / "here" / "z.pt").mkdir(parents=True)  # in the way
+    with pytest.raises((OSError, Qs3Error)):
+        bring(tmp_path / "there", tmp_path / "here")
+    assert [path.name for path in (tmp_path / "here").iterdir()] == ["z.pt"]
