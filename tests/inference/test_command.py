@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import zipfile
 from pathlib import Path
 
 import h5py
@@ -16,6 +15,7 @@ import qs3
 from qs3.data.store import open_pointset
 from qs3.runs.predictions import read_predictions
 from tests.commands import main
+from tests.data.importers.own_clouds import write_odd
 
 ONE = (".xyz", ".txt", ".npy", ".npz", ".ply", ".pcd", ".h5", ".hdf5")
 
@@ -144,12 +144,7 @@ def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, ca
     np.save(folder / "e.npy", np.array([{}], dtype=object), allow_pickle=True)
     (folder / "f.txt").write_text("")
     write(folder / "g.pcd", clouds[3])
-    header = "element vertex 1\nproperty list uchar float x\nproperty float y\nproperty float z\n"
-    (folder / "i.ply").write_text(f"ply\nformat ascii 1.0\n{header}end_header\n1 1 2 3\n")
-    with h5py.File(folder / "j.h5", "w") as file:
-        file["data"] = h5py.Empty("f4")
-    with zipfile.ZipFile(folder / "k.npz", "w") as file:
-        file.writestr("points.txt", "1 2 3")
+    write_odd(folder / "i.ply", folder / "j.h5", folder / "k.npz")
     large = clouds[0].astype("f8")
     large[4] = 1e300
     np.save(folder / "h.npy", large)

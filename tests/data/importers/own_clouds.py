@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zipfile
 from pathlib import Path
 
 import h5py
@@ -59,3 +60,13 @@ def own(tmp_path: Path, **settings) -> Domain:
     """The domain of tmp_path/in."""
     published = CloudFolder(tmp_path / "in", points=4, **settings)
     return Domain("own", "O", "own clouds", tmp_path / "store", published=published, classes=TWO)
+
+
+def write_odd(ply: Path, hdf5: Path, npz: Path) -> None:
+    """Whole files without a cloud: a list as coordinate, an empty dataset, a member of text."""
+    header = "element vertex 1\nproperty list uchar float x\nproperty float y\nproperty float z\n"
+    ply.write_text(f"ply\nformat ascii 1.0\n{header}end_header\n1 1 2 3\n")
+    with h5py.File(hdf5, "w") as file:
+        file["data"] = h5py.Empty("f4")
+    with zipfile.ZipFile(npz, "w") as file:
+        file.writestr("points.txt", "1 2 3")

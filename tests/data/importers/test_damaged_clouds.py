@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import re
-import zipfile
 from pathlib import Path
 
 import h5py
@@ -17,7 +16,7 @@ from qs3.config.hashing import config_hash
 from qs3.data.importers import CloudFolder, import_into
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import DataError
-from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write
+from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write, write_odd
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -155,12 +154,7 @@ def test_damaged_files_are_named_and_the_others_go_on(
 ) -> None:
     folder = tmp_path / "in"
     write(folder / "a.xyz")
-    header = "element vertex 1\nproperty list uchar float x\nproperty float y\nproperty float z\n"
-    (folder / "b.ply").write_text(f"ply\nformat ascii 1.0\n{header}end_header\n1 1 2 3\n")
-    with h5py.File(folder / "c.h5", "w") as file:
-        file["data"] = h5py.Empty("f4")
-    with zipfile.ZipFile(folder / "d.npz", "w") as file:
-        file.writestr("points.txt", "1 2 3")
+    write_odd(folder / "b.ply", folder / "c.h5", folder / "d.npz")
     data = own(tmp_path, layout="none", on_error="skip").open()
     assert data.ids == ("train/a",)
     for name in ("b.ply", "c.h5", "d.npz"):
