@@ -1,13 +1,114 @@
-"""What a run brings along from another place (`ckpt_path`)."""
+"""What a run brings along from another place (`ckpt_path`), without training any."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+import torch
 
-from qs3.errors import Qs3Error
-from qs3.training.resume import bring
+from qs3.config import hashing
+from qs3.config.hydra import build
+from qs3.datamodules.phases import Phases
+from qs3.errors import ConfigError, MissingDataError, Qs3Error
+from qs3.runs.checkpoints import save
+from qs3.runs.folder import write_started
+from qs3.training.resume import bring, take_checkpoint
+from qs3.training.run import Run
+from tests.training.toy import toy_config
+
+STARTED = {
+    "config_sha256": "c0ffee",
+    "data": {"source": "5", "target": "7"},
+    "versions": {"torch": torch.__version__},
+}
+
+
+def run_with(folder: Path, *overrides: str) -> Run:
+    """A run that has not begun."""
+    cfg = toy_config(folder, *overrides)
+    scheme = build(cfg.selftraining)
+    protocol = cfg.protocol
+    return Run(
+        cfg=cfg,
+        folder=hashing.run_folder(cfg),
+        seed=0,
+        phases=Phases(
+            protocol.epochs, scheme.rounds, scheme.epochs, protocol.steps, scheme.steps
+        ),
+        scheme=scheme,
+        source=build(cfg.data.source),
+        target=build(cfg.data.target),
+    )
+
+
+def begin(folder: Path) -> Path:
+    """The folder of a run that was begun; returns its checkpoint."""
+    folder.mkdir(parents=True)
+    write_started(folder, STARTED)
+    save({"epoch": torch.tensor(3)}, folder / "last.ckpt")
+    return folder / "last.ckpt"
+
+
+@pytest.mark.parametrize("named", ["folder", "file", "file by another spelling"])
+def test_the_same_run_is_brought_from_elsewhere(tmp_path: Path, named: str) -> None:
+    name = run_with(tmp_path).folder.name
+    there = begin(tmp_path / "elsewhere" / name)
+    spelling = {
+        "folder": there.parent,
+        "file": there,
+        "file by another spelling": f"{tmp_path}/./elsewhere/../elsewhere/{name}/last.ckpt",
+    }
+    run = run_with(tmp_path, f"ckpt_path={spelling[named]}")
+    take_checkpoint(run, STARTED)
+    assert (run.folder / "last.ckpt").read_bytes() == there.read_bytes()
+
+
+@pytest.mark.parametrize("rank", ["1", "2"])
+def test_processes_beside_the_first_leave_it_to_that(
+    tmp_path: Path, rank: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = begin(tmp_path / "elsewhere" / run_with(tmp_path).folder.name)
+    run = run_with(tmp_path, f"ckpt_path={there}")
+    monkeypatch.setitem(os.environ, "LOCAL_RANK", rank)
+    take_checkpoint(run, STARTED)
+    assert not run.folder.exists()
+    monkeypatch.setitem(os.environ, "LOCAL_RANK", "0")
+    take_checkpoint(run, STARTED)
+    assert (run.folder / "last.ckpt").is_file()
+
+
+def test_a_run_with_a_checkpoint_of_its_own_takes_no_other(tmp_path: Path) -> None:
+    run = run_with(tmp_path, f"ckpt_path={tmp_path}/nowhere")
+    own = begin(run.folder).read_bytes()
+    take_checkpoint(run, STARTED)
+    assert (run.folder / "last.ckpt").read_bytes() == own
+
+
+@pytest.mark.parametrize("file", ["a.ckpt", "zero.ckpt"])
+def test_another_file_of_the_run_is_no_checkpoint(tmp_path: Path, file: str) -> None:
+    """Whether its name sorts before that of the checkpoint or behind it."""
+    there = begin(tmp_path / "elsewhere" / run_with(tmp_path).folder.name)
+    other = there.rename(there.with_name(file))
+    run = run_with(tmp_path, f"ckpt_path={other}")
+    with pytest.raises(MissingDataError, match=r"no last\.ckpt of a run is there"):
+        take_checkpoint(run, STARTED)
+
+
+def test_a_folder_whose_name_sorts_behind_the_word_last(tmp_path: Path) -> None:
+    run = run_with(tmp_path, "ckpt_path=yesterday")
+    with pytest.raises(MissingDataError, match=r"no last\.ckpt of a run is there"):
+        take_checkpoint(run, STARTED)
+
+
+@pytest.mark.parametrize("name", ["seed0-00000000", "seed9-ffffffff"])
+def test_another_run_is_refused(tmp_path: Path, name: str) -> None:
+    there = begin(tmp_path / "elsewhere" / name)
+    run = run_with(tmp_path, f"ckpt_path={there}")
+    with pytest.raises(ConfigError, match=f"belongs to another run: its folder is {name}"):
+        take_checkpoint(run, STARTED)
+    assert not run.folder.exists()
 
 
 def test_what_going_on_takes_and_nothing_else(tmp_path: Path) -> None:
