@@ -259,8 +259,9 @@ def work(
         if (root / name).is_file():
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(root / name, copy / name)
+    path = os.pathsep.join(filter(None, [str(copy), os.environ.get("PYTHONPATH")]))
     os.environ.update(
-        PYTHONPATH=str(copy), OMP_NUM_THREADS="1", MPLBACKEND="Agg", TMPDIR=str(copy.parent)
+        PYTHONPATH=path, OMP_NUM_THREADS="1", MPLBACKEND="Agg", TMPDIR=str(copy.parent)
     )
     tempfile.tempdir = str(copy.parent)
     sys.path.insert(0, str(copy))

@@ -102,6 +102,17 @@ def test_gather() -> None:
     assert gather(x, index[:, 0]).shape == (2, 2, 2)
 
 
+@pytest.mark.parametrize("shape", [(2, 5, 7), (7, 5, 2), (3, 1, 1)])
+def test_gather_by_loops(shape: tuple[int, int, int]) -> None:
+    b, n, c = shape
+    x = torch.randn(b, n, c)
+    index = torch.randint(n, (b, 4, 3))
+    expected = torch.stack([cloud[rows] for cloud, rows in zip(x, index, strict=True)])
+    assert torch.equal(gather(x, index), expected)
+    with as_on_device():
+        assert torch.equal(gather(x, index), expected)
+
+
 def _on_device(*args: Any) -> torch.Tensor:
     with as_on_device():
         return farthest_point_sampling(*args)
@@ -117,8 +128,9 @@ def test_fps_batched(sample: object) -> None:
     for cloud, row in zip(x, order, strict=True):
         assert len(set(row.tolist())) == 60
         assert_farthest(cloud.double().numpy(), row.numpy())
-    repeated = sample(x, 130)
-    assert torch.equal(repeated[:, 120:], repeated[:, :10])
+    repeated = sample(x, 250)
+    assert torch.equal(repeated[:, 120:240], repeated[:, :120])
+    assert torch.equal(repeated[:, 240:], repeated[:, :10])
     copies = sample(torch.ones(2, 6, 3), 6, 2)
     assert copies[:, 0].tolist() == [2, 2]
     assert torch.equal(copies.sort(1)[0], torch.arange(6).expand(2, 6))

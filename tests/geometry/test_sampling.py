@@ -83,7 +83,7 @@ def test_fps_of_one_repeated_point_and_of_too_few() -> None:
     assert farthest_point_sampling_np(square, 0).tolist() == []
 
 
-@pytest.mark.parametrize(("n", "start"), [(2, 3), (2, -1), (-1, 0)])
+@pytest.mark.parametrize(("n", "start"), [(2, 3), (2, 4), (2, -1), (-1, 0)])
 def test_fps_bad_arguments(n: int, start: int) -> None:
     with pytest.raises(DataError, match="cannot take"):
         farthest_point_sampling_np(np.zeros((3, 3)), n, start)

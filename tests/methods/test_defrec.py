@@ -32,6 +32,12 @@ def test_head_is_the_layer_on_concatenated_features() -> None:
     assert widths == [256, 128, 3]
 
 
+def test_no_layer_of_the_head_has_a_bias() -> None:
+    layers = [m for m in ReconstructionHead(8, 4, 0.5).modules() if isinstance(m, nn.Linear)]
+    assert [tuple(layer.weight.shape) for layer in layers] == [(256, 256), (128, 256), (3, 128)]
+    assert all(layer.bias is None for layer in layers)
+
+
 def test_terms_and_weights() -> None:
     net, batch = tiny_net(), _batch()
     values = {}

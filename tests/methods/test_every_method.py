@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import copy
+import inspect
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import yaml
+from hydra.utils import get_class
 from torch import nn
 
 from qs3.errors import ConfigError
@@ -74,6 +78,66 @@ def test_a_step_is_a_function_of_the_generator(name: str) -> None:
     ):  # these draw nothing of their own
         assert not torch.equal(values[0], values[2])
     torch.set_rng_state(state)
+
+
+def _terms(name: str, **settings: Any) -> dict[str, torch.Tensor]:
+    net, method, batch = _made(name)
+    for key, value in settings.items():
+        setattr(method, key, value)
+    torch.manual_seed(5)
+    return method.loss(net, batch, torch.Generator().manual_seed(0))
+
+
+WEIGHTS = {
+    "dann": {"class_weight": {"ce"}, "domain_weight": {"domain"}},
+    "gast": {
+        "class_weight": {"ce"},
+        "def_weight": {"def_source", "def_target"},
+        "rot_weight": {"rot_source", "rot_target"},
+    },
+    "gast_pcm": {"class_weight": {"pcm"}},
+    "pointdan": {
+        "class_weight": {"ce"},
+        "discrepancy_weight": {"discrepancy"},
+        "node_weight": {"nodes"},
+    },
+    "pcfea_styled": {"align_weight": {"align_source", "align_target"}},
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_a_weight_multiplies_its_terms_and_no_others(name: str) -> None:
+    once = _terms(name)
+    for key, weighted in WEIGHTS[name].items():
+        _, method, _ = _made(name)
+        found = _terms(name, **{key: 3 * getattr(method, key)})
+        assert found.keys() == once.keys()
+        for term, value in once.items():
+            assert value.abs() > 1e-4, f"{term} says nothing"
+            factor = 3.0 if term in weighted else 1.0
+            torch.testing.assert_close(found[term], factor * value, rtol=1e-4, atol=1e-6)
+
+
+def test_who_sees_the_target() -> None:
+    seen = {name for name, case in CASES.items() if case.make().uses_target}
+    without = {"source_only", "supervised", "pcm"}
+    students = {name for name in CASES if name.startswith("student")}  # theirs are pseudo-labelled
+    assert seen == set(CASES) - without - students
+
+
+CONFIGS = [
+    path
+    for path in sorted((Path(__file__).parents[2] / "conf" / "method").glob("*.yaml"))
+    if "_target_" in yaml.safe_load(path.read_text())
+]
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_defaults_are_those_of_the_configs(path: Path) -> None:
+    """`Gast()` in a notebook is `method=gast`."""
+    written = yaml.safe_load(path.read_text())
+    taken = inspect.signature(get_class(written.pop("_target_"))).parameters.values()
+    assert {p.name: p.default for p in taken if p.default is not p.empty} == written
 
 
 @parametrize

@@ -69,6 +69,10 @@ def test_attention_belongs_to_a_domain() -> None:
     assert net.backbone.node_module.residual.layers[0].weight.grad.abs().max() > 0
 
 
+def test_the_kernels_of_the_paper() -> None:
+    assert SIGMAS == (0.01, 0.1, 1.0, 10.0, 100.0)
+
+
 def test_another_model_is_refused() -> None:
     with pytest.raises(ConfigError, match="model=pointdan"):
         PointDan().prepare(tiny_net())

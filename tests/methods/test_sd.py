@@ -97,6 +97,7 @@ def test_what_stays_lies_before_a_plane(b: int, n: int, kept: float, seed: int) 
     before = points.clone()
     found = spoilt(points, kept, torch.Generator().manual_seed(seed))
     assert torch.equal(points, before)
+    assert found.shape == points.shape
     generator = torch.Generator().manual_seed(seed)
     size = 0.7 + 0.8 * torch.rand(b, 1, 1, generator=generator)
     whole, left = points * size, max(1, round(kept * n))

@@ -134,6 +134,22 @@ def test_a_pool_by_hand() -> None:
         torch.testing.assert_close(method.source_mean[k], of_class.mean(0), rtol=1e-4, atol=1e-5)
 
 
+def test_a_class_without_a_cloud_in_the_pool_keeps_the_source_s_mean() -> None:
+    net, data = tiny_net(), _data()
+    method = Pcfea()
+    method.prepare(net)
+    method.start_epoch(net, data, 99, 100)  # hardly any source cloud is left
+    with torch.no_grad():
+        f, z = penultimate(net.eval(), data.target.points)
+    named = z.argmax(1)
+    counts = torch.bincount(named, minlength=CLASSES)
+    assert (counts == 0).any()
+    for k in range(CLASSES):
+        expected = f[named == k].mean(0) if counts[k] else method.source_mean[k]
+        if counts[k] <= 2:  # all of them are in
+            torch.testing.assert_close(method.mean[k], expected, rtol=1e-4, atol=1e-5)
+
+
 def test_a_selector_chooses_the_target_s_part() -> None:
     """One that keeps nothing leaves the source's share; its clouds get its labels."""
     net, data = tiny_net(), _data()
@@ -186,10 +202,12 @@ def test_wrong_settings_name_the_key(settings: dict, message: str) -> None:
         Pcfea(**settings)
 
 
-def test_a_head_that_is_not_linear_at_its_end_is_refused() -> None:
-    net = PointClassifier(OneLayer(), nn.Linear(OneLayer.feature_dim, 2))
+@pytest.mark.parametrize("layers", [1, 2])
+def test_a_head_that_is_not_linear_at_its_end_is_refused(layers: int) -> None:
+    linear = nn.Linear(OneLayer.feature_dim, 2)
+    head = linear if layers == 1 else nn.Sequential(linear, nn.ReLU())
     with pytest.raises(ConfigError, match="method=pcfea needs a class head whose last layer"):
-        Pcfea().prepare(net)
+        Pcfea().prepare(PointClassifier(OneLayer(), head))
 
 
 def _gaussians(labels: Tensor, generator: torch.Generator, target: bool) -> Tensor:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -90,6 +92,21 @@ def test_the_first_round_and_the_unsure_keep_the_teacher_s_labels() -> None:
     assert 3 <= sure.sum() < 60
     np.testing.assert_allclose(later.soft.sum(1)[~sure], 0.1)
     np.testing.assert_array_equal(later.labels[~sure], teacher.predicted[~sure])
+
+
+def test_each_class_has_at_least_one_that_is_sure() -> None:
+    teacher, _ = _two_groups(wrong=0.0)
+    found = GraphRefined(graph=False, growth=0.001).select(teacher, 0.0, 1)
+    sure = np.isclose(found.soft.sum(1), 1.0)
+    assert sorted(found.labels[sure]) == [0, 1, 2]
+
+
+def test_defaults_are_those_of_the_config() -> None:
+    path = Path(__file__).parents[2] / "conf" / "selftraining" / "sd.yaml"
+    written = yaml.safe_load(path.read_text())["selector"]
+    del written["_target_"]
+    own = dataclasses.asdict(GraphRefined())
+    assert own == {**written, "seed": 0}
 
 
 def test_the_order_of_the_rows_and_torch_s_generator_do_not_matter() -> None:

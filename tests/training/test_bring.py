@@ -34,9 +34,7 @@ def run_with(folder: Path, *overrides: str) -> Run:
         cfg=cfg,
         folder=hashing.run_folder(cfg),
         seed=0,
-        phases=Phases(
-            protocol.epochs, scheme.rounds, scheme.epochs, protocol.steps, scheme.steps
-        ),
+        phases=Phases(protocol.epochs, scheme.rounds, scheme.epochs, protocol.steps, scheme.steps),
         scheme=scheme,
         source=build(cfg.data.source),
         target=build(cfg.data.target),

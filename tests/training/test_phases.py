@@ -78,6 +78,19 @@ def persistent(tmp_path_factory: pytest.TempPathFactory, toy_data: Path) -> Kept
     return kept_run(tmp_path_factory.mktemp("persistent"), toy_data, *PERSISTENT)
 
 
+@pytest.mark.parametrize("run", ["scratch", "continued"])
+def test_a_round_says_how_many_labels_it_kept_from_the_round_before(run, request):
+    found = request.getfixturevalue(run)
+    assert found.metrics.rounds[0].agreement is None
+    labels = [
+        [row.label for row in read_pseudo_labels(path_of(found.folder, round_))]
+        for round_ in range(2)
+    ]
+    kept = [a == b for a, b in zip(*labels, strict=True)]
+    assert found.metrics.rounds[1].agreement == pytest.approx(sum(kept) / len(kept))
+    assert not all(kept)
+
+
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     assert a.keys() == b.keys()
     return all(torch.equal(a[name], b[name]) for name in a)

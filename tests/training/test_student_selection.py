@@ -270,8 +270,8 @@ def test_too_few_to_hold_out(toy, monkeypatch):
         return table
 
     monkeypatch.setattr("qs3.selftraining.callback.predict", two_of_each)
-    with pytest.raises(SelectionError, match=r"round 1: .*pseudo_val.*no class has three \(ball"):
-        train(toy("selection.student=pseudo_val"))
+    with pytest.raises(SelectionError, match=r"round 2: .*pseudo_val.*no class has three \(ball"):
+        train(toy("selection.student=pseudo_val", "selftraining.rounds=3", "selftraining.epochs=1"))
 
 
 # --- the target's labels ----------------------------------------------------------------------
