@@ -259,9 +259,9 @@ def work(
         if (root / name).is_file():
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(root / name, copy / name)
-    path = os.pathsep.join(filter(None, [str(copy), os.environ.get("PYTHONPATH")]))
+    packages = os.pathsep.join(filter(None, [str(copy), os.environ.get("PYTHONPATH")]))
     os.environ.update(
-        PYTHONPATH=path, OMP_NUM_THREADS="1", MPLBACKEND="Agg", TMPDIR=str(copy.parent)
+        PYTHONPATH=packages, OMP_NUM_THREADS="1", MPLBACKEND="Agg", TMPDIR=str(copy.parent)
     )
     tempfile.tempdir = str(copy.parent)
     sys.path.insert(0, str(copy))
@@ -293,7 +293,10 @@ def work(
             limits[which] = 3 * seconds + 15
             traced[which] = json.loads(trace.read_text())
         sys.dont_write_bytecode = True
-        changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
+        try:
+            changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
+        except AttributeError:  # cosmic-ray's for exceptions of a module: `except yaml.YAMLError`
+            changed = None
         for cached in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
             cached.unlink()
         if changed is None or changed == source:

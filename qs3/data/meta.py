@@ -93,8 +93,8 @@ def _words(value: Any) -> bool:
 _META_FITS: dict[str, Callable[[Any], bool]] = {
     "name": lambda value: isinstance(value, str),
     "classes": lambda value: _words(value) and len(value) > 0,
-    "clouds": lambda value: type(value) is int and value >= 0,
-    "points": lambda value: type(value) is int and value >= 0,
+    "clouds": lambda value: type(value) is int and value > 0,
+    "points": lambda value: type(value) is int and value > 0,
     "sha256": lambda value: (
         isinstance(value, dict) and "manifest" in value and _words(sorted(map(str, value)))
     ),

@@ -217,7 +217,7 @@ def write_pointset(
     check_rows(rows, classes, where=f"rows of dataset {name!r}")
     stacked = {key: _stack(name, key, value) for key, value in arrays.items()}
     clouds = sum(row.status == OK for row in rows)
-    shape = _check_arrays(name, stacked, clouds, tables)
+    clouds, points = _check_arrays(name, stacked, clouds, tables)
 
     make_folder(folder)
     (folder / META).unlink(missing_ok=True)
@@ -233,8 +233,8 @@ def write_pointset(
         "created_by": f"qs3 {VERSION}",
         "name": name,
         "classes": list(classes),
-        "clouds": shape[0],
-        "points": shape[1],
+        "clouds": clouds,
+        "points": points,
         "failed": len(rows) - clouds,
         "sha256": {**hashes, "manifest": sha256_file(folder / MANIFEST)},
     }
@@ -354,8 +354,8 @@ def _check_arrays(
     arrays: Mapping[str, np.ndarray],
     clouds: int,
     tables: Mapping[str, Sequence[str]],
-) -> tuple[int, int, int]:
-    """The common shape of all clouds, after checking that all arrays fit the manifest."""
+) -> tuple[int, int]:
+    """How many clouds of how many points, after checking that all arrays fit the manifest."""
     if "points" not in arrays:
         raise DataError(f"dataset {name!r} needs an array 'points', got {sorted(arrays)}")
     if wrong := sorted(set(tables) - set(arrays) | set(tables) & {"points"}):
@@ -381,7 +381,7 @@ def _check_arrays(
             bad = int(np.flatnonzero(~np.isfinite(array).all(axis=(1, 2)))[0])
             raise DataError(f"array {key!r} of dataset {name!r}: cloud {bad} is not finite")
     n, p, _ = arrays["points"].shape
-    return n, p, 3
+    return n, p
 
 
 def _header(shape: tuple[int, ...]) -> bytes:

@@ -62,6 +62,18 @@ def test_round_trip(tmp_path):
     assert rows[1].reason == "empty mesh"
 
 
+def test_the_smallest_dataset(tmp_path):
+    """One point of one cloud of one class, beside an object that failed."""
+    rows = [
+        ManifestRow("bed/0", "bed", "train"),
+        ManifestRow("bed/1", "bed", "train", status="failed"),
+    ]
+    make(tmp_path / "d", classes=["bed"], arrays={"points": np.ones((1, 1, 3))}, rows=rows)
+    found = open_pointset(tmp_path / "d")
+    assert (found.classes, found.points.tolist()) == (("bed",), [[[1.0, 1.0, 1.0]]])
+    assert (found.meta["clouds"], found.meta["points"], found.meta["failed"]) == (1, 1, 1)
+
+
 def test_what_is_begun_is_not_finished(tmp_path):
     folder = tmp_path / "d"
     assert not store.is_begun(folder)
@@ -196,11 +208,18 @@ def test_the_number_of_clouds_is_checked_against_the_manifest(tmp_path):
     ("line", "other", "message"),
     [
         ("clouds: 6", "clouds: -6", "has no clouds as"),
+        ("clouds: 6", "clouds: 0", "has no clouds as"),
         ("clouds: 6", "clouds: six", "has no clouds as"),
+        ("points: 5", "points: -5", "has no points as"),
+        ("points: 5", "points: 0", "has no points as"),
         ("points: 5", "points: [5]", "has no points as"),
         ("name: tiny", "named: tiny", "has no name as"),
         ("classes:", "classes: 3\nkinds:", "has no classes as"),
+        ("classes:", "classes: []\nkinds:", "has no classes as"),
+        ("classes:", "classes: [bed, bed]\nkinds:", "has no classes as"),
         ("sha256:", "sha256: all\nhashes:", "has no sha256 as"),
+        ("sha256:", "sha256: [manifest]\nhashes:", "has no sha256 as"),
+        ("sha256:", "sha256: {points: abc}\nhashes:", "has no sha256 as"),
         ("clouds: 6", "clouds: 6\ntables: [a]", "has no tables as"),
         ("clouds: 6", "clouds: [6", "was written by something else"),
         (None, "- 1\n", "was written by something else"),
