@@ -66,7 +66,7 @@ def test_the_smallest_dataset(tmp_path):
     """One point of one cloud of one class, beside an object that failed."""
     rows = [
         ManifestRow("bed/0", "bed", "train"),
-        ManifestRow("bed/1", "bed", "train", status="failed"),
+        ManifestRow("bed/1", "bed", "train", status="failed", reason="empty"),
     ]
     make(tmp_path / "d", classes=["bed"], arrays={"points": np.ones((1, 1, 3))}, rows=rows)
     found = open_pointset(tmp_path / "d")
