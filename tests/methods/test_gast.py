@@ -5,14 +5,14 @@ import torch
 
 from qs3.methods.deform import VOXELS
 from qs3.methods.gast import Gast, turn_parts
-from tests.methods.shapes import tiny_net
+from tests.methods.shapes import CLASSES, tiny_net
 
 
 def losses(method: Gast, zero: bool = False) -> dict[str, torch.Tensor]:
     """The terms of one step on four clouds; with `zero` the heads know nothing."""
     net = tiny_net()
     method.prepare(net)
-    for p in method.parameters() if zero else ():
+    for p in (*method.parameters(), *net.head.parameters()) if zero else ():
         torch.nn.init.zeros_(p)
     clouds = torch.rand(4, 64, 3) * 2 - 1
     source = {"points": clouds, "y_source": torch.tensor([0, 1, 2, 3])}
@@ -58,7 +58,8 @@ def test_the_two_labels_are_independent() -> None:
 
 
 def test_a_net_that_knows_nothing_pays_ln_27_and_ln_4() -> None:
-    terms = losses(Gast(min_points=2), zero=True)
+    terms = losses(Gast(min_points=2, class_weight=3.0), zero=True)
+    assert terms["ce"].item() == pytest.approx(3 * math.log(CLASSES), rel=1e-5)
     for domain in ("source", "target"):
         assert terms[f"def_{domain}"].item() == pytest.approx(0.5 * math.log(VOXELS), rel=1e-5)
         assert terms[f"rot_{domain}"].item() == pytest.approx(0.2 * math.log(4), rel=1e-5)
