@@ -148,3 +148,5 @@ def test_the_surest_worked_by_hand():
         assert kept(share) == expected
     assert [kept(0.01), kept(0.01, least=1), kept(0.5, least=3)] == ["", "ae", "abcefg"]
     assert [kept(0.3), kept(0.3, ids=list("abcdzfg"))] == ["ae", "af"]  # ties
+    three = most_confident(confidence, np.array([0, 0, 1, 1, 2, 2, 2]), 0.2)  # and least is 0
+    assert np.flatnonzero(three).tolist() == [4]  # 0.6 of three; 0.4 of two are none

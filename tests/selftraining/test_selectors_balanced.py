@@ -189,6 +189,7 @@ def test_random_draws_each_sample_equally_often() -> None:
     ("settings", "message"),
     [
         ({"portion": 0.0}, "portion=0.0"),
+        ({"portion": -0.1}, "portion=-0.1"),
         ({"portion": 0.6}, "0 < portion <= most"),
         ({"most": 1.1}, "most=1.1"),
         ({"step": -0.1}, "step must be >= 0"),
