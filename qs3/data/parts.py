@@ -54,7 +54,7 @@ class PartFiles:
         path = self.folder / RECIPE
         try:
             there = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(
                 f"{path} cannot be read ({error}): use force=true to start over"
             ) from error

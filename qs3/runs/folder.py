@@ -46,7 +46,7 @@ def read_started(folder: str | Path) -> dict[str, Any] | None:
         return started
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} cannot be read ({error}); delete it or run with force=true") from (
             error
         )

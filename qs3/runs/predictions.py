@@ -95,7 +95,7 @@ def read_predictions(path: Path) -> Predictions:
             np.array([classes.index(row[2]) if row[2] else -1 for row in rows]),
             np.array([[float(cell) for cell in row[len(_FIRST) :]] for row in rows]),
         )
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, IndexError, csv.Error) as error:
         raise DataError(f"{path} cannot be read ({error}); repeat the run with force=true") from (
             error
         )

@@ -119,11 +119,18 @@ class SummaryOfSeeds(Callback):
             lines = []
         entries = []
         for line in lines:
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, RecursionError):
                 entry = json.loads(line)
-                if isinstance(entry, dict) and {"folder", "overrides"} <= set(entry):
+                if _is_job(entry):
                     entries.append(entry)
         return entries
+
+
+def _is_job(entry: Any) -> bool:
+    if not isinstance(entry, dict) or not isinstance(entry.get("overrides"), list):
+        return False
+    words = [entry.get("folder"), entry.get("error", ""), *entry["overrides"]]
+    return all(isinstance(word, str) for word in words)
 
 
 def in_words(error: BaseException) -> str:

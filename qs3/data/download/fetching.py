@@ -173,7 +173,7 @@ class Resuming:
         try:
             note = json.loads(self.note.read_bytes())
             whole = note.keys() == {"url", "size", "etag", "modified"}
-        except (OSError, ValueError, AttributeError):
+        except (OSError, ValueError, AttributeError, RecursionError):
             return {}
         return note if whole and note["url"] == url else {}
 

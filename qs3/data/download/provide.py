@@ -91,7 +91,7 @@ def _is_in_place(place: Path, source: Source) -> bool:
         return False
     try:
         origin = json.loads((place / MARK).read_bytes())["source"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         origin = None
     if origin != source.name:
         log.warning(

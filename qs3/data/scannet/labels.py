@@ -86,7 +86,7 @@ def read_label_map(path: str | Path, column: str = "category") -> LabelMap:
             cls = _CLASS_OF.get((row[column] or "").strip())
             if cls is None:
                 continue
-            number = row["id"] or ""
+            number = (row["id"] or "")[:20]  # Python reads no more than 4300 digits
             if not number.isdecimal() or not 1 <= int(number) <= _MAX_ID:
                 raise DataError(f"{path}, line {line}: the id is {number!r}, not 1 to {_MAX_ID}")
             by_label[(row[raw] or "").strip()] = cls

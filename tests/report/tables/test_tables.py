@@ -152,7 +152,8 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("title: [", "x.yaml: while parsing"),
+        ("title: [", "x.yaml is not readable: while parsing"),
+        ("title: 2020-99-99", "x.yaml is not readable: month must be"),
         ("[]", "x.yaml: the file: "),
         ("title: x\nrows: []", "x.yaml: metrics: Field required"),
         ("HEAD\ntilte: y\nrows: []", "x.yaml: tilte: Unexpected"),
