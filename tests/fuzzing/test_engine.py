@@ -33,7 +33,7 @@ def spins(path):
 
 def takes_memory(path):
     if isinstance(value := value_of(path), int) and value > 100:
-        np.ones(25_000_000)
+        np.ones(10_000_000)
 
 
 def dies(path):
@@ -51,8 +51,8 @@ def escapes(path):
     [(spins, "hang"), (takes_memory, "memory"), (dies, "crash"), (escapes, "foreign")],
 )
 def test_what_a_reader_does_wrong_is_found(monkeypatch, read, kind):
-    monkeypatch.setattr(engine, "MOST_CPU_S", 0.05)
-    monkeypatch.setenv("QS3_MEMORY_GB", "0.1")
+    monkeypatch.setattr(engine, "MOST_CPU_S", 0.4)
+    monkeypatch.setenv("QS3_MEMORY_GB", "0.05")
     reader = Reader("planted", lambda folder: [SEED], read, "a.json")
     for seed in range(20):  # of short runs: it is found soon, but not in any second
         outcome = fuzz(reader, 0.5, seed)
