@@ -113,7 +113,10 @@ def build_table(
 def _read(path: Path) -> _Spec:
     try:
         spec = load_yaml(path.read_text(encoding="utf-8"), path)
-        return TypeAdapter(_Spec).validate_python(spec)
+        found = TypeAdapter(_Spec).validate_python(spec)
+        if not all(isinstance(row.get("name"), str) for row in found.rows):
+            raise ConfigError(f"{path}: missing or wrong entry 'name'")
+        return found
     except DataError as error:
         raise ConfigError(str(error)) from error
     except (OSError, UnicodeDecodeError) as error:
