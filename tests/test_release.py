@@ -22,7 +22,7 @@ NAMED = ("qs3/utils/version.py", "CITATION.cff", "CHANGELOG.md")
 AUTHOR = {
     f"GIT_{who}_{what}": "a@b.c" for who in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")
 }
-MAKEFILE = "%:\n\t@echo $@ >> out/made; test $@ != $(RED)\n"
+MAKEFILE = "%:\n\t@echo $@ >> out/made; test '$@' != '$(RED)'\n"
 CARD = "---\nlicense: mit\nlibrary_name: qs3\n---\n# A model\n"
 
 pytestmark = pytest.mark.skipif(not SCRIPT.is_file(), reason="an sdist is not released from")
@@ -175,10 +175,10 @@ def test_a_release_of_this_very_tree(release, tmp_path, capsys):
     commit(origin)
     git(tmp_path, "clone", "--quiet", str(origin), "tree")
     before = state(origin)
-    words = ["version=9.9.9", "go=true", "checks=lint docs", "environment=here", "date=2026-01-31"]
+    words = ["version=9.9.9", "go=true", "checks=lint test-all", "environment=here", "date=2026-01-31"]
     assert release.main(tree, *words) == 0, capsys.readouterr().err
     assert "git push origin HEAD v9.9.9" in capsys.readouterr().out
-    assert (tmp_path / "made" / "by").read_text().split() == ["lint", "docs"]
+    assert (tmp_path / "made" / "by").read_text().split() == ["lint", "test-all"]
     assert git(tree, "tag", "--list", "--format=%(objecttype) %(contents)").split("\n")[:3] == [
         "tag qs3 9.9.9", "", "- All of it.",
     ]  # fmt: skip

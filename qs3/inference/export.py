@@ -30,6 +30,7 @@ from qs3.models.base import PointClassifier
 from qs3.models.norms import norms_for, use_domain
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import atomic_path, make_folder
+from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.version import VERSION
 from qs3.utils.yamls import load_yaml
 
@@ -149,7 +150,7 @@ def _command(run: Path) -> str:
     """That trained the run, if it is known; of absolute paths only the last part."""
     try:
         path = run / ".hydra" / "overrides.yaml"
-        words = load_yaml(path.read_text("utf-8"), path)
+        words = load_yaml(read_whole(path, YAML_PEAK).decode(), path)
     except (OSError, ValueError, DataError):
         return ""
     given = [str(word) for word in words] if isinstance(words, list) else []

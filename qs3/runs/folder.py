@@ -30,6 +30,7 @@ from typing import Any
 from qs3.errors import ConfigError, DataError
 from qs3.runs.metrics import METRICS
 from qs3.utils.files import write_json
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 STARTED = "started.json"
 
@@ -40,7 +41,7 @@ def read_started(folder: str | Path) -> dict[str, Any] | None:
     """What `write_started` saved; None if the run never got that far."""
     path = Path(folder) / STARTED
     try:
-        started = json.loads(path.read_text(encoding="utf-8"))
+        started = json.loads(read_whole(path, JSON_PEAK))
         if not isinstance(started, dict):
             raise ValueError("no JSON object")
         return started

@@ -26,6 +26,7 @@ from qs3.evaluation.selection_rules import check_objective
 from qs3.runs.metrics import METRICS
 from qs3.sweeps.search import register
 from qs3.sweeps.search_space import check_varied, split
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +115,7 @@ class SummaryOfSeeds(Callback):
         """What was noted, but for damaged lines: two machines may write at one place."""
         assert self.journal is not None
         try:
-            lines = self.journal.read_bytes().splitlines()
+            lines = read_whole(self.journal, JSON_PEAK).splitlines()
         except FileNotFoundError:  # by a job that ends after the summary
             lines = []
         entries = []

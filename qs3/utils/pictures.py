@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,20 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">8sI4sIIBBBBB")
 _END = b"\0\0\0\0IEND\xaeB`\x82"
 _GREY = 0
+
+
+def png_bytes(path: Path) -> bytes:
+    """What a PNG file holds.
+
+    Raises:
+        DataError: it cannot be read, or is too large.
+    """
+    try:
+        if path.stat().st_size > MAX_PNG_BYTES:
+            raise DataError(f"{path}: the PNG has more than {MAX_PNG_BYTES} bytes; refused")
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
 
 
 def read_png(data: bytes, where: str) -> np.ndarray:

@@ -34,7 +34,7 @@ from tests.fuzzing.mutate import Shape, mutated
 MOST_CPU_S = 5.0
 """Processor time of one call; none of these inputs needs a tenth of it."""
 
-_SLACK = 0.25  # of the budget: what else the process takes meanwhile
+_SLACK = 1.25, 1 << 26  # times the budget, and bytes: what else the process takes meanwhile
 _SILENT_S = 90.0  # then the process hangs where no signal is heard
 _RECENT = 16
 
@@ -183,7 +183,7 @@ class _Loop:
             corpus = self.reader.seeds(Path(made))
         self._call(corpus[0])  # what is imported now is not the input's
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-        most = pages * resource.getpagesize() + 3 * memory_limit()
+        most = pages * resource.getpagesize() + 3 * memory_limit() + (1 << 30)
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
         signal.signal(signal.SIGPROF, self._stop)
         end = time.monotonic() + seconds
@@ -222,7 +222,7 @@ class _Loop:
             found = self._limited(data, MOST_CPU_S)
         took = max(0, _peak() - before)
         self.outcome.peak = max(self.outcome.peak, took)
-        if found is None and took > (1 + _SLACK) * memory_limit():
+        if found is None and took > _SLACK[0] * memory_limit() + _SLACK[1]:
             found = Found("memory", f"{took / 1e9:.2f} GB", self.reader.name, "")
         self.outcome.executions += 1
         if found is not None and (found.kind, found.where) not in self.known:

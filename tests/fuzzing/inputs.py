@@ -25,7 +25,9 @@ def folder_of(folder: Path) -> bytes:
 
 
 def laid_out(path: Path) -> Path:
-    """The folder of an input; names of members that lead elsewhere are passed over."""
+    """The folder of an input, if it is none yet; members with odd names are passed over."""
+    if path.is_dir():
+        return path
     root = path.parent / "folder"
     root.mkdir()
     try:
@@ -44,4 +46,4 @@ def laid_out(path: Path) -> Path:
 
 def half_of_all(path: Path) -> bool:
     """Of half of all inputs: whether checksums shall be made to match."""
-    return bool(hashlib.sha256(path.read_bytes()).digest()[0] & 1)
+    return path.is_file() and bool(hashlib.sha256(path.read_bytes()).digest()[0] & 1)

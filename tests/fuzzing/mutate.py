@@ -20,16 +20,21 @@ Part = tuple[str, bytes]
 
 
 class Shape(NamedTuple):
-    """How a file is taken apart and put together; taking apart may raise anything."""
+    """How a file is taken apart and put together; taking apart may raise anything.
+
+    `packs`: what repeats takes next to no bytes in it, so a part may become large.
+    """
 
     open: Callable[[bytes], list[Part]]
     close: Callable[[list[Part]], bytes]
+    packs: bool = False
 
 
 MOST_BYTES = 1 << 16
 """Longer inputs are cut: they take time and find nothing new."""
 
 _WIDTHS = (1, 2, 4, 8)
+_BLOATED = (1 << 16, 1 << 20, 1 << 24)
 _NUMBERS = (
     *("0", "-0", "-1", "1", "2", "7", "255", "256", "65536", "2147483647", "2147483648"),
     *("4294967296", "9223372036854775807", "18446744073709551616", "1e39", "-1e308", "1e999"),
@@ -66,7 +71,10 @@ def _by_parts(
         at = rng.randrange(len(parts))
         name, content = parts[at]
         how = rng.random()
-        if how < 0.8:
+        if shape.packs and how < 0.03:
+            some = content[rng.randrange(len(content) + 1) :][: rng.choice((1, 64, 4096))] or b"\0"
+            parts[at] = name, content + some * (rng.choice(_BLOATED) // len(some))
+        elif how < 0.8:
             parts[at] = name, _bytes(content, rng.choice(foreign)[1], rng)
         elif how < 0.85:
             del parts[at]
@@ -229,7 +237,7 @@ def zipped(parts: list[Part], how: int = zipfile.ZIP_STORED) -> bytes:
 
 
 ZIP = Shape(_zip_parts, zipped)
-PACKED = Shape(_zip_parts, lambda parts: zipped(parts, zipfile.ZIP_DEFLATED))
+PACKED = Shape(_zip_parts, lambda parts: zipped(parts, zipfile.ZIP_DEFLATED), packs=True)
 
 
 def _png_parts(data: bytes) -> list[Part]:
@@ -253,7 +261,7 @@ def _png(parts: list[Part]) -> bytes:
     return b"".join(out)
 
 
-PNG = Shape(_png_parts, _png)
+PNG = Shape(_png_parts, _png, packs=True)
 
 
 def _glb_parts(data: bytes) -> list[Part]:
@@ -294,7 +302,7 @@ def _tar(parts: list[Part]) -> bytes:
     return packer.compress(bytes(out)) + packer.flush()
 
 
-TAR_GZ = Shape(_tar_parts, _tar)
+TAR_GZ = Shape(_tar_parts, _tar, packs=True)
 
 
 def _safetensors_parts(data: bytes) -> list[Part]:

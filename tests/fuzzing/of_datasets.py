@@ -135,7 +135,8 @@ def _labels(folder: Path) -> list[bytes]:
 def _read_labels(path: Path) -> None:
     from qs3.data.scannet.labels import LabelMap, read_label_map, read_objects, read_scene_list
 
-    start = path.read_bytes()[:5]
+    with open(path, "rb") as file:
+        start = file.read(5)
     if start[:1] == b"{":
         read_objects(path, LabelMap({"chair": "chair", "sofa": "sofa"}, {2: "chair"}))
     elif start == b"scene":

@@ -174,7 +174,9 @@ def _lists(folder: Path) -> list[bytes]:
 def _read_list(path: Path) -> None:
     from qs3.inference.depth_list import Shown, find_shown
 
-    if path.read_bytes()[:1] not in (b"[", b"-"):
+    with open(path, "rb") as file:
+        start = file.read(1)
+    if start not in (b"[", b"-"):
         path = path.rename(path.with_suffix(".csv"))
     find_shown(str(path), "", Shown("", intrinsics="1,1,1,1"))
 

@@ -33,7 +33,7 @@ def spins(path):
 
 def takes_memory(path):
     if isinstance(value := value_of(path), int) and value > 100:
-        np.ones(10_000_000)
+        np.ones(20_000_000)
 
 
 def dies(path):

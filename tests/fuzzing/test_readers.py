@@ -73,3 +73,13 @@ def test_only_errors_for_people_leave_a_reader(name):
     assert [str(Found(**one)) for one in said["found"]] == []
     assert said["accepted"] > 0  # the seeds are whole files
     assert said["executions"] > 20
+
+
+@pytest.mark.slow
+def test_files_of_4_gb_are_told_or_read_in_little_memory():
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    words = [sys.executable, "-m", "tests.fuzzing.large"]
+    done = subprocess.run(
+        words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.stdout, done.returncode) == ("", 0), done.stderr[-2000:]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from qs3.errors import DataError, MissingDataError
-from qs3.utils.memory import check_memory, memory_limit
+from qs3.utils.memory import check_memory, memory_limit, read_whole
 
 _MOST_V5_BYTES = 1 << 28
 _PEAK_V5 = 8  # of memory to what is unpacked: small arrays are objects
@@ -64,7 +64,7 @@ def _check_v5(path: Path) -> None:
         DataError: of another version.
         ValueError: a length does not fit.
     """
-    data = memoryview(path.read_bytes())
+    data = memoryview(read_whole(path, _PEAK_V5))
     order = _ORDERS.get(bytes(data[124:128]))
     if bytes(data[124:128]) in (b"\x00\x02IM", b"\x02\x00MI"):
         raise DataError(

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from qs3.classes import ALIASES, CLASSES
 from qs3.errors import DataError, MissingDataError
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 NAMES: tuple[str, ...] = (
     "bathtub", "bed", "shelf", "cabinet", "chair", "lamp", "monitor", "plant", "couch", "table",
@@ -31,7 +32,6 @@ NAMES: tuple[str, ...] = (
 COLUMNS = ("category", "raw_category")
 
 _CLASS_OF = {name: ALIASES.get(name, name) for name in NAMES}
-_MAX_TEXT_BYTES = 1 << 28
 _MAX_ID = 65535  # of a 16-bit mask
 
 
@@ -159,9 +159,7 @@ def is_scene(name: str) -> bool:
 
 def _text(path: str | Path, what: str) -> str:
     try:
-        if Path(path).stat().st_size > _MAX_TEXT_BYTES:
-            raise DataError(f"{path} is too large for {what}")
-        return Path(path).read_bytes().decode("utf-8", "replace")
+        return read_whole(Path(path), JSON_PEAK).decode("utf-8", "replace")
     except FileNotFoundError as error:
         raise MissingDataError(f"there is no {path}, {what}") from error
     except OSError as error:

@@ -25,6 +25,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import Group, group, load_runs
 from qs3.report.tables.cells import Cell, Published, Table
 from qs3.report.tables.keeping import with_kept
+from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.yamls import load_yaml
 
 _SUPERVISED = "qs3.methods.supervised.Supervised"
@@ -112,7 +113,7 @@ def build_table(
 
 def _read(path: Path) -> _Spec:
     try:
-        spec = load_yaml(path.read_text(encoding="utf-8"), path)
+        spec = load_yaml(read_whole(path, YAML_PEAK).decode(), path)
         found = TypeAdapter(_Spec).validate_python(spec)
         if not all(isinstance(row.get("name"), str) for row in found.rows):
             raise ConfigError(f"{path}: missing or wrong entry 'name'")

@@ -12,7 +12,8 @@ import numpy as np
 from qs3.clouds.arrays import read_npy
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.cameras import Intrinsics
-from qs3.utils.pictures import MAX_PNG_BYTES, read_png
+from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.pictures import png_bytes, read_png
 
 _MAX_PIXELS = 1 << 26
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
@@ -46,7 +47,7 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
     """
     if text.lower().endswith(".json"):
         try:
-            values = _four(json.loads(Path(text).read_text(encoding="utf-8")))
+            values = _four(json.loads(read_whole(Path(text), JSON_PEAK)))
         except OSError as error:
             raise MissingDataError(f"intrinsics={text}: {error.strerror or error}") from error
         except (ValueError, RecursionError) as error:
@@ -176,13 +177,7 @@ def _resolution(depth_m: np.ndarray) -> float:
 
 
 def _png(path: Path) -> np.ndarray:
-    try:
-        size = path.stat().st_size
-        if size > MAX_PNG_BYTES:
-            raise DataError(f"{path}: the PNG has {size} bytes; refused")
-        image = read_png(path.read_bytes(), str(path))
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
+    image = read_png(png_bytes(path), str(path))
     if image.dtype != np.uint16:
         raise DataError(f"{path} is not a depth image: 8 bits a pixel; 16 bit grey is needed")
     return image
