@@ -175,7 +175,13 @@ def test_a_release_of_this_very_tree(release, tmp_path, capsys):
     commit(origin)
     git(tmp_path, "clone", "--quiet", str(origin), "tree")
     before = state(origin)
-    words = ["version=9.9.9", "go=true", "checks=lint test-all", "environment=here", "date=2026-01-31"]
+    words = [
+        "version=9.9.9",
+        "go=true",
+        "checks=lint test-all",
+        "environment=here",
+        "date=2026-01-31",
+    ]
     assert release.main(tree, *words) == 0, capsys.readouterr().err
     assert "git push origin HEAD v9.9.9" in capsys.readouterr().out
     assert (tmp_path / "made" / "by").read_text().split() == ["lint", "test-all"]

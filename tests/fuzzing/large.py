@@ -76,7 +76,7 @@ def main() -> int:
                 sys.stdout.write(f"{words}\n")
                 count += 1
         if time.monotonic() - began > 15:
-            sys.stdout.write(f"{reader.name}: {time.monotonic() - began:.0f} s\n")
+            sys.stderr.write(f"{reader.name}: {time.monotonic() - began:.0f} s\n")
     return count
 
 
