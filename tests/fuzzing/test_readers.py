@@ -19,7 +19,7 @@ SECONDS = 15
 
 OPENS = re.compile(
     r"(?<![\w.])(?<!def )open\(|np\.load\(|torch\.load\(|h5py\.File\(|json\.loads?\(|imread\("
-    r"|\.read_text\(|\.read_bytes\(|imdecode\(|Image\.open\(|yaml\.(safe_)?load\(|ZipFile\("
+    r"|\.read_text\(|read_whole\(|\.read_bytes\(|imdecode\(|Image\.open\(|yaml\.(safe_)?load\(|ZipFile\("
     r"|csv\.(Dict)?[rR]eader\(|tarfile\.open\(|loadmat\(|np\.frombuffer\(|pickle\.loads?\("
 )
 
@@ -37,6 +37,7 @@ OWN = {
     "sweeps/listed_jobs.py": "what the parent has just written",
     "utils/files.py": "bytes that are hashed",
     "utils/locks.py": "nothing is read",
+    "utils/memory.py": "bytes, for those that read them",
     "utils/pool.py": "what processes of our own send each other",
     "utils/seeding.py": "a hash",
 }
