@@ -18,7 +18,7 @@ from qs3.errors import DataError, MissingDataError
 from qs3.utils.memory import check_memory, memory_limit, read_whole
 
 _MOST_V5_BYTES = 1 << 28
-_PEAK_V5 = 8  # of memory to what is unpacked: small arrays are objects
+_PEAK_V5 = 8  # of memory to what is unpacked: small arrays are objects; 4.1 of SUN RGB-D's table
 _MOST_DEPTH = 16
 _INT8, _INT32, _UINT32, _MATRIX, _COMPRESSED = 1, 5, 6, 14, 15  # types of elements
 _NUMBERS, _LETTERS = {*range(1, 8), 9, 12, 13}, {16, 17, 18}
