@@ -33,14 +33,17 @@ def call(*words: str | Path, cwd: Path, **more: str) -> str:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """The folder that it was installed into; built from a copy, as a build leaves files."""
+    """The folder that it was installed into: QS3_WHEEL, or one that is built from a copy here."""
     copy, target = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("installed")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", "--no-input"]
+    alone = ["--no-index", "--no-deps"]
+    if given := os.environ.get("QS3_WHEEL"):
+        call(*pip, "install", *alone, "--target", target, given, cwd=copy)
+        return target
     for name in ("qs3", "conf"):
         shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, copy)
-    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", "--no-input"]
-    alone = ["--no-index", "--no-deps"]
     call(*pip, "wheel", *alone, "--no-build-isolation", "-w", copy / "dist", copy, cwd=copy)
     (wheel,) = (copy / "dist").glob("qs3-*.whl")
     call(*pip, "install", *alone, "--target", target, wheel, cwd=copy)

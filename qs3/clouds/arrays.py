@@ -37,6 +37,7 @@ def read_npy(
             check(shape, dtype)
         file.seek(0)
         array: np.ndarray = np.load(file, allow_pickle=False)
+        _check_words(path, array)
     return array
 
 
@@ -70,6 +71,7 @@ def read_npz(path: Path, choose: Callable[[list[str]], Sequence[str]]) -> dict[s
             data = archive.read(info)
             _header(f"{path}, {name}", io.BytesIO(data), len(data))
             arrays[name] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+            _check_words(f"{path}, {name}", arrays[name])
     return arrays
 
 
@@ -89,6 +91,14 @@ def _header(where: object, file: Any, size: int) -> tuple[tuple[int, ...], np.dt
     if size != expected or min(shape, default=0) < 0:
         raise DataError(f"{where}: {size} bytes, expected {expected} for shape {shape}")
     return shape, dtype
+
+
+def _check_words(where: object, array: np.ndarray) -> None:
+    """Refuse words of letters that do not exist: Python fails at them, wherever it meets them."""
+    if array.dtype.kind == "U" and array.dtype.itemsize:
+        letters = np.ascontiguousarray(array).reshape(-1).view(array.dtype.str[0] + "u4")
+        if ((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters < 0xE000))).any():
+            raise DataError(f"{where}: its words hold letters that do not exist")
 
 
 @contextlib.contextmanager

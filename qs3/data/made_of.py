@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from qs3.errors import DataError
+
 KEY = "made_of"
 """Its key in meta.yaml."""
 
@@ -40,8 +42,20 @@ class MadeOf:
 
     @staticmethod
     def of(meta: Mapping[str, Any]) -> MadeOf:
-        """As a store's meta.yaml says it."""
-        return MadeOf(**meta.get(KEY, {}))
+        """As a store's meta.yaml says it.
+
+        Raises:
+            DataError: it says something else.
+        """
+        given, known = meta.get(KEY) or {}, dataclasses.asdict(MadeOf())
+        if not isinstance(given, Mapping) or any(
+            key not in known or type(value) is not type(known[key]) for key, value in given.items()
+        ):
+            raise DataError(
+                f"meta.yaml of {meta.get('name')!r}: {KEY} is {str(given)[:200]}, not as qs3 "
+                "writes it; generate or import the dataset again"
+            )
+        return MadeOf(**given)
 
     @property
     def meta(self) -> dict[str, Any]:

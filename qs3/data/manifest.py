@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import DataError
+from qs3.utils.memory import TABLE_PEAK, read_whole
 from qs3.utils.text_table import csv_text
 
 MANIFEST = "manifest.csv"
@@ -77,7 +78,7 @@ def read_manifest(
     """
     path = Path(folder) / MANIFEST
     try:
-        data = path.read_bytes()
+        data = read_whole(path, TABLE_PEAK)
         text = data.decode()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error

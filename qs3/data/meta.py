@@ -12,11 +12,13 @@ import yaml  # type: ignore[import-untyped,unused-ignore]
 from qs3.data.manifest import AGAIN
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.files import write_text
+from qs3.utils.memory import read_whole
 
 FORMAT_VERSION = 1
 META = "meta.yaml"
 _CHECKSUM = "# sha256 of the lines above: "
 # A run opens its datasets some ten times, and libyaml is ten times as fast.
+_PEAK = 200  # of memory to its size: each value is an object before it is itself
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -63,7 +65,7 @@ def read_meta(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder) / META
     try:
-        text = path.read_bytes().decode()
+        text = read_whole(path, _PEAK).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
     body, mark, checksum = text.rpartition(_CHECKSUM)

@@ -18,6 +18,7 @@ import numpy as np
 from qs3.data.dataset_folder import PARTS, RECIPE
 from qs3.errors import ConfigError, DataError
 from qs3.utils.files import make_folder, remove_leftovers, write_bytes, write_json
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 _MOST_LINES = 12
 
@@ -53,8 +54,8 @@ class PartFiles:
         """
         path = self.folder / RECIPE
         try:
-            there = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
+            there = json.loads(read_whole(path, JSON_PEAK))
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(
                 f"{path} cannot be read ({error}): use force=true to start over"
             ) from error

@@ -21,6 +21,7 @@ from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import DataError
 from qs3.utils.files import write_text
+from qs3.utils.memory import TABLE_PEAK, read_whole
 
 
 class EpochRows(Callback):
@@ -91,8 +92,8 @@ class CsvHistory(Logger):
         if not self.path.is_file():
             return []
         try:
-            with open(self.path, encoding="utf-8", newline="") as file:
-                rows = list(csv.DictReader(file, strict=True))
+            text = read_whole(self.path, TABLE_PEAK).decode()
+            rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
             if not all(row["epoch"].isdecimal() and None not in row for row in rows):
                 raise ValueError("a row that is not of an epoch")
         except (OSError, ValueError, KeyError, AttributeError, csv.Error) as error:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.utils.yamls import check_yaml
+from qs3.utils.yamls import load_yaml
 
 LISTS = (".csv", ".json", ".yaml", ".yml")
 IMAGES = (".png", ".npy")
@@ -100,7 +100,7 @@ def numbers(words: Any, count: int, what: str) -> tuple[float, ...]:
     parts = words if isinstance(words, list | tuple) else str(words).replace(",", " ").split()
     try:
         found = tuple(float(part) for part in parts)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = ()
     if len(found) != count:
         raise ConfigError(f"{what}={words}: expected {count} numbers with commas between them")
@@ -181,13 +181,7 @@ def _table(text: str, path: Path) -> list[Mapping[str, Any]]:
 
 
 def _mappings(text: str, path: Path) -> list[Mapping[str, Any]]:
-    import yaml  # type: ignore[import-untyped,unused-ignore]
-
-    check_yaml(text, path)
-    try:
-        found = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError) as error:
-        raise DataError(f"{path} is not readable: {str(error).splitlines()[0]}") from error
+    found = load_yaml(text, path)
     if not isinstance(found, list) or not all(isinstance(row, Mapping) for row in found):
         raise DataError(f"{path}: expected a list of mappings with {', '.join(_COLUMNS)}")
     return found
@@ -223,7 +217,7 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
             words = given["intrinsics"]
             words = ",".join(map(str, words)) if isinstance(words, list) else str(words)
             shown = replace(shown, intrinsics=words, folder=folder)
-    except (ConfigError, TypeError, ValueError) as error:
+    except (ConfigError, TypeError, ValueError, OverflowError) as error:
         return Shown(name, wrong=f"{path.name}, row {number}: {error}")
     if not shown.intrinsics:
         return replace(shown, wrong=f"{path.name}, row {number}: no intrinsics")

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml  # type: ignore[import-untyped,unused-ignore]
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.config.checks import check_int
-from qs3.errors import ConfigError, Qs3Error
+from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.inference.model_card import card
 from qs3.inference.model_file import build_net, find_result, read_result, values_of
 from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
@@ -31,7 +30,9 @@ from qs3.models.base import PointClassifier
 from qs3.models.norms import norms_for, use_domain
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import atomic_path, make_folder
+from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.version import VERSION
+from qs3.utils.yamls import load_yaml
 
 ALLOWED = 1e-4  # difference of logits
 ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
@@ -148,8 +149,9 @@ def export_folder(ckpt: str | Path, folder: Path) -> str:
 def _command(run: Path) -> str:
     """That trained the run, if it is known; of absolute paths only the last part."""
     try:
-        words = yaml.safe_load((run / ".hydra" / "overrides.yaml").read_text("utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
+        path = run / ".hydra" / "overrides.yaml"
+        words = load_yaml(read_whole(path, YAML_PEAK).decode(), path)
+    except (OSError, ValueError, DataError):
         return ""
     given = [str(word) for word in words] if isinstance(words, list) else []
     kept = [word for word in given if not word.startswith(("paths.", "hydra."))]

@@ -22,6 +22,7 @@ from typing import Any
 from qs3.errors import DataError
 from qs3.inference.tensor_file import MAX_BYTES, read_tensors, write_tensors
 from qs3.utils.files import make_folder, sha256_file, write_json, write_text
+from qs3.utils.memory import read_whole
 from qs3.utils.version import VERSION
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
@@ -83,7 +84,7 @@ def _bytes(path: Path, most: int) -> bytes:
         size = path.stat().st_size
         if size > most:
             raise DataError(f"{path} has {size} bytes, more than {most}")
-        return path.read_bytes()
+        return read_whole(path, 2)  # and the tensors
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
 

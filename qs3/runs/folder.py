@@ -30,6 +30,7 @@ from typing import Any
 from qs3.errors import ConfigError, DataError
 from qs3.runs.metrics import METRICS
 from qs3.utils.files import write_json
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 STARTED = "started.json"
 
@@ -40,13 +41,13 @@ def read_started(folder: str | Path) -> dict[str, Any] | None:
     """What `write_started` saved; None if the run never got that far."""
     path = Path(folder) / STARTED
     try:
-        started = json.loads(path.read_text(encoding="utf-8"))
+        started = json.loads(read_whole(path, JSON_PEAK))
         if not isinstance(started, dict):
             raise ValueError("no JSON object")
         return started
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} cannot be read ({error}); delete it or run with force=true") from (
             error
         )

@@ -16,6 +16,7 @@ from pydantic.dataclasses import dataclass
 from qs3.data.made_of import MadeOf
 from qs3.errors import DataError
 from qs3.utils.files import write_text
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 METRICS = "metrics.json"
 FINISHED: Final = "finished"
@@ -295,7 +296,7 @@ def read_metrics(folder: str | Path) -> RunMetrics | None:
     """
     path = Path(folder) / METRICS
     try:
-        return _SCHEMA.validate_json(path.read_bytes())
+        return _SCHEMA.validate_json(read_whole(path, JSON_PEAK))
     except FileNotFoundError:
         return None
     except ValidationError as error:

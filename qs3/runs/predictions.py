@@ -7,6 +7,7 @@ where no mesh is known); label (empty if nobody knows it); predicted; and a prob
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from jaxtyping import Float, Int
 
 from qs3.errors import DataError
 from qs3.utils.files import write_text
+from qs3.utils.memory import TABLE_PEAK, read_whole
 from qs3.utils.text_table import csv_text
 
 FILE = "predictions.csv"
@@ -83,8 +85,8 @@ def read_predictions(path: Path) -> Predictions:
         DataError: it is not there, or not as `write_predictions` writes it.
     """
     try:
-        with open(path, encoding="utf-8", newline="") as file:
-            header, *rows = list(csv.reader(file))
+        text = read_whole(path, TABLE_PEAK).decode()
+        header, *rows = list(csv.reader(io.StringIO(text, newline="")))
         classes = tuple(name.removeprefix("p_") for name in header[len(_FIRST) :])
         if tuple(header[: len(_FIRST)]) != _FIRST or not classes or not rows:
             raise ValueError("it has other columns, or no rows")
@@ -95,7 +97,7 @@ def read_predictions(path: Path) -> Predictions:
             np.array([classes.index(row[2]) if row[2] else -1 for row in rows]),
             np.array([[float(cell) for cell in row[len(_FIRST) :]] for row in rows]),
         )
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, IndexError, csv.Error) as error:
         raise DataError(f"{path} cannot be read ({error}); repeat the run with force=true") from (
             error
         )

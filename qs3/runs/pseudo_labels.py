@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 
 from qs3.errors import DataError
 from qs3.utils.files import write_text
+from qs3.utils.memory import TABLE_PEAK, read_whole
 from qs3.utils.text_table import csv_text
 
 _COLUMNS = ("id", "label", "confidence", "selected")
@@ -52,8 +54,8 @@ def read_pseudo_labels(path: Path) -> list[PseudoLabel]:
         DataError: it is not there, or not as `write_pseudo_labels` writes it.
     """
     try:
-        with open(path, encoding="utf-8", newline="") as file:
-            header, *rows = csv.reader(file, strict=True)
+        text = read_whole(path, TABLE_PEAK).decode()
+        header, *rows = csv.reader(io.StringIO(text, newline=""), strict=True)
         if tuple(header) != _COLUMNS or not rows:
             raise ValueError("it has other columns, or no rows")
         return [

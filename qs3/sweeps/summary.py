@@ -26,6 +26,7 @@ from qs3.evaluation.selection_rules import check_objective
 from qs3.runs.metrics import METRICS
 from qs3.sweeps.search import register
 from qs3.sweeps.search_space import check_varied, split
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 log = logging.getLogger(__name__)
 
@@ -114,16 +115,23 @@ class SummaryOfSeeds(Callback):
         """What was noted, but for damaged lines: two machines may write at one place."""
         assert self.journal is not None
         try:
-            lines = self.journal.read_bytes().splitlines()
+            lines = read_whole(self.journal, JSON_PEAK).splitlines()
         except FileNotFoundError:  # by a job that ends after the summary
             lines = []
         entries = []
         for line in lines:
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, RecursionError):
                 entry = json.loads(line)
-                if isinstance(entry, dict) and {"folder", "overrides"} <= set(entry):
+                if _is_job(entry):
                     entries.append(entry)
         return entries
+
+
+def _is_job(entry: Any) -> bool:
+    if not isinstance(entry, dict) or not isinstance(entry.get("overrides"), list):
+        return False
+    words = [entry.get("folder"), entry.get("error", ""), *entry["overrides"]]
+    return all(isinstance(word, str) for word in words)
 
 
 def in_words(error: BaseException) -> str:

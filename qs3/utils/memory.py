@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from pathlib import Path
 
 from qs3.errors import ConfigError, DataError
 
@@ -47,3 +48,25 @@ def check_memory(needed: float, where: object, kind: type[DataError] = DataError
             f"{where} takes {needed / 1e9:.3g} GB of memory, more than {limit / 1e9:.3g} GB: "
             f"refused; if it is to be trusted, set {VARIABLE}={math.ceil(needed / 1e9)}".lstrip()
         )
+
+
+JSON_PEAK = 25
+"""Of memory to a text's size when its values are lists and dicts: "[[],[]," is the worst."""
+
+TABLE_PEAK = 20
+"""Likewise of cells of two letters in lists."""
+
+
+YAML_PEAK = 5
+"""Likewise of what `qs3.utils.yamls` reads, which counts the values."""
+
+
+def read_whole(path: Path, peak: float) -> bytes:
+    """A file's bytes, if `peak` times their number is within the limit.
+
+    Raises:
+        DataError: it is not.
+        OSError: the file cannot be read.
+    """
+    check_memory(peak * path.stat().st_size, path)
+    return path.read_bytes()

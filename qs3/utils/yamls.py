@@ -5,10 +5,27 @@ In a few lines with anchors and aliases a text can stand for more values than th
 
 from __future__ import annotations
 
+from typing import Any
+
 from qs3.errors import DataError
 
 MOST_VALUES = 100_000
 MOST_DEPTH = 64
+
+
+def load_yaml(text: str, where: object) -> Any:
+    """The plain values of a text that `check_yaml` lets through.
+
+    Raises:
+        DataError: begins with `where`.
+    """
+    import yaml  # type: ignore[import-untyped,unused-ignore]
+
+    check_yaml(text, where)
+    try:
+        return yaml.safe_load(text)
+    except Exception as error:  # a day that no month has, a number that none is: of Python's kinds
+        raise DataError(f"{where} is not readable: {str(error).splitlines()[0]}") from error
 
 
 def check_yaml(text: str, where: object) -> None:

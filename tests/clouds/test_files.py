@@ -199,3 +199,17 @@ def test_decimal_commas(text, expected, tmp_path):
     path = tmp_path / "a.txt"
     path.write_text(text)
     np.testing.assert_array_equal(parse_cloud(path), expected)
+
+
+@pytest.mark.parametrize("letter", [0x110000, 0xFFFFFFFF, 0xD800])
+@pytest.mark.parametrize("order", "<>")
+def test_letters_that_do_not_exist_are_refused(letter, order, tmp_path):
+    words = np.array([0x61, letter], dtype=f"{order}u4").view(f"{order}U1")
+    np.savez(tmp_path / "a.npz", points=np.ones((2, 4, 3)), label=words)
+    with pytest.raises(DataError, match=r"a\.npz, label: its words hold letters that do not exist"):
+        parse_clouds(tmp_path / "a.npz")
+    np.save(tmp_path / "b.npy", words)
+    with pytest.raises(DataError, match=r"b\.npy: its words hold letters"):
+        parse_clouds(tmp_path / "b.npy")
+    np.savez(tmp_path / "c.npz", points=np.ones((2, 4, 3)), label=np.array(["chaise", "été"]))
+    assert parse_clouds(tmp_path / "c.npz").labels == ("chaise", "été")

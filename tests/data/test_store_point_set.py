@@ -118,3 +118,6 @@ def test_clouds_of_a_dataset_cannot_be_put_in_place_of_others(tmp_path):
     assert data != dataclasses.replace(data)  # arrays have no single truth to compare
     meta = {"made_of": {"objects": "arrays of x.npz"}}
     assert str(make(tmp_path / "e", meta=meta).made_of) == str(MadeOf.of(meta))
+    for odd in ([1], {"colour": "red"}, {"views": "5"}, {1: None}):
+        with pytest.raises(DataError, match=r"made_of is .*, not as qs3 writes it"):
+            MadeOf.of({"name": "x", "made_of": odd})

@@ -20,7 +20,7 @@ from qs3.generation.provenance import (
     preview_of,
     provenance_of,
 )
-from qs3.generation.view_files import save_view, view_folder
+from qs3.generation.view_files import load_views, save_view, view_folder
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.pixel_status import Reason
@@ -227,6 +227,16 @@ def test_a_frame_without_photograph_or_depth_can_be_kept(tmp_path):
         assert list(file["reason_names"])[Reason.DARK] == "DARK"
         np.testing.assert_array_equal(file["reason"], blind.reason)
     assert cv2.imread(str(tmp_path / "a/b/view_0.png")) is not None
+    path = tmp_path / "a/b/view_0.npz"
+    arrays = dict(np.load(path))
+    for odd in ({"size_px": np.array(5)}, {"size_px": np.zeros((2, 2, 2))}, {"grid_px": None}):
+        np.savez(path, **{**arrays, **odd})
+        with pytest.raises(DataError, match=r"view_0\.npz is damaged"):
+            load_views(tmp_path, "a/b")
+    with zipfile.ZipFile(path, "w") as file:  # of this numpy's parser makes a TokenError
+        file.writestr("depth_m.npy", b"\x93NUMPY\x01\x00\x06\x00((((((")
+    with pytest.raises(DataError, match=r"view_0\.npz is damaged"):
+        load_views(tmp_path, "a/b")
 
 
 @pytest.mark.parametrize("key", ["provenance=true", "keep_views=true", "scene=room", "crop=mask"])

@@ -20,6 +20,7 @@ import qs3
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import point_out
 from qs3.errors import DataError
+from qs3.inference.depth_list import Shown, find_shown
 from qs3.inference.model_file import write_result
 from tests.commands import main
 from tests.fixtures.frame_files import Shot, Thing, kinect, write_archive
@@ -183,6 +184,17 @@ def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys):
     page = (frame / "said.html").read_text()
     assert "Not predicted: 5" in page
     assert "broken off" in page
+
+
+def test_rows_of_a_list_with_numbers_without_end_are_told(tmp_path):
+    rows = "- {depth: a.png, mask: m.png, object: .inf}\n"
+    rows += f"- {{depth: a.png, box: [1, 2, 3, 1{'0' * 400}]}}\n"
+    (tmp_path / "a.yaml").write_text(rows)
+    found, _ = find_shown(str(tmp_path / "a.yaml"), "", Shown("", intrinsics=CAMERA))
+    assert ["infinity" in found[0].wrong, "box=" in found[1].wrong] == [True, True]
+    (tmp_path / "a.yaml").write_text("- depth: 2020-99-99\n")
+    with pytest.raises(DataError, match=r"a\.yaml is not readable: month must be"):
+        find_shown(str(tmp_path / "a.yaml"), "", Shown(""))
 
 
 def test_two_folders_go_together_by_name(run, frame):

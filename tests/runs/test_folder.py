@@ -110,9 +110,10 @@ def test_what_a_run_was_started_with(tmp_path):
     assert runs.read_started(tmp_path) is None
     runs.write_started(tmp_path, {"config_sha256": "0" * 64})
     assert runs.read_started(tmp_path) == {"config_sha256": "0" * 64}
-    (tmp_path / runs.STARTED).write_text("{")
-    with pytest.raises(DataError, match=r"started\.json cannot be read.*force=true"):
-        runs.read_started(tmp_path)
+    for damaged in ("{", "[]", "[" * 100_000):
+        (tmp_path / runs.STARTED).write_text(damaged)
+        with pytest.raises(DataError, match=r"started\.json cannot be read.*force=true"):
+            runs.read_started(tmp_path)
 
 
 def test_lock_says_what_the_other_process_does(tmp_path):

@@ -26,7 +26,10 @@ def test_read_as_written(tmp_path, labels):
 HEADER = "id,mesh,label,predicted,p_a\n"
 
 
-@pytest.mark.parametrize("text", ["", "id,mesh\n", HEADER, HEADER + "1,2,q,a,1\n"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "id,mesh\n", HEADER, HEADER + "1,2,q,a,1\n", HEADER + "1\n", HEADER + "x" * 200_000],
+)
 def test_damage_is_an_error_that_names_the_file(tmp_path, text):
     path = tmp_path / "p.csv"
     path.write_text(text)

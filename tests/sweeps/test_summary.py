@@ -116,6 +116,7 @@ def test_a_damaged_line_costs_only_itself(summary, tmp_path, capsys):
     with open(summary.journal, "ab") as file:
         file.write(
             b'{"folder": "/logs/se{"folder": "/x", "overr\n[1]\n"x"\n\xff{}\n{"folder": "/y"}\n'
+            b'{"folder": "/z", "overrides": [["seed=0"]]}\n{"folder": null, "overrides": []}\n'
         )
     ended(summary, tmp_path / "exp" / "seed1-0123abcd", ValueError("broken"), seed=1)
     summary.on_multirun_end(config(tmp_path))

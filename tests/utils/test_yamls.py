@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import pytest
-import yaml
 
 from qs3.errors import DataError
-from qs3.utils.yamls import MOST_VALUES, check_yaml
+from qs3.utils.yamls import MOST_VALUES, check_yaml, load_yaml
 from tests.limits import time_of_at_most
 
 
@@ -42,9 +41,16 @@ def test_what_is_refused(text, message):
         check_yaml(text, "x")
 
 
+@pytest.mark.parametrize("text", ["a: 2020-99-99", f"a: {'1' * 5000}", "? [1]\n: 2", "a: !!x 1"])
+def test_values_that_python_does_not_know_are_told(text):
+    check_yaml(text, "x")
+    with pytest.raises(DataError, match=r"^x is not readable: "):
+        load_yaml(text, "x")
+
+
 def test_what_people_write_is_let_through():
     text = "camera: &c {fx: 500, fy: 500}\nrows:\n- {<<: *c, depth: a.png}\n- {<<: *c}\n- &n null\n"
     check_yaml(text, "x")
-    assert yaml.safe_load(text)["rows"][0]["fx"] == 500
+    assert load_yaml(text, "x")["rows"][0]["fx"] == 500
     check_yaml("", "x")
     check_yaml("\n".join(f"- {i}" for i in range(2000)), "x")

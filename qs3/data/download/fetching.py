@@ -17,9 +17,10 @@ from typing import Any, ClassVar
 import pooch
 import requests
 
-from qs3.errors import Qs3Error
+from qs3.errors import DataError, Qs3Error
 from qs3.utils.files import write_json
 from qs3.utils.locks import locked
+from qs3.utils.memory import JSON_PEAK, read_whole
 from qs3.utils.progress import byte_bar
 
 log = logging.getLogger(__name__)
@@ -171,9 +172,9 @@ class Resuming:
     def _read_note(self, url: str) -> dict[str, Any]:
         """What the server said of the part; {} if that is not known."""
         try:
-            note = json.loads(self.note.read_bytes())
+            note = json.loads(read_whole(self.note, JSON_PEAK))
             whole = note.keys() == {"url", "size", "etag", "modified"}
-        except (OSError, ValueError, AttributeError):
+        except (OSError, ValueError, AttributeError, RecursionError, DataError):
             return {}
         return note if whole and note["url"] == url else {}
 

@@ -14,6 +14,7 @@ from qs3.data.download.fetching import fetch
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.utils.files import make_folder, sha256_file, write_json
 from qs3.utils.locks import locked
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 log = logging.getLogger(__name__)
 
@@ -90,8 +91,8 @@ def _is_in_place(place: Path, source: Source) -> bool:
     if not os.path.lexists(place) or (place.is_dir() and not any(place.iterdir())):
         return False
     try:
-        origin = json.loads((place / MARK).read_bytes())["source"]
-    except (OSError, ValueError, KeyError, TypeError):
+        origin = json.loads(read_whole(place / MARK, JSON_PEAK))["source"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, DataError):
         origin = None
     if origin != source.name:
         log.warning(

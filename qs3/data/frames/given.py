@@ -28,7 +28,7 @@ from qs3.clouds.arrays import read_npy
 from qs3.data.frames.images import MAX_SIDE_PX, MOST_DEPTH_M, Pinhole
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.pictures import png_header, read_png
-from qs3.utils.yamls import check_yaml
+from qs3.utils.yamls import load_yaml
 
 MILLIMETRE = 1e-3
 MOST_OBJECTS = 1000
@@ -148,7 +148,7 @@ def read_intrinsics(words: str, folder: Path | None = None) -> Intrinsics:
         if found is not None:
             return Intrinsics(_camera(found, str(path)))
         return _of_mapping(_parsed(text, str(path)), str(path))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"{path}: not a readable file of intrinsics ({error})") from error
 
 
@@ -263,15 +263,9 @@ def _camera(values: list[float], where: str) -> Pinhole:
 
 
 def _parsed(text: str, where: str) -> Any:
-    """JSON or YAML; ValueError if neither."""
-    import yaml  # type: ignore[import-untyped,unused-ignore]
-
+    """JSON or YAML; DataError if neither."""
     text = text.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
-    check_yaml(text, where)
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(str(error).splitlines()[0]) from error
+    return load_yaml(text, where)
 
 
 def _of_mapping(given: Any, where: str) -> Intrinsics:

@@ -32,7 +32,7 @@ from qs3.data.frames.cutting import Box
 from qs3.data.frames.images import DepthImage, Pinhole
 from qs3.data.frames.matlab import listed, load_v5, variable
 from qs3.errors import DataError
-from qs3.utils.pictures import read_png
+from qs3.utils.pictures import png_bytes, read_png
 
 META = "SUNRGBDMeta3DBB_v2.mat"
 SPLITS = "SUNRGBDtoolbox/traintestSUNRGBD/allsplit.mat"
@@ -127,12 +127,8 @@ def open_image(root: Path, frame: Frame) -> DepthImage:
     (path,) = found
     if not path.resolve().is_relative_to(root.resolve()):
         raise DataError(f"{path} is a link that leads out of {root}; copy the files instead")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror})") from error
     return DepthImage(
-        millimetres(read_png(data, str(path)), str(path)) / 1000.0,
+        millimetres(read_png(png_bytes(path), str(path)), str(path)) / 1000.0,
         frame.camera,
         frame.world_from_camera,
     )

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from qs3.classes import ALIASES, CLASSES
 from qs3.errors import DataError, MissingDataError
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 NAMES: tuple[str, ...] = (
     "bathtub", "bed", "shelf", "cabinet", "chair", "lamp", "monitor", "plant", "couch", "table",
@@ -31,7 +32,6 @@ NAMES: tuple[str, ...] = (
 COLUMNS = ("category", "raw_category")
 
 _CLASS_OF = {name: ALIASES.get(name, name) for name in NAMES}
-_MAX_TEXT_BYTES = 1 << 28
 _MAX_ID = 65535  # of a 16-bit mask
 
 
@@ -86,7 +86,7 @@ def read_label_map(path: str | Path, column: str = "category") -> LabelMap:
             cls = _CLASS_OF.get((row[column] or "").strip())
             if cls is None:
                 continue
-            number = row["id"] or ""
+            number = (row["id"] or "")[:20]  # Python reads no more than 4300 digits
             if not number.isdecimal() or not 1 <= int(number) <= _MAX_ID:
                 raise DataError(f"{path}, line {line}: the id is {number!r}, not 1 to {_MAX_ID}")
             by_label[(row[raw] or "").strip()] = cls
@@ -159,9 +159,7 @@ def is_scene(name: str) -> bool:
 
 def _text(path: str | Path, what: str) -> str:
     try:
-        if Path(path).stat().st_size > _MAX_TEXT_BYTES:
-            raise DataError(f"{path} is too large for {what}")
-        return Path(path).read_bytes().decode("utf-8", "replace")
+        return read_whole(Path(path), JSON_PEAK).decode("utf-8", "replace")
     except FileNotFoundError as error:
         raise MissingDataError(f"there is no {path}, {what}") from error
     except OSError as error:

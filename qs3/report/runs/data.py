@@ -7,6 +7,7 @@ run does not have is None, and what is damaged is refused by the name of its fil
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 import shlex
@@ -24,6 +25,7 @@ from qs3.runs.metrics import METRICS, RoundRecord, RunMetrics, Scores, read_metr
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import Predictions, read_predictions
 from qs3.runs.pseudo_labels import PseudoLabel, path_of, read_pseudo_labels
+from qs3.utils.memory import TABLE_PEAK, YAML_PEAK, read_whole
 from qs3.utils.yamls import check_yaml
 
 HISTORY = "history.csv"
@@ -180,8 +182,8 @@ def _history(path: Path) -> History | None:
     if not path.is_file():
         return None
     try:
-        with open(path, encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
+        text = read_whole(path, TABLE_PEAK).decode()
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
         if not rows:
             return None
 
@@ -237,7 +239,7 @@ def _yaml(path: Path, kind: type) -> Any:
     if not path.is_file():
         return None
     try:
-        check_yaml(text := path.read_text("utf-8"), "its text")
+        check_yaml(text := read_whole(path, YAML_PEAK).decode(), "its text")
         found: Any = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
     except Exception as error:  # yaml's and omegaconf's kinds have nothing else in common
         raise _damaged(path, error) from error

@@ -15,17 +15,18 @@ from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import yaml  # type: ignore[import-untyped,unused-ignore]
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from qs3.config.compose import composing, first_line
 from qs3.config.location import CONF
 from qs3.config.quoting import override
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import Group, group, load_runs
 from qs3.report.tables.cells import Cell, Published, Table
 from qs3.report.tables.keeping import with_kept
+from qs3.utils.memory import YAML_PEAK, read_whole
+from qs3.utils.yamls import load_yaml
 
 _SUPERVISED = "qs3.methods.supervised.Supervised"
 
@@ -112,9 +113,14 @@ def build_table(
 
 def _read(path: Path) -> _Spec:
     try:
-        spec = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return TypeAdapter(_Spec).validate_python(spec)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        spec = load_yaml(read_whole(path, YAML_PEAK).decode(), path)
+        found = TypeAdapter(_Spec).validate_python(spec)
+        if not all(isinstance(row.get("name"), str) for row in found.rows):
+            raise ConfigError(f"{path}: missing or wrong entry 'name'")
+        return found
+    except DataError as error:
+        raise ConfigError(str(error)) from error
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]

@@ -13,11 +13,12 @@ from omegaconf import OmegaConf
 
 from qs3.config.compose import choices, composed
 from qs3.config.hydra import build
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
 from qs3.sensors.bench import edges, planar
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.files import write_json
+from qs3.utils.memory import JSON_PEAK, read_whole
 
 DEFAULT_SENSORS = (
     "kinect_v1", "structure_sensor", "realsense_d415", "realsense_d435", "speckle_stereo",
@@ -160,7 +161,7 @@ def fingerprint(*parts: Any) -> str:
 def read_cached(path: Path) -> dict[str, Any] | None:
     """A cached result; None if there is none that can be read."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads(read_whole(path, JSON_PEAK))
+    except (OSError, ValueError, RecursionError, DataError):
         return None
     return found if isinstance(found, dict) else None

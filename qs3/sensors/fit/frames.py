@@ -12,7 +12,8 @@ import numpy as np
 from qs3.clouds.arrays import read_npy
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.cameras import Intrinsics
-from qs3.utils.pictures import check_picture
+from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.pictures import png_bytes, read_png
 
 _MAX_PIXELS = 1 << 26
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
@@ -46,10 +47,10 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
     """
     if text.lower().endswith(".json"):
         try:
-            values = _four(json.loads(Path(text).read_text(encoding="utf-8")))
+            values = _four(json.loads(read_whole(Path(text), JSON_PEAK)))
         except OSError as error:
             raise MissingDataError(f"intrinsics={text}: {error.strerror or error}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise DataError(f"intrinsics={text} is not JSON: {error}") from error
         if values is None:
             raise DataError(
@@ -87,7 +88,7 @@ def _four(found: object) -> list[float] | None:
                 if k[6] == 0 and k[7] == 0:
                     return [k[0], k[4], k[2], k[5]]
                 return [k[0], k[4], k[6], k[7]]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     return None
 
@@ -176,21 +177,10 @@ def _resolution(depth_m: np.ndarray) -> float:
 
 
 def _png(path: Path) -> np.ndarray:
-    import cv2
-
-    check_picture(path, _MAX_PIXELS)
-    try:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(f"{path} cannot be read: {error}") from error
-    if image is None:
-        raise DataError(f"{path} is not a PNG, or damaged")
-    if image.ndim != 2 or image.dtype != np.uint16:
-        raise DataError(
-            f"{path} is not a depth image: {image.dtype}, shape {list(image.shape)}; 16 bit grey "
-            "is needed"
-        )
-    return np.asarray(image)
+    image = read_png(png_bytes(path), str(path))
+    if image.dtype != np.uint16:
+        raise DataError(f"{path} is not a depth image: 8 bits a pixel; 16 bit grey is needed")
+    return image
 
 
 def _npy(path: Path) -> np.ndarray:

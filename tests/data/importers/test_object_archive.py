@@ -151,6 +151,16 @@ def test_a_broken_off_file(tmp_path):
         read_archive(tmp_path / "x.npz")
 
 
+def test_damage_that_zipfile_has_other_words_for(tmp_path):
+    path = tmp_path / "x.npz"
+    write_archive(path, {"train": 1, "test": 1})
+    whole = bytearray(path.read_bytes())
+    whole[whole.index(b"PK\1\2") + 6] = 84  # the version of zip that reading takes
+    path.write_bytes(whole)
+    with pytest.raises(DataError, match=r"zip file version 8\.4"):
+        domain(path, tmp_path).open()
+
+
 @pytest.mark.skipif(not FOUND, reason="shared/data/nyuv2_objects is not at hand")
 def test_the_real_archive_has_the_counts_that_are_published():
     archive = read_archive(FOUND[0])

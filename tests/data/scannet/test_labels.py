@@ -63,6 +63,9 @@ def test_a_map_that_is_none_is_told(tmp_path):
     write_label_map(path, [*LABELS, (70000, "bed", "bed")])
     with pytest.raises(DataError, match=r"line 19: the id is '70000'"):
         read_label_map(path)
+    write_label_map(path, [*LABELS, ("1" * 5000, "bed", "bed")])
+    with pytest.raises(DataError, match=r"line 19: the id is '1{20}', not 1 to 65535"):
+        read_label_map(path)
 
 
 def test_objects_of_an_aggregation(tmp_path, label_map):

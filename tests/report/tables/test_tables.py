@@ -152,7 +152,8 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("title: [", "x.yaml: while parsing"),
+        ("title: [", "x.yaml is not readable: while parsing"),
+        ("title: 2020-99-99", "x.yaml is not readable: month must be"),
         ("[]", "x.yaml: the file: "),
         ("title: x\nrows: []", "x.yaml: metrics: Field required"),
         ("HEAD\ntilte: y\nrows: []", "x.yaml: tilte: Unexpected"),
@@ -162,6 +163,8 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
         ("HEAD\nrows:\n- {name: r, a: {paper: 101}}", "paper: 101.0.*from 0 to 100"),
         ("HEAD\nrows:\n- {name: r, a: {paper: [1, 2, 3]}}", "x.yaml: missing or wrong entry"),
         ("HEAD\nrows:\n- {a: {paper: 1}}", "x.yaml: missing or wrong entry 'name'"),
+        ("HEAD\nrows: [{name: [a], a: {paper: 1}}]", "x.yaml: missing or wrong entry 'name'"),
+        ("title: x\nmetrics: []\ncolumns: []\nrows: [{}]", "x.yaml: missing or wrong entry 'name'"),
         ("HEAD\nrows:\n- {name: r, a: {run: nonsense}}", "table cell 'r', 'a': .*nonsense"),
     ],
 )

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from qs3.errors import DataError
 from qs3.sensors.bench.laws import nguyen_axial_m
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
+from qs3.sensors.fit.frames import read_camera
 from tests.commands import main
 from tests.sensors.scenery import plane, scan
 
@@ -256,6 +258,17 @@ def test_errors_say_what_to_do(image, arguments, message, tmp_path, capsys):
     assert main(["fit", str(tmp_path / "a.npy"), *camera, *out, *arguments]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "x.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{", "[" * 100_000, "[]", '{"K": [1]}', f'{{"fx": 1, "fy": 1, "cx": 1, "cy": 1{"0" * 400}}}'],
+)
+def test_files_without_intrinsics_are_told(text, tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"camera\.json (is not JSON|has neither)"):
+        read_camera(str(path), 640, 480)
 
 
 def test_damaged_and_large_arrays_are_refused_by_their_headers(tmp_path, capsys):

@@ -1,0 +1,60 @@
+"""Texts of gigabytes are refused by their size, before they are read."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from qs3.data.frames.matlab import load_v5
+from qs3.data.manifest import MANIFEST, read_manifest
+from qs3.data.meta import META, read_meta
+from qs3.data.scannet.labels import read_scene_list
+from qs3.errors import DataError
+from qs3.runs.folder import STARTED, read_started
+from qs3.runs.metrics import METRICS, read_metrics
+from qs3.runs.predictions import read_predictions
+from qs3.runs.pseudo_labels import read_pseudo_labels
+from qs3.sensors.fit.frames import read_camera
+from qs3.utils.memory import read_whole
+from tests.limits import memory_of_at_most
+
+READERS = {
+    MANIFEST: lambda path: read_manifest(path.parent, ("a",)),
+    META: lambda path: read_meta(path.parent),
+    STARTED: lambda path: read_started(path.parent),
+    METRICS: lambda path: read_metrics(path.parent),
+    "predictions.csv": read_predictions,
+    "pseudo_labels.csv": read_pseudo_labels,
+    "scenes.txt": read_scene_list,
+    "camera.json": lambda path: read_camera(str(path), 4, 3),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_large_text_is_refused_before_it_is_read(name, tmp_path):
+    path = tmp_path / name
+    path.touch()
+    os.truncate(path, 4 << 30)  # a hole, which takes no disk
+    with (
+        memory_of_at_most(1 << 28),
+        pytest.raises(DataError, match=f"{name} takes .* GB of memory"),
+    ):
+        READERS[name](path)
+
+
+def test_matlab_files_count_with_what_they_become(tmp_path, monkeypatch):
+    path = tmp_path / "a.mat"
+    path.write_bytes(bytes(1 << 20))
+    monkeypatch.setenv("QS3_MEMORY_GB", "0.001")
+    with pytest.raises(DataError, match=r"a\.mat takes .* GB of memory"):
+        load_v5(path)
+
+
+def test_the_peak_is_what_counts(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_bytes(b"x" * 1000)
+    monkeypatch.setenv("QS3_MEMORY_GB", "0.00001")  # 10,000 bytes
+    assert read_whole(path, 10) == b"x" * 1000
+    with pytest.raises(DataError, match=r"a takes 1\.1e-05 GB of memory"):
+        read_whole(path, 11)
