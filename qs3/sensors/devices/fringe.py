@@ -27,7 +27,7 @@ from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.subpixel_offsets import sample_centres
 from qs3.sensors.pixel_status import Reason, first_reason
-from qs3.sensors.renderers.base import Image, Projector, Scene, tangents
+from qs3.sensors.renderers.base import Image, Projector, tangents
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class FringeProjection(TriangulatingSensor):
                 self.tan_half_width,
                 self.projector_strength,
             )
-            scene = Scene(shot.bodies, projector, self.ambient)
+            scene = shot.scene(projector, self.ambient)
             # One seed: a pixel sees the same piece of the surface in every exposure.
             images += shot.renderer.render(scene, [shot.camera], seed=seed, geometry=[not images])
         return images

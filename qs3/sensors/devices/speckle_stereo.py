@@ -24,7 +24,7 @@ from qs3.sensors.optics.blender_filmic import FilmicCamera
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Slide, Speckle
 from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.base import Image, Projector, Scene
+from qs3.sensors.renderers.base import Image, Projector
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class SpeckleStereo(TriangulatingSensor):
         slide, strength = self.pattern.slide, self.projector_strength
         projector = Projector(middle, slide, self.tan_half_width, strength)
         images = shot.renderer.render(
-            Scene(shot.bodies, projector, self.ambient),
+            shot.scene(projector, self.ambient),
             [shot.camera, Camera(self.intrinsics, right, window)],
             seed=shot.seed(),
             geometry=[True, False],  # only the left image gets a depth

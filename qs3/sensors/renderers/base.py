@@ -190,8 +190,8 @@ class RendererSettings:
     """Settings both renderers share.
 
     Attributes:
-        samples: samples a pixel (anti-aliasing of the dots, and of the shadows of an area light; the
-            light is direct only).
+        samples: samples a pixel (anti-aliasing of the dots, and places on an area light; light is
+            direct only).
         threads: 0 is all cores. Output must not depend on it.
     """
 

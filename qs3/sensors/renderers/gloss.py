@@ -58,7 +58,9 @@ class Gloss:
         return (1 + root) / (1 - root)
 
 
-def times_pi(albedo: float, gloss: Gloss, normal: np.ndarray, i: np.ndarray, o: np.ndarray) -> np.ndarray:
+def times_pi(
+    albedo: float, gloss: Gloss, normal: np.ndarray, i: np.ndarray, o: np.ndarray
+) -> np.ndarray:
     """[...] pi f(i, o), which is the albedo of a matt surface; unit vectors [..., 3]."""
     cos_i, cos_o = (np.maximum((normal * way).sum(-1), 1e-9) for way in (i, o))
     half = i + o

@@ -74,7 +74,7 @@ class GlossyScene(JitScene):
     def _surface(
         self, face: Any, valid: Any, albedo: Any, normal: Any, to_eye: Any
     ) -> Callable[[Any], Any]:
-        """pi f of the surface, by the unit vector to the light; see `gloss.times_pi`."""
+        """Pi f of the surface, by the unit vector to the light; see `gloss.times_pi`."""
         mi, dr = self._mi, self._dr
         body = dr.gather(mi.UInt32, self._body, face, valid)
         square, index, metal = (
