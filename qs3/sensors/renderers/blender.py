@@ -31,11 +31,11 @@ from qs3.sensors.renderers.base import (
     incidence,
 )
 from qs3.sensors.renderers.blender_surfaces import (
-    GLOW,
     add_area,
     add_projector,
     blender_pose,
     matrix_of,
+    show_camera_only,
     surface,
 )
 from qs3.sensors.renderers.exr import read_exr
@@ -129,7 +129,10 @@ class BlenderRenderer:
                 for thing in lamps:
                     thing.hide_render = True
                 for thing in bodies:
-                    _let_area_light_alone(thing)
+                    show_camera_only(thing)
+                    # Rays end on them, and so find the light where nothing is before it.
+                    thing.visible_shadow = thing.visible_diffuse = thing.visible_glossy = True
+                target.cycles.max_bounces = 1
                 add_area(bpy, target, scene.area)
                 none = [False] * len(cameras)
                 more = self._photographs(target, eye, cameras, ~seed, none, folder)
@@ -293,12 +296,6 @@ def _without_twins(mesh: Mesh) -> np.ndarray:
     _, place = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True)
     _, first = np.unique(np.sort(place.ravel()[mesh.faces]), axis=0, return_index=True)
     return mesh.faces[np.sort(first)]
-
-
-def _let_area_light_alone(thing: Any) -> None:
-    """Shadows by the body itself, and no glow of ambient light, which was rendered before."""
-    thing.visible_shadow = True
-    thing.data.materials[0].node_tree.nodes[GLOW].inputs["Strength"].default_value = 0.0
 
 
 def _cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> Any:

@@ -14,8 +14,7 @@ from qs3.sensors.renderers.base import AreaLight, Body, Projector
 
 # Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
 _WATT_PER_RADIANCE = 4 * math.pi**2
-GLOW = "ambient"
-"""Name of the node that gives a surface what it gains from ambient light."""
+_GLOW = "ambient"
 
 
 def surface(bpy: Any, body: Body, ambient: float) -> Any:
@@ -38,7 +37,7 @@ def surface(bpy: Any, body: Body, ambient: float) -> Any:
         bsdf.inputs["Specular IOR Level"].default_value = body.gloss.specular
     bsdf.inputs[colour].default_value = (body.albedo, body.albedo, body.albedo, 1.0)
     glow = node("ShaderNodeEmission")
-    glow.name = GLOW
+    glow.name = _GLOW
     glow.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     glow.inputs["Strength"].default_value = body.albedo * ambient
     total, output = node("ShaderNodeAddShader"), node("ShaderNodeOutputMaterial")
@@ -46,6 +45,24 @@ def surface(bpy: Any, body: Body, ambient: float) -> Any:
     link(glow.outputs[0], total.inputs[1])
     link(total.outputs[0], output.inputs["Surface"])
     return material
+
+
+def show_camera_only(thing: Any) -> None:
+    """Let an object be black for all rays but a camera's, and without its glow of ambient light.
+
+    With one bounce a ray that leaves a surface finds a light or nothing: direct light only.
+    """
+    tree = thing.data.materials[0].node_tree
+    tree.nodes[_GLOW].inputs["Strength"].default_value = 0.0
+    path, mix = tree.nodes.new("ShaderNodeLightPath"), tree.nodes.new("ShaderNodeMixShader")
+    black = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    end = next(node for node in tree.nodes if node.type == "OUTPUT_MATERIAL").inputs["Surface"]
+    shown = end.links[0].from_socket
+    tree.links.new(path.outputs["Is Camera Ray"], mix.inputs[0])
+    tree.links.new(black.outputs[0], mix.inputs[1])
+    tree.links.new(shown, mix.inputs[2])
+    tree.links.new(mix.outputs[0], end)
 
 
 def add_projector(bpy: Any, target: Any, projector: Projector) -> Any:
@@ -109,10 +126,8 @@ def add_area(bpy: Any, target: Any, area: AreaLight) -> Any:
     """The square light; its Blender object."""
     light = bpy.data.lights.new("area", "AREA")
     light.shape, light.size = "SQUARE", area.side_m
-    # Cycles: the radiance is the power over 4 times the area (and not pi times).
-    light.energy = area.radiance * 4 * area.side_m**2
-    # Else rays from surfaces look for it as well, and with no bounce find it black.
-    light.cycles.use_multiple_importance_sampling = False
+    light.energy = area.radiance * math.pi * area.side_m**2  # of a Lambertian source
+    light.cycles.use_multiple_importance_sampling = True  # by its places and by the surface's
     thing = bpy.data.objects.new("area", light)
     thing.matrix_world = blender_pose(area.world_from_light)
     thing.visible_camera = False
