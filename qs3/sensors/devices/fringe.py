@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from qs3.config.checks import check_ranges
+from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
 from qs3.sensors.optics.fringe_code import FringeCode
@@ -67,6 +68,11 @@ class FringeProjection(TriangulatingSensor):
             min_modulation=">= 0",
             max_misfit="(0, 0.5]",
         )
+        if self.infrared.needs_ambient:
+            raise ConfigError(
+                "sensor.infrared.ambient_speckles=false is for sensors that project speckle; leave "
+                "it out for fringes"
+            )
 
     @property
     def margin_px(self) -> int:
