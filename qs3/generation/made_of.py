@@ -51,10 +51,18 @@ def _sensor_files() -> dict[str, Any]:
 
 
 def _sensor(cfg: DictConfig) -> str:
-    """The name of the sensor's file in conf/sensor; its class where a value was changed."""
+    """The sensor's preset (its class where a value was changed), and materials and light."""
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
+    return _preset(cfg) + "".join(
+        words
+        for key, words in (("materials", ", mixed materials"), ("light", ", light above"))
+        if cfg.get(key)
+    )
+
+
+def _preset(cfg: DictConfig) -> str:
     plain = OmegaConf.to_container(cfg.sensor)
     for name, settings in _sensor_files().items():
         if settings == plain:

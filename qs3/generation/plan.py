@@ -34,6 +34,7 @@ UPS = ("auto", "z", "y")
 _SWITCHES = ("provenance", "keep_views", "force", "strict")
 # Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
 _OF_LOOKING = ("scene", "tracking", "crop")
+_OF_LIGHT = ("materials", "light")
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
 # Of a config: where things lie, and what never changes a byte.
 _UNSTORED = ("paths", "workers", "force", "strict")
@@ -66,6 +67,14 @@ def check(cfg: DictConfig) -> None:
                 f"authors made them; leave it out for domain={cfg.domain.name}"
             )
 
+    for key in _OF_LIGHT:
+        # Before the recipe is built: one that looks at nothing does not take them.
+        if cfg.get(key) and not cfg.sensor:
+            raise ConfigError(
+                f"domain {cfg.domain.name} looks at nothing, so {key}= says nothing to it: leave "
+                "it out"
+            )
+
 
 def known_classes(cfg: DictConfig) -> tuple[str, ...]:
     """The classes of the domain, in label order."""
@@ -90,6 +99,12 @@ def check_recipe(recipe: Any, cfg: DictConfig) -> None:
         if not part:
             raise ConfigError(
                 f"domain {cfg.domain.name} looks at meshes: {key}=none does not do, choose another"
+            )
+    for key in _OF_LIGHT:
+        if cfg.get(key) and not recipe.sensor.sees_light:
+            raise ConfigError(
+                f"this sensor adds noise to the true depth and sees no light, so {key}= says "
+                "nothing to it: leave it out, or take a sensor such as sensor=speckle_stereo"
             )
 
 

@@ -17,6 +17,8 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
+from qs3.generation.lights import LightAbove
+from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep, preview_of, provenance_of
 from qs3.generation.released.placement import PoseFile
 from qs3.generation.released.views import box_of_corners
@@ -141,6 +143,8 @@ class Mesh2Point:
         min_clean_points: as `min_points`, of the twin; None: the same. A thin lamp may give
             few: a matcher's patches make thin parts wide, the true depth does not.
         poses: from a file, in place of `placing` and of `views` (whose count is kept).
+        materials: of the bodies; None: as the scene has them, matt.
+        light: beside the sensor's own; None: none.
         box_of_corners: crop by the box of the turned corners of the mesh's own box, as the
             released code does, and not by the object's own axis-aligned box.
     """
@@ -157,6 +161,8 @@ class Mesh2Point:
     clean: bool = True
     min_clean_points: int | None = None
     poses: PoseFile | None = None
+    materials: MixedMaterials | None = None
+    light: LightAbove | None = None
     box_of_corners: bool = False
     needs_renderer: bool = True
 
@@ -179,14 +185,16 @@ class Mesh2Point:
         pose_rng = object_rng(seed, object_id, 1)
         true_poses = self.views.poses(pose_rng, box, object_id)
         bodies = self.scene.bodies(placed, np.stack(true_poses)[:, :3, 3], rng)
+        if self.materials is not None:
+            bodies = self.materials.dress(bodies, object_rng(seed, object_id, 0, 1))
+        lighting = None if self.light is None else self.light.over(box)
         believed_poses = self.drift.believed(true_poses, pose_rng)
 
         noisy, clean, frames, origins = [], [], [], []
         for i, (pose, believed) in enumerate(zip(true_poses, believed_poses, strict=True)):
             view_rng = object_rng(seed, object_id, 2 + i)
-            frame = self.sensor.scan(
-                bodies, box, pose, renderer, view_rng, explain=keep.views is not None
-            )
+            explain = keep.views is not None
+            frame = self.sensor.scan(bodies, box, pose, renderer, view_rng, explain, lighting)
             if frame is None:
                 continue
             frames.append(frame)

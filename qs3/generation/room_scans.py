@@ -21,6 +21,8 @@ from qs3.data.frames.rules import Rules
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
+from qs3.generation.lights import LightAbove
+from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep, preview_of, provenance_of
 from qs3.generation.recipes import Cloud, MaskCrop, TooFewPointsError
 from qs3.generation.scenes import HAIR_M, Room, Surroundings, around_an_eye
@@ -130,6 +132,7 @@ class RoomScan:
             as a counter, which leaves of a cabinet its front and maybe a side.
         attempts: pictures that are taken, each from elsewhere, until one is not refused.
         clean: also make the twin from the true depth of what is seen.
+        materials, light: as in `Mesh2Point`; the object has the same materials in every picture.
         views: 1, the only number of views there is.
     """
 
@@ -147,6 +150,8 @@ class RoomScan:
     attempts: int = 12
     clean: bool = True
     views: int = 1
+    materials: MixedMaterials | None = None
+    light: LightAbove | None = None
     needs_renderer: bool = True
 
     def __post_init__(self) -> None:
@@ -171,6 +176,7 @@ class RoomScan:
         placed = self.placing.place(mesh, object_rng(seed, object_id, 0), object_id)
         front = yaw_between(mesh, placed) - np.pi / 2
         around = placed.bounds + np.array([[-_AROUND_M], [_AROUND_M]])
+        lighting = None if self.light is None else self.light.over(placed.bounds)
         why = "it is outside the picture"
         for attempt in range(self.attempts):
             rng = object_rng(seed, object_id, 1 + attempt)
@@ -178,8 +184,10 @@ class RoomScan:
             seen = front if arranging.random() < self.fronts.get(cls, 0.0) else None
             pose = self.camera.pose(rng, placed.bounds, self.sensor.intrinsics, seen)
             bodies = self._bodies(placed, cls, pose, rng, arranging)
+            if self.materials is not None:
+                bodies = self.materials.dress(bodies, object_rng(seed, object_id, 0, 1))
             explain = keep.views is not None
-            frame = self.sensor.scan(bodies, around, pose, renderer, rng, explain=explain)
+            frame = self.sensor.scan(bodies, around, pose, renderer, rng, explain, lighting)
             if frame is None:
                 continue
             image, mask = depth_image(frame, pose), self.mask.keep(frame, rng)

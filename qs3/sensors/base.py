@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from qs3.sensors.matching import Match
 from qs3.sensors.matching.filters import PostFilter, Quantiser
 from qs3.sensors.matching.triangulation import Triangulation
 from qs3.sensors.optics.visibility import explained, reached_from
-from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
+from qs3.sensors.renderers.base import AreaLight, Body, Image, Projector, Renderer, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +82,26 @@ class Samples:
 
 
 @dataclass(frozen=True, eq=False)
+class Lighting:
+    """Light of the place where the device stands, beside the device's own.
+
+    Attributes:
+        area: a light with shadows.
+        ambient: radiance of light from all sides, in place of the sensor's `ambient`; None: that.
+            Both are in the units of the sensor's.
+    """
+
+    area: AreaLight
+    ambient: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Shot:
     """A frame in the making: what `DepthSensor.take` works with.
 
     Attributes:
         camera: at its true pose, with the window that the box covers.
-        bodies, box_m, renderer, rng, explain: as in `DepthSensor.scan`.
+        bodies, box_m, renderer, rng, explain, lighting: as in `DepthSensor.scan`.
     """
 
     camera: Camera
@@ -96,6 +110,7 @@ class Shot:
     renderer: Renderer
     rng: np.random.Generator
     explain: bool
+    lighting: Lighting | None = None
 
     @property
     def window(self) -> Window:
@@ -106,9 +121,17 @@ class Shot:
         """A seed for the renderer, drawn from `rng`."""
         return int(self.rng.integers(2**31))
 
+    def scene(self, projector: Projector | None, ambient: float) -> Scene:
+        """The bodies in the sensor's light and in that of the place; `ambient` is the sensor's."""
+        if self.lighting is None:
+            return Scene(self.bodies, projector, ambient)
+        if self.lighting.ambient is not None:
+            ambient = self.lighting.ambient
+        return Scene(self.bodies, projector, ambient, self.lighting.area)
+
     def image(self, projector: Projector | None = None, ambient: float = 0.0) -> Image:
         """What the camera sees, with the geometry; draws a seed."""
-        scene = Scene(self.bodies, projector, ambient)
+        scene = self.scene(projector, ambient)
         (image,) = self.renderer.render(scene, [self.camera], seed=self.seed(), geometry=[True])
         return image
 
@@ -183,7 +206,11 @@ class DepthSensor(ABC):
 
     Attributes:
         width_px, height_px, focal_px: of its camera, or of both.
+        sees_light: whether what it measures depends on materials and light; one that adds noise
+            to the true depth says False.
     """
+
+    sees_light: ClassVar[bool] = True
 
     width_px: int = 640
     height_px: int = 480
@@ -207,6 +234,7 @@ class DepthSensor(ABC):
         renderer: Renderer,
         rng: np.random.Generator,
         explain: bool = False,
+        lighting: Lighting | None = None,
     ) -> DepthFrame | None:
         """Take one frame.
 
@@ -219,6 +247,7 @@ class DepthSensor(ABC):
             rng: all randomness of this frame.
             explain: render also who sees and who lights each surface, for `DepthFrame.reason`
                 and the images "lit" and "seen". Costs renders and changes nothing else.
+            lighting: of the place; None: the sensor's own light and `ambient` alone.
 
         Returns:
             The frame, or None if the box is outside the view.
@@ -228,7 +257,7 @@ class DepthSensor(ABC):
         if window is None:
             return None
         camera = Camera(self.intrinsics, world_from_camera, window)
-        return self.take(Shot(camera, bodies, box_m, renderer, rng, explain))
+        return self.take(Shot(camera, bodies, box_m, renderer, rng, explain, lighting))
 
     @abstractmethod
     def take(self, shot: Shot) -> DepthFrame | None:

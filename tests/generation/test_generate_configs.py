@@ -127,7 +127,8 @@ def test_help_is_short(help_text):
 
 
 GROUPS = (
-    *("sensor", "sensor/matcher", "synthesis", "scene", "tracking", "crop", "renderer", "released"),
+    *("sensor", "sensor/matcher", "synthesis", "scene", "materials", "light", "tracking", "crop"),
+    *("renderer", "released"),
 )
 
 

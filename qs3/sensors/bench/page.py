@@ -48,8 +48,8 @@ _DIFFERENCES = """## Known differences from the devices
   only relative to ambient light. A device with one exposure for the room loses more.
 - Semi-global matching carries the D400 presets over planes that are nearly edge-on, where the
   devices lose pixels.
-- Light goes straight from projector to surface to camera: no gloss, no light from one surface on
-  another, no warming up, no lens distortion.
+- Light goes straight from projector to surface to camera: matt targets, no light from one surface
+  on another, no warming up, no lens distortion.
 """
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 
@@ -49,6 +50,7 @@ class DotMask(TriangulatingSensor):
         field_cell_px: its shortest wave.
     """
 
+    sees_light: ClassVar[bool] = False
     step_px: int = 1
     pattern: Speckle = field(
         default_factory=lambda: Speckle(columns=633, rows=495, tiles=1, dot_px=1, seed=2)

@@ -8,6 +8,7 @@ presets of this sensor.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -43,6 +44,7 @@ class FittedDepth(DepthSensor):
             measured. null: no shadows.
     """
 
+    sees_light: ClassVar[bool] = False
     cx_px: float | None = None
     cy_px: float | None = None
     step_px: int = 1

@@ -21,13 +21,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from qs3.config.checks import check_ranges
+from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Match
 from qs3.sensors.optics.fringe_code import FringeCode
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.subpixel_offsets import sample_centres
 from qs3.sensors.pixel_status import Reason, first_reason
-from qs3.sensors.renderers.base import Image, Projector, Scene, tangents
+from qs3.sensors.renderers.base import Image, Projector, tangents
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,11 @@ class FringeProjection(TriangulatingSensor):
             min_modulation=">= 0",
             max_misfit="(0, 0.5]",
         )
+        if self.infrared.needs_ambient:
+            raise ConfigError(
+                "sensor.infrared.ambient_speckles=false is for sensors that project speckle; leave "
+                "it out for fringes"
+            )
 
     @property
     def margin_px(self) -> int:
@@ -135,7 +141,7 @@ class FringeProjection(TriangulatingSensor):
                 self.tan_half_width,
                 self.projector_strength,
             )
-            scene = Scene(shot.bodies, projector, self.ambient)
+            scene = shot.scene(projector, self.ambient)
             # One seed: a pixel sees the same piece of the surface in every exposure.
             images += shot.renderer.render(scene, [shot.camera], seed=seed, geometry=[not images])
         return images

@@ -8,6 +8,7 @@ frequency can tell apart. For physics see qs3.sensors.devices.time_of_flight.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ class GaussianTimeOfFlight(DepthSensor):
         max_distance_m: surfaces further away give nothing.
     """
 
+    sees_light: ClassVar[bool] = False
     width_px: int = 176
     height_px: int = 144
     focal_px: float = 220.0

@@ -113,9 +113,16 @@ class ReferenceSpeckle(TriangulatingSensor):
             self.tan_half_width,
             strength=self.reference_m**2,  # white at reference_m has radiance 1
         )
-        image = shot.image(projector, self.ambient)
+        camera, seed = [shot.camera], shot.seed()
+        lit = shot.scene(projector, self.ambient)
+        (image,) = shot.renderer.render(lit, camera, seed=seed, geometry=[True])
+        ambient = None
+        if self.infrared.needs_ambient:
+            dim = shot.scene(None, self.ambient)
+            (other,) = shot.renderer.render(dim, camera, seed=seed, geometry=[False])
+            ambient = other.radiance
         gain = self.infrared.gain(image.radiance, np.isfinite(image.depth_m))
-        grey = self.infrared.expose(image.radiance, gain, shot.rng)
+        grey = self.infrared.expose(image.radiance, gain, shot.rng, ambient)
         rows, columns = shot.window.slices
         match = self.matcher.match(grey, self.reference[rows], shot.window.left)
         depth, disparity, reason = self.depth_of(match)

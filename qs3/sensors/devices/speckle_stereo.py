@@ -24,7 +24,7 @@ from qs3.sensors.optics.blender_filmic import FilmicCamera
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Slide, Speckle
 from qs3.sensors.pixel_status import Reason
-from qs3.sensors.renderers.base import Image, Projector, Scene
+from qs3.sensors.renderers.base import Image, Projector
 
 
 @dataclass(frozen=True)
@@ -107,19 +107,24 @@ class SpeckleStereo(TriangulatingSensor):
             return None
         slide, strength = self.pattern.slide, self.projector_strength
         projector = Projector(middle, slide, self.tan_half_width, strength)
-        images = shot.renderer.render(
-            Scene(shot.bodies, projector, self.ambient),
-            [shot.camera, Camera(self.intrinsics, right, window)],
-            seed=shot.seed(),
-            geometry=[True, False],  # only the left image gets a depth
-        )
+        cameras, seed = [shot.camera, Camera(self.intrinsics, right, window)], shot.seed()
+        scene = shot.scene(projector, self.ambient)
+        # Only the left image gets a depth.
+        images = shot.renderer.render(scene, cameras, seed=seed, geometry=[True, False])
         windows = (shot.window, window)
         canvas = self._canvas(*windows)
         gain = self.infrared.gain(images[0].radiance, images[0].label > 0)
-        grey = [
-            self.infrared.expose(_place(image, at, canvas), gain, shot.rng)
-            for image, at in zip(images, windows, strict=True)
-        ]
+        radiance = [_place(*seen, canvas) for seen in zip(images, windows, strict=True)]
+        if isinstance(self.infrared, InfraredCamera) and self.infrared.needs_ambient:
+            # The same seed: the same places in each pixel.
+            dim = shot.scene(None, self.ambient)
+            others = shot.renderer.render(dim, cameras, seed=seed, geometry=[False, False])
+            grey = [
+                self.infrared.expose(total, gain, shot.rng, _place(other, at, canvas))
+                for total, other, at in zip(radiance, others, windows, strict=True)
+            ]
+        else:
+            grey = [self.infrared.expose(total, gain, shot.rng) for total in radiance]
         depth, disparity, reason = self.depth_of(self._match(grey[0], grey[1], canvas.left))
         inside = replace(
             shot.window, left=shot.window.left - canvas.left, top=shot.window.top - canvas.top

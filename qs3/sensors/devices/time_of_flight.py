@@ -170,9 +170,9 @@ class TimeOfFlight(DepthSensor):
         camera = Camera(small, shot.camera.world_from_camera, part)
         lit = Scene(shot.bodies, lamp)
         (fine,) = shot.renderer.render(lit, [camera], seed=seed, geometry=[True])
-        if not self.ambient:
+        dim = shot.scene(None, self.ambient)
+        if not dim.ambient and dim.area is None:
             return fine, np.zeros((window.height, window.width), dtype=np.float32)
-        dim = Scene(shot.bodies, None, self.ambient)
         (other,) = shot.renderer.render(dim, [shot.camera], seed=seed, geometry=[False])
         return fine, other.radiance
 

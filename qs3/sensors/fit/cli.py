@@ -48,6 +48,7 @@ def fit(
         ConfigError, DataError: say which argument or file is to blame.
     """
     from qs3.geometry.cameras import Intrinsics
+    from qs3.sensors.fit.doubts import check_walls
     from qs3.sensors.fit.frames import read_camera, read_frame
     from qs3.sensors.fit.laws import find_bias, find_fill, find_noise
     from qs3.sensors.fit.planes import find_wall
@@ -74,8 +75,9 @@ def fit(
     steps = find_steps(frames)
     walls = [find_wall(frame.name, frame.depth_m, camera) for frame in frames]
     noise = find_noise(walls, steps, float(power) if power else None)
+    doubts = check_walls(walls, noise, steps)
     return FittedPreset(
-        camera, noise, steps, find_fill(walls), find_bias(walls, distances), baseline, walls
+        camera, noise, steps, find_fill(walls), find_bias(walls, distances), baseline, walls, doubts
     )
 
 
@@ -102,7 +104,8 @@ FIT = Command(
 FRAMES are .png (16 bits), .npy [h, w] or .pcd: three or more of a flat, matt wall, from distances
 that differ (say 1, 1.5, 2 and 3 m), turned by a few degrees so that several steps of depth are
 seen; and some at a slant (20 to 70 degrees) for the fill rate. Other things may be in view; the
-plane that covers most is the wall.
+plane that covers most is the wall. Frames whose errors do not look like a camera's noise on a wall
+are refused or, where that is not sure, named.
 
 What is found: noise against distance (before the quantiser; growing with Z^2 as for cameras that
 triangulate, or with Z, whichever fits better), its smoothness, steps of 1/Z or of Z, fill rate

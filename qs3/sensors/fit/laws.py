@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from qs3.errors import DataError
 from qs3.sensors.devices.fitted import FittedDepth, neighbour_correlation
 from qs3.sensors.fit.planes import Wall
-from qs3.sensors.fit.rounded import inner_spread, smooth_wall, spread_between
+from qs3.sensors.fit.rounded import inner_spread, share_together, smooth_wall, spread_between
 from qs3.sensors.fit.steps import Steps
 from qs3.sensors.fit.texture import noise_size_px
 
@@ -32,6 +32,8 @@ class Noise:
     Attributes:
         floor_m, factor, power: of the law.
         depth_m, sigma_m: [n] what was measured, quantiser included.
+        frame: [n] index of the wall that it was measured on.
+        together: for each wall, see `share_together`.
         power_known: whether the distances differ enough to tell the power.
         correlation_px: see FittedDepth.
     """
@@ -41,6 +43,8 @@ class Noise:
     power: float
     depth_m: np.ndarray
     sigma_m: np.ndarray
+    frame: np.ndarray
+    together: tuple[float, ...]
     power_known: bool
     correlation_px: float
 
@@ -77,10 +81,11 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     """
     if not steps.inverse_per_m and all(_few_levels(wall, steps) for wall in walls):
         raise DataError(_TURN)
-    depth, sigma, before, white = [], [], [], []
+    depth, sigma, before, white, frame, together = [], [], [], [], [], []
     hidden = False
-    for wall in walls:
+    for index, wall in enumerate(walls):
         surface = smooth_wall(wall, steps)
+        together.append(share_together(wall, surface, steps))
         usable = wall.on_wall & (wall.tilt_deg < _FACING_DEG)
         if not usable.any():
             usable = wall.on_wall
@@ -101,6 +106,7 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
             depth.append(float(z[inside].mean()))
             before.append(found * depth[-1] ** 2)
             white.append(inside.sum())
+            frame.append(index)
     if not depth and hidden:
         raise DataError(_TURN)
     if not depth:
@@ -111,6 +117,7 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     if not some.any():
         raise DataError(_TURN)
     z, total, weight, bare = (a[some] for a in (z, total, weight, bare))
+    seen_on = np.array(frame)[some]
     known = power is not None or z.max() / z.min() > _LEAST_RANGE
     if not known:
         factor = float((weight * bare / z**2).sum() / weight.sum())
@@ -131,7 +138,17 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
             depth_step_m=steps.depth_m,
         )
 
-    return Noise(floor, factor, chosen, z, total, known, noise_size_px(walls, simulated))
+    return Noise(
+        floor,
+        factor,
+        chosen,
+        z,
+        total,
+        seen_on,
+        tuple(together),
+        known,
+        noise_size_px(walls, simulated),
+    )
 
 
 def _within_a_step(inverse: np.ndarray, error: np.ndarray, gap: float) -> bool:

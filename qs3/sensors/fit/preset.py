@@ -30,6 +30,7 @@ class FittedPreset:
         bias_m: coefficients, see FittedDepth.
         baseline_m: as given; None if it was not.
         walls: the data.
+        doubts: see qs3.sensors.fit.doubts; printed, and written into the preset.
     """
 
     camera: Intrinsics
@@ -39,16 +40,18 @@ class FittedPreset:
     bias_m: tuple[float, ...]
     baseline_m: float | None
     walls: Sequence[Wall]
+    doubts: Sequence[str] = ()
 
     def save(self, path: Path, command: str) -> None:
         """Write the preset, with the command that made it."""
         k, noise, (nearest, farthest) = self.camera, self.noise, self._range()
         assumed = "" if noise.power_known else "   # assumed: all walls are equally far"
         baseline = "null" if self.baseline_m is None else f"{self.baseline_m:.6g}"
+        doubts = "".join(f"# doubtful: {doubt}\n" for doubt in self.doubts)
         text = f"""\
 # Fitted to depth frames of a flat wall; noise is added to the true depth.
 # {command}
-_target_: qs3.sensors.devices.fitted.FittedDepth
+{doubts}_target_: qs3.sensors.devices.fitted.FittedDepth
 width_px: {k.width_px}
 height_px: {k.height_px}
 focal_px: {k.focal_px:.8g}
@@ -101,7 +104,7 @@ baseline_m: {baseline}
             "bias      " + (f"{_numbers(self.bias_m)} m (constant first)" if known else
             "unknown, taken as 0: give the true distances with distances=")
         )  # fmt: skip
-        return lines
+        return lines + [f"doubtful  {doubt}" for doubt in self.doubts]
 
     def plot(self, path: Path) -> None:
         """Four panels: noise, steps, residuals of one frame, fill."""
@@ -121,10 +124,9 @@ baseline_m: {baseline}
     def _plot_noise(self, ax: Any) -> None:
         low, high = self._range()
         z = np.linspace(0.9 * low, 1.1 * high, 200)
-        step2 = (self.steps.inverse_per_m * z**2) ** 2 / 12 + self.steps.depth_m**2 / 12
         law = self.noise.law_m(z)
         ax.plot(self.noise.depth_m, 1e3 * self.noise.sigma_m, "o", ms=4, label="data")
-        ax.plot(z, 1e3 * np.sqrt(law**2 + step2), label="model with quantiser")
+        ax.plot(z, 1e3 * np.hypot(law, self.steps.rounding_m(z)), label="model with quantiser")
         ax.plot(z, 1e3 * law, "--", label="model before it")
         nguyen = 0.0012 + 0.0019 * (z - 0.4) ** 2
         ax.plot(z, 1e3 * nguyen, ":", color="grey", label="Kinect v1, Nguyen 2012")

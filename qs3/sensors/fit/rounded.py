@@ -11,6 +11,8 @@ from qs3.sensors.fit.steps import Steps
 
 _MAX_PIXELS = 12_000
 _OUTLIERS = 1e-4  # share of pixels that lie anywhere, so that a single one decides nothing
+PATCH_PX = 24
+"""Side of the patches that errors are averaged over: noise is smooth over a few pixels at most."""
 _COARSE = 0.5  # steps a standard deviation from which rounding is not a small extra error
 
 
@@ -50,6 +52,30 @@ def spread_between(low: np.ndarray, high: np.ndarray, mean: np.ndarray) -> float
 
     ends = (np.log(0.02 * step), np.log(3 * max(step, total)))
     return float(np.exp(minimize_scalar(cost, bounds=ends, method="bounded").x))
+
+
+def share_together(wall: Wall, surface: np.ndarray, steps: Steps) -> float:
+    """Share of the errors' variance that means over blocks of the image have; 0 to 1.
+
+    Errors are those that rounding to the steps cannot make; `surface` [h, w] is 1 / Z without
+    noise. 0 where they are smaller than half a step: rounding alone is even over patches.
+    """
+    low, high = steps.interval(wall.depth_m)
+    error = np.maximum(low - surface, 0) - np.maximum(surface - high, 0)
+    error = np.where(wall.on_wall, error, np.nan)
+    whole = float(np.nanvar(error))
+    if whole == 0 or np.sqrt(whole) < 0.5 * float(np.nanmedian(high - low)):
+        return 0.0
+    size = PATCH_PX
+    rows, columns = (n // size for n in error.shape)
+    blocks = error[: rows * size, : columns * size].reshape(rows, size, columns, size)
+    count = np.isfinite(blocks).sum(axis=(1, 3))
+    full = count > size * size / 2
+    if full.sum() < 10:
+        return 0.0
+    means = np.nansum(blocks, axis=(1, 3))[full] / count[full]
+    centre = np.average(means, weights=count[full])
+    return min(1.0, float(np.average((means - centre) ** 2, weights=count[full])) / whole)
 
 
 TRIMMED_NORMAL = 0.9616

@@ -44,6 +44,11 @@ class Steps:
         half = self.depth_m / 2
         return 1 / (depth_m + half), 1 / np.maximum(depth_m - half, 1e-3)
 
+    def rounding_m(self, depth_m: np.ndarray) -> np.ndarray:
+        """Standard deviation of the error of Z that rounding to the steps makes."""
+        inverse = self.inverse_per_m * depth_m**2
+        return np.asarray(np.sqrt((inverse**2 + self.depth_m**2) / 12))
+
 
 def find_steps(frames: Sequence[DepthImage]) -> Steps:
     """Look for steps in all depths of some frames."""

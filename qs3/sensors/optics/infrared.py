@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from qs3.config.checks import check_ranges
+from qs3.config.checks import check_bool, check_ranges
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,8 @@ class InfraredCamera:
         fixed_gain: grey values per unit of radiance; null is automatic exposure. White at the
             sensor's reference distance has radiance 1.
         speckle_grain_px: side of the square grains that share a value; 1 is a pixel.
+        ambient_speckles: false: light that is not the projector's, and so no laser's, has no
+            speckle; takes one more render a frame.
     """
 
     white_quantile: float = 0.98
@@ -40,6 +42,7 @@ class InfraredCamera:
     psf_px: float = 0.0
     fixed_gain: float | None = None
     speckle_grain_px: int = 1
+    ambient_speckles: bool = True
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -53,6 +56,12 @@ class InfraredCamera:
             psf_px="[0, 10]",
             fixed_gain="> 0",
         )
+        check_bool("ambient_speckles", self.ambient_speckles)
+
+    @property
+    def needs_ambient(self) -> bool:
+        """Whether `expose` asks for the ambient light alone."""
+        return self.speckle_contrast > 0 and not self.ambient_speckles
 
     def gain(self, radiance: np.ndarray, region: np.ndarray) -> float:
         """Grey values per unit of radiance, from the pixels of `region` (bool, [h, w])."""
@@ -62,14 +71,25 @@ class InfraredCamera:
         white = float(np.quantile(values, self.white_quantile)) if values.size else 0.0
         return self.white_level / white if white > 0 else 0.0
 
-    def expose(self, radiance: np.ndarray, gain: float, rng: np.random.Generator) -> np.ndarray:
+    def expose(
+        self,
+        radiance: np.ndarray,
+        gain: float,
+        rng: np.random.Generator,
+        ambient: np.ndarray | None = None,
+    ) -> np.ndarray:
         """One exposure, [h, w] uint8, of `radiance` [h, w] float32.
 
-        `gain` is shared by the cameras of one rig.
+        `gain` is shared by the cameras of one rig. `ambient` [h, w] is the part of the radiance
+        that has no speckle; None: nothing.
         """
         per_grey = self.electrons_at_white / 255.0
         if self.speckle_contrast:  # before the lens: grains are as small as its blur or smaller
-            radiance = radiance * self._grains(radiance.shape, rng)
+            grains = self._grains(radiance.shape, rng)
+            if ambient is None:
+                radiance = radiance * grains
+            else:
+                radiance = ambient + (radiance - ambient) * grains
         if self.psf_px:
             radiance = cv2.GaussianBlur(radiance, (0, 0), self.psf_px)
         electrons = radiance * np.float32(gain * per_grey)

@@ -6,6 +6,8 @@ renderer answers, with its own geometry.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from qs3.geometry.cameras import Camera
@@ -30,7 +32,8 @@ def reached_from(
     its +z; what lies behind it is not reached. A pixel counts if any part of its surface is
     reached.
     """
-    scene = Scene(bodies, white_lamp(world_from_source))
+    white = tuple(replace(body, albedo=1.0, gloss=None) for body in bodies)
+    scene = Scene(white, white_lamp(world_from_source))
     (image,) = renderer.render(scene, [camera], seed=0, geometry=[False])
     return image.radiance > 0
 

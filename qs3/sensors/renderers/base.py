@@ -13,24 +13,27 @@ from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera
 from qs3.meshes.mesh import Mesh
+from qs3.sensors.renderers.gloss import Gloss
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A mesh in the world with a diffuse surface.
+    """A mesh in the world with a surface of one kind.
 
     Attributes:
         mesh: world coordinates, metres.
-        albedo: diffuse reflectance in the near infrared, 0..1.
+        albedo: reflectance in the near infrared, 0..1: diffuse, or a metal's.
         label: 0 is background (floor, walls, clutter), 1 the object that is scanned.
+        gloss: how it shines; None: it is matt (Lambertian).
     """
 
     mesh: Mesh
     albedo: float = 0.8
     label: int = 1
+    gloss: Gloss | None = None
 
     def __post_init__(self) -> None:
-        check_ranges(self, albedo="(0, 1]", label="[0, 255]")
+        check_ranges(self, albedo="[0, 1]", label="[0, 255]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,21 +66,46 @@ class Projector:
 
 
 @dataclass(frozen=True, eq=False)
+class AreaLight:
+    """A square that glows evenly (as Lambert says) to one side and is not seen itself.
+
+    Attributes:
+        world_from_light: [4, 4] of its middle; it shines along its +z, its sides are along x and y.
+        side_m: of the square.
+        radiance: of each of its points.
+    """
+
+    world_from_light: np.ndarray
+    side_m: float
+    radiance: float
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "light.", side_m="> 0", radiance=">= 0")
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """Bodies, one projector, and uniform light from all sides.
+    """Bodies, one projector, uniform light from all sides, and maybe a light with shadows.
 
     Attributes:
         bodies: at least one.
         projector: None for a camera that needs no pattern.
         ambient: radiance of the surroundings, which reaches every surface from all sides,
-            never occluded: a surface gains albedo x ambient. So it carries no sampling
-            noise and is the same in every renderer. Surfaces do not light each other
+            never occluded: a surface gains albedo x ambient, glossy or not. So it carries no
+            sampling noise and is the same in every renderer. Surfaces do not light each other
             (direct light only), and the background of an image, where no body is, is 0.
+        area: sampled once for each sample of a pixel, so it has a little sampling noise.
     """
 
     bodies: tuple[Body, ...]
     projector: Projector | None = None
     ambient: float = 0.0
+    area: AreaLight | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether all is matt and no area light is on: what every variant can render."""
+        return self.area is None and all(body.gloss is None for body in self.bodies)
 
     def __post_init__(self) -> None:
         if not self.bodies:
@@ -162,7 +190,8 @@ class RendererSettings:
     """Settings both renderers share.
 
     Attributes:
-        samples: samples a pixel (anti-aliasing of the dots; the light is direct only).
+        samples: samples a pixel (anti-aliasing of the dots, and places on an area light; light is
+            direct only).
         threads: 0 is all cores. Output must not depend on it.
     """
 

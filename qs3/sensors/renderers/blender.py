@@ -6,12 +6,12 @@ builds its own data, renders, and removes it, so nothing is left for the next ca
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 
 from qs3.errors import RenderError
 from qs3.geometry.cameras import Camera
+from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers import blender_devices
 from qs3.sensors.renderers.base import (
     Body,
@@ -29,10 +30,16 @@ from qs3.sensors.renderers.base import (
     give_memory_back,
     incidence,
 )
+from qs3.sensors.renderers.blender_surfaces import (
+    add_area,
+    add_projector,
+    blender_pose,
+    matrix_of,
+    show_camera_only,
+    surface,
+)
 from qs3.sensors.renderers.exr import read_exr
 
-# Cycles: a point light of P watts lights a white plane at 1 m to the radiance P / (4 pi^2).
-_WATT_PER_RADIANCE = 4 * math.pi**2
 # How far behind a surface its shadow caster lies, relative to the distance from the projector:
 # 0.2 mm at 2 m, about the gap that Mitsuba leaves.
 _SHADOW_GAP = 1e-4
@@ -107,31 +114,59 @@ class BlenderRenderer:
         target = bpy.context.scene
         _configure(target, self.settings)
         blender_devices.use(bpy, target.cycles, self.device)
-        images = []
         try:
-            bodies = [_add_body(bpy, target, body, scene.ambient) for body in scene.bodies]
+            bodies = [_add_body(bpy, target, body, scene) for body in scene.bodies]
+            lamps = []
             if scene.projector is not None:
-                _add_projector(bpy, target, scene.projector)
-                for thing in bodies:
-                    _cast_shadow_by_copy(target, thing, scene.projector)
+                lamps.append(add_projector(bpy, target, scene.projector))
+                lamps += [_cast_shadow_by_copy(target, thing, scene.projector) for thing in bodies]
             eye = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
             target.collection.objects.link(eye)
             target.camera = eye
-            layer = target.view_layers[0]
-            for index, (camera, wanted) in enumerate(zip(cameras, geometry, strict=True)):
-                _aim(target, eye, camera)
-                layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_normal = wanted
-                # Cameras of one call must not share their sampling noise.
-                target.cycles.seed = (seed + 0x9E3779B9 * index) % 2**31
-                path = folder / f"{index}.exr"
-                target.render.filepath = str(path)
-                bpy.ops.render.render(write_still=True)
-                images.append(_image(read_exr(path), camera))
-                path.unlink()
+            images = self._photographs(target, eye, cameras, seed, geometry, folder)
+            if scene.area is not None:
+                # Apart: of several lights Cycles takes one at random for each sample.
+                for thing in lamps:
+                    thing.hide_render = True
+                for thing in bodies:
+                    show_camera_only(thing)
+                    # Rays end on them, and so find the light where nothing is before it.
+                    thing.visible_shadow = thing.visible_diffuse = thing.visible_glossy = True
+                target.cycles.max_bounces = 1
+                add_area(bpy, target, scene.area)
+                none = [False] * len(cameras)
+                more = self._photographs(target, eye, cameras, ~seed, none, folder)
+                images = [
+                    replace(image, radiance=image.radiance + other.radiance)
+                    for image, other in zip(images, more, strict=True)
+                ]
         finally:
             target.render.use_persistent_data = False
             _remove_everything(bpy)
             give_memory_back()
+        return images
+
+    def _photographs(
+        self,
+        target: Any,
+        eye: Any,
+        cameras: list[Camera],
+        seed: int,
+        geometry: list[bool],
+        folder: Path,
+    ) -> list[Image]:
+        """The Blender scene as it stands, once for each camera."""
+        layer, images = target.view_layers[0], []
+        for index, (camera, wanted) in enumerate(zip(cameras, geometry, strict=True)):
+            _aim(target, eye, camera)
+            layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_normal = wanted
+            # Cameras of one call must not share their sampling noise.
+            target.cycles.seed = (seed + 0x9E3779B9 * index) % 2**31
+            path = folder / f"{index}.exr"
+            target.render.filepath = str(path)
+            self._bpy.ops.render.render(write_still=True)
+            images.append(_image(read_exr(path), camera))
+            path.unlink()
         return images
 
 
@@ -225,9 +260,11 @@ def _configure(target: Any, settings: RendererSettings) -> None:
     output.exr_codec = "NONE"
 
 
-def _add_body(bpy: Any, target: Any, body: Body, ambient: float) -> Any:
-    """The Blender object of a body."""
+def _add_body(bpy: Any, target: Any, body: Body, scene: Scene) -> Any:
+    """The Blender object of a body of a scene."""
     faces = body.mesh.faces
+    if scene.area is not None:
+        faces = _without_twins(body.mesh)
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]  # Blender's meshes may not repeat a corner
     mesh = bpy.data.meshes.new("body")
@@ -240,31 +277,28 @@ def _add_body(bpy: Any, target: Any, body: Body, ambient: float) -> Any:
     mesh.update(calc_edges=True)
     mesh.shade_flat()
 
-    material = bpy.data.materials.new("diffuse")
-    material.use_nodes = True
-    material.cycles.emission_sampling = "NONE"  # the ambient term lights nothing else
-    tree = material.node_tree
-    tree.nodes.clear()
-    node, link = tree.nodes.new, tree.links.new
-    diffuse, glow = node("ShaderNodeBsdfDiffuse"), node("ShaderNodeEmission")
-    diffuse.inputs["Color"].default_value = (body.albedo, body.albedo, body.albedo, 1.0)
-    diffuse.inputs["Roughness"].default_value = 0.0
-    glow.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-    glow.inputs["Strength"].default_value = body.albedo * ambient
-    total, output = node("ShaderNodeAddShader"), node("ShaderNodeOutputMaterial")
-    link(diffuse.outputs[0], total.inputs[0])
-    link(glow.outputs[0], total.inputs[1])
-    link(total.outputs[0], output.inputs["Surface"])
-    mesh.materials.append(material)
+    mesh.materials.append(surface(bpy, body, scene.ambient))
 
     thing = bpy.data.objects.new("body", mesh)
     thing.pass_index = body.label
     thing.visible_diffuse = False  # Cycles follows a diffuse ray to what glows even at 0 bounces
+    thing.visible_glossy = scene.plain
     target.collection.objects.link(thing)
     return thing
 
 
-def _cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> None:
+def _without_twins(mesh: Mesh) -> np.ndarray:
+    """Faces [F, 3] without those at the place of another one.
+
+    In the light of an area there is no place for shadow casters (`_cast_shadow_by_copy`) that is
+    behind the surface for all of it, so that twins would shadow each other.
+    """
+    _, place = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True)
+    _, first = np.unique(np.sort(place.ravel()[mesh.faces]), axis=0, return_index=True)
+    return mesh.faces[np.sort(first)]
+
+
+def _cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> Any:
     """Let an invisible copy cast the shadow, enlarged a little about the projector.
 
     CAD files often hold a face twice. Cycles starts a shadow ray on the surface itself, so
@@ -275,71 +309,17 @@ def _cast_shadow_by_copy(target: Any, thing: Any, projector: Projector) -> None:
     matrix = np.diag([scale, scale, scale, 1.0])
     matrix[:3, 3] = centre * (1 - scale)
     copy = thing.copy()
-    copy.matrix_world = _matrix(matrix)
+    copy.matrix_world = matrix_of(matrix)
     copy.visible_camera = False
     thing.visible_shadow = False
     target.collection.objects.link(copy)
-
-
-def _add_projector(bpy: Any, target: Any, projector: Projector) -> None:
-    height, width = projector.slide.shape
-    tan_x = projector.tan_half_width
-    tan_y = tan_x * height / width
-
-    picture = bpy.data.images.new("slide", width, height, float_buffer=True, is_data=True)
-    picture.use_half_precision = False
-    pixels = np.ones((height, width, 4), dtype=np.float32)
-    pixels[..., :3] = projector.slide[::-1, :, None]  # Blender's first row is the lowest
-    picture.pixels.foreach_set(pixels.ravel())
-    picture.update()
-
-    light = bpy.data.lights.new("projector", "SPOT")
-    light.energy = projector.strength * _WATT_PER_RADIANCE
-    light.shadow_soft_size = 0.0  # a point: hard shadows
-    light.spot_blend = 0.0
-    # The cone only has to hold the slide; the slide's edge is the texture's.
-    light.spot_size = min(2 * math.atan(math.hypot(tan_x, tan_y)) + 0.1, math.radians(179.0))
-    light.use_nodes = True
-    tree = light.node_tree
-    tree.nodes.clear()
-    node, link = tree.nodes.new, tree.links.new
-
-    # The direction (x, y, z) in the light's frame (it looks along -z, y up) falls on the
-    # slide at (x, y) / -z.
-    coordinates, parts = node("ShaderNodeTexCoord"), node("ShaderNodeSeparateXYZ")
-    divide, place = node("ShaderNodeVectorMath"), node("ShaderNodeVectorMath")
-    divide.operation, place.operation = "DIVIDE", "MULTIPLY_ADD"
-    place.inputs[1].default_value = (-0.5 / tan_x, -0.5 / tan_y, 0.0)
-    place.inputs[2].default_value = (0.5, 0.5, 0.0)
-    texture = node("ShaderNodeTexImage")
-    texture.image, texture.interpolation, texture.extension = picture, "Linear", "CLIP"
-    link(coordinates.outputs["Normal"], parts.inputs[0])
-    link(coordinates.outputs["Normal"], divide.inputs[0])
-    link(parts.outputs["Z"], divide.inputs[1])
-    link(divide.outputs[0], place.inputs[0])
-    link(place.outputs[0], texture.inputs["Vector"])
-
-    # A point's light falls on a plane as cos^3 of the angle to the axis; a projector's lens
-    # is built so that the plane is evenly bright.
-    cosine, rise = node("ShaderNodeMath"), node("ShaderNodeMath")
-    cosine.operation, rise.operation = "ABSOLUTE", "POWER"
-    rise.inputs[1].default_value = -3.0
-    emission, output = node("ShaderNodeEmission"), node("ShaderNodeOutputLight")
-    link(parts.outputs["Z"], cosine.inputs[0])
-    link(cosine.outputs[0], rise.inputs[0])
-    link(texture.outputs["Color"], emission.inputs["Color"])
-    link(rise.outputs[0], emission.inputs["Strength"])
-    link(emission.outputs[0], output.inputs["Surface"])
-
-    thing = bpy.data.objects.new("projector", light)
-    thing.matrix_world = _blender_pose(projector.world_from_projector)
-    target.collection.objects.link(thing)
+    return copy
 
 
 def _aim(target: Any, eye: Any, camera: Camera) -> None:
     """Pose, lens and window of the camera."""
     k, window, render = camera.intrinsics, camera.rendered, target.render
-    eye.matrix_world = _blender_pose(camera.world_from_camera)
+    eye.matrix_world = blender_pose(camera.world_from_camera)
     lens = eye.data
     lens.sensor_fit = "HORIZONTAL"  # so that all is in units of the width
     lens.sensor_width = 36.0
@@ -355,17 +335,6 @@ def _aim(target: Any, eye: Any, camera: Camera) -> None:
     render.border_max_x = min((window.left + window.width + 0.25) / k.width_px, 1.0)
     render.border_min_y = (k.height_px - window.top - window.height + 0.25) / k.height_px
     render.border_max_y = min((k.height_px - window.top + 0.25) / k.height_px, 1.0)
-
-
-def _blender_pose(world_from_local: np.ndarray) -> Any:
-    """Pose of a camera or light: they look along -z with y up."""
-    return _matrix(np.asarray(world_from_local) @ np.diag([1.0, -1.0, -1.0, 1.0]))
-
-
-def _matrix(matrix: np.ndarray) -> Any:
-    import mathutils
-
-    return mathutils.Matrix(matrix.tolist())
 
 
 def _image(channels: dict[str, np.ndarray], camera: Camera) -> Image:

@@ -20,11 +20,13 @@ class Faces:
         mesh: all bodies.
         albedo: [F] float32.
         label: [F] uint8.
+        body: [F] uint32, index of the body.
     """
 
     mesh: Mesh
     albedo: np.ndarray
     label: np.ndarray
+    body: np.ndarray
 
     @staticmethod
     def of(bodies: tuple[Body, ...]) -> Faces:
@@ -34,6 +36,7 @@ class Faces:
             merge([body.mesh for body in bodies]),
             np.repeat(np.array([body.albedo for body in bodies], dtype=np.float32), counts),
             np.repeat(np.array([body.label for body in bodies], dtype=np.uint8), counts),
+            np.repeat(np.arange(len(bodies), dtype=np.uint32), counts),
         )
 
     def corners(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

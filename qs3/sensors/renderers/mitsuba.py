@@ -27,6 +27,7 @@ from qs3.sensors.renderers.base import (
     Scene,
     give_memory_back,
 )
+from qs3.sensors.renderers.mitsuba_glossy import GlossyScene
 from qs3.sensors.renderers.mitsuba_jit import JitScene
 from qs3.sensors.renderers.mitsuba_scalar import ScalarScene
 
@@ -76,8 +77,7 @@ class MitsubaRenderer:
             raise RenderError(f"{len(cameras)} cameras but {len(geometry)} geometry flags")
         mi = self._activate()
         try:
-            make = ScalarScene if self.variant.startswith("scalar_") else JitScene
-            built = make(mi, scene)
+            built = self._build(mi, scene)
             images = []
             for index, (camera, wanted) in enumerate(zip(cameras, geometry, strict=True)):
                 # Cameras of one call must not share their sampling noise.
@@ -107,6 +107,17 @@ class MitsubaRenderer:
             number = ".".join(map(str, llvm.libllvm_version(self._probe.llvm_path)))
             found["llvm"] = number or os.path.basename(self._probe.llvm_path)
         return found
+
+    def _build(self, mi: Any, scene: Scene) -> ScalarScene | JitScene:
+        """The scene for this variant; RenderError if it shows more than the variant can."""
+        if not self.variant.startswith("scalar_"):
+            return JitScene(mi, scene) if scene.plain else GlossyScene(mi, scene)
+        if not scene.plain:
+            raise RenderError(
+                f"renderer.variant={self.variant} knows matt surfaces and even light only: leave "
+                "out materials= and light=, install a libLLVM (libllvm19), or take renderer=blender"
+            )
+        return ScalarScene(mi, scene)
 
     def _activate(self) -> Any:
         """Mitsuba with our variant and threads, whatever else in this process used it since."""

@@ -14,6 +14,7 @@ from qs3.sensors.renderers.faces import Faces, mitsuba_mesh
 # Offset of a shadow ray's origin along the normal, relative to 1 + the largest coordinate.
 # Mitsuba's own rule for single precision, so that both paths have the same contact shadows.
 _RAY_EPSILON = 1500 * 2.0**-24
+TO_UNIT = 2.0**-32  # of fixed point with 32 bits
 
 
 class JitScene:
@@ -62,12 +63,12 @@ class JitScene:
         shift_u, shift_v = mi.sample_tea_32(place, dr.opaque(mi.UInt32, seed))
         # The golden ratio's counterpart for two dimensions, in 32 bit fixed point.
         step_u, step_v = mi.UInt32(3242174889), mi.UInt32(2447445414)
-        to_unit = 2.0**-32
+        lamp = self._lamp_samples(place, seed)
 
         def body(index: Any, total: Any) -> tuple[Any, Any]:
-            du = mi.Float(shift_u + index * step_u) * to_unit - 0.5
-            dv = mi.Float(shift_v + index * step_v) * to_unit - 0.5
-            return index + 1, total + self._shade(ray_of(u + du, v + dv))
+            du = mi.Float(shift_u + index * step_u) * TO_UNIT - 0.5
+            dv = mi.Float(shift_v + index * step_v) * TO_UNIT - 0.5
+            return index + 1, total + self._shade(ray_of(u + du, v + dv), lamp(index))
 
         count = dr.opaque(mi.UInt32, samples)
         _, total = dr.while_loop(
@@ -91,7 +92,11 @@ class JitScene:
         face = np.array(hit.prim_index).reshape(depth.shape)
         return depth, np.where(np.isfinite(depth), face.astype(np.int64), -1)
 
-    def _shade(self, ray: Any) -> Any:
+    def _lamp_samples(self, place: Any, seed: int) -> Callable[[Any], Any]:
+        """Where sample `index` of a pixel at `place` samples the area light; there is none here."""
+        return lambda index: None
+
+    def _shade(self, ray: Any, lamp: Any) -> Any:
         """Radiance along a ray, 0 where nothing is hit."""
         mi, dr = self._mi, self._dr
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
@@ -102,7 +107,11 @@ class JitScene:
             return albedo * light
 
         normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, valid)
-        point = ray.o + hit.t * ray.d
+        return albedo * (light + self._projected(ray, ray.o + hit.t * ray.d, normal, valid))
+
+    def _projected(self, ray: Any, point: Any, normal: Any, valid: Any) -> Any:
+        """Radiance that the projector gives a white matt surface at `point`."""
+        mi, dr = self._mi, self._dr
         to_light = self._slide_origin - point
         x, y, z = (-dr.dot(axis, to_light) for axis in self._slide_axes)
         place = mi.Point2f(x, y) / z * self._slide_scale + 0.5
@@ -112,14 +121,16 @@ class JitScene:
         lit &= (slide > 0) & (cosine * dr.dot(normal, -ray.d) > 0)
 
         start = point + normal * (self._epsilon * dr.sign(cosine))
-        shadow_ray = mi.Ray3f(start, self._slide_origin - start)
-        shadow_ray.maxt = 1 - 1e-4
-        lit &= ~self._scene.ray_test(shadow_ray, coherent=True, active=lit)
+        lit &= self._free(start, self._slide_origin, lit)
         # strength / z^2 on a plane that faces the projector, elsewhere times the cosine of
         # incidence (cosine / distance) over that plane's (z / distance).
-        return albedo * (
-            light + dr.select(lit, self._strength * slide * dr.abs(cosine) / (z * z * z), 0)
-        )
+        return dr.select(lit, self._strength * slide * dr.abs(cosine) / (z * z * z), 0)
+
+    def _free(self, start: Any, end: Any, active: Any) -> Any:
+        """Whether nothing lies between two points."""
+        shadow_ray = self._mi.Ray3f(start, end - start)
+        shadow_ray.maxt = 1 - 1e-4
+        return ~self._scene.ray_test(shadow_ray, coherent=True, active=active)
 
     def _pixels(self, camera: Camera) -> tuple[Any, Any, Callable[[Any, Any], Any]]:
         """Pixel centres (u, v) of the window, row by row, and the ray through a place (u, v)."""

@@ -210,6 +210,77 @@ def test_smooth_noise_below_a_step_is_found_to_be_smooth(size, tmp_path):
     assert found.correlation_px == pytest.approx(size, rel=0.15)
 
 
+SMALLER = FittedDepth(width_px=240, height_px=180, focal_px=220.0, noise_factor=0.0015)
+
+
+def kitchen(depth_m, relief, seed):
+    """A front of cupboards: 40 things that stand out from a plane, or are set back."""
+    rng, k = np.random.default_rng(seed), SMALLER.intrinsics
+    clean = np.full((k.height_px, k.width_px), depth_m, dtype=np.float32)
+    clean /= 1 + 0.1 * (np.arange(k.width_px, dtype=np.float32) - k.cx_px) / k.focal_px
+    for _ in range(40):
+        width, height = rng.integers(12, 70, 2)
+        row, col = rng.integers(0, k.height_px - 10), rng.integers(0, k.width_px - 10)
+        clean[row : row + height, col : col + width] *= 1 + rng.uniform(-relief, relief)
+    return SMALLER.measure(clean, np.full_like(clean, 0.95), rng)[0]
+
+
+def told(folder, images, capsys):
+    """Exit status and what was printed of a fit of some images."""
+    files = [folder / f"{name}.npy" for name in images]
+    for file, image in zip(files, images.values(), strict=True):
+        np.save(file, image)
+    out = folder / "found.yaml"
+    status = main(["fit", *map(str, files), "focal=220", f"out={out}"])
+    said = capsys.readouterr()
+    return status, said.out + said.err, out
+
+
+@pytest.mark.slow
+def test_a_kitchen_among_walls_is_named_and_refused(tmp_path, capsys):
+    images = {
+        "near": wall(SMALLER, 1.0, 5, seed=0),
+        "kitchen": kitchen(1.6, 0.05, seed=1),
+        "far": wall(SMALLER, 2.4, 5, seed=2),
+    }
+    status, said, out = told(tmp_path, images, capsys)
+    assert status == 1
+    assert "not of a flat wall:" in said
+    assert "kitchen.npy: " in said
+    assert "the law of all frames says" in said
+    assert "near.npy: 1" not in said
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_kitchens_alone_agree_with_each_other_and_are_refused(tmp_path, capsys):
+    """Their law fits them; errors of whole patches of the image are not a camera's noise."""
+    images = {f"kitchen_{i}": kitchen(z, 0.05, seed=i) for i, z in enumerate((1.0, 1.6, 2.4))}
+    status, said, out = told(tmp_path, images, capsys)
+    assert status == 1
+    for name in images:
+        assert f"{name}.npy: errors of " in said
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_what_may_be_a_wall_is_doubted_in_the_preset_too(tmp_path, capsys):
+    status, said, out = told(tmp_path, {"front": kitchen(1.6, 0.012, seed=1)}, capsys)
+    assert status == 0
+    assert "doubtful  front.npy: " in said
+    assert "\n# doubtful: front.npy: " in out.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0.0, 1.5, 4.0])
+def test_smooth_noise_on_walls_is_not_doubted(size, tmp_path, capsys):
+    sensor = replace(SMALLER, correlation_px=size)
+    images = {f"{i}": wall(sensor, z, tilt, seed=i) for i, (z, tilt) in enumerate(POSES)}
+    status, said, _ = told(tmp_path, images, capsys)
+    assert status == 0
+    assert "doubtful" not in said
+
+
 @pytest.mark.parametrize(("rate", "hole"), [(0.9, 1.0), (0.6, 3.0), (0.5, 8.0)])
 def test_holes_of_any_size_count(rate, hole, tmp_path):
     found, _ = recovered(tmp_path, FittedDepth(fill_rates=(rate,), hole_px=hole))

@@ -77,3 +77,18 @@ def test_what_is_off_draws_nothing():
     InfraredCamera().expose(radiance, 200.0, a)
     b.standard_normal(radiance.shape, dtype=np.float32)
     assert a.random() == b.random()
+
+
+def test_ambient_light_without_speckle_keeps_its_evenness():
+    """Of 60 grey values 50 are ambient: the projector's 10 vary by half, which is 5."""
+    camera = InfraredCamera(
+        electrons_at_white=1e9, read_noise_e=0.0, speckle_contrast=0.5, ambient_speckles=False
+    )
+    assert camera.needs_ambient
+    total, ambient = (np.full((300, 300), value, np.float32) for value in (60.0, 50.0))
+    split = camera.expose(total, 1.0, np.random.default_rng(0), ambient)
+    assert split.std() == pytest.approx(5.0, rel=0.03)
+    assert split.min() >= 50
+    assert camera.expose(total, 1.0, np.random.default_rng(0)).std() == pytest.approx(30, rel=0.03)
+    none = camera.expose(total, 1.0, np.random.default_rng(0), 0 * ambient)
+    np.testing.assert_array_equal(none, camera.expose(total, 1.0, np.random.default_rng(0)))

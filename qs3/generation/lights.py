@@ -1,0 +1,45 @@
+"""Light of the place where an object is scanned, beside the sensor's own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from qs3.config.checks import check_ranges
+from qs3.sensors.base import Lighting
+from qs3.sensors.renderers.base import AreaLight
+
+
+@dataclass(frozen=True)
+class LightAbove:
+    """The paper's light (section 3.1): one area light on top of the object, a level square.
+
+    Attributes:
+        height_m: over the object's highest point.
+        side_m: of the square, whose middle is over the object's.
+        strength: radiance of a white level surface there, in the units of `sensor.ambient`: with
+            sensor=speckle_stereo a lit dot on white has 1 at 4 m.
+        ambient: of light from all sides, in place of `sensor.ambient`; null: that.
+    """
+
+    height_m: float = 1.5
+    side_m: float = 24.34
+    strength: float = 0.15
+    ambient: float | None = None
+
+    def __post_init__(self) -> None:
+        positive = dict.fromkeys(("height_m", "side_m"), "> 0")
+        check_ranges(self, "light.", strength=">= 0", ambient=">= 0", **positive)
+
+    def over(self, box_m: np.ndarray) -> Lighting:
+        """Over an object with box [2, 3]."""
+        middle = box_m.mean(axis=0)
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])  # it looks down
+        pose[:3, 3] = middle[0], middle[1], box_m[1, 2] + self.height_m
+        # The share of what a point sees above itself that the square fills, by cosines.
+        slope = self.side_m / (2 * self.height_m)
+        part = slope / math.hypot(1, slope)
+        seen = 4 / math.pi * part * math.atan(part)
+        return Lighting(AreaLight(pose, self.side_m, self.strength / seen), self.ambient)

@@ -1,0 +1,168 @@
+"""What `mitsuba_jit` leaves out: surfaces that shine, and an area light with its shadows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from qs3.sensors.renderers.base import Scene
+from qs3.sensors.renderers.gloss import COSINES, Gloss, kept_back
+from qs3.sensors.renderers.mitsuba_facets import Facets, clip
+from qs3.sensors.renderers.mitsuba_jit import TO_UNIT, JitScene
+
+_MATT = Gloss(roughness=1.0, specular=0.0)
+# Fractional parts of the roots of 2, 3, 5 and 7 in 32 bit fixed point: a sequence in four
+# dimensions, which beside the pixel's R2 is one in six.
+_STEPS = (1779033703, 3144134277, 1013904242, 2773480762)
+
+
+class GlossyScene(JitScene):
+    """A scene for the compiled variants with `Body.gloss` and `Scene.area`.
+
+    Its kernel is another one, so that scenes without either keep theirs, and its bytes.
+    """
+
+    def __init__(self, mi: Any, scene: Scene) -> None:
+        super().__init__(mi, scene)
+        kinds = [body.gloss or _MATT for body in scene.bodies]
+        self._body = mi.UInt32(self.faces.body)
+
+        def each(values: list[float]) -> Any:
+            return mi.Float(np.array(values, dtype=np.float32))
+
+        self._square = each([kind.alpha**2 for kind in kinds])
+        self._index = each([kind.refractive_index for kind in kinds])
+        self._metal = each([float(kind.metal) for kind in kinds])
+        tables = np.concatenate([kept_back(kind) for kind in kinds])
+        self._kept_back = mi.Float(tables.astype(np.float32))
+        self._area = scene.area
+        if scene.area is not None:
+            self._area_axes, self._area_origin = self._pose(scene.area.world_from_light)
+            self._area_half = self._opaque(scene.area.side_m / 2)
+            self._area_radiance = self._opaque(scene.area.radiance)
+
+    def _lamp_samples(self, place: Any, seed: int) -> Callable[[Any], Any]:
+        """Four numbers in 0..1 for each sample: a place on the light, and a facet."""
+        if self._area is None:
+            return super()._lamp_samples(place, seed)
+        mi, dr = self._mi, self._dr
+        shifts = [
+            shift
+            for salt in (1, 2)  # neither is the pixel's own
+            for shift in mi.sample_tea_32(place, dr.opaque(mi.UInt32, (seed ^ ~salt) % 2**32))
+        ]
+
+        def at(index: Any) -> Any:
+            pairs = zip(shifts, _STEPS, strict=True)
+            return [mi.Float(shift + index * mi.UInt32(step)) * TO_UNIT for shift, step in pairs]
+
+        return at
+
+    def _shade(self, ray: Any, lamp: Any) -> Any:
+        mi, dr = self._mi, self._dr
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        valid = hit.is_valid()
+        point = ray.o + hit.t * ray.d
+        normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, valid)
+        to_eye = dr.normalize(-ray.d)
+        facing = mi.Vector3f(normal * dr.sign(dr.dot(normal, to_eye)))
+        albedo = dr.gather(mi.Float, self._albedo, hit.prim_index, valid)
+        diffuse, facets = self._surface(hit.prim_index, valid, albedo, facing, to_eye)
+        total = dr.select(valid, albedo * self._ambient, 0)
+        if self._projector is not None:
+            projected = self._projected(ray, point, normal, valid)
+            shine = facets.times_pi(dr.normalize(self._slide_origin - point))
+            # Where nothing is hit, or the light is opposite to the eye, there is no half-way.
+            total += dr.select(projected > 0, (diffuse + shine) * projected, 0)
+        if self._area is not None:
+            total += self._from_area(point, facing, valid, lamp, diffuse, facets)
+        return total
+
+    def _surface(
+        self, face: Any, valid: Any, albedo: Any, normal: Any, to_eye: Any
+    ) -> tuple[Any, Facets]:
+        """Pi f of the Lambertian part, and the facets."""
+        mi, dr = self._mi, self._dr
+        body = dr.gather(mi.UInt32, self._body, face, valid)
+        square, index, metal = (
+            dr.gather(mi.Float, values, body, valid)
+            for values in (self._square, self._index, self._metal)
+        )
+        facets = Facets(mi, normal, to_eye, square, index, metal > 0, albedo)
+        place = facets.cos_o * (COSINES - 1)
+        low = mi.UInt32(clip(dr, place, 0, COSINES - 2))
+        left, right = (
+            dr.gather(mi.Float, self._kept_back, body * COSINES + low + i, valid) for i in (0, 1)
+        )
+        kept = dr.lerp(left, right, place - mi.Float(low))
+        return dr.select(metal > 0, 0, albedo * (1 - kept)), facets
+
+    def _from_area(
+        self, point: Any, facing: Any, valid: Any, lamp: Any, diffuse: Any, facets: Facets
+    ) -> Any:
+        """Radiance by one place on the area light, and of its reflex also by one facet.
+
+        Both are weighed by their densities (Veach's balance heuristic): a reflex narrower than the
+        light is rarely met by places on the light, and a wider one rarely by facets.
+        """
+        dr = self._dr
+        start = point + facing * self._epsilon
+        seen_from = start - self._area_origin
+        x, y, z = (dr.dot(axis, seen_from) for axis in self._area_axes)
+        before = valid & (z > 0)
+        z = dr.select(before, z, 1)
+        ends = [
+            -self._area_half - x,
+            self._area_half - x,
+            -self._area_half - y,
+            self._area_half - y,
+        ]
+        u, v, solid_angle = self._on_square(ends, z, lamp[0], lamp[1])
+        ax, ay, az = self._area_axes
+        there = ax * u + ay * v - az * z
+        way = dr.normalize(there)
+        cosine = dr.dot(facing, way)
+        lit = before & (cosine > 0) & (solid_angle > 0)
+        lit &= self._free(start, start + there, lit)
+        shine = facets.times_pi(way) / (1 + solid_angle * facets.density(way))
+        total = dr.select(lit, cosine * solid_angle * (diffuse + shine), 0)
+
+        way = facets.reflected(lamp[2], lamp[3])
+        cosine = dr.dot(facing, way)
+        along = -dr.dot(az, way)
+        there = way * (z / dr.select(along > 1e-6, along, 1))
+        u, v = dr.dot(ax, there), dr.dot(ay, there)
+        met = before & (cosine > 0) & (along > 1e-6)
+        met &= (u >= ends[0]) & (u <= ends[1]) & (v >= ends[2]) & (v <= ends[3])
+        met &= self._free(start, start + there, met)
+        shine = facets.times_pi(way) * solid_angle / (1 + solid_angle * facets.density(way))
+        total += dr.select(met, cosine * shine, 0)
+        return total * self._area_radiance / dr.pi
+
+    def _on_square(self, ends: list[Any], z: Any, s: Any, t: Any) -> tuple[Any, Any, Any]:
+        """A place on the light, drawn evenly over the solid angle that it fills, and that angle.
+
+        After Urena, Fajardo and King, "An Area-Preserving Parametrization for Spherical
+        Rectangles", EGSR 2013. `ends` are x0, x1, y0, y1 of its sides from the point, `z` > 0 the
+        distance of its plane; `s` and `t` are drawn from 0..1.
+        """
+        dr = self._dr
+        x0, x1, y0, y1 = ends
+        # z of the normals of the planes through the point and each side
+        sides = [a * dr.rsqrt(a * a + z * z) for a in (-y0, x1, y1, -x0)]
+        corners = [dr.acos(clip(dr, -sides[i] * sides[(i + 1) % 4], -1, 1)) for i in range(4)]
+        rest = 2 * dr.pi - corners[2] - corners[3]
+        solid_angle = clip(dr, corners[0] + corners[1] - rest, 0, 2 * dr.pi)
+        angle = s * solid_angle + rest
+        sine = dr.sin(angle)
+        slope = (dr.cos(angle) * sides[0] - sides[2]) / dr.select(sine == 0, 1e-9, sine)
+        cosine = dr.copysign(dr.rsqrt(slope * slope + sides[0] * sides[0] + 1e-12), slope)
+        cosine = clip(dr, cosine, -1, 1)
+        u = clip(dr, cosine * z * dr.rsqrt(clip(dr, 1 - cosine * cosine, 1e-12, 1)), x0, x1)
+        distance = dr.sqrt(u * u + z * z)
+        low, high = (y * dr.rsqrt(distance * distance + y * y) for y in (y0, y1))
+        level = dr.lerp(low, high, t)
+        v = level * distance * dr.rsqrt(clip(dr, 1 - level * level, 1e-7, 1))
+        return u, clip(dr, v, y0, y1), solid_angle

@@ -1,0 +1,294 @@
+"""Surfaces that shine and the area light, against their formulas."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.errors import RenderError
+from qs3.geometry.cameras import Camera, Intrinsics, Window
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.matching import StereoBlockMatcher
+from qs3.sensors.renderers.base import AreaLight, Projector, RendererSettings, Scene, tangents
+from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.gloss import COSINES, Gloss, kept_back, times_pi
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.sensors.renderers.scenes import busy_scene, moved, octahedron, quad, tilted_pose, wall
+from tests.sensors.scenery import POSE, box_of, square
+
+UP = np.array([0.0, 0.0, 1.0])
+GLOSSES = [Gloss(0.5, 0.5), Gloss(0.25, 1.0), Gloss(0.9, 0.3), Gloss(0.3, metal=True)]
+WHITE = np.ones((8, 8), dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def mitsuba():
+    renderer = MitsubaRenderer(samples=16)
+    if renderer.variant.startswith("scalar_"):
+        pytest.skip("no compiled variant works here")
+    return renderer
+
+
+def sky(count=160):
+    """Directions whose mean is the integral over the hemisphere of f cos / pi, evenly placed."""
+    a, b = (x.ravel() for x in np.meshgrid(*[(np.arange(count) + 0.5) / count] * 2))
+    sine, turn = np.sqrt(a), 2 * np.pi * b
+    return np.stack([sine * np.cos(turn), sine * np.sin(turn), np.sqrt(1 - a)], axis=-1)
+
+
+def eye(cosine):
+    return np.array([np.sqrt(1 - cosine**2), 0.0, cosine])
+
+
+def reflected(albedo, gloss, cosine):
+    """Share of even light from all sides that is sent to the eye."""
+    way = sky()
+    return times_pi(albedo, gloss, UP, way, np.broadcast_to(eye(cosine), way.shape)).mean()
+
+
+# --- the formula
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.5, 1.0])
+@pytest.mark.parametrize("cosine", [0.25, 0.75, 1.0])
+def test_kept_back_is_the_mean_reflectance_of_the_facets(roughness, cosine):
+    """What a black surface reflects of a white sky, over what facets that are mirrors do."""
+    mirrors = reflected(1.0, Gloss(roughness, metal=True), cosine)
+    found = np.interp(cosine, np.linspace(0, 1, COSINES), kept_back(Gloss(roughness, 0.5)))
+    assert found == pytest.approx(reflected(0.0, Gloss(roughness), cosine) / mirrors, rel=0.02)
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    albedo=st.floats(0, 1),
+    roughness=st.floats(0.2, 1),
+    specular=st.floats(0, 1),
+    cosine=st.floats(0.1, 1),
+    metal=st.booleans(),
+)
+def test_nothing_reflects_more_than_it_gets(albedo, roughness, specular, cosine, metal):
+    gloss = Gloss(roughness, specular, metal)
+    assert 0 <= reflected(albedo, gloss, cosine) <= 1.005
+
+
+def test_facing_mirrors_reflect_eight_hundredths_of_specular_and_metals_their_albedo():
+    for gloss, share in ((Gloss(0.5, 1.0), 0.08), (Gloss(0.5, 0.25), 0.02)):
+        # pi D V at normal incidence is 1 / (4 alpha^2), the Lambertian part keeps the rest
+        got = times_pi(0.6, gloss, UP, UP, UP) - 0.6 * (1 - kept_back(gloss)[-1])
+        assert got == pytest.approx(share / (4 * 0.5**4))
+    assert times_pi(0.6, Gloss(0.5, metal=True), UP, UP, UP) == pytest.approx(0.6 / (4 * 0.5**4))
+    assert Gloss(specular=0.5).refractive_index == pytest.approx(1.5)
+
+
+def test_without_facets_it_is_lambert():
+    way = sky(20)
+    assert np.ptp(times_pi(0.3, Gloss(specular=0.0), UP, way, way[::-1]) - 0.3) == 0
+
+
+# --- Mitsuba's kernel
+
+
+def tilted_plane(gloss, albedo=0.4):
+    """A plane seen at a slant, lit from the side; what its formula says of each pixel."""
+    body = replace(
+        quad([[-2, -2, 1.6], [2, -2, 2.4], [2, 2, 2.4], [-2, 2, 1.6]], albedo), gloss=gloss
+    )
+    camera = Camera(Intrinsics.centred(41, 31, 30.0), np.eye(4))
+    x, y = tangents(camera)
+    z = 2 / (1 - 0.2 * x) + 0 * y
+    points = np.stack([x * z, y * z, z], axis=-1)
+    normal = np.array([0.2, 0, -1]) / np.hypot(0.2, 1)
+    return body, camera, points, normal
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("gloss", GLOSSES)
+def test_a_plane_under_the_projector_shines_as_the_formula_says(gloss, mitsuba):
+    body, camera, points, normal = tilted_plane(gloss)
+    lamp = np.array([-0.6, 0, 0])
+    scene = Scene((body,), Projector(moved(-0.6), WHITE, 1.6, strength=2.0), ambient=0.1)
+    (image,) = mitsuba.render(scene, [camera], seed=0, geometry=[False])
+    way = unit(lamp - points)
+    # `Projector.strength`: cosine of incidence over that to the axis, and Z squared
+    light = 2 * (way @ normal) * np.linalg.norm(points - lamp, axis=-1) / points[..., 2] ** 3
+    expected = 0.04 + times_pi(0.4, gloss, normal, way, unit(-points)) * light
+    error = np.abs(image.radiance / expected - 1)[1:-1, 1:-1]
+    assert np.median(error) < 0.002
+    assert np.quantile(error, 0.99) < 0.1  # a pixel is not a point: where the reflex is steep
+    assert expected.max() > 1.5 * np.median(expected) or gloss.roughness > 0.5
+
+
+def above(camera_down_m, depth_m):
+    """A light above the camera's axis that looks down (the camera's y)."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T
+    pose[:3, 3] = 0, camera_down_m, depth_m
+    return pose
+
+
+@pytest.mark.parametrize("gloss", [None, Gloss(0.6, 1.0), Gloss(0.4, metal=True)])
+@pytest.mark.parametrize("side", [0.5, 4.0])
+def test_an_area_light_is_the_sum_of_its_points(gloss, side, mitsuba):
+    """A slow twin: 120 x 120 lamps on the square, each by the inverse square and two cosines."""
+    body, camera, points, normal = tilted_plane(gloss)
+    pose = above(-1.0, 1.2)
+    mitsuba.settings = RendererSettings(samples=8192)
+    scene = Scene((body,), area=AreaLight(pose, side, radiance=0.7))
+    offsets = ((np.arange(120) + 0.5) / 120 - 0.5) * side
+    lamps = (
+        pose[:3, 3] + np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2) @ pose[:3, :2].T
+    )
+    for row, col in ((8, 12), (15, 20), (27, 33)):
+        to = lamps - points[row, col]
+        distance = np.linalg.norm(to, axis=-1)
+        way = to / distance[:, None]
+        lit = np.maximum(way @ normal, 0) * np.maximum(-way @ pose[:3, 2], 0) / distance**2
+        if gloss is None:
+            factor = 0.4
+        else:
+            eye_way = np.broadcast_to(unit(-points[row, col]), way.shape)
+            above_it = way @ normal > 0
+            factor = np.where(above_it, times_pi(0.4, gloss, normal, way, eye_way), 0)
+        expected = 0.7 * (factor * lit).sum() / np.pi * (side / 120) ** 2
+        pixel = replace(camera, window=Window(col, row, 1, 1))
+        (image,) = mitsuba.render(scene, [pixel], seed=0, geometry=[False])
+        assert image.radiance[0, 0] == pytest.approx(expected, rel=0.015)
+
+
+def test_white_below_a_square_has_its_form_factor(mitsuba):
+    """Of a square of side 2h at distance h a point below its middle sees 0.5541."""
+    light = AreaLight(moved(0.0), 3.0, radiance=2.0)
+    camera = Camera(Intrinsics.centred(9, 9, 400.0), np.eye(4))
+    mitsuba.settings = RendererSettings(samples=64)
+    scene = Scene((wall(1.5, albedo=0.5),), area=light)
+    (image,) = mitsuba.render(scene, [camera], seed=0, geometry=[False])
+    assert image.radiance.mean() == pytest.approx(0.5 * 2 * 0.5541, rel=0.003)
+    # Behind the light it is dark.
+    turned = replace(light, world_from_light=moved(0.0) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    (dark,) = mitsuba.render(replace(scene, area=turned), [camera], seed=0, geometry=[False])
+    assert (dark.radiance == 0).all()
+
+
+def test_shadow_of_an_area_light(mitsuba):
+    """A square of 0.4 m half a metre before a wall, in light of 0.5 m width 2 m from it."""
+    blocker = quad([[-0.2, -0.2, 1.5], [0.2, -0.2, 1.5], [0.2, 0.2, 1.5], [-0.2, 0.2, 1.5]])
+    camera = Camera(Intrinsics.centred(101, 41, 60.0), look_along_wall())
+    light = AreaLight(moved(0.0), 0.5, radiance=1.0)
+    bare, shaded = (
+        mitsuba.render(Scene((*more, wall(2.0)), area=light), [camera], seed=0, geometry=[True])[0]
+        for more in ((), (blocker,))
+    )
+    x, y = tangents(camera)
+    depth = np.minimum(bare.depth_m, 100)  # beside the wall there is nothing
+    local = np.stack([x * depth, y * depth, depth], axis=-1)
+    place = local @ camera.world_from_camera[:3, :3].T + camera.world_from_camera[:3, 3]
+    off = np.abs(place[..., :2]).max(axis=-1)
+    seen = shaded.label == 0
+    # From 0.183 m on one edge of the light is seen past the blocker, from 0.35 m on all of it.
+    assert (shaded.radiance[seen & (off < 0.15)] == 0).all()
+    free = seen & (off > 0.38)
+    assert min((seen & (off < 0.15)).sum(), free.sum()) > 50
+    same = np.isclose(shaded.radiance[free], bare.radiance[free], rtol=1e-4)
+    assert same.mean() > 0.98  # all but pixels on the blocker's outline
+    half = seen & (off > 0.2) & (off < 0.33)
+    assert 0.1 < (shaded.radiance[half] / bare.radiance[half]).mean() < 0.9
+
+
+def look_along_wall():
+    pose = np.eye(4)
+    pose[:3, 3] = -1.0, 0, 1.0
+    forward = unit(np.array([1.0, 0, 1.0]))
+    pose[:3, :3] = np.stack([np.cross([0, 1.0, 0], forward), [0, 1.0, 0], forward], axis=1)
+    return pose
+
+
+def shiny_scene():
+    scene = busy_scene()
+    bodies = tuple(replace(b, gloss=g) for b, g in zip(scene.bodies, GLOSSES[:2], strict=True))
+    return replace(scene, bodies=bodies, area=AreaLight(above(-1.0, 1.0), 1.0, 0.5))
+
+
+def test_window_is_a_crop_and_same_call_same_bytes(mitsuba):
+    camera, window = (
+        Camera(Intrinsics(96, 80, 90.0, 45.3, 41.8), moved(0.02)),
+        Window(31, 17, 40, 32),
+    )
+    part = replace(camera, window=window)
+    mitsuba.settings = RendererSettings(samples=16)
+
+    def render(camera, seed):
+        (image,) = mitsuba.render(shiny_scene(), [camera], seed=seed, geometry=[False])
+        return image.radiance
+
+    whole = render(camera, seed=3)
+    assert np.abs(render(part, seed=3) - whole[window.slices]).max() < 0.6  # noise of dots' edges
+    mitsuba.settings = RendererSettings(samples=16, threads=2)
+    np.testing.assert_array_equal(render(camera, seed=3), whole)
+    assert (render(camera, seed=4) != whole).any()
+
+
+def test_the_variant_without_a_compiler_refuses_and_names_the_settings():
+    renderer = MitsubaRenderer(variant="scalar_rgb")
+    camera = Camera(Intrinsics.centred(8, 8, 8.0), np.eye(4))
+    for scene in (shiny_scene(), Scene((wall(1.0),), area=AreaLight(np.eye(4), 1.0, 1.0))):
+        with pytest.raises(RenderError, match="materials= and light="):
+            renderer.render(scene, [camera], seed=0, geometry=[False])
+
+
+# --- what a sensor makes of it
+
+
+@pytest.mark.parametrize("gloss", [None, Gloss(0.5, 0.0)])
+def test_a_black_body_shows_no_dots_and_gets_no_depth(gloss, mitsuba):
+    mitsuba.settings = RendererSettings(samples=4)
+    sensor = SpeckleStereo(
+        width_px=300, height_px=300, focal_px=400.0, step_px=1, matcher=StereoBlockMatcher(64, 11)
+    )
+    white, black = (replace(square(2.0, 0.15, albedo), gloss=gloss) for albedo in (0.5, 0.0))
+    frames = [
+        sensor.scan((body,), box_of(body), POSE, mitsuba, np.random.default_rng(0), explain=True)
+        for body in (white, black)
+    ]
+    inside = [np.isfinite(frame.depth_m[frame.label == 1]).mean() for frame in frames]
+    assert inside[0] > 0.95
+    assert inside[1] < 0.02  # where noise resembles noise
+    assert frames[0].images["left"].max() > 200
+    assert frames[1].images["left"].max() < 6  # read noise of 0.8 grey values
+    assert frames[1].images["lit"][frames[1].label == 1].mean() > 0.95  # it is lit, and dark
+
+
+# --- Blender
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gloss", [None, *GLOSSES])
+def test_blender_s_principled_bsdf_is_the_same_surface(gloss, mitsuba):
+    """Another implementation of the same model: radiance of a plane and of a body with corners."""
+    body, camera, _, _ = tilted_plane(gloss)
+    ball = replace(quad([[0, 0, 1]] * 4), mesh=octahedron((0.05, 0.02, 1.0), 0.3), gloss=gloss)
+    projector = Projector(moved(-0.6), WHITE, 1.6, strength=2.0)
+    light = AreaLight(above(-1.0, 1.2), 1.5, radiance=1.0)
+    mitsuba.settings = RendererSettings(samples=64)
+    blender = BlenderRenderer(samples=64)
+    for scene, typical, worst in (
+        (Scene((body,), projector, 0.1), 0.001, 0.06),
+        (Scene((body, ball), projector, 0.1, light), 0.005, 0.1),
+    ):
+        (a,), (b,) = (
+            r.render(scene, [camera], seed=0, geometry=[False]) for r in (mitsuba, blender)
+        )
+        error = np.abs(b.radiance / a.radiance - 1)[1:-1, 1:-1]
+        assert np.median(error) < typical
+        assert np.quantile(error, 0.95) < worst
+        assert b.radiance.mean() == pytest.approx(a.radiance.mean(), rel=0.005)
+
+
+def test_pose_of_tests_is_a_rotation():
+    for pose in (above(-1, 1), tilted_pose(), look_along_wall()):
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
