@@ -224,7 +224,7 @@ TRAIN = Command(
     _train,
     (
         *_TABLE,
-        Option("seeds", several(whole(0)), "that each cell should have", (0, 1, 2)),
+        Option("seeds", several(whole(0)), "of each cell (default: the table's, mostly 0,1,2)", ()),
         Option("rows", several(text("WORD")), "only rows of this name, or with it in theirs", ()),
         Option("columns", several(text("WORD")), "likewise", ()),
         Option("jobs", whole(), "runs at the same time (default 1, or what the launcher does)"),

@@ -194,6 +194,10 @@ def _check_settings(cfg: DictConfig) -> None:
         raise ConfigError(
             "force=true begins the run anew and ckpt_path goes on with one; give one of them"
         )
+    if "sha256" in cfg.method and not cfg.method.sha256:
+        raise ConfigError(
+            f"method.file={cfg.method.file} cannot be read; method=own needs a Python file"
+        )
     check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike

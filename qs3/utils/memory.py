@@ -1,13 +1,16 @@
 """How much memory reading one file may take: one limit for all readers, asked before they take it.
 
 A file is not trusted: a few bytes can promise gigabytes. `QS3_MEMORY_GB` in the environment moves
-the limit, for files that are known to be large.
+the limit, for files that are known to be large. Beside it, how much this process has had at most.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import re
+from pathlib import Path
 
 from qs3.errors import ConfigError, DataError
 
@@ -47,3 +50,21 @@ def check_memory(needed: float, where: object, kind: type[DataError] = DataError
             f"{where} takes {needed / 1e9:.3g} GB of memory, more than {limit / 1e9:.3g} GB: "
             f"refused; if it is to be trusted, set {VARIABLE}={math.ceil(needed / 1e9)}".lstrip()
         )
+
+
+_PROCESS = Path("/proc/self")
+
+
+def forget_peak() -> None:
+    """Begin anew with what `peak_bytes` says, where the system can (Linux)."""
+    with contextlib.suppress(OSError):
+        (_PROCESS / "clear_refs").write_text("5")
+
+
+def peak_bytes() -> int | None:
+    """The most that this process has had in memory since `forget_peak`; None if nobody knows."""
+    try:
+        found = re.search(r"^VmHWM:\s*(\d+) kB$", (_PROCESS / "status").read_text(), re.MULTILINE)
+    except OSError:
+        return None
+    return None if found is None else 1024 * int(found[1])

@@ -24,6 +24,7 @@ FIRST, LAST = 3, 6
 FEATURED = "model._target_=tests.training.nets.featured"
 NODES = "model._target_=tests.training.nets.with_nodes"
 FREE = "selftraining.theta=0"  # CBST has thresholds of its own
+OWN = Path(__file__).parent / "own_method.py"
 SCHEMES = {
     "qbst": ("selftraining=qbst",),
     "spst": ("selftraining=spst", "selftraining.weight_step=0.1"),
@@ -48,6 +49,7 @@ METHODS = {
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
     "pcfea_qbst": ("method=pcfea_qbst", FEATURED),
     "supervised": ("method=supervised",),
+    "own": ("method=own", f"method.file={OWN}"),
 }
 
 
@@ -78,7 +80,7 @@ def test_every_scheme_goes_on_in_the_middle_of_a_round(toy, tmp_path, name):
     check(toy, tmp_path, (*SHORT, *SCHEMES[name]), FIRST, LAST)
 
 
-@pytest.mark.parametrize("name", fast_are({"gast", "pointdan"}, METHODS))
+@pytest.mark.parametrize("name", fast_are({"gast", "pointdan", "own"}, METHODS))
 def test_every_method_goes_on_in_the_middle_of_the_warmup(toy, tmp_path, name):
     epochs = (1, 2) if name == "pcfea" else (1,)
     check(toy, tmp_path, ("protocol.epochs=3", "selftraining=none", *METHODS[name]), *epochs)
