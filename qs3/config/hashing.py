@@ -28,7 +28,7 @@ _UNHASHED = (
     "trainer.gpus",  # which of several GPUs trains a run
     "data.cache_dir",
     "data.make_source",
-    "method.file",  # its content matters, wherever it lies: method.sha256
+    *("method.file", "model.file"),  # their content matters, wherever they lie: .sha256
     *(
         f"data.{domain}.{key}"
         for domain in ("source", "target")
@@ -47,12 +47,13 @@ def config_sha256(cfg: DictConfig) -> str:
     """64 hex digits over the composed config, without the keys that do not change a result.
 
     Interpolations are hashed as they are written: what they point to is hashed at its own place,
-    or does not matter (`${paths.data_dir}/...`). But a method's file is hashed by its content.
+    or does not matter (`${paths.data_dir}/...`). But a method's or a model's file is hashed by its
+    content.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
-    method: Any = cfg.get("method") or {}
-    if "sha256" in method:
-        plain["method"]["sha256"] = method.sha256
+    for group in ("method", "model"):
+        if "sha256" in (plain.get(group) or {}):
+            plain[group]["sha256"] = cfg[group].sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
     if (plain.get("data") or {}).get("scale") != "above_floor":

@@ -80,7 +80,7 @@ def test_every_scheme_goes_on_in_the_middle_of_a_round(toy, tmp_path, name):
     check(toy, tmp_path, (*SHORT, *SCHEMES[name]), FIRST, LAST)
 
 
-@pytest.mark.parametrize("name", fast_are({"gast", "pointdan", "own"}, METHODS))
+@pytest.mark.parametrize("name", fast_are({"gast", "pointdan"}, METHODS))
 def test_every_method_goes_on_in_the_middle_of_the_warmup(toy, tmp_path, name):
     epochs = (1, 2) if name == "pcfea" else (1,)
     check(toy, tmp_path, ("protocol.epochs=3", "selftraining=none", *METHODS[name]), *epochs)
