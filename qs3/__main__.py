@@ -19,6 +19,7 @@ QS3 = Group(
         "predict": "qs3.inference.cli:PREDICT",
         "export": "qs3.inference.cli:EXPORT",
         "report": "qs3.report.cli:REPORT",
+        "leaderboard": "qs3.report.leaderboard.cli:LEADERBOARD",
         "bench": "qs3.sensors.bench.cli:BENCH",
         "fit": "qs3.sensors.fit.cli:FIT",
     },

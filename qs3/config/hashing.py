@@ -9,6 +9,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from qs3.errors import MissingDataError
+from qs3.utils.files import sha256_file
+
 # Keys that do not change a result: where things lie, what is shown, how data would be made, and the
 # seed, which is in the folder's name. Everything else is hashed, so two different runs never share
 # a folder. (Other data, wherever they lie, have another hash, which `started.json` guards.)
@@ -25,6 +28,7 @@ _UNHASHED = (
     "trainer.gpus",  # which of several GPUs trains a run
     "data.cache_dir",
     "data.make_source",
+    *("method.file", "model.file"),  # their content matters, wherever they lie: .sha256
     *(
         f"data.{domain}.{key}"
         for domain in ("source", "target")
@@ -43,9 +47,13 @@ def config_sha256(cfg: DictConfig) -> str:
     """64 hex digits over the composed config, without the keys that do not change a result.
 
     Interpolations are hashed as they are written: what they point to is hashed at its own place,
-    or does not matter (`${paths.data_dir}/...`).
+    or does not matter (`${paths.data_dir}/...`). But a method's or a model's file is hashed by its
+    content.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
+    for group in ("method", "model"):
+        if "sha256" in (plain.get(group) or {}):
+            plain[group]["sha256"] = cfg[group].sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
     if (plain.get("data") or {}).get("scale") != "above_floor":
@@ -59,6 +67,14 @@ def config_sha256(cfg: DictConfig) -> str:
         trainer["devices"] = 1
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_sha256(file: str) -> str:
+    """Of a file that the config names; MissingDataError if it cannot be read."""
+    try:
+        return sha256_file(Path(file).expanduser())
+    except OSError as error:
+        raise MissingDataError(f"{file} cannot be read ({error})") from error
 
 
 def _leave_out(plain: Any, key: str) -> None:

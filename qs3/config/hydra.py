@@ -1,8 +1,8 @@
 """What Hydra needs from us: resolvers, instantiation, plain errors.
 
 Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_id:}`,
-`${qs3.tags:}` and `${qs3.gpu_in_turn:N}`, and for help texts `${qs3.choices:GROUP}`,
-`${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
+`${qs3.tags:}`, `${qs3.gpu_in_turn:N}` and `${qs3.sha256:FILE}`, and for help texts
+`${qs3.choices:GROUP}`, `${qs3.described:GROUP}` and `${qs3.typed:COMMAND}`.
 """
 
 from __future__ import annotations
@@ -66,7 +66,17 @@ def component_names(cfg: DictConfig) -> dict[str, str]:
         group: str(choices.get(group) or node.get("_target_", "none").rsplit(".", 1)[-1].lower())
         for group, node in nodes.items()
     }
+    if file := cfg.method.get("file"):  # method=own
+        names["method"] = Path(file).stem
     return names if hashing.has_rounds(cfg) else {**names, "selftraining": "none"}
+
+
+def _sha256(file: str | None) -> str:
+    """Of a file; "" if there is none, for the command that needs it to say so."""
+    try:
+        return hashing.file_sha256(file) if file else ""
+    except Qs3Error:
+        return ""
 
 
 def _choices(group: str, indent: int = 0) -> str:
@@ -108,6 +118,7 @@ OmegaConf.register_new_resolver("qs3.described", _described, replace=True)
 OmegaConf.register_new_resolver("qs3.gpu_in_turn", _gpu_in_turn, replace=True)
 OmegaConf.register_new_resolver("qs3.tags", _tags, replace=True)
 OmegaConf.register_new_resolver("qs3.run_name", _run_name, replace=True)
+OmegaConf.register_new_resolver("qs3.sha256", _sha256, replace=True, use_cache=True)
 OmegaConf.register_new_resolver("qs3.typed", typed, replace=True)
 OmegaConf.register_new_resolver("qs3.wandb_id", _wandb_id, replace=True)
 

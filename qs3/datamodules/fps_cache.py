@@ -75,12 +75,12 @@ def prepare(
     cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
     name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
     shape = (n, starts, count)
-    order = _read(cache, shape, name)
+    order = read_array(cache, shape, name)
     if order is None:
         with _alone(cache_dir):  # seeds that start at the same time wait for the first
-            order = _read(cache, shape, name)
+            order = read_array(cache, shape, name)
             if order is None:
-                order = _kept(cache, work(), name)
+                order = keep_array(cache, work(), name)
     return Clouds.of(points, order, scale, floor)
 
 
@@ -95,8 +95,8 @@ def remove_old_leftovers(cache_dir: Path) -> None:
 # The cache's file is an .npy with 32 bytes after it: SHA-256 of what it is and of what it holds.
 
 
-def _read(path: Path, shape: tuple[int, ...], name: str) -> np.ndarray | None:
-    """The cached indices as a memmap; None if they are not there or not what they should be."""
+def read_array(path: Path, shape: tuple[int, ...], name: str) -> np.ndarray | None:
+    """A cached array as a memmap; None if it is not there or not what it should be."""
     if not path.is_file():
         return None
     try:
@@ -105,16 +105,16 @@ def _read(path: Path, shape: tuple[int, ...], name: str) -> np.ndarray | None:
             file.seek(-_DIGEST, os.SEEK_END)
             digest = file.read()
     except Exception as error:  # numpy's parser of headers raises whatever Python's does
-        log.warning("%s cannot be read (%s); sampling again", path, error)
+        log.warning("%s cannot be read (%s); made again", path, error)
         return None
     if array.shape != shape or digest != _digest(array, name):
-        log.warning("%s is damaged or of another version; sampling again", path)
+        log.warning("%s is damaged or of another version; made again", path)
         return None
     return array
 
 
-def _kept(path: Path, order: np.ndarray, name: str) -> np.ndarray:
-    """The indices from the cache, after writing them there; from memory if that is not possible."""
+def keep_array(path: Path, order: np.ndarray, name: str) -> np.ndarray:
+    """The array from the cache, after writing it there; from memory if that is not possible."""
     try:
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
             np.save(file, order, allow_pickle=False)
@@ -122,7 +122,7 @@ def _kept(path: Path, order: np.ndarray, name: str) -> np.ndarray:
     except Qs3Error as error:  # others' folder, a full disk
         log.warning("%s (paths.cache_dir, or data.cache_dir=null to keep none)", error)
         return order
-    kept = _read(path, order.shape, name)
+    kept = read_array(path, order.shape, name)
     return order if kept is None else kept
 
 

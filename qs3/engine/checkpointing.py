@@ -1,4 +1,4 @@
-"""Checkpoints of each epoch, written atomically, read without pickles; and a run's wall time."""
+"""Checkpoints of each epoch, written atomically, read without pickles; and what a run takes."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import CheckpointIO
 
 from qs3.runs.checkpoints import LAST, load, save
+from qs3.runs.metrics import Times
+from qs3.utils.memory import forget_peak, peak_bytes
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -49,7 +52,7 @@ class SaveLast(Checkpoint):
 
 
 class Clock(Callback):
-    """Counts on from the checkpoint that a run continues.
+    """Time and memory, counted on from the checkpoint that a run continues.
 
     What was done between a checkpoint and a kill is done again, and counts once. A warm-up that was
     taken from another run (`qs3.training.shared_warmup`) brings its time along: the sum is what
@@ -62,15 +65,32 @@ class Clock(Callback):
     def __init__(self, began: float) -> None:
         self.began = began
         self.before = 0.0
+        self.peaks = {"memory": 0, "gpu": 0}
+        forget_peak()
+        if torch.cuda.is_available():
+            torch.cuda.reset_peak_memory_stats()
 
     def seconds(self) -> float:
         """Wall time so far."""
         return self.before + time.time() - self.began
 
+    def taken(self) -> Times:
+        """What the run has taken so far."""
+        gb = {name: round(peak / 1e9, 3) or None for name, peak in self._now().items()}
+        seconds = round(self.seconds(), 1)
+        return Times(seconds=seconds, memory_gb=gb["memory"], gpu_memory_gb=gb["gpu"])
+
     def state_dict(self) -> dict[str, Any]:
-        """Seconds so far."""
-        return {"seconds": self.seconds()}
+        """Seconds and bytes so far."""
+        return {"seconds": self.seconds(), "peaks": self._now()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over the seconds of earlier starts."""
+        """Take over what earlier starts took."""
         self.before = float(state_dict["seconds"])
+        self.peaks |= state_dict.get("peaks", {})
+
+    def _now(self) -> dict[str, int]:
+        """Bytes at most, in the process and on its GPU; 0 for what is not known."""
+        gpu = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
+        now = {"memory": peak_bytes() or 0, "gpu": gpu}
+        return {name: max(peak, self.peaks[name]) for name, peak in now.items()}

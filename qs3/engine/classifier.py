@@ -157,6 +157,7 @@ class Classifier(LightningModule):
         In the warm-up the method prepares its epoch.
         """
         if self.phases.phase(self.current_epoch) == 0:
+            torch.manual_seed(derive(self.seed, "start", self.current_epoch, self.global_rank))
             data = self.trainer.datamodule  # type: ignore[attr-defined]
             self.method.start_epoch(self.net, data, self.current_epoch, self.phases.warmup)
         torch.manual_seed(derive(self.seed, "dropout", self.current_epoch, self.global_rank))

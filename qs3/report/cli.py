@@ -26,6 +26,7 @@ def _built(
     overrides: str,
     kept: str | None = None,
     runs: bool = True,
+    columns: Sequence[str] = (),
 ) -> Table:
     """The table that the options ask for, with our runs; `runs`: there are some, one may think."""
     from qs3.config.quoting import override
@@ -37,7 +38,7 @@ def _built(
         raise ConfigError(f"kept={kept} is not there; `qs3 report keep` makes such a folder")
     if runs and not kept and log_dir and not Path(log_dir).is_dir():
         raise ConfigError(f"log_dir={log_dir} is not there; it is the paths.log_dir of the runs")
-    return build_table(table, log_dir or "logs", extra, target, kept)
+    return build_table(table, log_dir or "logs", extra, target, kept, columns=columns)
 
 
 def _saved_at(table: Table, out: str | None, given: dict[str, Any]) -> Path:
@@ -73,7 +74,8 @@ def _train(
     if launcher not in (*LAUNCHERS, None) or (more and launcher is None):
         what = f"launcher={launcher}" if launcher else f"{more[0]} needs a launcher"
         raise ConfigError(f"{what}; set launcher={'|'.join(LAUNCHERS)}")
-    table = _built(**given, runs=False)
+    only = () if given["target"] else columns  # another target renames them
+    table = _built(**given, runs=False, columns=only)
     todo = missing(table, seeds, rows, columns)
     print(f"table {table.name}: {len(todo)} runs to do", flush=True)
     launcher = launcher or ("joblib" if (jobs or 1) > 1 else "basic")
@@ -224,7 +226,7 @@ TRAIN = Command(
     _train,
     (
         *_TABLE,
-        Option("seeds", several(whole(0)), "that each cell should have", (0, 1, 2)),
+        Option("seeds", several(whole(0)), "of each cell (default: the table's, mostly 0,1,2)", ()),
         Option("rows", several(text("WORD")), "only rows of this name, or with it in theirs", ()),
         Option("columns", several(text("WORD")), "likewise", ()),
         Option("jobs", whole(), "runs at the same time (default 1, or what the launcher does)"),

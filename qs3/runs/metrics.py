@@ -222,9 +222,17 @@ class DataMadeOf:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Times:
-    """Wall time over all starts of the run."""
+    """What the run took, over all of its starts.
+
+    Attributes:
+        seconds: wall time.
+        memory_gb: the most that a start's process had in memory; None: not known.
+        gpu_memory_gb: the most that torch had taken on the GPU; None without one.
+    """
 
     seconds: float
+    memory_gb: float | None = None
+    gpu_memory_gb: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

@@ -43,6 +43,14 @@ CENTRED_ONLY = {
 }
 """Parts that cannot see heights, likewise."""
 
+_STILL = {
+    **{"crop": 1.0, "drop_regions": 0, "rotate_z": False, "scale": 1.0},
+    **{"shift": 0.0, "lift": 0.0, "jitter_sigma": 0.0},
+}
+"""Of `protocol.augment`: what leaves clouds as they are."""
+
+_ONNX = "model=features needs an ONNX file"
+_FEATURES = "qs3.models.features.features"
 _SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
 
 
@@ -70,6 +78,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     )
     _check_rounds(run)
     _check_scale(run)
+    _check_frozen(run)
     check_objective(cfg.objective)
     _refuse_ddp_in_multirun(cfg)
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:  # DDP: the first process owns the folder
@@ -194,6 +203,9 @@ def _check_settings(cfg: DictConfig) -> None:
         raise ConfigError(
             "force=true begins the run anew and ckpt_path goes on with one; give one of them"
         )
+    for group, what in (("method", "method=own needs a Python file"), ("model", _ONNX)):
+        if "sha256" in cfg[group] and not cfg[group].sha256:
+            raise ConfigError(f"{group}.file={cfg[group].file} cannot be read; {what}")
     check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
@@ -243,6 +255,17 @@ def _check_scale(run: Run) -> None:
                     f"data.scale={cfg.data.scale} and {group}={component_names(cfg)[group]}: {why};"
                     f" set data.scale={allowed[0]}, or choose another {group}"
                 )
+
+
+def _check_frozen(run: Run) -> None:
+    """Refuse augmentation of clouds whose features are kept: no cloud would come twice."""
+    augment = run.cfg.protocol.augment
+    changes = [key for key, value in _STILL.items() if augment.get(key, value) != value]
+    if run.cfg.model.get("_target_") == _FEATURES and changes:
+        raise ConfigError(
+            "model=features keeps the features of clouds as they are stored, and protocol.augment "
+            f"({', '.join(changes)}) changes clouds in each step; set protocol=frozen"
+        )
 
 
 def _warn_of_one_domain(run: Run) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from pathlib import Path
 
 import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -15,6 +16,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from qs3.config.hydra import build
 from qs3.engine.trainer import quieten
 from qs3.methods.base import Method
+from qs3.models.features import remember
 from qs3.runs.checkpoints import LAST, copy_weights, save
 from qs3.runs.metrics import RunMetrics
 from qs3.training.build import Built, build_training
@@ -45,9 +47,17 @@ def fit(run: Run) -> RunMetrics:
     if not run.cfg.force:
         take_checkpoint(run, loaded.started)
     built = build_training(run, method, loaded, began)
+    _remember(run, loaded, built)
     _fit(run, loaded, built)
     outcome = evaluate(run, loaded, built)
     return write_outcome(run, loaded, built, outcome)
+
+
+def _remember(run: Run, loaded: Loaded, built: Built) -> None:
+    """Features of all clouds, for a net that is frozen; nothing for others."""
+    data, kept = loaded.data, run.cfg.data.cache_dir
+    clouds = (data.all_labelled, data.target.clouds, loaded.evaluation.test.clouds)
+    remember(built.classifier.net, clouds, Path(kept) if kept else None)
 
 
 def _fit(run: Run, loaded: Loaded, built: Built) -> None:

@@ -24,7 +24,6 @@ from qs3.runs.metrics import (
     RunMetrics,
     Selection,
     StudentChoice,
-    Times,
     Warmup,
 )
 from qs3.runs.predictions import FILE as PREDICTIONS
@@ -97,7 +96,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
         training=outcome.training,
         data=DataHashes(**loaded.started["data"]),
         made_of=loaded.made_of,
-        times=Times(seconds=round(built.clock.seconds(), 1)),
+        times=built.clock.taken(),
         versions=loaded.started["versions"],
     )
 

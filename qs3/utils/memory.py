@@ -1,13 +1,15 @@
 """How much memory reading one file may take: one limit for all readers, asked before they take it.
 
 A file is not trusted: a few bytes can promise gigabytes. `QS3_MEMORY_GB` in the environment moves
-the limit, for files that are known to be large.
+the limit, for files that are known to be large. Beside it, how much this process has had at most.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import re
 from pathlib import Path
 
 from qs3.errors import ConfigError, DataError
@@ -70,3 +72,21 @@ def read_whole(path: Path, peak: float) -> bytes:
     """
     check_memory(peak * path.stat().st_size, path)
     return path.read_bytes()
+
+
+_PROCESS = Path("/proc/self")
+
+
+def forget_peak() -> None:
+    """Begin anew with what `peak_bytes` says, where the system can (Linux)."""
+    with contextlib.suppress(OSError):
+        (_PROCESS / "clear_refs").write_text("5")
+
+
+def peak_bytes() -> int | None:
+    """The most that this process has had in memory since `forget_peak`; None if nobody knows."""
+    try:
+        found = re.search(r"^VmHWM:\s*(\d+) kB$", (_PROCESS / "status").read_text(), re.MULTILINE)
+    except OSError:
+        return None
+    return None if found is None else 1024 * int(found[1])

@@ -128,7 +128,7 @@ def test_who_sees_the_target() -> None:
 CONFIGS = [
     path
     for path in sorted((Path(__file__).parents[2] / "conf" / "method").glob("*.yaml"))
-    if "_target_" in yaml.safe_load(path.read_text())
+    if "_target_" in yaml.safe_load(path.read_text()) and path.stem != "own"  # a user's
 ]
 
 

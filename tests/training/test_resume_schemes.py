@@ -24,6 +24,7 @@ FIRST, LAST = 3, 6
 FEATURED = "model._target_=tests.training.nets.featured"
 NODES = "model._target_=tests.training.nets.with_nodes"
 FREE = "selftraining.theta=0"  # CBST has thresholds of its own
+OWN = Path(__file__).parent / "own_method.py"
 SCHEMES = {
     "qbst": ("selftraining=qbst",),
     "spst": ("selftraining=spst", "selftraining.weight_step=0.1"),
@@ -48,6 +49,7 @@ METHODS = {
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
     "pcfea_qbst": ("method=pcfea_qbst", FEATURED),
     "supervised": ("method=supervised",),
+    "own": ("method=own", f"method.file={OWN}"),
 }
 
 

@@ -10,7 +10,7 @@ from qs3.config.location import typed
 from qs3.errors import ConfigError
 from qs3.report.tables.aggregate import FEW_SEEDS, Group, Stat, scores_of
 
-SEEDS = "0,1,2"
+SEEDS = (0, 1, 2)
 METRICS = {"accuracy": "accuracy %", "balanced_accuracy": "balanced accuracy %"}
 INCOMPLETE = "†"
 """Marks a number that lacks a seed which failed or is not finished."""
@@ -56,6 +56,7 @@ class Cell:
         missing: why the cell cannot be run at all ("" if it can).
         target: name of the target domain; "" if the cell is not to be run.
         simulated: whether that target is simulated.
+        seeds: that it should have.
     """
 
     row: str
@@ -67,6 +68,7 @@ class Cell:
     missing: str = ""
     target: str = ""
     simulated: bool = False
+    seeds: tuple[int, ...] = SEEDS
 
     @property
     def runnable(self) -> bool:
@@ -78,7 +80,8 @@ class Cell:
         """The command that fills the cell; "" if there is none."""
         if not self.runnable:
             return ""
-        return typed(f"python train.py {shlex.join(self.overrides)} seed={SEEDS} -m")
+        seeds = ",".join(map(str, self.seeds))
+        return typed(f"python train.py {shlex.join(self.overrides)} seed={seeds} -m")
 
     @property
     def incomplete(self) -> bool:
@@ -120,6 +123,7 @@ class Table:
             average over the columns.
         averages: published averages by row, in percent, where they differ in the last digit from
             the mean of the published numbers.
+        costs: whether time and memory stand beside the numbers.
     """
 
     name: str
@@ -130,11 +134,21 @@ class Table:
     rows: Mapping[str, tuple[Cell | None, ...]]
     benchmark: bool = False
     averages: Mapping[str, float] = field(default_factory=dict)
+    costs: bool = False
 
     @property
     def cells(self) -> list[Cell]:
         """All cells."""
         return [cell for row in self.rows.values() for cell in row if cell]
+
+    def groups(self, row: str) -> list[Group]:
+        """Finished runs of a row, by column."""
+        cells = [cell for cell in self.rows[row] if cell]
+        return [cell.group for cell in cells if cell.group and cell.group.finished]
+
+    def ours(self, column: int) -> bool:
+        """Whether a column is for runs of ours; else it has published numbers alone."""
+        return any((cell := row[column]) and cell.runnable for row in self.rows.values())
 
     def simulated(self, column: int) -> tuple[str, ...]:
         """Names of a column's simulated targets."""

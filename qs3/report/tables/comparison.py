@@ -42,6 +42,24 @@ def against(table: Table, base: str) -> list[Compared]:
     Raises:
         ConfigError: there is no such row.
     """
+    return [_compared(name, [(cell, own)]) for name, cell, own in _beside(table, base)]
+
+
+def minus_each(table: Table, row: str) -> list[Compared]:
+    """The row minus each other row, column by column, where both have runs.
+
+    Raises:
+        ConfigError: there is no such row.
+    """
+    return [
+        _compared(name, [(own, cell)])
+        for name, cell, own in _beside(table, row)
+        if cell.group and own.group
+    ]
+
+
+def _beside(table: Table, base: str) -> list[tuple[str, Cell, Cell]]:
+    """Name and cell of each other row and column, and the cell of the row `base` there."""
     if base not in table.rows:
         raise ConfigError(
             f"table {table.name} has no row {base!r}; rows are {', '.join(map(repr, table.rows))}"
@@ -54,7 +72,7 @@ def against(table: Table, base: str) -> list[Compared]:
             if cell is None or other is None or not cell.runnable:
                 continue
             name = f"{row}, {column}" if len(table.columns) > 1 else row
-            found.append(_compared(name, [(cell, other)]))
+            found.append((name, cell, other))
     return found
 
 

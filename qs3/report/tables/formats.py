@@ -13,7 +13,7 @@ from qs3.utils.text_table import latex_row, latex_text
 
 _ACCURACY = "accuracy"  # what papers give
 SIMULATED = "SIMULATED target"
-TO_RUN = "Not run yet, or fewer than three seeds"
+TO_RUN = "Not run yet, or with fewer seeds than are wanted"
 _RULES = {"source_val": "source validation", "last": "last epoch"}
 
 
@@ -26,16 +26,27 @@ def _plain_grid(table: Table) -> list[list[str]]:
     """For each task our metrics, then the paper's if any."""
     many = len(table.columns) > 1
     header = ["method"]
-    for i in range(len(table.columns)):
-        paper = "paper" if _ACCURACY in table.metrics else f"paper, {METRICS[_ACCURACY]}"
-        header += _heads(table, i, many) + ([paper] if _has_paper(table, i) else [])
+    for i, column in enumerate(table.columns):
+        if not table.ours(i):
+            header.append(f"{column}, published {METRICS[_ACCURACY]}")
+            continue
+        beside = "paper" if _ACCURACY in table.metrics else f"paper, {METRICS[_ACCURACY]}"
+        header += _heads(table, i, many) + ([beside] if _has_paper(table, i) else [])
+    header += ["time a run", "memory"] if table.costs else []
     lines = [header if many else [*header, "seeds"]]
     for name, cells in table.rows.items():
         line = [name]
         for i, cell in enumerate(cells):
+            paper = cell.paper if cell else None
+            if not table.ours(i):
+                line.append(f"{paper.text()} ({paper.selected})" if paper else "")
+                continue
             line += _ours(table, cell)
             if _has_paper(table, i):
-                line.append(cell.paper.text() if cell and cell.paper else "")
+                line.append(paper.text() if paper else "")
+        if table.costs:
+            groups = table.groups(name)
+            line += [_time(groups), _memory(groups)]
         if not many:
             finished = cells[0].group.seeds if cells[0] and cells[0].group else []
             line.append(", ".join(map(str, finished)) or "-")
@@ -101,7 +112,7 @@ def _rule(cell: Cell, role: str) -> str:
 def details(table: Table) -> list[list[str]]:
     """What stands behind each of our numbers, a line a cell, header first."""
     header = ["method", "task", "target", "mean ± SEM %", "n", "seeds", "teacher selected by",
-              "student selected by", "time a run", "runs"]  # fmt: skip
+              "student selected by", "time a run", "memory", "runs"]  # fmt: skip
     lines = [header]
     for cell in table.cells:
         if cell.group is None or not cell.group.finished:
@@ -117,7 +128,8 @@ def details(table: Table) -> list[list[str]]:
                 ", ".join(map(str, cell.group.seeds)),
                 _rule(cell, "teacher"),
                 _rule(cell, "student"),
-                _time(cell.group),
+                _time([cell.group]),
+                _memory([cell.group]),
                 f"{cell.group.experiment}/seed*-{cell.group.hash}",
             ]
         )
@@ -129,14 +141,31 @@ def seconds(group: Group) -> list[float]:
     return [result.times.seconds for result in group.results]
 
 
-def _time(group: Group) -> str:
-    """Such as "3.5 min" or "3.5 to 4.1 min"."""
-    found = seconds(group)
+def _time(groups: Sequence[Group]) -> str:
+    """Such as "3.5 min" or "3.5 to 4.1 min"; "" without runs."""
+    found = [value for group in groups for value in seconds(group)]
+    most = max(found, default=0.0)
     unit, name = next(
-        (u, n) for u, n in ((3600, "h"), (60, "min"), (1, "s")) if max(found) >= u or u == 1
+        (u, n) for u, n in ((3600, "h"), (60, "min"), (1, "s")) if most >= u or u == 1
     )
-    ends = dict.fromkeys(f"{value / unit:.1f}" for value in (min(found), max(found)))
-    return f"{' to '.join(ends)} {name}"
+    return _from_to([value / unit for value in found], name)
+
+
+def _memory(groups: Sequence[Group]) -> str:
+    """Such as "0.8 GB" or "0.8 to 0.9 GB, GPU 2.1 GB"; "" where it is not known."""
+    times = [result.times for group in groups for result in group.results]
+    parts = [
+        _from_to([t.memory_gb for t in times if t.memory_gb is not None], "GB"),
+        _from_to([t.gpu_memory_gb for t in times if t.gpu_memory_gb is not None], "GB"),
+    ]
+    return parts[0] + (f", GPU {parts[1]}" if parts[1] else "")
+
+
+def _from_to(values: Sequence[float], unit: str) -> str:
+    if not values:
+        return ""
+    ends = dict.fromkeys(f"{value:.1f}" for value in (min(values), max(values)))
+    return f"{' to '.join(ends)} {unit}"
 
 
 def marks(table: Table) -> list[str]:
@@ -179,7 +208,8 @@ def remarks(table: Table) -> list[str]:
         if any(seconds(g) for g in found):
             lines.append(
                 "time: wall time of each run, the least and the most; all of its starts together, "
-                "also the warm-up that was taken from another run"
+                "also the warm-up that was taken from another run; memory: the most that its "
+                "process had"
             )
     for source in dict.fromkeys(c.paper.source for c in table.cells if c.paper and c.paper.source):
         rows = dict.fromkeys(c.row for c in table.cells if c.paper and c.paper.source == source)
@@ -200,7 +230,7 @@ def to_run(table: Table) -> list[str]:
         for cell in table.cells
         if cell.runnable
         and not cell.missing
-        and ((stat := cell.ours(table.metrics[0])) is None or stat.n < FEW_SEEDS)
+        and ((stat := cell.ours(table.metrics[0])) is None or stat.n < len(cell.seeds))
         and not (cell.group and cell.group.unlabelled)
     ]
     return list(dict.fromkeys(cell.command for cell in empty))
@@ -241,8 +271,8 @@ def csv_text(table: Table) -> str:
     rows: list[list[Any]] = [
         ["row", "column", "metric", "mean", "sem", "n", "seeds", "paper_mean", "paper_sem",
          "paper_selected", "paper_source", "task", "target", "simulated", "source_made_of",
-         "target_made_of", "teacher_selected", "student_selected", "seconds", "problems", "hash",
-         "command"]
+         "target_made_of", "teacher_selected", "student_selected", "seconds", "memory_gb",
+         "gpu_memory_gb", "problems", "hash", "command"]
     ]  # fmt: skip
     for cell in table.cells:
         known = cell.group.first if cell.group else None
@@ -259,6 +289,10 @@ def csv_text(table: Table) -> str:
             values += [known.made_of.source, known.made_of.target] if known else ["", ""]
             values += [_rule(cell, "teacher"), _rule(cell, "student")]
             values.append(" ".join(f"{value:g}" for value in times))
+            taken = [result.times for result in cell.group.results] if cell.group else []
+            for name in ("memory_gb", "gpu_memory_gb"):
+                peaks = [getattr(one, name) for one in taken]
+                values.append(" ".join("" if peak is None else f"{peak:g}" for peak in peaks))
             values.append("; ".join(cell.group.problems) if cell.group else "")
             rows.append([*values, cell.group.hash if cell.group else "", cell.command])
     return text_table.csv_text(rows)

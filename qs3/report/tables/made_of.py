@@ -17,11 +17,11 @@ def results_of(table: Table) -> list[RunMetrics]:
 
 
 def is_other(table: Table, cell: Cell | None) -> bool:
-    """Whether a table has published figures, and the cell's runs saw data that are not theirs."""
+    """Whether a column has published figures, and the cell's runs saw data that are not theirs."""
     return bool(
-        any(other.paper for other in table.cells)
-        and cell
+        cell
         and cell.group
+        and any(other.paper for other in table.cells if other.column == cell.column)
         and any(not m.published for r in cell.group.results for m in r.domains.values())
     )
 

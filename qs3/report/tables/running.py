@@ -48,12 +48,12 @@ class Job:
 
 
 def missing(
-    table: Table, seeds: Sequence[int], rows: Sequence[str] = (), columns: Sequence[str] = ()
+    table: Table, seeds: Sequence[int] = (), rows: Sequence[str] = (), columns: Sequence[str] = ()
 ) -> list[Job]:
     """What is to be run: row by row, in each row seed by seed; what cells share, once.
 
     Args:
-        seeds: that each cell should have.
+        seeds: that each cell should have; none: those that the table wants.
         rows, columns: only those of one of these names, or, where none has that name, whose name
             contains the word; all if empty.
 
@@ -63,8 +63,8 @@ def missing(
     cells = [c for c in table.cells if c.runnable and not c.missing]
     for kind, words in (("row", rows), ("column", columns)):
         names = dict.fromkeys(getattr(c, kind) for c in cells)
-        chosen = _chosen(names, words)
-        cells = [c for c in cells if getattr(c, kind) in chosen]
+        meant = chosen(names, words)
+        cells = [c for c in cells if getattr(c, kind) in meant]
         if words and not cells:
             raise ConfigError(
                 f"no {kind} of table {table.name} has {' or '.join(map(repr, words))} in its name; "
@@ -73,7 +73,7 @@ def missing(
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in cells:
         done = set(cell.group.seeds) if cell.group else set()
-        for seed in seeds:
+        for seed in seeds or cell.seeds:
             if seed not in done:
                 overrides = (*cell.overrides, f"seed={seed}")
                 where = f"{cell.row}, {cell.column}" if len(table.columns) > 1 else cell.row
@@ -81,7 +81,7 @@ def missing(
     return list(jobs.values())
 
 
-def _chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
+def chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
     """Names that are meant by the words: the one that is the word, else all that contain it."""
     typed = {name: name.lower().replace("→", "->") for name in names}
     if not words:

@@ -23,8 +23,9 @@ from qs3.config.location import CONF
 from qs3.config.quoting import override
 from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import Group, group, load_runs
-from qs3.report.tables.cells import Cell, Published, Table
+from qs3.report.tables.cells import SEEDS, Cell, Published, Table
 from qs3.report.tables.keeping import with_kept
+from qs3.report.tables.running import chosen
 from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.yamls import load_yaml
 
@@ -37,11 +38,12 @@ class _Spec:
 
     title: str
     metrics: list[Literal["accuracy", "balanced_accuracy"]]
-    columns: list[str] | dict[str, str]
+    columns: list[str] | dict[str, str | None]
     rows: list[dict[str, Any]]
     layout: Literal["", "benchmark"] = ""
     notes: list[str] = field(default_factory=list)
     sources: dict[str, str] = field(default_factory=dict)
+    costs: bool = False
 
 
 def table_names() -> list[str]:
@@ -55,6 +57,8 @@ def build_table(
     extra: Sequence[str] = (),
     target: str | None = None,
     kept: str | Path | None = None,
+    rows: Sequence[Mapping[str, Any]] = (),
+    columns: Sequence[str] = (),
 ) -> Table:
     """Read a table's file and find our runs of its cells.
 
@@ -65,10 +69,13 @@ def build_table(
         target: another target domain for all cells, e.g. "kinectsim10"; the paper's numbers,
             measured on another target, are then left out.
         kept: folder of results of runs that need not be there any more (`keeping.keep`).
+        rows: further ones, as in the file.
+        columns: only these, as `report train` takes them, and those that are published alone:
+            each cell takes a fifth of a second.
 
     Raises:
         ConfigError: no such table, its file or an override is wrong, or `target` is given for
-            a benchmark, whose columns have targets of their own.
+            a table whose columns have targets of their own.
     """
     path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
     if not path.is_file():
@@ -77,9 +84,12 @@ def build_table(
             "file of your own, NAME.yaml"
         )
     name, spec = path.stem, _read(path)
+    spec.rows.extend(map(dict, rows))
+    wanted = chosen(spec.columns, columns) or set(spec.columns)
+    shown = [column for column in spec.columns if column in wanted or _task(spec, column) is None]
     if target is not None:
         check_domain("target=", target)
-        if spec.layout:
+        if isinstance(spec.columns, dict):
             raise ConfigError(
                 f"target={target}: the columns of table {name} have several targets; leave it out"
             )
@@ -91,16 +101,19 @@ def build_table(
             replace(cell, column=_column(column, target))
             for row in spec.rows
             for i, column in enumerate(spec.columns)
-            if (cell := _cell(spec, row, i, column, more, published=not target))
+            if column in shown and (cell := _cell(spec, row, i, column, more, published=not target))
         ]
+        names = [row["name"] for row in spec.rows]
         averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
     except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
+    if twice := [one for one in names if names.count(one) > 1]:
+        raise ConfigError(f"{path}: two rows are called {twice[0]!r}; give one another name")
     groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
     filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
-    columns = tuple(_column(column, target) for column in spec.columns)
-    rows = {
-        row["name"]: tuple(filled.get((row["name"], column)) for column in columns)
+    named = tuple(_column(column, target) for column in shown)
+    filled_rows = {
+        row["name"]: tuple(filled.get((row["name"], column)) for column in named)
         for row in spec.rows
     }
     title, notes = spec.title, spec.notes
@@ -108,7 +121,10 @@ def build_table(
         title = f"{title}, on another target: {target}"
         notes = [*notes, f"all cells on the target {target}, which is not the paper's"]
     metrics = tuple(spec.metrics)
-    return Table(name, title, tuple(notes), metrics, columns, rows, bool(spec.layout), averages)
+    return Table(
+        name, title, tuple(notes), metrics, named, filled_rows, bool(spec.layout), averages,
+        spec.costs,
+    )  # fmt: skip
 
 
 def _read(path: Path) -> _Spec:
@@ -135,6 +151,11 @@ def _column(name: str, target: str | None) -> str:
     return f"{source}{arrow}{target}" if target and arrow else name
 
 
+def _task(spec: _Spec, column: str) -> str | None:
+    """Overrides of a column; None where it is not for runs of ours, "" where rows have them all."""
+    return spec.columns[column] if isinstance(spec.columns, dict) else ""
+
+
 def _cell(
     spec: _Spec,
     row: Mapping[str, Any],
@@ -145,12 +166,13 @@ def _cell(
 ) -> Cell | None:
     """The cell of an entry `<column>: {run:, paper:, ...}`, or of what the row has for all columns.
 
-    A row's `run` is followed by the overrides of its columns; its `paper` has a number a column.
+    A row's `run` is followed by the overrides of its columns; a column without any has published
+    numbers alone. Its `paper` has a number a column; `seeds` is how many it should have.
     """
     own = row.get(column, {})
     line = own.get("run")
-    if line is None and "run" in row:
-        line = f"{row['run']} {spec.columns[column]}"  # type: ignore[call-overload]
+    if line is None and "run" in row and (task := _task(spec, column)) is not None:
+        line = f"{row['run']} {task}"
     numbers = row.get("paper")
     if numbers is not None and len(numbers) != len(spec.columns):
         raise ConfigError(
@@ -172,7 +194,8 @@ def _cell(
         )
     overrides = () if line is None else (*shlex.split(line), *more)
     take = own.get("take", row.get("take", "final"))
-    return Cell(row["name"], column, overrides, paper, take)
+    seeds = tuple(range(row["seeds"])) if "seeds" in row else SEEDS
+    return Cell(row["name"], column, overrides, paper, take, seeds=seeds)
 
 
 def check_domain(key: str, name: str) -> None:

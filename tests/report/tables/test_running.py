@@ -16,7 +16,7 @@ import pytest
 from qs3.errors import ConfigError
 from qs3.report.tables.cells import Table
 from qs3.report.tables.comparison import against, csv_text, effects, text
-from qs3.report.tables.running import Job, _chosen, launch, missing
+from qs3.report.tables.running import Job, chosen, launch, missing
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
@@ -59,13 +59,13 @@ def test_one_cell(tmp_path):
     assert job.name == f"{row}, {column}, seed 0"
     assert len(missing(table, [0], columns=[column])) < len(every)
     cells = [cell for cell in build_table("self_training", tmp_path).cells if cell.runnable]
-    chosen = _chosen((cell.column for cell in cells), ["s -> d"])
-    assert len([cell for cell in cells if cell.column in chosen]) == len(cells) / 2
+    wanted = chosen((cell.column for cell in cells), ["s -> d"])
+    assert len([cell for cell in cells if cell.column in wanted]) == len(cells) / 2
     names = ["PCM", "DefRec+PCM", "DANN", "PCM + QBST"]
-    assert _chosen(names, ["pcm"]) == {"PCM"}  # the row of that name, not all that contain it
-    assert _chosen(names, ["qbst", "dann"]) == {"PCM + QBST", "DANN"}
-    assert _chosen(names, ["rec+p"]) == {"DefRec+PCM"}
-    assert _chosen(names, []) == set(names)
+    assert chosen(names, ["pcm"]) == {"PCM"}  # the row of that name, not all that contain it
+    assert chosen(names, ["qbst", "dann"]) == {"PCM + QBST", "DANN"}
+    assert chosen(names, ["rec+p"]) == {"DefRec+PCM"}
+    assert chosen(names, []) == set(names)
     with pytest.raises(ConfigError, match=r"no column of table .* has 'x' in its name; columns to"):
         missing(table, [0], columns=["x"])
 

@@ -1,0 +1,228 @@
+"""Frozen features of a foundation net in an ONNX file, and a head that is trained on them.
+
+For nets such as Uni3D, OpenShape or ULIP-2, through a file of the user's own: [B, N, 3] float32
+clouds to [B, D] features. An ONNX file holds a graph of known operations and numbers, no code: it
+is run by onnxruntime from the bytes whose SHA-256 is in the run's config, and files beside it that
+it names are not read. Features of a run's clouds are computed once (`remember`) and kept on disk,
+under the hash of the file and of the clouds; any other cloud is computed when it comes.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.fps_cache import keep_array, read_array
+from qs3.errors import ConfigError, DataError
+from qs3.geometry.neighbours import exporting
+from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.utils.memory import check_memory
+
+log = logging.getLogger(__name__)
+
+_BATCH = 32  # clouds at once: always the same ones together, so that a resume has the same bits
+_PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
+
+
+class Encoder:
+    """The net in an ONNX file, and the features that are known.
+
+    Attributes:
+        dim: D.
+        known: features [D] by the SHA-256 of a cloud's bytes.
+    """
+
+    def __init__(self, data: bytes, sha256: str, where: str) -> None:
+        try:
+            import onnx
+            import onnxruntime  # type: ignore[import-untyped]
+        except ImportError as error:
+            raise ConfigError(
+                f"model=features needs onnxruntime ({error}); pip install 'qs3[onnx]'"
+            ) from error
+        self.sha256, self.where = sha256, where
+        self.known: dict[bytes, Float[np.ndarray, " d"]] = {}
+        try:
+            model = onnx.load_model_from_string(data)
+        except Exception as error:  # protobuf's parser raises errors of its own
+            raise DataError(f"{where} is not an ONNX file, or damaged ({error})") from error
+        if _names_files(model):
+            raise DataError(
+                f"{where} keeps weights in files beside it, which are not read; export it as one "
+                "file (torch.onnx.export(..., external_data=False))"
+            )
+        del model
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 4  # what it has to say is in the error
+        options.intra_op_num_threads = torch.get_num_threads()
+        there = onnxruntime.get_available_providers()
+        try:
+            self.session = onnxruntime.InferenceSession(
+                data, options, providers=[name for name in _PROVIDERS if name in there]
+            )
+        except Exception as error:  # of pybind: a RuntimeError, or one of its own classes
+            raise DataError(f"{where} cannot be run by onnxruntime ({error})") from error
+        inputs, outputs = self.session.get_inputs(), self.session.get_outputs()
+        if len(inputs) != 1 or len(outputs) != 1:
+            raise DataError(
+                f"{where} has {len(inputs)} inputs and {len(outputs)} outputs; expected one of "
+                "each: clouds [B, N, 3] to features [B, D]"
+            )
+        self.name = inputs[0].name
+        size = outputs[0].shape[-1] if outputs[0].shape else None
+        if not isinstance(size, int):
+            raise DataError(
+                f"{where}: its output is {outputs[0].shape}; expected a known D in [B, D]"
+            )
+        self.dim = size
+
+    def __deepcopy__(self, memo: Any) -> Encoder:
+        """Copies of a net share it: nothing in it is trained."""
+        return self
+
+    def __call__(self, points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b d"]:
+        """Features, of known clouds without computing them.
+
+        Raises:
+            DataError: the file's net cannot take these clouds, or does not give finite [B, D].
+        """
+        found = [self.known.get(digest) for digest in map(_digest, points)]
+        new = [i for i, one in enumerate(found) if one is None]
+        if new:
+            for i, one in zip(new, self.compute(points[new]), strict=True):
+                found[i] = one
+        return np.stack(found)  # type: ignore[arg-type]
+
+    def compute(self, points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b d"]:
+        """Features by the net itself; see `__call__`."""
+        try:
+            (found,) = self.session.run(None, {self.name: np.ascontiguousarray(points)})
+        except Exception as error:
+            raise DataError(
+                f"{self.where} does not take clouds {list(points.shape)} ({error})"
+            ) from error
+        expected = (len(points), self.dim)
+        if found.shape != expected or found.dtype != np.float32 or not np.isfinite(found).all():
+            raise DataError(
+                f"{self.where} gave {found.dtype} {list(found.shape)} for clouds "
+                f"{list(points.shape)}; expected finite float32 {list(expected)}"
+            )
+        return np.asarray(found)
+
+    def remember(self, clouds: Clouds, folder: Path | None) -> None:
+        """Know the features of these clouds in all samples, from `folder` if they are there."""
+        points = [
+            clouds.take(index, torch.full_like(index, start)).numpy()
+            for start in range(clouds.starts)
+            for index in torch.arange(len(clouds)).split(_BATCH)
+        ]
+        digests = [digest for batch in points for digest in map(_digest, batch)]
+        data = hashlib.sha256(b"".join(digests)).hexdigest()
+        name, shape = f"features {self.sha256} {data}", (len(digests), self.dim)
+
+        def work() -> Float[np.ndarray, "n d"]:
+            log.info("features of %d clouds by %s", len(digests), self.where)
+            return np.concatenate([self.compute(batch) for batch in points])
+
+        if folder is None:
+            found = work()
+        else:
+            path = folder / "features" / f"{self.sha256[:16]}-{data[:16]}.npy"
+            kept = read_array(path, shape, name)
+            found = keep_array(path, work(), name) if kept is None else kept
+        self.known.update(zip(digests, np.array(found), strict=True))
+
+
+class Frozen(Backbone):
+    """A backbone that is not trained and has no weights of its own: they stay in their file."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        super().__init__()
+        self.encoder, self.feature_dim = encoder, encoder.dim
+
+    def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
+        """[B, N, 3] to the file's features; no gradient goes back to the points."""
+        if exporting():
+            raise ConfigError(
+                "model=features cannot be exported: its backbone is an ONNX file of yours already; "
+                "its head is `net.head` of qs3.load(run)"
+            )
+        found = self.encoder(points.detach().cpu().to(torch.float32).numpy())
+        return Features(torch.from_numpy(found).to(points), None)
+
+
+def features(
+    num_classes: int,
+    file: str,
+    sha256: str,
+    hidden: tuple[int, ...] = (256,),
+    dropout: float = 0.5,
+    norm: str = "batch",
+) -> PointClassifier:
+    """A head on the features that a file's net gives.
+
+    Args:
+        num_classes: C.
+        file: ONNX; no file beside it is read.
+        sha256: 64 hex digits, of its content.
+        hidden: widths of the head; none is a linear probe.
+        dropout: in the head.
+        norm: of the head: "batch" or "domain".
+
+    Raises:
+        ConfigError: the file is not there, or another one than that of this hash.
+        DataError: it is damaged, or is not such a net.
+    """
+    encoder = _encoder(str(file), str(sha256))
+    head = ClassHead(encoder.dim, num_classes, hidden=tuple(hidden), dropout=dropout, norm=norm)
+    return PointClassifier(Frozen(encoder), head)
+
+
+def remember(net: nn.Module, of: Iterable[Clouds], folder: Path | None) -> None:
+    """Compute what a net of `features` will be asked for, or read it; of other nets nothing."""
+    for module in net.modules():
+        if isinstance(module, Frozen):
+            for clouds in of:
+                module.encoder.remember(clouds, folder)
+
+
+@functools.lru_cache(maxsize=2)
+def _encoder(file: str, sha256: str) -> Encoder:
+    """One for all nets of a process: it is large, and what is known is known to all."""
+    path = Path(file).expanduser()
+    if not path.is_file():
+        raise ConfigError(f"model.file={file} is not there; model=features needs an ONNX file")
+    check_memory(3 * path.stat().st_size, f"model.file={file}")
+    data = path.read_bytes()
+    if (found := hashlib.sha256(data).hexdigest()) != sha256:
+        raise ConfigError(
+            f"model.file={file} is another file than the one that was meant (SHA-256 "
+            f"{found[:12]}, not {sha256[:12]})"
+        )
+    return Encoder(data, sha256, f"model.file={file}")
+
+
+def _digest(cloud: Float[np.ndarray, "n 3"]) -> bytes:
+    return hashlib.sha256(cloud.tobytes()).digest()
+
+
+def _names_files(message: Any) -> bool:
+    """Whether a tensor anywhere in an ONNX graph lies in another file."""
+    if message.DESCRIPTOR.name == "TensorProto" and message.data_location == message.EXTERNAL:
+        return True
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            each = value if field.is_repeated else [value]
+            if any(_names_files(one) for one in each):
+                return True
+    return False

@@ -1,0 +1,177 @@
+"""A user's own method by the rules of `table=leaderboard`: `qs3 leaderboard method=my_method.py`.
+
+The method's file becomes one more row of that table: the experiment, the columns and the seeds are
+the table's, so it is trained, evaluated and compared as all other rows are.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from qs3.config.compose import choices
+from qs3.errors import ConfigError
+from qs3.utils.cli import Command, Option, path, several, text, whole
+
+if TYPE_CHECKING:
+    from qs3.report.tables.cells import Table
+
+ALONE = "experiment=leaderboard"
+WITH_ROUNDS = "protocol.epochs=10 protocol.steps=1000"
+"""What rows with rounds have beside `ALONE`: as many steps in all as the others."""
+
+
+def _leaderboard(
+    method: Path,
+    name: str | None,
+    selftraining: str,
+    table: str,
+    seeds: Sequence[int],
+    columns: Sequence[str],
+    jobs: int | None,
+    log_dir: str,
+    data_dir: str | None,
+    overrides: str,
+    kept: str | None,
+    out: str | None,
+    more: Sequence[str],
+) -> int:
+    """Train what the row lacks, and print it beside the rows that are there."""
+    from qs3.config.quoting import override
+    from qs3.report.tables.formats import csv_text, latex, markdown
+    from qs3.report.tables.running import launch, missing
+    from qs3.report.tables.table import build_table
+    from qs3.utils.files import write_text
+
+    row = own_row(method, name, selftraining, more)
+    extra = shlex.split(overrides)
+    extra += [override("paths.data_dir", data_dir)] if data_dir else []
+
+    def built() -> Table:
+        return build_table(table, log_dir, extra, kept=kept, rows=[row], columns=columns)
+
+    before, name = built(), row["name"]
+    _check_class(before, name)
+    todo = missing(before, seeds, [name], columns)
+    print(f"{name}: {len(todo)} runs to do", flush=True)
+    status = launch(todo, "joblib" if (jobs or 1) > 1 else "basic", jobs, log_dir)
+    shown = beside(built(), name)
+    at = Path(out or Path(log_dir) / "tables") / f"{shown.name}-{method.stem}"
+    page = markdown(shown) + _intervals(shown, name)
+    write_text(f"{at}.md", page)
+    for suffix, write in ((".csv", csv_text), (".tex", latex)):
+        write_text(f"{at}{suffix}", write(shown))
+    print(f"{page}\nsaved {at}.md, .csv, .tex")
+    return status
+
+
+def own_row(
+    file: Path, name: str | None, selftraining: str, settings: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The row of a method's file, as one in the table's file.
+
+    Args:
+        file: of the method; its SHA-256 is in the row's command, so the runs are of this content.
+        name: of the row; None: the file's.
+        selftraining: of conf/selftraining; "none".
+        settings: of the class, such as "method.weight=0.5".
+
+    Raises:
+        MissingDataError: there is no such file.
+        ConfigError: there is no such selftraining.
+    """
+    from qs3.config.hashing import file_sha256
+    from qs3.config.quoting import override
+
+    if selftraining not in choices("selftraining"):
+        known = ", ".join(choices("selftraining"))
+        raise ConfigError(f"selftraining={selftraining} is not there; there are {known}")
+    words = [
+        *(ALONE, "method=own", override("method.file", file)),
+        f"method.sha256={file_sha256(str(file))}",
+        *(f"+{word}" for word in settings),
+    ]
+    if selftraining != "none":
+        words += [f"selftraining={selftraining}", *WITH_ROUNDS.split()]
+    return {"name": name or file.stem, "run": shlex.join(words)}
+
+
+def beside(table: Table, name: str) -> Table:
+    """The row `name` first, and below it the rows with runs; of the columns those with some."""
+    rows = {name: table.rows[name]}
+    rows |= {row: cells for row, cells in table.rows.items() if table.groups(row)}
+    kept = [
+        i
+        for i in range(len(table.columns))
+        if not table.ours(i) or any((c := cells[i]) and c.group for cells in rows.values())
+    ]
+    return replace(
+        table,
+        title=f"{table.title}: {name}",
+        columns=tuple(table.columns[i] for i in kept),
+        rows={row: tuple(cells[i] for i in kept) for row, cells in rows.items()},
+    )
+
+
+def _check_class(table: Table, name: str) -> None:
+    """Build the method as each run will, before any has begun.
+
+    Raises:
+        ConfigError: the file is not a method (`qs3.methods.own`).
+    """
+    from qs3.config.compose import composed
+    from qs3.config.hydra import build
+
+    cell = next(cell for cell in table.rows[name] if cell and cell.runnable)
+    build(composed("train", *cell.overrides).method)
+
+
+def _intervals(table: Table, name: str) -> str:
+    """The row minus each other row, paired."""
+    from qs3.report.tables.comparison import minus_each
+    from qs3.report.tables.comparison import text as shown
+
+    found = minus_each(table, name)
+    return f"\n{name} minus\n\n{shown(found, markdown=True)}" if found else ""
+
+
+LEADERBOARD = Command(
+    "qs3 leaderboard",
+    "a method of your own, trained and shown by the rules of table=leaderboard",
+    _leaderboard,
+    (
+        Option("method", path("FILE"), "Python, with one class derived from Method", None, True),
+        Option("name", text("NAME"), "of its row (default: the file's)"),
+        Option("selftraining", text("NAME"), "rounds after the warm-up by it", "none"),
+        Option(
+            "table", text("NAME"), "whose rows and columns: of conf/table, or a file", "leaderboard"
+        ),
+        Option("seeds", several(whole(0)), "default 0,1,2", ()),
+        Option("columns", several(text("WORD")), "only columns with it in their name", ()),
+        Option("jobs", whole(), "runs at the same time (default 1)"),
+        Option(
+            "log_dir", text("FOLDER"), "paths.log_dir of the runs, these and the table's", "logs"
+        ),
+        Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
+        Option(
+            "overrides", text('"A=B ..."'), "that all of the table's runs had beyond its own", ""
+        ),
+        Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: taken up"),
+        Option("out", text("FOLDER"), "where the page goes (default LOG_DIR/tables)"),
+    ),
+    (
+        "qs3 leaderboard method=my_method.py",
+        'qs3 leaderboard method=my_method.py method.weight=0.5 name="Mine, w = 0.5"',
+        'qs3 leaderboard method=my_method.py columns="S -> K" seeds=0 selftraining=qbst',
+    ),
+    about="""
+The file is imported, which runs it: name one that you trust. An edited file is another row, whose
+runs begin anew; the same command goes on with interrupted runs and trains nothing twice.
+Rules and an example: docs/how-to/leaderboard.md. The other rows are trained by
+`qs3 report train table=leaderboard`.
+""",
+    others={"method.": "settings of the class"},
+)

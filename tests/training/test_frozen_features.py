@@ -1,0 +1,76 @@
+"""A run whose net is a head on the frozen features of a file."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import qs3
+from qs3.config import hashing
+from qs3.errors import ConfigError
+from qs3.models.features import Encoder
+from qs3.runs.checkpoints import load
+from qs3.training.command import train
+from tests.models.onnx_files import write_encoder
+from tests.training.conftest import result_of
+from tests.training.toy import CONF, overrides
+from tests.training.watching import interrupt
+
+
+@pytest.fixture
+def frozen(toy_data, tmp_path):
+    """Composes a run of `model=features` with a random net of 16 features."""
+    from tests.composing import compose
+
+    write_encoder(tmp_path / "net.onnx", dim=16)
+    words = [word for word in overrides(tmp_path) if "model." not in word]
+
+    def config(*more, file=tmp_path / "net.onnx"):
+        own = ("model=features", f"model.file={file}", "model.hidden=[8]", "protocol=frozen")
+        paths = (f"paths.data_dir={toy_data}", f"paths.cache_dir={tmp_path / 'cache'}")
+        return compose("train", [*words, *own, *paths, "protocol.epochs=4", *more])
+
+    return config
+
+
+@pytest.mark.parametrize(
+    "rounds",
+    ["selftraining=none", pytest.param("selftraining.epochs=2", marks=pytest.mark.slow)],
+)
+def test_a_run_is_computed_once_goes_on_and_is_loaded(frozen, tmp_path, monkeypatch, rounds):
+    asked = []
+    real = Encoder.compute
+    monkeypatch.setattr(Encoder, "compute", lambda self, x: asked.append(len(x)) or real(self, x))
+    words = ("method=dann", "model.dropout=0.1", rounds)
+    cfg = frozen(*words, f"paths.log_dir={tmp_path / 'whole'}")
+    metrics = train(cfg)
+    assert metrics.warmup.last.scores.accuracy > 0.6  # 0.33 by chance
+    assert len(list((tmp_path / "cache" / "features").iterdir())) == 3
+    # Two clouds for the width; 72 for training of source and target in four samples, and 24 for
+    # tests; nothing in all epochs; then the turned ones by which a run estimates its accuracy.
+    pieces = [32, 32, 8] * 4
+    assert asked[:26] == [2, *pieces, *pieces, 24]
+    assert set(asked[26:]) <= {24}
+    asked.clear()
+    broken = frozen(*words, f"paths.log_dir={tmp_path / 'broken'}")
+    interrupt(broken, epoch=2)
+    assert asked == [2]  # features were there
+    if metrics.rounds:
+        interrupt(broken, epoch=6)
+    train(broken)
+    folder = hashing.run_folder(cfg)
+    assert result_of(hashing.run_folder(broken)) == result_of(folder)
+    assert all(name.startswith("head.") for name in load(folder / "student.pt"))
+    assert qs3.load(folder).probabilities(torch.randn(3, 64, 3)).shape == (3, 3)
+    (tmp_path / "net.onnx").rename(tmp_path / "moved.onnx")
+    again = frozen(*words, f"paths.log_dir={tmp_path / 'whole'}", file=tmp_path / "moved.onnx")
+    assert hashing.run_folder(again) == folder
+
+
+def test_what_is_refused(frozen, tmp_path):
+    with pytest.raises(ConfigError, match=r"protocol\.augment \(rotate_z, jitter_sigma\) changes"):
+        train(frozen("protocol=paper"))
+    with pytest.raises(ConfigError, match=r"model\.file=no\.onnx cannot be read; model=features"):
+        train(frozen(file="no.onnx"))
+    assert not (tmp_path / "logs").exists()
+    assert (CONF / "protocol" / "frozen.yaml").is_file()
