@@ -94,7 +94,7 @@ def build_table(
             if (cell := _cell(spec, row, i, column, more, published=not target))
         ]
         averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
-    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
     groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
     filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
