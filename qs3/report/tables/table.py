@@ -105,7 +105,7 @@ def build_table(
         ]
         names = [row["name"] for row in spec.rows]
         averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
-    except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
     if twice := [one for one in names if names.count(one) > 1]:
         raise ConfigError(f"{path}: two rows are called {twice[0]!r}; give one another name")

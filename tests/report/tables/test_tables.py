@@ -162,6 +162,7 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
         ("HEAD\nrows:\n- {name: r, paper: [1]}", "row 'r': paper: has 1 numbers.*2 columns"),
         ("HEAD\nrows:\n- {name: r, a: {paper: 101}}", "paper: 101.0.*from 0 to 100"),
         ("HEAD\nrows:\n- {name: r, a: {paper: [1, 2, 3]}}", "x.yaml: missing or wrong entry"),
+        (f"HEAD\nrows:\n- {{name: r, a: {{paper: 1{'0' * 400}}}}}", "wrong entry int too large"),
         ("HEAD\nrows:\n- {a: {paper: 1}}", "x.yaml: missing or wrong entry 'name'"),
         ("HEAD\nrows: [{name: [a], a: {paper: 1}}]", "x.yaml: missing or wrong entry 'name'"),
         ("title: x\nmetrics: []\ncolumns: []\nrows: [{}]", "x.yaml: missing or wrong entry 'name'"),
