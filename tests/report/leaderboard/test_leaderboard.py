@@ -252,8 +252,8 @@ def test_the_commands_train_and_print(toy):
     assert re.search(r"with rounds minus\n\n.*\n.*\n\| source only, S → K +\| [+-]", beside)
     report = [f"log_dir={toy / 'logs'}", f"data_dir={toy / 'data'}", f"overrides={TOY}"]
     first = qs3(
-        "report", "train", "table=leaderboard", "rows=dann", "columns=S -> K", "seeds=0", *report
+        "report", "train", "table=leaderboard", "rows=cpcm", "columns=S -> K", "seeds=0", *report
     )
     assert "table leaderboard: 1 runs to do" in first
     table = qs3("report", "table=leaderboard", *report)
-    assert re.search(r"\| DANN +\| not run .*\| \d+\.\d \(n=1\) ", table)
+    assert re.search(r"\| CPCM +\| not run .*\| \d+\.\d \(n=1\) ", table)
