@@ -57,6 +57,16 @@ PATTERNS = (
     r"sensors/devices/test_every_sensor\.py::test_both_renderers_give_the_same_depth\[fringes",
     r"models/test_simpleview\.py::test_float32_error",
     r"inference/test_export\.py::test_a_net_of_one_s_own_is_exported_as_it_is",
+    # What takes seconds and whose parts have tests of their own.
+    r"test_api\.py::test_train_leaves_what_the_command_leaves",
+    r"generation/test_room_scans\.py::test_fronts_are_seen_as_often",
+    r"generation/test_arrangements\.py::test_real_chairs_do_not_go",
+    r"datamodules/test_batches\.py::test_pieces_of_a_way",
+    r"meshes/test_catalogue\.py::test_the_same_meshes_in_another_process",
+    r"training/test_target_labels\.py::test_the_upper_bound_does",
+    r"training/test_frozen_features\.py::test_a_run_is_computed_once",
+    r"report/leaderboard/test_leaderboard\.py::test_(one_s_own_method|what_is_shown)",
+    r"training/test_own_method\.py::test_on_a_target_without",
     # One or two of each family stay.
     r"methods/test_steps\.py::test_(operations_do|no_value).*\[(?!pcm\]|gast\]|student\]|dann\]|supervised\])",
     r"data/test_domain\.py::test_missing_data_is_explained\[(?!depthscannet10\]|modelnet10\]|specklenet10\]|own\])",
