@@ -87,7 +87,7 @@ class Clock(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take over what earlier starts took."""
         self.before = float(state_dict["seconds"])
-        self.peaks |= state_dict.get("peaks", {})
+        self.peaks |= state_dict["peaks"]
 
     def _now(self) -> dict[str, int]:
         """Bytes at most, in the process and on its GPU; 0 for what is not known."""
