@@ -205,7 +205,9 @@ def _check_settings(cfg: DictConfig) -> None:
         )
     for group, what in (("method", "method=own needs a Python file"), ("model", _ONNX)):
         if "sha256" in cfg[group] and not cfg[group].sha256:
-            raise ConfigError(f"{group}.file={cfg[group].file} cannot be read; {what}")
+            file = cfg[group].file
+            why = f"{group}.file={file} cannot be read" if file else f"{group}.file is not set"
+            raise ConfigError(f"{why}; {what}, {group}.file=PATH")
     check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
