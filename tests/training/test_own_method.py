@@ -23,7 +23,7 @@ def test_on_a_target_without_labels(toy, unlabelled):  # noqa: F811
 
 @pytest.mark.parametrize(
     ("words", "why"),
-    [((), "is not set"), (("method.file=no.py",), r"=no\.py cannot be read")],
+    [((), " is not set"), (("method.file=no.py",), r"=no\.py cannot be read")],
 )
 def test_without_a_file_nothing_begins(toy, words, why):
     cfg = toy(*SHORT, *words)
