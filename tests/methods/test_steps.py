@@ -6,6 +6,7 @@ does is tested in `tests/models/test_device.py`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -168,7 +169,9 @@ def test_a_gpu_is_never_waited_for(name: str) -> None:
     batch = batch_of(CASES[name], method, 4, 64, CLASSES, "cuda")
     generator = torch.Generator("cuda").manual_seed(0)
     total(method, net, batch, generator).backward()  # loads libraries, which waits
-    torch.cuda.set_sync_debug_mode("error")
+    with warnings.catch_warnings():  # torch says that the mode is new
+        warnings.simplefilter("ignore", UserWarning)
+        torch.cuda.set_sync_debug_mode("error")
     try:
         total(method, net, batch, generator).backward()
     finally:

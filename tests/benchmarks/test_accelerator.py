@@ -1,0 +1,91 @@
+"""Every net against the straight one of its authors' operations, a training step of equal batches.
+
+The figures of docs/reference/accelerators.md; on the CPU each net has a file of its own, with
+baselines that fit its memory.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from statistics import median
+
+import pytest
+import torch
+from pytest_benchmark.fixture import BenchmarkFixture
+from torch import nn
+from torch.nn import functional as F
+
+from tests.benchmarks.device import DEVICE, WHERE, finish
+from tests.benchmarks.test_kernels import STRAIGHT
+from tests.benchmarks.test_simpleview_speed import boxes
+from tests.models.test_all_nets import NETS, build
+
+ROUNDS, WARMUP, SECONDS = 30, 5, 4.0
+SIZES = ((16, 256), (16, 1024), (64, 1024))
+
+
+def _milliseconds(net: nn.Module, points: torch.Tensor) -> float:
+    """The median of some steps, forward and backward; NaN if the memory is too small."""
+    labels = torch.arange(len(points), device=points.device) % 5
+
+    def step() -> None:
+        net.zero_grad()
+        F.cross_entropy(net(points), labels).backward()
+        finish()
+
+    try:
+        return _median_ms(step)
+    except torch.OutOfMemoryError:
+        return float("nan")
+
+
+def _median_ms(step: Callable[[], None]) -> float:
+    times: list[float] = []
+    end = float("inf")
+    for turn in range(WARMUP + ROUNDS):
+        begin = time.perf_counter()
+        step()
+        if turn >= WARMUP:
+            times.append(time.perf_counter() - begin)
+        if turn == 0:
+            end = begin + SECONDS  # slow ones are seen less often
+        elif turn >= WARMUP + 2 and time.perf_counter() > end:
+            break
+    return 1e3 * median(times)
+
+
+def _peak_gb(net: nn.Module, points: torch.Tensor) -> float:
+    torch.cuda.reset_peak_memory_stats()
+    F.cross_entropy(net(points), torch.arange(len(points), device=DEVICE) % 5).backward()
+    return torch.cuda.max_memory_allocated() / 1e9
+
+
+def test_steps(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
+    """The benchmark's own time is that of PointNet."""
+    small = boxes(16, 256)[:, :, :3].to(DEVICE)
+    net = build("pointnet").float().train().to(DEVICE)
+    benchmark.pedantic(_milliseconds, (net, small[:2, :64]), rounds=1)
+    if not benchmark.enabled or DEVICE.type != "cuda":
+        assert set(STRAIGHT) <= set(NETS)
+        return
+    rows = [f"\n{WHERE}, torch {torch.__version__}: ms a step, forward and backward"]
+    rows += ["| net | clouds | ms | straight, ms | times faster | GB | straight, GB |"]
+    rows += ["|---|---|---|---|---|---|---|"]
+    for name in NETS:
+        for b, n in SIZES:
+            points = boxes(b, n).to(DEVICE)
+            net = build(name).float().train().to(DEVICE)
+            ours, memory = _milliseconds(net, points), _peak_gb(net, points)
+            shown = f"| {name} | {b} x {n} | {ours:.2f} |"
+            if name in STRAIGHT:
+                straight = STRAIGHT[name](build(name).float()).train().to(DEVICE)
+                theirs = _milliseconds(straight, points)
+                benchmark.extra_info[f"{name} {b} x {n}"] = theirs / ours
+                shown += f" {theirs:.2f} | {theirs / ours:.1f} | {memory:.2f} |"
+                shown += f" {_peak_gb(straight, points):.2f} |"
+            else:
+                shown += f" - | - | {memory:.2f} | - |"
+            rows.append(shown)
+    with capsys.disabled():
+        print("\n".join(rows))  # noqa: T201
