@@ -8,6 +8,7 @@ does not end, a process that dies.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import mmap
 import os
@@ -35,6 +36,8 @@ MOST_CPU_S = 5.0
 """Processor time of one call; none of these inputs needs a tenth of it."""
 
 _SLACK = 1.25, 1 << 26  # times the budget, and bytes: what else the process takes meanwhile
+_GLIBC = (-4, 65536), (-3, 128 << 10), (-1, 128 << 10), (-2, 128 << 10)
+# of malloc.h: M_MMAP_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD and M_TOP_PAD as they are by default
 _SILENT_S = 90.0  # then the process hangs where no signal is heard
 _RECENT = 16
 
@@ -182,6 +185,7 @@ class _Loop:
         with tempfile.TemporaryDirectory(dir=self.folder) as made:
             corpus = self.reader.seeds(Path(made))
         self._call(corpus[0])  # what is imported now is not the input's
+        _hand_back_freed_memory()
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         most = pages * resource.getpagesize() + 3 * memory_limit() + (1 << 30)
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
@@ -264,6 +268,18 @@ def _line_of(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     ours = [one for one in frames if "/qs3/" in one.filename] or frames
     return f"{ours[-1].filename.rpartition('/qs3/')[2]}:{ours[-1].lineno}"
+
+
+def _hand_back_freed_memory() -> None:
+    """Or what is taken from memory that was freed before, by a training say, is not seen.
+
+    Trainings ask glibc to keep it (`qs3.utils.allocator`), for the whole process and its forks.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        glibc = ctypes.CDLL(None)
+        for key, value in _GLIBC:
+            glibc.mallopt(key, value)
+        glibc.malloc_trim(0)
 
 
 def _reset_peak() -> int:

@@ -6,12 +6,14 @@ import json
 import os
 import random
 import signal
+import sys
 import zipfile
 
 import numpy as np
 import pytest
 
 from qs3.errors import DataError
+from qs3.utils.allocator import keep_freed_memory
 from tests.fuzzing import engine, mutate
 from tests.fuzzing.coverage import Coverage
 from tests.fuzzing.engine import Reader, fuzz
@@ -66,6 +68,22 @@ def test_what_a_reader_does_wrong_is_found(monkeypatch, read, kind):
     assert {one.kind for one in outcome.found} == {kind}, outcome
     found = json.loads(bytes.fromhex(outcome.found[0].data))["n"]
     assert {"hang": str, "crash": type(None), "foreign": list, "memory": int}[kind] is type(found)
+
+
+def after_a_training(folder):
+    """What glibc keeps since is enough for all that `takes_memory` takes."""
+    assert keep_freed_memory()
+    np.ones(40_000_000)
+    return [SEED]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's")
+def test_memory_that_was_freed_before_counts(monkeypatch):
+    monkeypatch.setenv("QS3_MEMORY_GB", "0.05")
+    reader = Reader("planted", after_a_training, takes_memory, "a.json")
+    outcomes = (fuzz(reader, 0.5, seed) for seed in range(20))
+    found = next((outcome.found for outcome in outcomes if outcome.found), [])
+    assert [one.kind for one in found] == ["memory"]
 
 
 def test_a_reader_without_a_fault_has_none():
