@@ -41,6 +41,8 @@ def fit(run: Run) -> RunMetrics:
     began = time.time()
     quieten()
     keep_freed_memory()
+    # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     torch.set_num_threads(run.cfg.trainer.threads or os.cpu_count() or 1)
     method: Method = build(run.cfg.method)
     loaded = load_data(run, method)

@@ -16,8 +16,9 @@ moments of the *inputs*: with A the adjacency (A_ij = 1 if j is a neighbour of i
     sum_ij z_ij   = W1 X'd + k E X'1
     sum_ij z_ij^2 = diag(W1 X' diag(d) X W1' + 2 E X'(A X) W1' + k E X'X E').
 
-That is for the CPU. To an accelerator these are 164 kernels a layer, forward and backward, each
-started by itself; there z_ij is written out where its statistics are asked for, in 30.
+That is for the CPU, where what goes along the edges, A and the maximum, is compiled
+(`qs3.geometry.compiled`). To an accelerator these are 164 kernels a layer, forward and backward,
+each started by itself; there z_ij is written out where its statistics are asked for, in 30.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from qs3.geometry import compiled
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import exporting
 from qs3.models import fast
@@ -45,6 +47,11 @@ class _NeighbourMax(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, index: Tensor) -> Tensor:
+        ctx.points = x.shape[0]
+        if compiled.usable(x):
+            out, where = compiled.neighbour_max(x, index)
+            ctx.save_for_backward(where)
+            return out
         rows, k = index.shape
         channels = x.shape[1]
         out = torch.empty(rows, channels, dtype=x.dtype, device=x.device)
@@ -56,13 +63,14 @@ class _NeighbourMax(torch.autograd.Function):
             out[i : i + block] = best
             torch.gather(part, 1, j, out=where[i : i + block])
         ctx.save_for_backward(where)
-        ctx.points = x.shape[0]
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (where,) = ctx.saved_tensors
+        if compiled.usable(grad):
+            return compiled.neighbour_max_backward(grad, where, ctx.points), None
         out = grad.new_zeros(ctx.points, grad.shape[1])
         return out.scatter_add_(0, where, grad), None
 
@@ -93,6 +101,8 @@ class _Moments(torch.autograd.Function):
         dx.baddbmm_(x, d_xx + d_xx.transpose(1, 2))
         dx.baddbmm_(sums, d_xax.transpose(1, 2))
         upstream = (x @ d_xax).flatten(0, 1)
+        if compiled.usable(x):
+            return dx.add_(compiled.add_to_neighbours(upstream, index).view_as(dx)), None
         rows = dx.flatten(0, 1)  # a view
         for j in range(index.shape[1]):
             rows.index_add_(0, index[:, j], upstream)

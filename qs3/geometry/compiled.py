@@ -1,0 +1,102 @@
+"""What EdgeConv does along its edges, compiled for the CPU.
+
+By torch's operations the gathered rows are written and read again, k times the size of the result;
+here it is one loop. Where numba is not there, and off the CPU, callers go by torch's operations, with
+the same values and gradients whose sums are in another order.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from importlib.util import find_spec
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+_ALONE = 1 << 16  # values that are too few to be shared by threads
+
+
+def usable(x: Tensor) -> bool:
+    """Whether the operations of this module may be called for `x`."""
+    return x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and _has_numba()
+
+
+@torch.library.custom_op("qs3::neighbour_max", mutates_args=())
+def neighbour_max(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    """Maximum over each row's neighbours, per channel, as torch's: NaN is above all.
+
+    Args:
+        x: [p, c] float32 or float64.
+        index: [q, k] int64, rows of `x`.
+
+    Returns:
+        [q, c], and int32 [q, c]: the first of its neighbours that has it (of NaN: one that is).
+    """
+    best = x.new_empty(len(index), x.shape[1])
+    where = torch.empty(best.shape, dtype=torch.int32)
+    _shared("neighbour_max", len(index), best.numel(), x, index, best, where)
+    return best, where
+
+
+@neighbour_max.register_fake
+def _(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    best = x.new_empty(len(index), x.shape[1])
+    return best, best.new_empty(best.shape, dtype=torch.int32)
+
+
+@torch.library.custom_op("qs3::neighbour_max_backward", mutates_args=())
+def neighbour_max_backward(grad: Tensor, where: Tensor, points: int) -> Tensor:
+    """The gradient [points, c] of `x`, from that of the maxima [q, c] and their rows."""
+    out = grad.new_zeros(points, grad.shape[1])
+    _shared("add_where", grad.shape[1], grad.numel(), grad, where, out)
+    return out
+
+
+@neighbour_max_backward.register_fake
+def _(grad: Tensor, where: Tensor, points: int) -> Tensor:
+    return grad.new_empty(points, grad.shape[1])
+
+
+@torch.library.custom_op("qs3::add_to_neighbours", mutates_args=())
+def add_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
+    """A'x: each row of x [q, c] added to the rows that index [q, k] names, [q, c]."""
+    out = x.new_zeros(x.shape)
+    _shared("add_to_neighbours", x.shape[1], index.numel() * x.shape[1], x, index, out)
+    return out
+
+
+@add_to_neighbours.register_fake
+def _(x: Tensor, index: Tensor) -> Tensor:
+    return x.new_empty(x.shape)
+
+
+def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:
+    """Call a kernel on parts of its range, one for each of torch's threads."""
+    from qs3.geometry import numba_kernels
+
+    run: Callable[..., None] = getattr(numba_kernels, kernel)
+    arrays = [one.detach().contiguous().numpy() for one in tensors]  # results are contiguous
+    parts = 1 if values < _ALONE else min(torch.get_num_threads(), size)
+    ends = [size * i // parts for i in range(parts + 1)]
+    if parts == 1:
+        run(*arrays, 0, size)
+        return
+    threads = _threads(parts, os.getpid())
+    jobs = [threads.submit(run, *arrays, *part) for part in pairwise(ends)]
+    for job in jobs:
+        job.result()
+
+
+@cache
+def _threads(number: int, process: int) -> ThreadPoolExecutor:
+    """Of this process: a fork has none of its parent's."""
+    return ThreadPoolExecutor(number, thread_name_prefix="qs3-kernels")
+
+
+@cache
+def _has_numba() -> bool:
+    return find_spec("numba") is not None

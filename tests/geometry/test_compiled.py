@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.geometry import compiled
+from qs3.models.fast import edgeconv
+
+
+def edges(points: int, rows: int, k: int, seed: int = 0) -> torch.Tensor:
+    return torch.randint(points, (rows, k), generator=torch.Generator().manual_seed(seed))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    points=st.integers(1, 9),
+    rows=st.integers(0, 9),
+    k=st.integers(1, 5),
+    channels=st.integers(1, 20),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    seed=st.integers(0, 99),
+)
+def test_maxima_and_who_has_them_first(points, rows, k, channels, dtype, seed):
+    torch.manual_seed(seed)
+    x = torch.randint(3, (points, channels)).to(dtype)  # with many that are equal
+    x[torch.rand(x.shape) < 0.05] = torch.nan
+    index = edges(points, rows, k, seed)
+    best, where = compiled.neighbour_max(x, index)
+    for i in range(rows):
+        for c in range(channels):
+            values = x[index[i], c].numpy()
+            first = int(np.argmax(values))  # numpy's, too, takes the first, and NaN before all
+            assert np.array_equal(best[i, c].numpy(), values[first], equal_nan=True)
+            if not np.isnan(values[first]):
+                assert where[i, c] == index[i, first]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_values_are_torchs_whatever_the_threads_and_the_layout(monkeypatch, threads, dtype):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    torch.manual_seed(0)
+    x = torch.randn(40, 300, dtype=dtype).T  # no row in one piece
+    index, grad = edges(300, 2000, 7), torch.randn(2000, 40, dtype=dtype)
+    best, where = compiled.neighbour_max(x, index)
+    assert torch.equal(best, x[index].amax(1))
+    assert torch.equal(best, x.gather(0, where.long()))
+    found = compiled.neighbour_max_backward(grad, where, 300)
+    expected = torch.zeros(300, 40, dtype=torch.float64)
+    expected.scatter_add_(0, where.long(), grad.double())
+    torch.testing.assert_close(found, expected.to(dtype), rtol=1e-4, atol=1e-5)
+    up = torch.randn(40, 2000, dtype=dtype).T
+    index = edges(2000, 2000, 7)
+    added = torch.zeros(2000, 40, dtype=torch.float64)
+    for j in range(7):
+        added.index_add_(0, index[:, j], up.double())
+    ours = compiled.add_to_neighbours(up, index)
+    torch.testing.assert_close(ours, added.to(dtype), rtol=1e-4, atol=1e-5)
+
+
+def test_threads_move_no_bit(monkeypatch):
+    torch.manual_seed(0)
+    x, index = torch.randn(500, 64), edges(500, 4000, 20)
+    results = []
+    for threads in (1, 2, 5):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        best, where = compiled.neighbour_max(x, index)
+        back = compiled.neighbour_max_backward(best, where, 500)
+        results.append((best, where, back, compiled.add_to_neighbours(best, index % 4000)))
+    for others in results[1:]:
+        assert all(map(torch.equal, results[0], others))
+
+
+def test_without_numba_torch_gives_the_same(monkeypatch):
+    torch.manual_seed(0)
+    b, n, k = 2, 60, 6
+    index = torch.randint(n, (b, n, k))
+    layer = edgeconv.nn.BatchNorm1d(12).double()
+
+    def outcome() -> list[torch.Tensor]:
+        torch.manual_seed(1)
+        x = torch.randn(b, n, 5, dtype=torch.float64, requires_grad=True)
+        weight = torch.randn(12, 10, dtype=torch.float64, requires_grad=True)
+        out = edgeconv.edge_conv(x, index, weight, layer, 0.2)
+        out.square().sum().backward()
+        return [out.detach(), x.grad, weight.grad]
+
+    asked = []
+    real = compiled.neighbour_max
+    monkeypatch.setattr(compiled, "neighbour_max", lambda *given: asked.append(1) or real(*given))
+    with_it = outcome()
+    assert asked
+    asked.clear()
+    monkeypatch.setattr(compiled, "_has_numba", lambda: False)
+    for ours, theirs in zip(with_it, outcome(), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    assert not asked
+
+
+def test_torchs_compiler_knows_them():
+    x, index = torch.randn(9, 4), edges(9, 9, 3)
+    best, where = compiled.neighbour_max(x, index)
+    checks = ("test_schema", "test_faketensor")
+    torch.library.opcheck(compiled.neighbour_max, (x, index), test_utils=checks)
+    torch.library.opcheck(compiled.neighbour_max_backward, (best, where, 9), test_utils=checks)
+    torch.library.opcheck(compiled.add_to_neighbours, (x, index), test_utils=checks)
+
+
+FORKED = """
+import os, torch
+from qs3.geometry import compiled
+torch.set_num_threads(2)
+x, index = torch.randn(500, 64), torch.randint(500, (4000, 20))
+best, _ = compiled.neighbour_max(x, index)
+if os.fork() == 0:
+    os._exit(0 if torch.equal(compiled.neighbour_max(x, index)[0], best) else 1)
+print(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+
+
+def test_a_fork_has_threads_of_its_own():
+    run = [sys.executable, "-c", FORKED]
+    said = subprocess.run(run, capture_output=True, text=True, check=True, timeout=60)
+    assert said.stdout.split() == ["0"]
