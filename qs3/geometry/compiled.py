@@ -1,8 +1,8 @@
 """What EdgeConv does along its edges, compiled for the CPU.
 
 By torch's operations the gathered rows are written and read again, k times the size of the result;
-here it is one loop. Where numba is not there, and off the CPU, callers go by torch's operations, with
-the same values and gradients whose sums are in another order.
+here it is one loop. Without numba, and off the CPU, callers go by torch's operations, with the same
+values, and gradients whose sums are in another order.
 """
 
 from __future__ import annotations
