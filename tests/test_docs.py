@@ -20,7 +20,7 @@ OURS = ("qs3 ", "python train.py", "python generate.py", "qs3-train", "qs3-gener
 
 
 def anchors(page: Path) -> set[str]:
-    """Of a page's headings, as GitHub and mkdocs make them."""
+    """Anchors of a page's headings, as GitHub and mkdocs make them."""
     found = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in found}
 

@@ -121,7 +121,7 @@ class Predictor:
 
     @property
     def camera_height(self) -> float | None:
-        """Of the target's camera above the floor, in metres, if its clouds have it as the origin.
+        """Height of the target's camera above the floor, in metres, if it is its clouds' origin.
 
         None: their floor is at or above the origin, so they say nothing about a camera.
         """
@@ -175,7 +175,7 @@ class Predictor:
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
     ) -> Float[np.ndarray, "n c"]:
-        """Of prepared clouds; n >= 1."""
+        """Class probabilities of prepared clouds; n >= 1."""
         found = predict(self.net, points, batch_size, self.device)
         if found.shape[1] != len(self.classes):
             raise DataError(

@@ -30,7 +30,7 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Of the rows with a prediction and a label that is a class of the net's.
+    """Scores of the rows with a prediction and a label that is one of the net's classes.
 
     Attributes:
         all: right ones.

@@ -38,7 +38,7 @@ _READERS: dict[str, Callable[[bytes, Path, Colliders], Triangles]] = {
 }
 
 _PEAK = {".off": 4, ".stl": 7, ".obj": 10, ".ply": 10, ".dae": 10, ".glb": 12, ".gltf": 12}
-"""Of memory to a file's size, as measured with 330,000 triangles; 3MF knows its own."""
+"""Peak memory over a file's size, as measured with 330,000 triangles; 3MF knows its own."""
 
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """Suffixes of the files that `load_mesh` reads, in lower case."""

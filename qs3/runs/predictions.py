@@ -27,7 +27,7 @@ _FIRST = ("id", "mesh", "label", "predicted")
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Of n clouds.
+    """Predictions of n clouds.
 
     Attributes:
         classes: names in label order.

@@ -27,7 +27,7 @@ INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help")
 _WIDTH = 100
-# Of Hydra: what shows something and ends.
+# Flags of Hydra that show something and end.
 _SHOWS = (*_HELP, "--hydra-help", "--version", "--cfg", "-c", "--info", "-i", "-sc")
 
 

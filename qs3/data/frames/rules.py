@@ -17,7 +17,7 @@ from qs3.errors import ConfigError
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one class.
+    """What an object of one class must be like.
 
     Attributes:
         pixels: an object has at least so many with depth.
@@ -119,5 +119,5 @@ class Rules:
             raise ConfigError(f"published.rules: {error}") from error
 
     def limits_of(self, cls: str) -> Limits:
-        """Of a class."""
+        """Limits of a class: its own, or the default ones."""
         return self.limits.get(cls) or self.limits.get("default") or Limits()

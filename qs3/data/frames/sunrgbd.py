@@ -94,7 +94,7 @@ def read_frames(root: Path) -> list[Frame]:
 
 
 def read_splits(root: Path, splits: str = SPLITS) -> dict[PurePosixPath, str]:
-    """Of each frame's folder: "train" or "test".
+    """The split of each frame, by its folder: "train" or "test".
 
     Raises:
         MissingDataError: there is no such file.

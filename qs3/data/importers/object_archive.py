@@ -148,7 +148,7 @@ class ObjectArchive(Importer):
 
     @property
     def path(self) -> Path:
-        """Of the .npz."""
+        """Where the .npz lies."""
         return self.root / Path(self.file).expanduser()
 
     def made_of(self) -> MadeOf:
@@ -218,7 +218,7 @@ class ObjectArchive(Importer):
         return f"the objects in {self.path}"
 
     def _splits(self, archive: Archive) -> list[str]:
-        """Of each object; "" for those that are left out.
+        """The split of each object; "" for those that are left out.
 
         Raises:
             DataError: the file has no parts to make folds of.
