@@ -1,4 +1,4 @@
-"""`predictions.csv`: what a run's result says of each evaluated cloud of the target, one row each.
+"""`predictions.csv`: a run's predictions for the target's evaluated clouds, one row each.
 
 Columns: id; mesh (hash of the object's mesh: scans of one mesh are not independent samples; the id
 where no mesh is known); label (empty if nobody knows it); predicted; and a probability per class.

@@ -20,7 +20,7 @@ from qs3.errors import SelectionError
 
 @dataclass(frozen=True, eq=False)
 class TeacherPredictions:
-    """What a teacher says of each target sample.
+    """A teacher's predictions for the target samples.
 
     Attributes:
         ids: of the samples, all different.

@@ -22,7 +22,7 @@ def memory_limit() -> int:
     """Bytes that reading one file may take.
 
     Raises:
-        ConfigError: the variable is no positive number.
+        ConfigError: the variable is not a positive number.
     """
     words = os.environ.get(VARIABLE, "")
     try:

@@ -45,7 +45,7 @@ _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the unit is wrong
 
 
 class Intrinsics(NamedTuple):
-    """What a file says of a camera.
+    """A camera as a file describes it.
 
     Attributes:
         camera: without distortion.

@@ -43,7 +43,7 @@ class Rules:
     """How an object is cut, and when it is refused.
 
     Attributes:
-        near_m, far_m: depths outside are no measurements.
+        near_m, far_m: depths outside do not count as measured.
         erode_px: taken off a mask all round; a box has no such edge.
         jump_m, jump_share: neighbouring pixels belong together if their depths differ by no more
             than the larger of the two, the second a share of the depth.

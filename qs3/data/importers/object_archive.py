@@ -13,8 +13,8 @@
     rim, occ       [N] float      optional: share of its outline that the picture cuts off, and that
                                   something nearer covers
 
-Frames in a row show one room: objects of one block of frames are no independent samples, and a
-part of the archive that judges is blocks away from one that is trained on.
+Frames in a row show one room: objects of one block of frames are not independent, and a part of the
+archive that judges is blocks away from one that is trained on.
 """
 
 from __future__ import annotations

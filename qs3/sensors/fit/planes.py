@@ -1,4 +1,4 @@
-"""The wall in a depth image, and what the camera says of it."""
+"""The wall in a depth image, and how the camera measures it."""
 
 from __future__ import annotations
 
