@@ -46,7 +46,7 @@ def global_features(
     *,
     domain: str = "target",
 ) -> Float[np.ndarray, "n d"]:
-    """What the backbone says about each cloud, float64: as `said_of`.
+    """The backbone's features of each cloud, float64: as `said_of`.
 
     Raises:
         ConfigError: the model is not a backbone with a head.

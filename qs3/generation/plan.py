@@ -36,7 +36,7 @@ _SWITCHES = ("provenance", "keep_views", "force", "strict")
 _OF_LOOKING = ("scene", "tracking", "crop")
 _OF_LIGHT = ("materials", "light")
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
-# Of a config: where things lie, and what never changes a byte.
+# Keys of a config that say where things lie, or that never change a byte.
 _UNSTORED = ("paths", "workers", "force", "strict")
 
 

@@ -33,7 +33,7 @@ class Scores:
         predicted: how many were given to each class, in label order.
         accuracy, balanced_accuracy, majority_rate: None without labels.
         per_class_recall: None for a class without clouds.
-        confusion: [i][j] counts clouds of class i predicted as j.
+        confusion: `[i][j]` counts clouds of class i predicted as j.
         calibration_error: expected calibration error; None for a net that has diverged.
     """
 

@@ -34,7 +34,7 @@ JUDGE = "judge"
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one family of runs on one tier of objects.
+    """Figures of one family of runs on one tier of objects.
 
     Attributes:
         tier: "all", "clean" or "hard".

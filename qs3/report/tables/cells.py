@@ -172,7 +172,7 @@ class Table:
         return tuple(dict.fromkeys(c.target for c in cells if c and c.simulated))
 
     def average(self, row: str, metric: Metric) -> Stat | None:
-        """Of our numbers over all columns, seed by seed; None unless every column has the same."""
+        """Average of our numbers over all columns, by seed; None unless all have the same seeds."""
         values: dict[int, list[float]] = {}
         for cell in self.rows[row]:
             stat = cell.ours(metric) if cell else None

@@ -252,7 +252,7 @@ class _Composed(NamedTuple):
 
 @functools.lru_cache(maxsize=4096)
 def _composed(words: tuple[str, ...]) -> _Composed:
-    """Of a command line of train.py. Kept: `report train` and effects read a table again and again.
+    """A command line of train.py, composed. Kept: `report train` and effects ask for it often.
 
     Raises:
         HydraException: as Hydra's `compose`.
