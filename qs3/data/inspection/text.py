@@ -176,8 +176,7 @@ def _up_verdict(up: Numbers) -> str:
         return (
             f"WARNING: {', '.join(up['contradicting'])} do not stand upright on z{untold}. A wrong "
             "axis costs tens of points of accuracy: check the importer's `up`, or for clouds from "
-            "generate.py the `up` of the meshes"
-            + f". {_OF_FUSED}" * (up["single_views"] is None)
+            "generate.py the `up` of the meshes" + f". {_OF_FUSED}" * (up["single_views"] is None)
         )
     if up["confirming"]:
         return f"z is up, by the shapes of {', '.join(up['confirming'])}{untold}"
