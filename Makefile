@@ -63,7 +63,7 @@ mutants: install ## how many faults put into the core the tests notice; hours, g
 	$(RUN) .ci/mutants.py .ci/mutants.toml docs/results/mutants.csv
 
 docs: install ## the docs as a site, in out/site
-	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build -q -f .ci/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict -f .ci/mkdocs.yml
 	@echo "open out/site/index.html"
 
 release: install ## what a release of VERSION=0.1.0 would do; GO=true: does it, and pushes nothing

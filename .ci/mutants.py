@@ -178,7 +178,7 @@ class Tracer:
 
 
 def judges(tests: list[str], lines: dict[str, list[str]], source: str, line: int) -> list[str]:
-    """Of a module's tests those that execute a line; all where none is known to.
+    """Those of a module's tests that execute a line; all where none is known to.
 
     Args:
         tests: files, in the order in which they run.

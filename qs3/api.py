@@ -69,9 +69,11 @@ def generate(*arguments: Any) -> Any:
 
     Meshes: first one `trimesh.Trimesh`, `trimesh.Scene` or `qs3.meshes.mesh.Mesh`, or a list or a
     dict of them, then the words. They are metres with z up, as they stand, or with "up=y" y up
-    (trimesh leaves glTF files so). Everything happens in this process, and nothing is written. An
-    object's bytes depend on the seed and on its id: the key of a dict, "object" for a single mesh,
-    "0", "1", ... in a list. With the id of a dataset's object they are those of the dataset.
+    (trimesh leaves glTF files so). A scene's invisible collision nodes, such as `table_collider`,
+    are left out as those of files are, unless the words have "colliders=keep". Everything happens
+    in this process, and nothing is written. An object's bytes depend on the seed and on its id:
+    the key of a dict, "object" for a single mesh, "0", "1", ... in a list. With the id of a
+    dataset's object they are those of the dataset.
 
     Returns:
         Of words the dataset; of a mesh a `qs3.generation.scan.Scan`; of a list or dict one each.

@@ -1,5 +1,7 @@
 """The documents: links lead somewhere, commands exist, and what is said of the layers is so."""
 
+import ast
+import os
 import re
 import shlex
 import subprocess
@@ -18,7 +20,7 @@ OURS = ("qs3 ", "python train.py", "python generate.py", "qs3-train", "qs3-gener
 
 
 def anchors(page: Path) -> set[str]:
-    """Of a page's headings, as GitHub and mkdocs make them."""
+    """Anchors of a page's headings, as GitHub and mkdocs make them."""
     found = re.findall(r"^#+ (.+)$", page.read_text("utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in found}
 
@@ -30,7 +32,7 @@ def test_internal_links_lead_somewhere(page):
             continue
         name, _, anchor = link.partition("#")
         target = page if not name else (page.parent / name).resolve()
-        assert target.exists(), f"{link}: there is no such file"
+        assert target.is_file(), f"{link}: there is no such file"
         if anchor and target.suffix == ".md":
             assert anchor in anchors(target), f"{link}: there is no such heading"
 
@@ -118,17 +120,39 @@ def test_the_root_of_the_package_holds_six_modules_at_most():
     assert len(list((ROOT / "qs3").glob("*.py"))) <= 6
 
 
+def defined(file: str) -> set[str]:
+    """Functions and classes of a module, and `Class.method`."""
+    found: set[str] = set()
+    for node in ast.parse((ROOT / file).read_text("utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            inner = [n.name for n in node.body if isinstance(n, ast.FunctionDef)]
+            found |= {f"{node.name}.{name}" for name in inner}
+    return found
+
+
 def test_the_walk_names_what_is_there():
-    """Files and names of the walk through the code; no question needs more than three files."""
+    """Files and names of the walk through the code; no question needs more than three files.
+
+    What follows a file is defined there; what else its item names stands in it, at least.
+    """
     page = (ROOT / "docs/explanation/walk.md").read_text("utf-8")
-    for part in page.split("\n## ")[1:]:
+    *questions, whole_run = page.split("\n## ")[1:]
+    for part in questions:
         files = re.findall(r"^\d\. `(qs3/[\w/]+\.py)`", part, re.MULTILINE)
-        assert len(files) <= 3
+        assert 1 <= len(files) <= 3
         for line in re.findall(r"^\d\..*?(?=^\d\.|\Z)", part, re.MULTILINE | re.DOTALL):
             file, *names = re.findall(r"`([\w./]+)`", line)
+            assert names[0] in defined(file), f"{file} defines no {names[0]}"
             source = (ROOT / file).read_text("utf-8")
             for word in (word for name in names if "/" not in name for word in name.split(".")):
                 assert re.search(rf"\b{word}\b", source), f"{file} has no {word}"
+    file, *names = re.findall(r"`([\w./]+)`", whole_run)
+    source = (ROOT / file).read_text("utf-8")
+    places = [source.find(f" {name}(") for name in names if "/" not in name]
+    assert -1 not in places
+    assert places == sorted(places)  # it reads from top to bottom
 
 
 def test_every_page_is_in_the_site():
@@ -142,6 +166,23 @@ def test_every_page_is_in_the_site():
 
     there = {str(page.relative_to(ROOT / "docs")) for page in ROOT.glob("docs/**/*.md")}
     assert set(pages(spec["nav"])) == there
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path):
+    """As `make docs` does it: of docstrings, too, whose brackets may read as links."""
+    pytest.importorskip("mkdocs")
+    words = ["-m", "mkdocs", "build", "--strict", "-f", ".ci/mkdocs.yml", "-d", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "reference/api/index.html").is_file()
 
 
 # Lightning 2.6.6 asks torch 2.13 in an old way; not ours to fix.

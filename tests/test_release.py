@@ -226,7 +226,7 @@ def test_hosts_install_and_run_what_ci_runs(name):
 def test_hosts_have_the_python_that_is_needed():
     major, minor = sys.version_info[:2]
     text = (ROOT / ".ci" / "github.yml").read_text("utf-8")
-    loaded = yaml.load(text, yaml.BaseLoader)  # its `on` is no boolean
+    loaded = yaml.load(text, yaml.BaseLoader)  # its `on` is not a boolean
     assert set(loaded["on"]) == {"pull_request", "push"}
     setup = next(
         one for one in loaded["jobs"]["checks"]["steps"] if "python" in one.get("uses", "")

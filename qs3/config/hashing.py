@@ -70,7 +70,7 @@ def config_sha256(cfg: DictConfig) -> str:
 
 
 def file_sha256(file: str) -> str:
-    """Of a file that the config names; MissingDataError if it cannot be read."""
+    """Hash of a file that the config names; MissingDataError if it cannot be read."""
     try:
         return sha256_file(Path(file).expanduser())
     except OSError as error:

@@ -72,7 +72,7 @@ def component_names(cfg: DictConfig) -> dict[str, str]:
 
 
 def _sha256(file: str | None) -> str:
-    """Of a file; "" if there is none, for the command that needs it to say so."""
+    """Hash of a file; "" if there is none, for the command that needs it to say so."""
     try:
         return hashing.file_sha256(file) if file else ""
     except Qs3Error:

@@ -1,4 +1,4 @@
-"""meta.yaml: what a finished dataset says of itself; its last line is a checksum of the others."""
+"""meta.yaml: the description of a finished dataset; its last line is a checksum of the others."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from qs3.config.checks import check_int, check_ranges
 
 REGION_SHARE = (0.1, 0.25)
-"""Of a cloud's points, from which and up to which share a dropped region takes."""
+"""The smallest and largest share of a cloud's points that a dropped region takes."""
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ class Batches:
             yield batch
 
     def _parts(self, name: str, table: Table) -> list[tuple[Tensor, ...]]:
-        """Of each batch the positions [size], and while training the samples [size]."""
+        """Positions [size] of each batch, and while training its samples [size]."""
         index = self._order(name, table)
         parts = [index.split(self.sizes)]
         if self.shuffle and table.clouds.starts > 1:

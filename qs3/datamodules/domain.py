@@ -3,6 +3,8 @@
     data = SpeckleNetData(points=256, batch_size=32)
     Trainer(max_epochs=10).fit(my_module, data)
 
+or, from conf/datamodule, `hydra.utils.instantiate(cfg.datamodule)` with `+datamodule=specklenet`.
+
 A batch is `{"points": [B, N, 3] float32, "labels": [B] int64}`: clouds in the unit ball (or in
 metres, if `scale` says so), z up, sampled by farthest points. Without labels the key "labels" is
 not there; without a trainer, that takes them away, the step's "index" and "epoch" are there too.

@@ -228,6 +228,6 @@ def ood_fraction(clouds: Clouds, source: Clouds) -> float:
 
 
 def source_ranges(source: Clouds, most: int = 1000) -> dict[str, list[float]]:
-    """Of each measure the range in at most `most` clouds; of points no more than the net sees."""
+    """Range of each measure in at most `most` clouds; of points no more than the net sees."""
     seen = source.stored.shape[1] if source.order is None else source.order.shape[2]
     return relax_min_points(limits(source, most=most), seen)

@@ -46,7 +46,7 @@ def global_features(
     *,
     domain: str = "target",
 ) -> Float[np.ndarray, "n d"]:
-    """What the backbone says about each cloud, float64: as `said_of`.
+    """The backbone's features of each cloud, float64: as `said_of`.
 
     Raises:
         ConfigError: the model is not a backbone with a head.
@@ -182,6 +182,7 @@ class Evaluation:
         batch_size: of the predictions.
         rotations: over how many rotations `rotation_averaged` averages; 0 leaves it out.
         meshes: of the test clouds by id; None or missing where not known.
+        tiers: likewise.
     """
 
     def __init__(
@@ -193,11 +194,13 @@ class Evaluation:
         batch_size: int,
         rotations: int = 0,
         meshes: Mapping[str, str] | None = None,
+        tiers: Mapping[str, str] | None = None,
     ) -> None:
         self.test, self.classes, self.batch_size = test, tuple(classes), batch_size
         self.y_target_eval = None if labels is None else labels.numpy()
         self.rotations = rotations
         self._train, self._meshes = train_labels, meshes or {}
+        self._tiers = np.array([(tiers or {}).get(id_, "") for id_ in test.ids])
 
     @property
     def labelled(self) -> bool:
@@ -222,6 +225,16 @@ class Evaluation:
     def scores_of(self, probabilities: Float[np.ndarray, "n c"]) -> Scores:
         """What these predictions of the test clouds are worth."""
         return scores(probabilities, self.y_target_eval, self.classes)
+
+    def scores_of_tiers(self, probabilities: Float[np.ndarray, "n c"]) -> dict[str, Scores] | None:
+        """The same for the clouds of each tier; None without tiers or labels."""
+        if self.y_target_eval is None:
+            return None
+        of = {str(tier): self._tiers == tier for tier in np.unique(self._tiers) if tier}
+        return {
+            tier: scores(probabilities[chosen], self.y_target_eval[chosen], self.classes)
+            for tier, chosen in of.items()
+        } or None
 
     def rotation_averaged(self, net: nn.Module, device: Any = "cpu") -> Scores | None:
         """The same for probabilities averaged over turns; None if that was not asked for."""

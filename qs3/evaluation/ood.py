@@ -77,7 +77,7 @@ def measure_one(clouds: Clouds, index: int) -> dict[str, float]:
 
 
 def limits(*domains: Clouds, most: int = _MOST) -> dict[str, list[float]]:
-    """Of each measure the least and the largest usual value: [low, high].
+    """The least and the largest usual value of each measure: [low, high].
 
     From 0.1 % to 99.9 % of the clouds of each domain, and of these ranges the lowest and highest
     end. Of fewer than a thousand clouds this is about the range of all. At most `most` of a domain

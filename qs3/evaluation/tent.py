@@ -16,7 +16,7 @@ from qs3.evaluation.metrics import adapt_norms, even_batches
 from qs3.models.norms import norms_for, running_norms, use_domain
 
 RATE = 1e-3
-"""Of Adam, as in the paper; without weight decay."""
+"""Adam's learning rate, as in the paper; without weight decay."""
 
 
 def entropy(logits: Float[Tensor, "b c"]) -> Float[Tensor, ""]:

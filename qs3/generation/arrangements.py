@@ -22,7 +22,7 @@ from qs3.meshes.mesh import Mesh, merge
 _CHAIR_M = (0.38, 0.55)
 _SEAT_M = (0.42, 0.5)
 _BACK_M = (0.75, 1.05)
-"""Of chairs that only hide things: width and depth, height of the seat and of the back."""
+"""Chairs that only hide things: width and depth, height of the seat and of the back."""
 _CELL_M = 0.04
 _SAMPLES = 20_000
 _FLAT_M = 0.03

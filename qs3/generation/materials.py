@@ -1,4 +1,4 @@
-"""Of what bodies are made: materials drawn for the parts of an object, and for all around it."""
+"""What bodies are made of: materials drawn for the parts of an object, and for all around it."""
 
 from __future__ import annotations
 

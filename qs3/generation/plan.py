@@ -22,7 +22,7 @@ from qs3.data.dataset_folder import VIEWS
 from qs3.errors import ConfigError
 from qs3.generation.provenance import Keep
 from qs3.generation.released.poses import read_poses
-from qs3.meshes.folder import MeshFolder
+from qs3.meshes.folder import SPLITS, MeshFolder
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import sha256_file
 from qs3.utils.version import VERSION
@@ -36,7 +36,7 @@ _SWITCHES = ("provenance", "keep_views", "force", "strict")
 _OF_LOOKING = ("scene", "tracking", "crop")
 _OF_LIGHT = ("materials", "light")
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
-# Of a config: where things lie, and what never changes a byte.
+# Keys of a config that say where things lie, or that never change a byte.
 _UNSTORED = ("paths", "workers", "force", "strict")
 
 
@@ -52,6 +52,11 @@ def check(cfg: DictConfig) -> None:
         known = known_classes(cfg)
         if unknown := sorted(set(cfg.classes) - set(known)):
             raise ConfigError(f"classes: {unknown} are not among the known {', '.join(known)}")
+    if cfg.splits is not None:
+        if not (isinstance(cfg.splits, ListConfig) and cfg.splits):
+            raise ConfigError(f"splits is a list: splits=[train], got {cfg.splits}")
+        if unknown := sorted(set(map(str, cfg.splits)) - set(SPLITS)):
+            raise ConfigError(f"splits: {unknown} are not among {', '.join(SPLITS)}")
     for key in _SWITCHES:
         check_bool(key, cfg[key])
     check_choice("colliders", cfg.colliders, COLLIDERS)
@@ -128,7 +133,8 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
         items = build(cfg.catalogue, classes=classes or CLASSES).items()
     else:
         items = mesh_folder(cfg).items()
-    kept = _first_of_each(items, cfg.limit, cfg.fraction)
+    wanted = [item for item in items if item.split in (cfg.splits or SPLITS)]
+    kept = _first_of_each(wanted, cfg.limit, cfg.fraction)
     return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]
 
 

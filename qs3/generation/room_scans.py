@@ -238,7 +238,7 @@ class RoomScan:
     def _cloud(
         self, frame: DepthFrame, own: np.ndarray, pose: np.ndarray, object_id: str, keep: Keep
     ) -> Cloud:
-        """Of the pixels `own` [h, w], sampled; the twin has the same pixels where they are true."""
+        """Points of the pixels `own`, sampled; the twin has the same pixels where they are true."""
         depth = np.where(own, frame.depth_m, np.nan)
         points = frame.points(depth, pose).astype(np.float32)
         order = farthest_point_sampling_np(points, self.points)

@@ -36,6 +36,7 @@ class Scan:
         valid_points: measured points before sampling to P.
         frames: the depth frames of all views; empty where the domain looks at nothing.
         provenance: with provenance=true [P, 5], see `qs3.generation.provenance`; else None.
+        colliders: invisible nodes of a scene that were left out; 0 with colliders=keep.
     """
 
     id: str
@@ -45,6 +46,7 @@ class Scan:
     valid_points: int
     frames: tuple[DepthFrame, ...] = ()
     provenance: np.ndarray | None = None
+    colliders: int = 0
 
 
 class Scanner:
@@ -105,15 +107,18 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
                 f"{key}= is for files: a scan of meshes from memory has no use for it"
             )
     scanner = Scanner(cfg)
+    return {name: _scan(scanner, name, solid, cfg) for name, solid in solids.items()}
+
+
+def _scan(scanner: Scanner, name: str, solid: Any, cfg: DictConfig) -> Scan:
     keep = Keep(provenance=cfg.provenance)
-    return {name: _scan(scanner, name, solid, cfg.up, keep) for name, solid in solids.items()}
-
-
-def _scan(scanner: Scanner, name: str, solid: Any, up: str, keep: Keep) -> Scan:
     try:
-        mesh = solid if isinstance(solid, Mesh) else Mesh.from_trimesh(solid)
-        if up == "y":
-            mesh = Mesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces)
+        if isinstance(solid, Mesh):
+            mesh = solid
+        else:
+            mesh = Mesh.from_trimesh(solid, keep_colliders=cfg.colliders == "keep")
+        if cfg.up == "y":
+            mesh = Mesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces, mesh.colliders)
         cloud = scanner.cloud(mesh, name, keep)
     except DataError as error:
         raise type(error)(f"{name}: {error}") from error
@@ -125,4 +130,5 @@ def _scan(scanner: Scanner, name: str, solid: Any, up: str, keep: Keep) -> Scan:
         valid_points=cloud.valid_points,
         frames=cloud.frames,
         provenance=cloud.arrays.get("provenance"),
+        colliders=mesh.colliders,
     )

@@ -58,7 +58,7 @@ class Evidence:
         return {cls: up_direction(scores) for cls, scores in self.scores.items()}
 
     def shares(self) -> str:
-        """Of each class how many of its meshes look better with z up than with y up."""
+        """How many meshes of each class look better with z up than with y up."""
         return ", ".join(
             f"{cls} {int((of[:, _Z] > of[:, _Y]).sum())} of {len(of)}"
             for cls, of in self.scores.items()

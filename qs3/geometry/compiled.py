@@ -1,4 +1,4 @@
-"""What EdgeConv does along its edges, compiled for the CPU.
+"""EdgeConv along its edges, and maxima of linear layers backwards, compiled for the CPU.
 
 By torch's operations the gathered rows are written and read again, k times the size of the result;
 here it is one loop. Without numba, and off the CPU, callers go by torch's operations, with the same
@@ -72,6 +72,32 @@ def add_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
 @add_to_neighbours.register_fake
 def _(x: Tensor, index: Tensor) -> Tensor:
     return x.new_empty(x.shape)
+
+
+@torch.library.custom_op("qs3::linear_max_backward", mutates_args=())
+def linear_max_backward(
+    x: Tensor, weight: Tensor, grad: Tensor, where: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Gradients of the maximum of x W' over the rows of each cloud, of x and of W.
+
+    Args:
+        x: [b, n, c].
+        weight: [d, c].
+        grad: [b, d], of the maxima.
+        where: [b, d] int64, the row of its cloud that has each.
+
+    Returns:
+        [b, n, c] and [d, c].
+    """
+    dx, dweight = x.new_zeros(x.shape), weight.new_zeros(weight.shape)
+    values = grad.numel() * x.shape[2]
+    _shared("add_products", x.shape[2], values, x, weight, grad, where, dx, dweight)
+    return dx, dweight
+
+
+@linear_max_backward.register_fake
+def _(x: Tensor, weight: Tensor, grad: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
+    return x.new_empty(x.shape), weight.new_empty(weight.shape)
 
 
 def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:

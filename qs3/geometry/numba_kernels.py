@@ -1,6 +1,7 @@
 """Loops over neighbours that numba compiles for this processor. Imported where numba is.
 
 Each works on a range, so that threads can share it: of rows, or, where rows add up, of channels.
+Inner loops begin at 0: an index that may be negative keeps LLVM from using vectors.
 """
 
 from __future__ import annotations
@@ -45,8 +46,9 @@ def neighbour_max(x: Any, index: Any, best: Any, where: Any, begin: int, end: in
 def add_where(grad: Any, where: Any, out: Any, begin: int, end: int) -> None:
     """out[where[i, c], c] += grad[i, c], of these channels."""
     for i in range(grad.shape[0]):
-        for c in range(begin, end):
-            out[where[i, c], c] += grad[i, c]
+        rows, values = where[i, begin:end], grad[i, begin:end]
+        for c in range(len(rows)):
+            out[rows[c], begin + c] += values[c]
 
 
 @_compiled
@@ -54,8 +56,24 @@ def add_to_neighbours(x: Any, index: Any, out: Any, begin: int, end: int) -> Non
     """out[index[i, j]] += x[i], of these channels."""
     k = index.shape[1]
     for i in range(x.shape[0]):
-        values = x[i]
+        values = x[i, begin:end]
         for j in range(k):
-            row = out[index[i, j]]
-            for c in range(begin, end):
+            row = out[index[i, j], begin:end]
+            for c in range(len(row)):
                 row[c] += values[c]
+
+
+@_compiled
+def add_products(
+    x: Any, weight: Any, grad: Any, where: Any, dx: Any, dweight: Any, begin: int, end: int
+) -> None:
+    """dx[b, where] += grad * weight[d] and dweight[d] += grad * x[b, where], of these channels."""
+    for b in range(grad.shape[0]):
+        for d in range(grad.shape[1]):
+            factor = grad[b, d]
+            row = where[b, d]
+            of_x, of_weight = x[b, row, begin:end], weight[d, begin:end]
+            to_x, to_weight = dx[b, row, begin:end], dweight[d, begin:end]
+            for c in range(len(of_x)):
+                to_x[c] += factor * of_weight[c]
+                to_weight[c] += factor * of_x[c]

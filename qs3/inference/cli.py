@@ -33,7 +33,7 @@ def _processors() -> int:
 
 PREDICT = Command(
     "qs3 predict",
-    "what a trained classifier says of your clouds, or of objects in your depth images",
+    "classes and confidences of your clouds, or of objects in your depth images",
     _predict,
     (
         _CKPT,

@@ -43,7 +43,7 @@ _SHOWN = 10  # failures in the text for the terminal
 
 @dataclass(frozen=True)
 class Settings:
-    """Of one call.
+    """Settings of one call.
 
     Attributes:
         ckpt: a run's folder or result.pt.

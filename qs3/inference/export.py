@@ -65,7 +65,7 @@ class Comparison:
 
     @classmethod
     def of(cls, theirs: Float[np.ndarray, "n c"], ours: Float[np.ndarray, "n c"]) -> Comparison:
-        """Of two nets on the same n clouds."""
+        """Compare two nets' logits of the same n clouds."""
         difference = np.abs(theirs - ours).max(axis=1)
         odd = int((~(difference <= ALLOWED)).sum())  # NaN is odd
         return cls(len(ours), float(np.median(difference)), float(difference.max()), odd)
@@ -324,7 +324,7 @@ def _quiet() -> Iterator[None]:
     logging.disable(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
-            # Of tensors that share memory; the logits are compared after reading back.
+            # A warning about tensors that share memory; the logits are compared after reading back.
             warnings.filterwarnings("ignore", message="No complete tensor found")
             # torch 2.13 asks its own tree of arguments in an old way, when it copies it.
             warnings.filterwarnings("ignore", message=".*LeafSpec", category=FutureWarning)

@@ -57,7 +57,7 @@ class Sample(NamedTuple):
     picture: tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]] | None = None
 
     def row(self, reason: str, probabilities: np.ndarray | None) -> Row:
-        """With what the net says of it, or why it says nothing."""
+        """Its row of the table, with the net's prediction or the reason why there is none."""
         return Row(
             self.name,
             len(self.cloud),

@@ -25,7 +25,7 @@ MOST_SHOWN = 300
 """Objects with pictures; the others are in the table alone."""
 
 _FEW, _COLLAPSED = 20, 0.8
-"""Of so many predictions, and such a share of one class, the page says so."""
+"""With so many predictions and such a share of one class the page has a caution."""
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1d2430; margin: 1.6rem auto; padding: 0 1rem;

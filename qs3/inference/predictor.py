@@ -60,7 +60,7 @@ class Prepared(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DepthPrediction:
-    """What a classifier says of one object of a depth image.
+    """A classifier's prediction for one object of a depth image.
 
     Attributes:
         name: "[3]", the number in the mask; "[210,95,480,430]", the box; "" of a mask of bool.
@@ -69,7 +69,7 @@ class DepthPrediction:
         probabilities: [C] float64, in the order of the predictor's classes.
         points_m: [n, 3] float32, z up, the camera at the origin.
         tier: "clean", "hard", or "poor": datasets leave such objects out.
-        cautions: why, in words, and what is not sure about the picture.
+        cautions: the reasons for `tier`, and what is not sure about the picture.
         up: how the vertical is known: "given", "planes" of the picture, or "level" camera.
         strange: how the cloud differs from all of training's; see `qs3.evaluation.ood`.
     """
@@ -121,7 +121,7 @@ class Predictor:
 
     @property
     def camera_height(self) -> float | None:
-        """Of the target's camera above the floor, in metres, if its clouds have it as the origin.
+        """Height of the target's camera above the floor, in metres, if it is its clouds' origin.
 
         None: their floor is at or above the origin, so they say nothing about a camera.
         """
@@ -147,7 +147,7 @@ class Predictor:
 
         Raises:
             DataError: no points, or NaN or infinite coordinates; says which.
-            ConfigError: `floor` is no number.
+            ConfigError: `floor` is not a number.
         """
         cloud = _array(cloud, name)
         if cloud.ndim != 2 or cloud.shape[1] < 3:
@@ -175,7 +175,7 @@ class Predictor:
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
     ) -> Float[np.ndarray, "n c"]:
-        """Of prepared clouds; n >= 1."""
+        """Class probabilities of prepared clouds; n >= 1."""
         found = predict(self.net, points, batch_size, self.device)
         if found.shape[1] != len(self.classes):
             raise DataError(
@@ -235,7 +235,7 @@ class Predictor:
         Args:
             depth_m: [h, w] floats, metres along the optical axis; 0 or not finite: not measured.
             camera: fx, fy, cx, cy in pixels, the centre of the top left one at (0, 0).
-            mask: [h, w] whole numbers or bool; 0 is no object. Or:
+            mask: [h, w] whole numbers or bool; 0 is background. Or:
             box: left, top, right, bottom in pixels.
             up: in the camera's frame (x right, y down, z forward), any length; None: by the planes
                 of the picture, and where it shows none, up in the picture.

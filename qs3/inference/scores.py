@@ -30,7 +30,7 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Of the rows with a prediction and a label that is a class of the net's.
+    """Scores of the rows with a prediction and a label that is one of the net's classes.
 
     Attributes:
         all: right ones.
@@ -39,7 +39,7 @@ class Scores:
         tiers: right ones of each tier, if there are any.
         kinds: by what was wrong with a cloud: right ones with it, and without it.
         confusion: [C, C] how often each label (row) was called each class (column).
-        unknown: labels that are no class of the net's, and how often.
+        unknown: labels that are not among the net's classes, and how often.
         unlabelled: rows with a prediction and no label.
     """
 

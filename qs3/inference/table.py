@@ -1,4 +1,4 @@
-"""What `qs3 predict` says of each object: the rows of its table, as CSV and as JSON."""
+"""The table of `qs3 predict`, a row for each object, as CSV and as JSON."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Row(NamedTuple):
 
 
 def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
-    """What both formats say of a cloud, by `COLUMNS`, and "probabilities"; None if nothing."""
+    """A cloud's values in both formats, by `COLUMNS`, and "probabilities"; None where empty."""
     found: dict[str, Any] = {
         **dict.fromkeys(COLUMNS),
         "file": row.file,

@@ -45,7 +45,7 @@ class MeshFolder:
     Attributes:
         path: the root; its sub-folders are classes.
         classes: the wanted ones; None: all known. A wanted one that is not there is an error,
-            which names the folders that are no class: it may be misspelt.
+            which names the folders that are not classes: it may be misspelt.
         test_fraction: of the meshes of a class whose folder has no splits, the part for test.
         half: "all", or "first" or "second": two disjoint halves of every class and split, so
             that a source and a target domain made from one folder share no shape.

@@ -38,7 +38,7 @@ _READERS: dict[str, Callable[[bytes, Path, Colliders], Triangles]] = {
 }
 
 _PEAK = {".off": 4, ".stl": 7, ".obj": 10, ".ply": 10, ".dae": 10, ".glb": 12, ".gltf": 12}
-"""Of memory to a file's size, as measured with 330,000 triangles; 3MF knows its own."""
+"""Peak memory over a file's size, as measured with 330,000 triangles; 3MF knows its own."""
 
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """Suffixes of the files that `load_mesh` reads, in lower case."""
@@ -74,7 +74,7 @@ def load_mesh(path: str | Path, keep_colliders: bool = False, up: str = "z") -> 
             vertices, faces = _read(path, colliders)
             if up == "y" and path.suffix.lower() not in DECLARE_UP:
                 vertices = vertices @ Y_UP_TO_Z_UP.T
-            return _checked(vertices, faces, colliders.count)
+            return _checked(vertices, faces, colliders)
     except MeshError as error:
         raise MeshError(f"{path}: {error}. Export the mesh again or remove the file") from error
     except MemoryError as error:
@@ -99,16 +99,15 @@ def _read(path: Path, colliders: Colliders) -> Triangles:
     return reader(path.read_bytes(), path.parent, colliders)
 
 
-def _checked(vertices: np.ndarray, faces: np.ndarray, colliders: int) -> Mesh:
+def _checked(vertices: np.ndarray, faces: np.ndarray, colliders: Colliders) -> Mesh:
     if len(faces) == 0:
-        but = f" but in {colliders} colliders, which are left out: colliders=keep keeps them"
-        raise MeshError("has no faces" + (but if colliders else ""))
+        raise MeshError(f"has no faces{colliders.exception}")
     check_counts(len(vertices), len(faces))
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= len(vertices):  # before Mesh makes them 32 bits wide
         bad = low if low < 0 else high
         raise MeshError(f"has a face with vertex {bad}, but there are {len(vertices)} vertices")
-    mesh = Mesh(vertices, faces, colliders)
+    mesh = Mesh(vertices, faces, colliders.count)
     if not _has_area(mesh):
         raise MeshError("has no surface: all its faces have zero area")
     return mesh

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from qs3.errors import MeshError
+from qs3.meshes.formats.colliders import Colliders
 
 if TYPE_CHECKING:
     import trimesh
@@ -21,7 +22,7 @@ class Mesh:
     Attributes:
         vertices: [V, 3] float64.
         faces: [F, 3] int32, indices into `vertices`; orientation is not relied upon.
-        colliders: invisible nodes that were left out when it was read from a file.
+        colliders: invisible nodes of its file or scene that were left out.
     """
 
     vertices: np.ndarray
@@ -50,10 +51,16 @@ class Mesh:
         object.__setattr__(self, "faces", faces)
 
     @classmethod
-    def from_trimesh(cls, solid: trimesh.Trimesh | trimesh.Scene) -> Mesh:
+    def from_trimesh(
+        cls, solid: trimesh.Trimesh | trimesh.Scene, keep_colliders: bool = False
+    ) -> Mesh:
         """The triangles of a mesh of trimesh, or of a scene put together, as they stand.
 
         z is up here and lengths are metres; nothing is turned or scaled.
+
+        Args:
+            solid: a mesh, whatever its name, or a scene.
+            keep_colliders: as `qs3.meshes.io.load_mesh`.
 
         Raises:
             MeshError: it has no triangles, or is neither of the two.
@@ -61,8 +68,14 @@ class Mesh:
         import trimesh
 
         if isinstance(solid, trimesh.Scene):
-            parts = [part for part in solid.dump() if isinstance(part, trimesh.Trimesh)]
-            return merge([cls.from_trimesh(part) for part in parts if len(part.faces)])
+            colliders = Colliders(skip=not keep_colliders)
+            hidden = colliders.left_out_of(solid)
+            solids = [part for part in solid.dump() if isinstance(part, trimesh.Trimesh)]
+            seen = [part for part in solids if part.metadata["node"] not in hidden]
+            parts = [cls.from_trimesh(part) for part in seen if len(part.faces)]
+            if colliders.count and not parts:
+                raise MeshError(f"has no faces{colliders.exception}")
+            return replace(merge(parts), colliders=colliders.count)
         if not isinstance(solid, trimesh.Trimesh):
             raise MeshError(f"expected a trimesh.Trimesh or Scene, got {type(solid).__name__}")
         return cls(np.array(solid.vertices), np.array(solid.faces))

@@ -14,7 +14,7 @@ from qs3.models.norms import head_norm, make_norm
 
 
 class Features(NamedTuple):
-    """What a backbone says about a batch of clouds.
+    """A backbone's features of a batch of clouds.
 
     Attributes:
         global_: [B, D] one vector a cloud, D = `Backbone.feature_dim`.

@@ -18,7 +18,7 @@ LEVEL = 0.95
 
 
 def weights(labels: Int[np.ndarray, " n"], balanced: bool) -> Float[np.ndarray, " n"]:
-    """Of objects in a mean: 1/n, or 1/(C n_class) for balanced accuracy, C the classes there."""
+    """Weights of objects in a mean: 1/n, or 1/(C n_class) for balanced accuracy of C classes."""
     if not balanced:
         return np.full(len(labels), 1 / len(labels))
     classes, index, counts = np.unique(labels, return_inverse=True, return_counts=True)
@@ -52,5 +52,5 @@ def t2(clusters: Any) -> Any:
 
 
 def _variance(sums: Float[np.ndarray, " c"]) -> float:
-    """Of the sum of independent clusters whose mean is 0, with the small-sample factor."""
+    """Variance of a sum of independent clusters of mean 0, with the small-sample factor."""
     return float((sums**2).sum()) * len(sums) / (len(sums) - 1)

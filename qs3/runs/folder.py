@@ -11,7 +11,7 @@ written last, and atomically: it is the mark of a finished run.
         warmup_selected.pt   weights of the teacher of round 0;  warmup_last.pt, student.pt likewise
         result.pt            what is reported, the warm-up's net or the student's, with all that
                              using it takes (`qs3.load`, qs3/inference/model_file.py)
-        predictions.csv      what they say of each of the target's test clouds
+        predictions.csv      their predictions for the target's test clouds
         student_selected.pt  of another epoch than the last, if selection.student asks for one
         round_03/pseudo_labels.csv
         history.csv          one row an epoch

@@ -33,7 +33,7 @@ class Scores:
         predicted: how many were given to each class, in label order.
         accuracy, balanced_accuracy, majority_rate: None without labels.
         per_class_recall: None for a class without clouds.
-        confusion: [i][j] counts clouds of class i predicted as j.
+        confusion: `[i][j]` counts clouds of class i predicted as j.
         calibration_error: expected calibration error; None for a net that has diverged.
     """
 
@@ -92,6 +92,8 @@ class Evaluated:
         rotations: rotations about the up axis over which the further scores average; 0: none.
         norms: "trained", "adabn" or "tent".
         final_over_rotations, warmup_over_rotations: those scores.
+        tiers: the final scores of the clouds of each tier, for datasets that have tiers ("clean",
+            "hard": how much of the object is seen) and labels.
     """
 
     split: str
@@ -100,6 +102,7 @@ class Evaluated:
     norms: str
     final_over_rotations: Scores | None = None
     warmup_over_rotations: Scores | None = None
+    tiers: dict[str, Scores] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

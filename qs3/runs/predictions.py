@@ -1,4 +1,4 @@
-"""`predictions.csv`: what a run's result says of each evaluated cloud of the target, one row each.
+"""`predictions.csv`: a run's predictions for the target's evaluated clouds, one row each.
 
 Columns: id; mesh (hash of the object's mesh: scans of one mesh are not independent samples; the id
 where no mesh is known); label (empty if nobody knows it); predicted; and a probability per class.
@@ -27,7 +27,7 @@ _FIRST = ("id", "mesh", "label", "predicted")
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Of n clouds.
+    """Predictions of n clouds.
 
     Attributes:
         classes: names in label order.

@@ -176,7 +176,7 @@ class SelfTraining(Callback):
     def _predictions(
         self, trainer: Trainer, pl_module: Classifier, data: AdaptationData, round_: int
     ) -> TeacherPredictions:
-        """Of the warm-up's selected weights (not its last ones), later of the student."""
+        """Predictions by the warm-up's selected weights (not its last), later by the student."""
         teacher = pl_module.net
         if round_ == 0:
             teacher = pl_module.fresh_net(phase=0).to(pl_module.device)

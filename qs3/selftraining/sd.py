@@ -174,7 +174,7 @@ class GraphNet(nn.Module):
 def _refined(
     features: Float[Tensor, "n d"], said: Float[Tensor, "n k"], edges: Tensor, steps: int
 ) -> Float[Tensor, "n k"]:
-    """What a graph net says of each cloud, that has learned what the teacher says."""
+    """Predictions of a graph net that has learned the teacher's."""
     net = GraphNet(features.shape[1], said.shape[1])
     optimizer = torch.optim.Adam(net.parameters(), lr=1e-3, weight_decay=5e-4)
     labels = said.argmax(dim=1)

@@ -20,7 +20,7 @@ from qs3.errors import SelectionError
 
 @dataclass(frozen=True, eq=False)
 class TeacherPredictions:
-    """What a teacher says of each target sample.
+    """A teacher's predictions for the target samples.
 
     Attributes:
         ids: of the samples, all different.
@@ -170,7 +170,7 @@ def most_confident(
     ids: Sequence[str] | None = None,
     least: int = 0,
 ) -> Bool[np.ndarray, " n"]:
-    """Of each of n_k samples labelled k the max(least, round(share n_k)) of highest confidence.
+    """The max(least, round(share n_k)) most confident of the n_k samples of each label k.
 
     Ties go by id, or by position where there are none.
     """

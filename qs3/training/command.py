@@ -47,7 +47,7 @@ _STILL = {
     **{"crop": 1.0, "drop_regions": 0, "rotate_z": False, "scale": 1.0},
     **{"shift": 0.0, "lift": 0.0, "jitter_sigma": 0.0},
 }
-"""Of `protocol.augment`: what leaves clouds as they are."""
+"""Settings of `protocol.augment` that leave clouds as they are."""
 
 _ONNX = "model=features needs an ONNX file"
 _FEATURES = "qs3.models.features.features"

@@ -85,6 +85,7 @@ def load_data(run: Run, method: Method) -> Loaded:
         cfg.data.eval_batch_size,
         cfg.evaluation.rotations,
         _objects_by_id(target, run.target),
+        _tiers_by_id(target, run.target),
     )
     made_of = DataMadeOf(source=labelled, target=of_target)
     return Loaded(data, evaluation, split, target.points.shape[1], started, made_of)
@@ -130,3 +131,9 @@ def _objects_by_id(dataset: PointSet, domain: Domain) -> dict[str, str]:
     rows = read_manifest(domain.folder, dataset.classes)
     known = {row.id: row.mesh_sha256 or of_id(row.id) for row in rows}
     return {id_: name for id_, name in known.items() if name}
+
+
+def _tiers_by_id(dataset: PointSet, domain: Domain) -> dict[str, str]:
+    """How much of its object each cloud shows, as its importer says: "clean" or "hard"."""
+    rows = read_manifest(domain.folder, dataset.classes)
+    return {row.id: row.more["tier"] for row in rows if row.more.get("tier")}

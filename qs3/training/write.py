@@ -79,6 +79,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
             norms=cfg.evaluation.norms,
             final_over_rotations=over,
             warmup_over_rotations=before,
+            tiers=evaluation.scores_of_tiers(outcome.predictions.probabilities),
         ),
         warmup=Warmup(
             selected=EpochScores(epoch=built.warmup.epoch, scores=outcome.scores["selected"]),

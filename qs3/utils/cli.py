@@ -27,7 +27,7 @@ INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help")
 _WIDTH = 100
-# Of Hydra: what shows something and ends.
+# Flags of Hydra that show something and end.
 _SHOWS = (*_HELP, "--hydra-help", "--version", "--cfg", "-c", "--info", "-i", "-sc")
 
 
@@ -143,6 +143,7 @@ class Command:
         examples: lines to type.
         about: paragraphs below the options.
         words: what words without "=" stand for, such as "A B"; `run` gets them as `words`.
+        bare: instead of these, the key that one word without "=" gives the value of.
         others: beginnings of keys that are handed on, with their help; "" for any key. `run` gets
             these key=value words as `more`.
         line: `run` also gets the line that was typed as `line`, to record it.
@@ -156,6 +157,7 @@ class Command:
     examples: Sequence[str]
     about: str = ""
     words: str = ""
+    bare: str = ""
     others: Mapping[str, str] = field(default_factory=dict)
     line: bool = False
     interrupted: str = "run the same command again and it continues"
@@ -182,6 +184,8 @@ class Command:
         words, more = [], []
         for word in argv:
             key, equals, value = word.partition("=")
+            if self.bare and not equals and not word.startswith("-"):
+                key, equals, value = self.bare, "=", word
             option = known.get(key) or known.get(key.removeprefix("paths."))
             if not equals and self.words:
                 words.append(word)
@@ -219,8 +223,10 @@ class Command:
         """What `--help` prints."""
         rows = [(f"{o.key}={o.kind.word}", o.explained()) for o in self.options]
         rows += [(f"{prefix}KEY=VALUE", meaning) for prefix, meaning in self.others.items()]
-        words = f" {self.words}" if self.words else ""
-        return _page(f"{self.name}{words}", self.summary, self.examples, rows, self.about)
+        words = [self.words] if self.words else []
+        words += [option.kind.word for option in self.options if option.key == self.bare]
+        name = " ".join([self.name, *words])
+        return _page(name, self.summary, self.examples, rows, self.about)
 
 
 @dataclass(frozen=True)

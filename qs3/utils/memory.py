@@ -22,7 +22,7 @@ def memory_limit() -> int:
     """Bytes that reading one file may take.
 
     Raises:
-        ConfigError: the variable is no positive number.
+        ConfigError: the variable is not a positive number.
     """
     words = os.environ.get(VARIABLE, "")
     try:
@@ -53,7 +53,7 @@ def check_memory(needed: float, where: object, kind: type[DataError] = DataError
 
 
 JSON_PEAK = 25
-"""Of memory to a text's size when its values are lists and dicts: "[[],[]," is the worst."""
+"""Peak memory over a text's size when its values are lists and dicts: "[[],[]," is the worst."""
 
 TABLE_PEAK = 20
 """Likewise of cells of two letters in lists."""

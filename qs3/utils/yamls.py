@@ -32,7 +32,7 @@ def check_yaml(text: str, where: object) -> None:
     """Refuse a text with too many values once its aliases are followed, or nested too deeply.
 
     Raises:
-        DataError: begins with `where`; also for what is no YAML.
+        DataError: begins with `where`; also if the text is not YAML.
     """
     import yaml  # type: ignore[import-untyped,unused-ignore]
 

@@ -27,7 +27,7 @@ MAKE = {"mitsuba": MitsubaRenderer, "blender": BlenderRenderer}
 
 
 def resident_mb() -> float:
-    """Of this process, now."""
+    """Resident memory of this process, now."""
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 

@@ -178,7 +178,7 @@ def test_objects_that_lie_are_found_though_each_is_turned_by_another_angle(scans
 
 
 def test_a_shape_alike_on_all_sides_tells_nothing():
-    """Of balls called chairs nothing is said, neither for z nor against it."""
+    """Balls called chairs say nothing, neither for z nor against it."""
     balls = np.random.default_rng(0).normal(size=(12, 512, 3))
     balls /= np.linalg.norm(balls, axis=2, keepdims=True)
     verdict = catalogue_model().judge(balls, "chair")

@@ -118,6 +118,25 @@ def test_mean_over_turns():
     assert not np.allclose(predict(net, points, 4), predict(net, turned, 4), atol=1e-2)
 
 
+@pytest.mark.parametrize("labelled", [True, False])
+@pytest.mark.parametrize("tiers", [{"a": "clean", "b": "hard", "d": "clean"}, {}, None])
+def test_each_tier_is_scored_by_itself(labelled, tiers):
+    clouds = Clouds.of(np.zeros((4, 6, 3), np.float32))
+    labels = torch.tensor([0, 1, 0, 1]) if labelled else None
+    evaluation = Evaluation(
+        Unlabelled(clouds, tuple("abcd")), labels, None, ("x", "y"), 2, tiers=tiers
+    )
+    p = np.array([[0.9, 0.1], [0.8, 0.2], [0.4, 0.6], [0.3, 0.7]], np.float32)
+    found = evaluation.scores_of_tiers(p)
+    if not (labelled and tiers):
+        assert found is None
+        return
+    assert {tier: (s.n, s.accuracy) for tier, s in found.items()} == {
+        "clean": (2, 1.0),  # a and d; c has none
+        "hard": (1, 0.0),
+    }
+
+
 @pytest.mark.parametrize("rotations", [0, 3])
 @pytest.mark.parametrize("labelled", [True, False])
 def test_turned_scores_stand_beside_the_plain_ones(rotations, labelled):

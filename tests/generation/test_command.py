@@ -63,6 +63,16 @@ def test_fewer_objects_or_classes_are_the_same_objects(finished, meshes, tmp_pat
         np.testing.assert_array_equal(part.points[i], whole.points[whole.ids.index(name)])
 
 
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_one_split_has_the_objects_that_it_has_in_both(finished, meshes, tmp_path, split):
+    _, whole = finished
+    part = generate(config(tmp_path, meshes, "workers=0", f"splits=[{split}]"))
+    assert set(part.counts()) == {split}
+    assert part.ids == whole.split(split).ids
+    for i, name in enumerate(part.ids):
+        np.testing.assert_array_equal(part.points[i], whole.points[whole.ids.index(name)])
+
+
 def test_a_finished_dataset_is_left_alone_and_other_settings_are_refused(finished, meshes):
     folder, _ = finished
     before = (folder / "points.npy").stat().st_mtime_ns
@@ -155,6 +165,9 @@ def test_broken_meshes_are_recorded_and_the_others_go_on(finished, meshes, tmp_p
         (["classes=[chair,dragon]"], ConfigError, "dragon"),
         (["classes=[chair,bed]"], (ConfigError, MissingDataError), "bed"),
         (["fraction=0"], ConfigError, r"fraction must be in \(0, 1\]"),
+        (["splits=train"], ConfigError, r"splits is a list: splits=\[train\]"),
+        (["splits=[]"], ConfigError, "splits is a list"),
+        (["splits=[train,val]"], ConfigError, "splits: .'val'. are not among train, test"),
         (["limit=abc"], ConfigError, "limit must be a whole number >= 1, got 'abc'"),
         (["views=1.5"], ConfigError, r"views must be a whole number >= 0, got 1\.5"),
     ],

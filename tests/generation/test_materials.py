@@ -1,4 +1,4 @@
-"""Of what bodies are made, and in which light they stand."""
+"""What bodies are made of, and in which light they stand."""
 
 import numpy as np
 import pytest

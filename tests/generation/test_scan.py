@@ -102,3 +102,17 @@ def test_colliders_of_files_are_counted_in_the_manifest(tmp_path):
     assert rows["bare"].mesh_sha256 == rows["hidden"].mesh_sha256
     assert [row.reason for row in rows.values()] == ["", "colliders left out: 1", ""]
     assert {row.status for row in rows.values()} == {"ok"}
+
+
+@pytest.mark.parametrize("up", ["z", "y"])
+def test_colliders_of_a_scene_in_memory(up):
+    bare, hidden = trimesh.Scene(), trimesh.Scene()
+    for scene in (bare, hidden):
+        scene.add_geometry(BOX, node_name="chair")
+    hidden.add_geometry(trimesh.creation.box((2, 2, 2)), node_name="chair_collider")
+    words = ("domain=modelnet10", "recipe.points=64", f"up={up}")
+    plain, seen = qs3.generate(bare, *words), qs3.generate(hidden, *words)
+    kept = qs3.generate(hidden, *words, "colliders=keep")
+    np.testing.assert_array_equal(plain.points, seen.points)
+    assert not np.array_equal(plain.points, kept.points)
+    assert [scan.colliders for scan in (plain, seen, kept)] == [0, 1, 0]

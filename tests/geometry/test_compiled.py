@@ -64,6 +64,20 @@ def test_values_are_torchs_whatever_the_threads_and_the_layout(monkeypatch, thre
     torch.testing.assert_close(ours, added.to(dtype), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_gradients_of_a_linear_layers_maxima(monkeypatch, threads):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    torch.manual_seed(0)
+    x = torch.randn(3, 50, 40, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(70, 40, dtype=torch.float64, requires_grad=True)
+    best, where = (x @ weight.T).max(1)
+    grad = torch.randn(70, 3, dtype=torch.float64).T
+    expected = torch.autograd.grad(best, (x, weight), grad)
+    found = compiled.linear_max_backward(x, weight, grad, where)
+    for ours, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
 def test_threads_move_no_bit(monkeypatch):
     torch.manual_seed(0)
     x, index = torch.randn(500, 64), edges(500, 4000, 20)
@@ -110,6 +124,8 @@ def test_torchs_compiler_knows_them():
     torch.library.opcheck(compiled.neighbour_max, (x, index), test_utils=checks)
     torch.library.opcheck(compiled.neighbour_max_backward, (best, where, 9), test_utils=checks)
     torch.library.opcheck(compiled.add_to_neighbours, (x, index), test_utils=checks)
+    of_layer = torch.randn(2, 9, 4), torch.randn(3, 4), torch.randn(2, 3), edges(9, 2, 3)
+    torch.library.opcheck(compiled.linear_max_backward, of_layer, test_utils=checks)
 
 
 FORKED = """

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3.errors import MeshError
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.io import load_mesh
+from qs3.meshes.mesh import Mesh
 from tests.meshes.written import PYRAMID, corners, dae, gltf, refused, save
 
 
@@ -65,3 +67,48 @@ def test_collada(tmp_path):
     path = save(tmp_path, "a.dae", dae(nodes=nodes))
     assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (2, 1)
     assert len(load_mesh(path, keep_colliders=True).faces) == 6
+
+
+@pytest.mark.parametrize("kind", ["glb", "3mf"])
+def test_a_scene_in_memory_goes_by_the_same_rule(tmp_path, kind):
+    scene = trimesh.Scene()
+    scene.add_geometry(PYRAMID, node_name="chair", geom_name="chair")
+    scene.add_geometry(trimesh.creation.box((9, 9, 9)), node_name="UCX_chair_01")
+    path = save(tmp_path, f"a.{kind}", scene.export(file_type=kind))
+    for keep in (False, True):
+        read = load_mesh(path, keep_colliders=keep)
+        for held in (scene, trimesh.load(path)):
+            mesh = Mesh.from_trimesh(held, keep_colliders=keep)
+            assert (len(mesh.faces), mesh.colliders) == (len(read.faces), read.colliders)
+    assert len(mesh.faces) == len(PYRAMID.faces) + 12
+    alone = trimesh.Scene(PYRAMID)
+    np.testing.assert_allclose(corners(Mesh.from_trimesh(scene)), corners(PYRAMID))
+    assert Mesh.from_trimesh(alone).colliders == 0
+
+
+def test_below_a_node_in_memory():
+    """All of it goes and is counted once; below a mesh of such a name the rest stays."""
+
+    def held(node, mesh):
+        scene = trimesh.Scene()
+        scene.add_geometry(PYRAMID, node_name="chair", geom_name="chair")
+        scene.add_geometry(PYRAMID, node_name=node, geom_name=mesh)
+        scene.add_geometry(PYRAMID, node_name="b", geom_name="leg", parent_node_name=node)
+        scene.add_geometry(PYRAMID, node_name=7, geom_name="foot", parent_node_name="b")
+        scene.add_geometry(PYRAMID, node_name="c_collider", geom_name="c", parent_node_name="b")
+        return scene
+
+    found = {
+        (node, mesh): Mesh.from_trimesh(held(node, mesh))
+        for node, mesh in [("a_collider", "a"), ("a", "a_collision"), ("a", "a")]
+    }
+    parts = [(len(m.faces) / len(PYRAMID.faces), m.colliders) for m in found.values()]
+    assert parts == [(1, 1), (3, 2), (4, 1)]
+
+
+def test_nothing_but_colliders_in_memory():
+    scene = trimesh.Scene({"a_collider": PYRAMID})
+    with pytest.raises(MeshError, match=r"no faces but in 1 colliders.*colliders=keep"):
+        Mesh.from_trimesh(scene)
+    assert len(Mesh.from_trimesh(scene, keep_colliders=True).faces) == len(PYRAMID.faces)
+    assert len(Mesh.from_trimesh(PYRAMID).faces) == len(PYRAMID.faces)

@@ -40,7 +40,7 @@ def test_tree_order_by_recursion(b: int, n: int, seed: int) -> None:
 
 
 def test_matches_are_near_those_of_the_exact_assignment() -> None:
-    """Of clouds of different classes; at 1,024 points 1.1 to 1.3 times the least total distance."""
+    """For clouds of different classes; at 1,024 points 1.1 to 1.3 times the least distance."""
     generator = torch.Generator().manual_seed(0)
     labels = torch.arange(4)
     first, second = boxes(labels, 256, generator), boxes(labels.flip(0), 256, generator)

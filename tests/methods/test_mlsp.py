@@ -144,7 +144,7 @@ def thin(points: Tensor) -> Tensor:
 
 @pytest.mark.slow
 def test_mlsp_learns_the_target_s_surfaces() -> None:
-    """Of thin target clouds not seen it tells normals and places that its copy does not know.
+    """It tells normals and places of unseen thin target clouds, which its copy does not know.
 
     The copy does the same task on the source's clouds. This is what its loss asks for: normals 0.72
     (1 by chance) against 1.10, places 0.57 against 0.75; cardinalities are the same. Of three

@@ -27,7 +27,7 @@ CATALOGUE = MadeOf(objects="embedded catalogue", sensor="kinect_like", views=4, 
 
 
 def scores(accuracy=0.5, **changes):
-    """Of 200 clouds of two classes; with accuracy=None of clouds without labels."""
+    """Scores of 200 clouds of two classes; with accuracy=None of clouds without labels."""
     known = {}
     if accuracy is not None:
         known = {"accuracy": accuracy, "balanced_accuracy": accuracy - 0.1, "majority_rate": 0.45}

@@ -39,7 +39,7 @@ def test_student_result_and_checkpoint_have_the_same_weights(finished):  # noqa:
 
 
 def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
-    """Of all bytes a sixth; torch alone takes flips in the weights for other weights."""
+    """Every sixth byte is tried; torch alone takes flips in the weights for other weights."""
     file = tmp_path / "a.pt"
     value = {"epoch": 3, "w": torch.arange(6.0)}
     save(value, file)

@@ -54,7 +54,7 @@ def whole() -> RunMetrics:
         final=judged,
         evaluation=Evaluated(
             split="test", labels=True, rotations=12, norms="adabn",
-            final_over_rotations=judged, warmup_over_rotations=judged,
+            final_over_rotations=judged, warmup_over_rotations=judged, tiers={"hard": judged},
         ),
         warmup=Warmup(selected=last, last=last),
         rounds=[

@@ -77,7 +77,7 @@ class Problem:
     def student(
         self, selector: Selector, theta: float, method: Student | None = None, rounds: int = 3
     ) -> nn.Module:
-        """Of the last round: each begins afresh, on the selected target samples alone."""
+        """Student of the last round: each begins afresh, on the selected target samples alone."""
         teacher = self.teacher
         ids = [f"{i:04d}" for i in range(len(self.target))]
         for round_ in range(rounds):
@@ -92,7 +92,7 @@ class Problem:
         return teacher
 
     def balanced_accuracy(self, net: nn.Module) -> float:
-        """Of the held-out target samples."""
+        """Balanced accuracy on the held-out target samples."""
         right = torch.from_numpy(probabilities(net, self.held_out).argmax(1)) == self.labels
         return float(np.mean([right[self.labels == k].double().mean() for k in range(CLASSES)]))
 

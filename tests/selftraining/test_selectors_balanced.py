@@ -123,7 +123,7 @@ def test_spst_keeps_every_confident_sample(p, theta) -> None:
 
 @given(probabilities, st.sampled_from([0.2, 0.35, 0.5, 1.0]))
 def test_cbst_keeps_at_least_its_portion_of_each_class(p, portion) -> None:
-    """Of the samples predicted k, floor(portion n_k) at least are >= theta_k."""
+    """At least floor(portion n_k) of the samples predicted k are >= theta_k."""
     selection, _ = select(Cbst(portion=portion, most=1.0), p)
     predicted = p.argmax(axis=1)
     for k in range(4):

@@ -258,7 +258,7 @@ def test_configs_are_within_what_self_training_takes(name):
 
 
 def test_the_grid_is_every_combination(tmp_path):
-    """Of what the command line leaves open; it ends with the objective of each."""
+    """Every combination of what the command line leaves open; it ends with each objective."""
     fixed = [
         "selftraining.rounds=6",
         "selftraining.epsilon=0.0,0.01",

@@ -139,7 +139,7 @@ def test_a_share_of_the_target_exceeds_each_round_s_threshold(continued: Kept) -
 
 @pytest.mark.slow
 def test_target_norms_go_on_from_the_source_s(tmp_path: Path, toy_data: Path) -> None:
-    """Of a teacher that never saw the target: by its batches, the source's statistics count."""
+    """For a teacher that never saw the target, by its batches: the source's statistics count."""
     net = "model._target_=tests.training.nets.domained"
     settings = ("selftraining=spst", "selftraining.theta=0.35", "selftraining.rounds=1", net)
     run = kept_run(tmp_path, toy_data, "method=source_only", *settings)

@@ -231,7 +231,7 @@ def test_held_out_clouds_are_not_trained_on(toy, monkeypatch):
 
 
 def test_held_out_accuracy(by_rule, toy, toy_data):
-    """Of the epoch that was chosen, again from its weights, the seed and the round's table."""
+    """Computed again for the chosen epoch from its weights, the seed and the round's table."""
     folder = by_rule("pseudo_val")
     student = metrics_of(folder).student
     rows = read_pseudo_labels(folder / "round_01" / "pseudo_labels.csv")

@@ -97,6 +97,21 @@ def test_words_are_refused_where_none_belong():
         QS3.command("predict").parse(["ckpt=x", "scans"])
 
 
+def test_one_bare_word_may_stand_for_a_key():
+    inspect = QS3.command("inspect")
+    assert inspect.parse(["modelnet10", "sample=9"]) == inspect.parse(
+        ["domain=modelnet10", "sample=9"]
+    )
+    assert inspect.help().startswith("qs3 inspect NAME: ")
+    for words in (["modelnet10", "shapenet10"], ["domain=modelnet10", "modelnet10"]):
+        with pytest.raises(ConfigError, match="domain= is given twice"):
+            inspect.parse(words)
+    with pytest.raises(ConfigError, match="'--sample' is not key=value"):
+        inspect.parse(["modelnet10", "--sample"])
+    with pytest.raises(ConfigError, match="domain=NAME is missing"):
+        inspect.parse(["variant=x"])
+
+
 def test_a_key_that_any_domain_might_have_is_named_if_one_is_missing():
     with pytest.raises(ConfigError, match="domain=NAME is missing; not domian="):
         QS3.command("inspect").parse(["domian=modelnet10", "variant=x"])

@@ -230,7 +230,7 @@ def inliers(points_m: Float[np.ndarray, "n 3"], rules: Rules) -> Bool[np.ndarray
 
 
 def thickness_m(points_m: Float[np.ndarray, "n 3"]) -> float:
-    """Of the thinnest plate about the mean that holds nine tenths of the points."""
+    """Thickness of the thinnest plate about the mean that holds nine tenths of the points."""
     centred = points_m - points_m.mean(axis=0)
     _, _, axes = np.linalg.svd(centred.T @ centred)
     low, high = np.quantile(centred @ axes[2], [(1 - _PLATE) / 2, (1 + _PLATE) / 2])

@@ -32,7 +32,7 @@ from qs3.utils.yamls import load_yaml
 
 MILLIMETRE = 1e-3
 MOST_OBJECTS = 1000
-"""Of a mask: one with more numbers is something else."""
+"""Limit on the objects of a mask: an image with more numbers is something else."""
 
 _MOST_TEXT = 1 << 20  # bytes of a file with intrinsics
 _MOST_PNG = 1 << 26
@@ -45,7 +45,7 @@ _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the unit is wrong
 
 
 class Intrinsics(NamedTuple):
-    """What a file says of a camera.
+    """A camera as a file describes it.
 
     Attributes:
         camera: without distortion.

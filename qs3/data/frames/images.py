@@ -78,7 +78,7 @@ class DepthImage:
 
     @cached_property
     def points_m(self) -> Float[np.ndarray, "h w 3"]:
-        """Of each pixel, z up, the camera at the origin; pixels without depth are at the origin."""
+        """Points of all pixels, z up; the camera and pixels without depth are at the origin."""
         rays = self.camera.rays(*self.depth_m.shape)
         return (rays * self.depth_m[..., None]) @ np.asarray(self.world_from_camera).T
 

@@ -33,7 +33,7 @@ from qs3.data.frames.matlab import AGAIN, load_v5, own_array, variable, words
 from qs3.errors import DataError, MissingDataError
 
 CAMERA = Pinhole(518.857901, 519.469611, 325.582449 - 1, 253.736166 - 1)
-"""Of the colour camera, whose image the depth lies in; (0, 0) is the first pixel's centre."""
+"""The colour camera, whose image the depth lies in; (0, 0) is the first pixel's centre."""
 
 AREA = (44, 471, 40, 601)
 """Rows from, to and columns from, to of the depth that was projected; of pictures of 640 x 480."""
@@ -173,7 +173,7 @@ class LabelledFrames:
 
 
 def read_splits(path: Path, frames: int) -> list[str]:
-    """Of each frame: "train", "test", or "" if it is in neither list.
+    """The split of each frame: "train", "test", or "" if it is in neither list.
 
     Raises:
         MissingDataError: there is no such file.

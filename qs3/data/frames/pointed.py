@@ -208,7 +208,7 @@ def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, i
     """Rows from, to and columns from, to of a box within the picture.
 
     Raises:
-        DataError: four numbers that are no box, or one beside the picture.
+        DataError: the numbers do not make a box, or it lies outside the picture.
     """
     height, width = shape
     values = [float(value) for value in box]

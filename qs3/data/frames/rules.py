@@ -17,7 +17,7 @@ from qs3.errors import ConfigError
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one class.
+    """What an object of one class must be like.
 
     Attributes:
         pixels: an object has at least so many with depth.
@@ -43,7 +43,7 @@ class Rules:
     """How an object is cut, and when it is refused.
 
     Attributes:
-        near_m, far_m: depths outside are no measurements.
+        near_m, far_m: depths outside do not count as measured.
         erode_px: taken off a mask all round; a box has no such edge.
         jump_m, jump_share: neighbouring pixels belong together if their depths differ by no more
             than the larger of the two, the second a share of the depth.
@@ -119,5 +119,5 @@ class Rules:
             raise ConfigError(f"published.rules: {error}") from error
 
     def limits_of(self, cls: str) -> Limits:
-        """Of a class."""
+        """Limits of a class: its own, or the default ones."""
         return self.limits.get(cls) or self.limits.get("default") or Limits()

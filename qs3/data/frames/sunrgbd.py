@@ -94,7 +94,7 @@ def read_frames(root: Path) -> list[Frame]:
 
 
 def read_splits(root: Path, splits: str = SPLITS) -> dict[PurePosixPath, str]:
-    """Of each frame's folder: "train" or "test".
+    """The split of each frame, by its folder: "train" or "test".
 
     Raises:
         MissingDataError: there is no such file.
@@ -170,7 +170,7 @@ def _frame(entry: Any, number: int, where: str) -> Frame:
 
 
 def _box(entry: dict[str, Any]) -> LabelledBox:
-    """One of thousands that people drew: what is no box costs only itself."""
+    """One of thousands that people drew: one that is not a box costs only itself."""
     name = str(entry.get("classname", ""))
     try:
         axes = _numbers(_field(entry, "the box", "basis"), (3, 3), "its basis")

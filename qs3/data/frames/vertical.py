@@ -39,7 +39,7 @@ _WITHIN_DEG = (45.0, 45.0, 45.0, 15.0, 15.0, 15.0)  # a plane counts as level or
 def floor_up(
     depth_m: Float[np.ndarray, "h w"], camera: Pinhole, floor: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, " 3"] | None:
-    """Unit vector up by the floor; None if too little of it is seen, or it is no plane."""
+    """Unit vector up by the floor; None if too little of it is seen, or it is not plane."""
     used = floor & (depth_m > 0)
     if used.sum() < LEAST_FLOOR_PX:
         return None

@@ -30,7 +30,7 @@ class NamedArrays(Importer):
 
     @property
     def path(self) -> Path:
-        """Of the .npz."""
+        """Where the .npz lies."""
         return self.root / self.file
 
     def made_of(self) -> MadeOf:

@@ -48,7 +48,7 @@ class FrameTask:
         cluster: what is not independent of it: its room, or the block of frames it is one of.
         sensor: that took it.
         vertical: how its vertical was found.
-        world_from_camera: [3][3] rotation to z up; None if the reader knows it.
+        world_from_camera: `[3][3]` rotation to z up; None if the reader knows it.
     """
 
     number: int

@@ -162,7 +162,7 @@ class NYUv2(FrameImporter):
     def _verticals(
         self, frames: LabelledFrames, splits: Sequence[str]
     ) -> dict[int, tuple[str, np.ndarray] | None]:
-        """Of each frame of a split: the way its vertical was found, and up in the camera."""
+        """How the vertical of each frame of a split was found, and up in its camera."""
         chosen = [i for i, split in enumerate(splits) if split]
         floors: dict[int, np.ndarray] = {}
         if "planes" not in self.vertical[:1]:
@@ -211,7 +211,7 @@ class NYUv2(FrameImporter):
 
 
 def _room(scene: str) -> str:
-    """Of a scene's name: bookstore_0001d is one of several recordings of bookstore_0001."""
+    """The room in a scene's name: bookstore_0001d is a recording of bookstore_0001."""
     return re.sub(r"(?<=\d)[a-z]$", "", re.sub(r"[^\w-]", "-", scene))
 
 

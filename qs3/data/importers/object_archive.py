@@ -13,8 +13,8 @@
     rim, occ       [N] float      optional: share of its outline that the picture cuts off, and that
                                   something nearer covers
 
-Frames in a row show one room: objects of one block of frames are no independent samples, and a
-part of the archive that judges is blocks away from one that is trained on.
+Frames in a row show one room: objects of one block of frames are not independent, and a part of the
+archive that judges is blocks away from one that is trained on.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class ObjectArchive(Importer):
 
     @property
     def path(self) -> Path:
-        """Of the .npz."""
+        """Where the .npz lies."""
         return self.root / Path(self.file).expanduser()
 
     def made_of(self) -> MadeOf:
@@ -243,7 +243,7 @@ class ObjectArchive(Importer):
         return f"the objects in {self.path}"
 
     def _splits(self, archive: Archive) -> list[str]:
-        """Of each object; "" for those that are left out.
+        """The split of each object; "" for those that are left out.
 
         Raises:
             DataError: the file has no parts to make folds of.

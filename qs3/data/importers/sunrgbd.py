@@ -1,7 +1,7 @@
 """SUN RGB-D: objects by oriented box, less the floor, from the raw depth of four sensors.
 
 The archive is described in `qs3.data.frames.sunrgbd`. What lies in an object's box and is not its
-floor is cut by `qs3.data.frames.cutting`. A box is no mask: a chair under a table lies in the
+floor is cut by `qs3.data.frames.cutting`. A box is not a mask: a chair under a table lies in the
 table's box, too, and what stands on a table is cut with it. Nor can it have holes: that column of
 the manifest is 0.
 """

@@ -56,20 +56,26 @@ INSPECT = Command(
     "what a dataset is like, before training on it",
     _inspect,
     (
-        Option("domain", text("NAME"), "of conf/domain, or a dataset's folder", required=True),
+        Option(
+            "domain",
+            text("NAME"),
+            "of conf/domain, or a dataset's folder; domain= may be left out",
+            required=True,
+        ),
         *_COMMON,
         Option("out", text("FOLDER"), "out/inspection/NAME by default"),
     ),
     (
-        "qs3 inspect domain=modelnet10",
+        "qs3 inspect modelnet10",
         "qs3 inspect domain=own published.folder=scans",
-        "qs3 inspect domain=data/specklenet10 variant=points_clean",
+        "qs3 inspect data/specklenet10 variant=points_clean",
     ),
     about="""
 What it is made of, counts by class and split, sizes, which way is up by the shape, spacing,
 density, coverage, copies, leaks from train to test, odd objects; a contact sheet, and a page where
 clouds can be turned. Published files are imported first.
 """,
+    bare="domain",
     others={"": _KEYS},
     interrupted="nothing was saved",
 )

@@ -32,7 +32,7 @@ UPS: tuple[str, ...] = ("+z", "-z", "+x", "-x", "+y", "-y")
 """The directions that may point up, in the order of all arrays here."""
 
 POINTS = 512
-"""Of a cloud that are looked at."""
+"""How many points of a cloud are looked at."""
 
 LEARNT = Path(__file__).with_name("gravity.json")
 """The model of the embedded catalogue."""

@@ -2,4 +2,4 @@
 
 COLOURS = ("height", "view", "residual", "class", "confidence")
 MOST_CLOUDS, MOST_POINTS, MOST_IN_ALL = 500, 200_000, 3_000_000
-"""Of a page, of a cloud, and of all clouds together: 8 bytes a point and what is known of it."""
+"""Limits of a page, a cloud, and all clouds together: 8 bytes a point and what is known of it."""

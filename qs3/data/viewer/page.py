@@ -103,7 +103,7 @@ def points_each(clouds: int, asked: int | None) -> int:
     """How many points each of so many clouds may have: `asked`, else what keeps a page small.
 
     Raises:
-        ConfigError: so many clouds of so many points are no page that a browser likes.
+        ConfigError: so many clouds of so many points are too much for a browser.
     """
     if clouds > MOST_CLOUDS:
         raise ConfigError(f"clouds={clouds}: a page holds {MOST_CLOUDS} at most")

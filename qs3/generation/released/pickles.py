@@ -142,6 +142,6 @@ class _Unpickler(_PythonUnpickler):
 
 
 def _check_keys(keys: list[Any]) -> None:
-    """Texts only: to find a tuple of tuples, all of it is looked through."""
+    """Refuse keys but strings: to find a tuple of tuples, all of it is looked through."""
     if any(type(key) is not str for key in keys):
-        raise DataError("a key that is no text")
+        raise DataError("a key that is not a string")

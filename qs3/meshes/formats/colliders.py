@@ -11,6 +11,11 @@ fill the legs of a chair. Known by the name of the node or of its mesh, in any c
 from __future__ import annotations
 
 import re
+from collections.abc import Hashable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import trimesh
 
 _NAME = re.compile(
     r"^(UCX|UBX|UCP|USP|MCDCX)_"
@@ -21,7 +26,7 @@ _NAME = re.compile(
 
 
 class Colliders:
-    """Says which nodes are left out of a file, and counts them.
+    """Says which nodes are left out of a file or of a scene in memory, and counts them.
 
     Attributes:
         skip: False leaves none out.
@@ -37,3 +42,27 @@ class Colliders:
         found = self.skip and any(_NAME.search(str(name)) for name in names if name)
         self.count += found
         return found
+
+    def left_out_of(self, scene: trimesh.Scene) -> set[Hashable]:
+        """Nodes of trimesh's scene whose geometry is left out: colliders, and all below them.
+
+        As in files: a node below another one that is left out is not counted again, and a mesh
+        with such a name hides the node's own geometry only.
+        """
+        forest, hidden = scene.graph.transforms, set()
+        waiting = [node for node in forest.nodes if node not in forest.parents]
+        while waiting:
+            node = waiting.pop()
+            if self.left_out(str(node)):
+                hidden |= forest.successors(node)
+                continue
+            if self.left_out(forest.node_data[node].get("geometry")):
+                hidden.add(node)
+            waiting += forest.children.get(node, ())
+        return hidden
+
+    @property
+    def exception(self) -> str:
+        """What follows "has no faces" where colliders were left out."""
+        but = f" but in {self.count} colliders, which are left out: colliders=keep keeps them"
+        return but if self.count else ""

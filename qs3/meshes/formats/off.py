@@ -1,7 +1,8 @@
 """OFF, the format of ModelNet, with its variants of the first line.
 
-trimesh 5.2 is not used here: it reads a file that was cut without a word, crashes on mixed
-polygons, divides quads in another order, takes "4OFF" for OFF, and needs seven times as long.
+trimesh 5.2 is not used here: it reads a file whose last faces were cut off without a word, and
+crashes on a pentagon or a larger polygon beside any other. Triangles with quads it reads correctly,
+with the quads' faces last. It takes "4OFF" for OFF, and needs about six times as long.
 
 http://www.geomview.org/docs/html/OFF.html
 """

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from qs3.geometry import compiled
 from qs3.geometry.matmul import matmul_t
 from qs3.geometry.neighbours import exporting
 from qs3.models import fast
@@ -114,6 +115,9 @@ class _Largest(torch.autograd.Function):
             dweight += torch.outer(dmean, centre)
         else:
             dy, dweight = torch.zeros_like(rows), torch.zeros_like(weight)
+        if compiled.usable(rows):
+            found = compiled.linear_max_backward(rows.view(b, n, c), weight, dbest, where)
+            return dy.view(b, n, c).add_(found[0]), dweight.add_(found[1]), None
         for i in range(b):  # D has one entry a cloud and channel
             at, grad = where[i] + i * n, dbest[i, :, None]
             dy.index_add_(0, at, grad * weight)
@@ -164,6 +168,9 @@ class _PooledLinear(torch.autograd.Function):
         most, mean = grad.chunk(2, dim=1)  # [b, d] each
         dx = (mean @ weight / x.shape[1])[:, None].expand_as(x).contiguous()
         dweight = mean.T @ centre
+        if compiled.usable(x):
+            found = compiled.linear_max_backward(x, weight, most, where)
+            return dx.add_(found[0]), dweight.add_(found[1])
         for x_i, dx_i, most_i, where_i in zip(x, dx, most[:, :, None], where, strict=True):
             dx_i.index_add_(0, where_i, most_i * weight)
             dweight.addcmul_(most_i, x_i.index_select(0, where_i))

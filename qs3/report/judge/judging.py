@@ -33,7 +33,7 @@ BLOCK = 30
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one family of runs on one tier of objects.
+    """Figures of one family of runs on one tier of objects.
 
     Attributes:
         tier: "all", "clean" or "hard".

@@ -43,7 +43,7 @@ def part_of_run(
     residuals: bool = True,
     advance: Callable[[], None] = lambda: None,
 ) -> Part:
-    """Clouds of the run's target with what its result says of them.
+    """Clouds of the run's target with its result's predictions.
 
     Args:
         run: finished.

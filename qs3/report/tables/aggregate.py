@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from qs3.data.importers.object_archive import TIERS
 from qs3.errors import DataError
 from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, Scores, read_metrics
 from qs3.utils.text_table import aligned
@@ -117,14 +118,27 @@ class Group:
         return self.first is not None and self.first.final.accuracy is None
 
     def stat(self, score: str, take: str = "final") -> Stat | None:
-        """Mean of a score of `Scores` over seeds; None if there is nothing that may be averaged.
-
-        `take`: "final", or "warmup" for the teacher of round 0.
-        """
+        """Mean of a score over seeds, see `value_of`; None if nothing may be averaged."""
         if not self.results or not self.comparable:
             return None
-        values = [getattr(scores_of(result, take), score) for result in self.results]
-        return None if None in values else Stat.of(values)
+        values = [value_of(result, score, take) for result in self.results]
+        known = [value for value in values if value is not None]
+        return Stat.of(known) if len(known) == len(values) else None
+
+
+def value_of(metrics: RunMetrics, score: str, take: str = "final") -> float | None:
+    """A run's score by the name of a table's metric.
+
+    Args:
+        score: of `Scores`; with "_clean" or "_hard" behind it of that tier, for "final" alone.
+        take: "final", or "warmup" for the teacher of round 0.
+    """
+    name, _, tier = score.rpartition("_")
+    if tier not in TIERS:
+        found: float | None = getattr(scores_of(metrics, take), score)
+        return found
+    tiers = (metrics.evaluation.tiers or {}) if take == "final" else {}
+    return getattr(tiers[tier], name) if tier in tiers else None
 
 
 def scores_of(metrics: RunMetrics, take: str = "final") -> Scores:

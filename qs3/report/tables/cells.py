@@ -5,13 +5,27 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from qs3.config.location import typed
 from qs3.errors import ConfigError
-from qs3.report.tables.aggregate import FEW_SEEDS, Group, Stat, scores_of
+from qs3.report.tables.aggregate import FEW_SEEDS, Group, Stat, value_of
 
 SEEDS = (0, 1, 2)
-METRICS = {"accuracy": "accuracy %", "balanced_accuracy": "balanced accuracy %"}
+Metric = Literal[
+    "accuracy", "balanced_accuracy",
+    "accuracy_clean", "accuracy_hard", "balanced_accuracy_clean", "balanced_accuracy_hard",
+]  # fmt: skip
+"""What a table can show: scores of all clouds, or of one tier of a dataset that has tiers."""
+
+METRICS: Mapping[Metric, str] = {
+    "accuracy": "accuracy %",
+    "balanced_accuracy": "balanced accuracy %",
+    "accuracy_clean": "accuracy, clean %",
+    "accuracy_hard": "accuracy, hard %",
+    "balanced_accuracy_clean": "balanced accuracy, clean %",
+    "balanced_accuracy_hard": "balanced accuracy, hard %",
+}
 INCOMPLETE = "†"
 """Marks a number that lacks a seed which failed or is not finished."""
 
@@ -88,11 +102,11 @@ class Cell:
         """Whether a seed failed, is not finished or not readable."""
         return bool(self.group and self.group.problems)
 
-    def ours(self, metric: str) -> Stat | None:
+    def ours(self, metric: Metric) -> Stat | None:
         """Our mean of a metric; None if there is none."""
         return self.group.stat(metric, self.take) if self.group else None
 
-    def text(self, metric: str) -> str:
+    def text(self, metric: Metric) -> str:
         """What the table shows: the number, or why there is none."""
         mark = f" {INCOMPLETE}" if self.incomplete else ""
         if (stat := self.ours(metric)) is not None:
@@ -103,6 +117,8 @@ class Cell:
             return "not available yet"
         if self.group and self.group.unlabelled:
             return "no target labels"
+        if self.group and self.group.results and value_of(self.group.results[0], metric) is None:
+            return "no such tier"
         if self.group and self.group.finished:
             return "not averaged" + mark
         return "not finished" + mark if mark else "not run"
@@ -129,7 +145,7 @@ class Table:
     name: str
     title: str
     notes: tuple[str, ...]
-    metrics: tuple[str, ...]
+    metrics: tuple[Metric, ...]
     columns: tuple[str, ...]
     rows: Mapping[str, tuple[Cell | None, ...]]
     benchmark: bool = False
@@ -155,21 +171,22 @@ class Table:
         cells = (row[column] for row in self.rows.values())
         return tuple(dict.fromkeys(c.target for c in cells if c and c.simulated))
 
-    def average(self, row: str, metric: str) -> Stat | None:
-        """Of our numbers over all columns, seed by seed; None unless every column has the same."""
+    def average(self, row: str, metric: Metric) -> Stat | None:
+        """Average of our numbers over all columns, by seed; None unless all have the same seeds."""
         values: dict[int, list[float]] = {}
         for cell in self.rows[row]:
             stat = cell.ours(metric) if cell else None
             if cell is None or cell.group is None or stat is None:
                 return None
             for result in cell.group.results:
-                found = getattr(scores_of(result, cell.take), metric)
-                values.setdefault(result.seed, []).append(found)
+                found = value_of(result, metric, cell.take)
+                if found is not None:
+                    values.setdefault(result.seed, []).append(found)
         if any(len(v) != len(self.columns) for v in values.values()):
             return None
         return Stat.of([sum(v) / len(v) for v in values.values()])
 
-    def average_text(self, row: str, metric: str) -> str:
+    def average_text(self, row: str, metric: Metric) -> str:
         """What the table shows of it; "" if there is none."""
         stat = self.average(row, metric)
         if stat is None:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from qs3.report.tables.aggregate import FEW_SEEDS, Group, data_lines, task
-from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Table
+from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Metric, Table
 from qs3.report.tables.made_of import OTHER_DATA, data_marks, is_other, results_of
 from qs3.utils import text_table
 from qs3.utils.text_table import latex_row, latex_text
 
-_ACCURACY = "accuracy"  # what papers give
+_ACCURACY: Metric = "accuracy"  # what papers give
 SIMULATED = "SIMULATED target"
 TO_RUN = "Not run yet, or with fewer seeds than are wanted"
 _RULES = {"source_val": "source validation", "last": "last epoch"}

@@ -19,7 +19,7 @@ from qs3.runs.metrics import FINISHED, METRICS, write_metrics
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
 
 DIGITS = 4
-"""Of the probabilities that are kept."""
+"""Digits of the probabilities that are kept."""
 
 
 def keep(table: Table, folder: str | Path) -> list[Path]:
@@ -48,7 +48,7 @@ def keep(table: Table, folder: str | Path) -> list[Path]:
 
 
 def finished_runs(table: Table) -> list[Run]:
-    """Of all cells, each once."""
+    """Finished runs of all cells, each once."""
     found = {run.folder: run for c in table.cells if c.group for run in c.group.finished}
     return list(found.values())
 

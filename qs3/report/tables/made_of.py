@@ -12,7 +12,7 @@ OTHER_DATA = "‡"
 
 
 def results_of(table: Table) -> list[RunMetrics]:
-    """Of all finished runs of a table, cell by cell."""
+    """Results of all finished runs of a table, cell by cell."""
     return [result for cell in table.cells if cell.group for result in cell.group.results]
 
 

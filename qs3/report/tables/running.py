@@ -26,7 +26,7 @@ LAUNCHERS: Mapping[str, str | None] = {
     "submitit_slurm": "hydra.launcher.array_parallelism",
     "slurm": "hydra.launcher.array_parallelism",
 }
-"""Of Hydra, and the setting of each that says how many jobs run at the same time, if it can."""
+"""Hydra's launchers, and the setting of each for how many jobs run at the same time, if any."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from qs3.config.location import CONF
 from qs3.config.quoting import override
 from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import Group, group, load_runs
-from qs3.report.tables.cells import SEEDS, Cell, Published, Table
+from qs3.report.tables.cells import SEEDS, Cell, Metric, Published, Table
 from qs3.report.tables.keeping import with_kept
 from qs3.report.tables.running import chosen
 from qs3.utils.memory import YAML_PEAK, read_whole
@@ -37,7 +37,7 @@ class _Spec:
     """A table's file; a row's entries are `_cell`'s business."""
 
     title: str
-    metrics: list[Literal["accuracy", "balanced_accuracy"]]
+    metrics: list[Metric]
     columns: list[str] | dict[str, str | None]
     rows: list[dict[str, Any]]
     layout: Literal["", "benchmark"] = ""
@@ -252,7 +252,7 @@ class _Composed(NamedTuple):
 
 @functools.lru_cache(maxsize=4096)
 def _composed(words: tuple[str, ...]) -> _Composed:
-    """Of a command line of train.py. Kept: `report train` and effects read a table again and again.
+    """A command line of train.py, composed. Kept: `report train` and effects ask for it often.
 
     Raises:
         HydraException: as Hydra's `compose`.

@@ -39,7 +39,7 @@ _HEADER = 1 << 16  # bytes of a PLY file that its header is looked for in
 
 @dataclass(frozen=True)
 class Settings:
-    """Of one call; see `qs3 view --help`."""
+    """Settings of one call; see `qs3 view --help`."""
 
     paths: tuple[str, ...]
     out: str = "view.html"

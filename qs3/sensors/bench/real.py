@@ -118,7 +118,7 @@ def outline(depth_m: np.ndarray) -> np.ndarray:
 
 
 def shadow_side(depth_m: np.ndarray, gaps: np.ndarray) -> float:
-    """Of the hole pixels between two depths 3 cm apart or more: the share left of the nearer."""
+    """Share of the hole pixels between depths 3 cm apart or more that lie left of the nearer."""
     left_px = right_px = 0
     for row, line in zip(depth_m, gaps, strict=True):
         edges = np.flatnonzero(np.diff(np.pad(line.astype(np.int8), 1)))

@@ -16,7 +16,7 @@ from qs3.sensors.renderers.base import Body
 
 POSE = look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]))
 ALBEDO = 0.8
-"""Of all targets: a light wall."""
+"""Albedo of all targets: a light wall."""
 
 _QUAD = np.array([[0, 1, 2], [0, 2, 3]])
 

@@ -94,7 +94,7 @@ class FittedDepth(DepthSensor):
     def measure(
         self, clean_m: np.ndarray, cosine: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the camera says of true depths `clean_m` [h, w] float32, inf where nothing is.
+        """Depths that the camera measures where `clean_m` [h, w] are true, inf where nothing is.
 
         `cosine` [h, w] float32 is that of the angle of incidence.
 

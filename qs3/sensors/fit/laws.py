@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -81,50 +82,22 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
     """
     if not steps.inverse_per_m and all(_few_levels(wall, steps) for wall in walls):
         raise DataError(_TURN)
-    depth, sigma, before, white, frame, together = [], [], [], [], [], []
-    hidden = False
+    bins: list[_Bin] = []
+    together, hidden = [], False
     for index, wall in enumerate(walls):
         surface = smooth_wall(wall, steps)
         together.append(share_together(wall, surface, steps))
-        usable = wall.on_wall & (wall.tilt_deg < _FACING_DEG)
-        if not usable.any():
-            usable = wall.on_wall
-        z, mean, measured = wall.plane_m[usable], surface[usable], wall.depth_m[usable]
-        if _within_a_step(1 / z, 1 / measured - mean, wall.gap_per_m):
-            hidden = True
-            continue
-        low, high = steps.interval(measured)
-        bins = np.floor(np.log(z) / np.log(_BIN)).astype(int)
-        for number in np.unique(bins):
-            inside = bins == number
-            if inside.sum() < _LEAST_IN_BIN:
-                continue
-            sigma.append(inner_spread(measured[inside] - 1 / mean[inside]))
-            # A single level says nothing of what lies below a step.
-            levels = len(np.unique(measured[inside].astype(np.float32)))
-            found = spread_between(low[inside], high[inside], mean[inside]) if levels > 1 else 0.0
-            depth.append(float(z[inside].mean()))
-            before.append(found * depth[-1] ** 2)
-            white.append(inside.sum())
-            frame.append(index)
-    if not depth and hidden:
-        raise DataError(_TURN)
-    if not depth:
+        found = _bins(index, wall, surface, steps)
+        hidden |= found is None
+        bins += found or []
+    if not bins and not hidden:
         raise DataError("too few pixels lie on the wall to measure noise: 400 at one distance")
-    z, total, weight = np.array(depth), np.array(sigma), np.sqrt(np.array(white, dtype=float))
-    bare = np.array(before)
-    some = bare > 0  # a quiet camera may see one level only
-    if not some.any():
+    bins = [one for one in bins if one.before_m > 0]  # a quiet camera may see one level only
+    if not bins:
         raise DataError(_TURN)
-    z, total, weight, bare = (a[some] for a in (z, total, weight, bare))
-    seen_on = np.array(frame)[some]
-    known = power is not None or z.max() / z.min() > _LEAST_RANGE
-    if not known:
-        factor = float((weight * bare / z**2).sum() / weight.sum())
-        floor, chosen = 0.0, 2.0
-    else:
-        laws = [_law(z, bare, weight, p) for p in ((1.0, 2.0) if power is None else (power,))]
-        _, floor, factor, chosen = min(laws)
+    z = np.array([one.depth_m for one in bins])
+    known = power is not None or float(z.max() / z.min()) > _LEAST_RANGE
+    floor, factor, chosen = _fitted_law(bins, power) if known else _parabola(bins)
 
     def simulated(size_px: float) -> FittedDepth:
         return FittedDepth(
@@ -143,12 +116,78 @@ def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) 
         factor,
         chosen,
         z,
-        total,
-        seen_on,
+        np.array([one.sigma_m for one in bins]),
+        np.array([one.frame for one in bins]),
         tuple(together),
         known,
         noise_size_px(walls, simulated),
     )
+
+
+class _Bin(NamedTuple):
+    """Pixels of one wall at about one distance.
+
+    Attributes:
+        frame: index of the wall.
+        depth_m: mean distance.
+        sigma_m: of the errors, quantiser included.
+        before_m: that before the quantiser; 0 where a single level is seen.
+        pixels: how many.
+    """
+
+    frame: int
+    depth_m: float
+    sigma_m: float
+    before_m: float
+    pixels: int
+
+
+def _bins(frame: int, wall: Wall, surface: np.ndarray, steps: Steps) -> list[_Bin] | None:
+    """Errors from the `surface` by distance; None if rounding hides them (`_within_a_step`)."""
+    usable = wall.on_wall & (wall.tilt_deg < _FACING_DEG)
+    if not usable.any():
+        usable = wall.on_wall
+    z, mean, measured = wall.plane_m[usable], surface[usable], wall.depth_m[usable]
+    if _within_a_step(1 / z, 1 / measured - mean, wall.gap_per_m):
+        return None
+    low, high = steps.interval(measured)
+    numbers = np.floor(np.log(z) / np.log(_BIN)).astype(int)
+    found = []
+    for number in np.unique(numbers):
+        inside = numbers == number
+        pixels = int(inside.sum())
+        if pixels < _LEAST_IN_BIN:
+            continue
+        depth = float(z[inside].mean())
+        sigma = inner_spread(measured[inside] - 1 / mean[inside])
+        # A single level says nothing of what lies below a step.
+        levels = len(np.unique(measured[inside].astype(np.float32)))
+        spread = spread_between(low[inside], high[inside], mean[inside]) if levels > 1 else 0.0
+        found.append(_Bin(frame, depth, sigma, spread * depth**2, pixels))
+    return found
+
+
+def _fitted_law(bins: Sequence[_Bin], power: float | None) -> tuple[float, float, float]:
+    """Floor, factor and power of the law that fits best, or of `power`."""
+    z, sigma, weight = _columns(bins)
+    laws = [_law(z, sigma, weight, p) for p in ((1.0, 2.0) if power is None else (power,))]
+    _, floor, factor, chosen = min(laws)
+    return floor, factor, chosen
+
+
+def _parabola(bins: Sequence[_Bin]) -> tuple[float, float, float]:
+    """Floor, factor and power where distances do not tell the law: factor Z^2."""
+    z, sigma, weight = _columns(bins)
+    return 0.0, float((weight * sigma / z**2).sum() / weight.sum()), 2.0
+
+
+def _columns(bins: Sequence[_Bin]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance, sigma before the quantiser, and weight of each bin."""
+    z, sigma, pixels = (
+        np.array([getattr(one, name) for one in bins], dtype=float)
+        for name in ("depth_m", "before_m", "pixels")
+    )
+    return z, sigma, np.sqrt(pixels)
 
 
 def _within_a_step(inverse: np.ndarray, error: np.ndarray, gap: float) -> bool:

@@ -1,8 +1,9 @@
-"""The wall in a depth image, and what the camera says of it."""
+"""The wall in a depth image, and how the camera measures it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -58,15 +59,63 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
     Raises:
         DataError: there is no plane, or it covers too little; the message begins with `name`.
     """
-    height, width = depth_m.shape
-    rows, cols = np.nonzero(np.isfinite(depth_m))
+    seen = np.isfinite(depth_m)
+    rows, cols = np.nonzero(seen)
     x = (cols - camera.cx_px) / camera.focal_px
     y = (rows - camera.cy_px) / camera.focal_px
     inverse = 1 / depth_m[rows, cols]
     design = np.stack([np.ones_like(x), x, y], axis=1)
+    normal = _plane_of_three(design, inverse, np.random.default_rng(seed))
+    if normal is None:
+        raise DataError(f"{name}: no plane was found")
+    fit = _least_squares(normal, design, inverse)
+    if fit.near.sum() < max(_LEAST_PIXELS, 0.05 * len(x)):
+        raise DataError(
+            f"{name}: only {int(fit.near.sum())} pixels lie on one plane; show the camera a flat "
+            "wall"
+        )
+    if fit.error_per_m > _LARGEST_ERROR * float(np.median(inverse)):
+        raise DataError(
+            f"{name}: no plane was found; the best one leaves an error of "
+            f"{100 * fit.error_per_m / float(np.median(inverse)):.0f} %. Show the camera a flat "
+            "wall"
+        )
+    mask = np.zeros(depth_m.shape, dtype=np.uint8)
+    mask[rows[fit.near], cols[fit.near]] = 1
+    about = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)) > 0
+    pure = mask.sum() / max((about & seen).sum(), 1)
+    if pure < _LEAST_PURE:
+        raise DataError(
+            f"{name}: no plane was found; of the pixels about the best one only {100 * pure:.0f} % "
+            "lie on it. Show the camera a flat wall"
+        )
+    measured = np.where(mask > 0, depth_m, np.nan)
+    plane, tilt = _view(fit.normal, camera, depth_m.shape)
+    centre = 1 / float(fit.normal[0]) + _error_around(measured - plane, camera)
+    return Wall(name, measured, plane, tilt, _region(mask > 0, seen), centre, fit.gap_per_m)
 
-    rng = np.random.default_rng(seed)
-    few = rng.choice(len(x), min(len(x), 4000), replace=False)
+
+class _Fit(NamedTuple):
+    """A plane by least squares, in 1 / Z.
+
+    Attributes:
+        normal: [3] 1 / Z is its product with (1, x, y).
+        near: [n] bool: pixels that lie on it.
+        error_per_m: standard deviation of their errors.
+        gap_per_m: see `level_gap`.
+    """
+
+    normal: np.ndarray
+    near: np.ndarray
+    error_per_m: float
+    gap_per_m: float
+
+
+def _plane_of_three(
+    design: np.ndarray, inverse: np.ndarray, rng: np.random.Generator
+) -> np.ndarray | None:
+    """The plane through three pixels drawn at random that most others are near, of many tries."""
+    few = rng.choice(len(inverse), min(len(inverse), 4000), replace=False)
     best, normal = np.inf, None
     for _ in range(_TRIES):
         triple = rng.choice(few, 3, replace=False)
@@ -76,10 +125,13 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
         quantile = float(np.quantile(np.abs(design[few] @ trial - inverse[few]), 0.3))
         if quantile < best:
             best, normal = quantile, trial
-    if normal is None:
-        raise DataError(f"{name}: no plane was found")
+    return normal
+
+
+def _least_squares(normal: np.ndarray, design: np.ndarray, inverse: np.ndarray) -> _Fit:
+    """Fit the plane near `normal`, and find anew what lies on it, until too little does."""
     near = np.abs(design @ normal - inverse) < _WIDE * inverse
-    gap = 0.0
+    gap = scale = 0.0
     for _ in range(8):
         if near.sum() < _LEAST_PIXELS:
             break
@@ -89,43 +141,21 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
         # Within one level errors say nothing, so the next levels count as well.
         scale = max(float(np.quantile(error[near], 0.68)), 0.6 * gap, 1e-7)
         near = error < np.minimum(4.5 * scale, 5 * _WIDE * inverse)
-    if near.sum() < max(_LEAST_PIXELS, 0.05 * len(x)):
-        raise DataError(
-            f"{name}: only {int(near.sum())} pixels lie on one plane; show the camera a flat wall"
-        )
-    if scale > _LARGEST_ERROR * float(np.median(inverse)):
-        raise DataError(
-            f"{name}: no plane was found; the best one leaves an error of "
-            f"{100 * scale / float(np.median(inverse)):.0f} %. Show the camera a flat wall"
-        )
+    return _Fit(normal, near, scale, gap)
 
+
+def _view(
+    normal: np.ndarray, camera: Intrinsics, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """[h, w] depth of the plane, inf where it is not in view, and angle of incidence in degrees."""
+    height, width = shape
     u, v = np.arange(width), np.arange(height)[:, None]
     rx, ry = (u - camera.cx_px) / camera.focal_px, (v - camera.cy_px) / camera.focal_px
     along = normal[0] + normal[1] * rx + normal[2] * ry
     with np.errstate(divide="ignore"):
         plane = np.where(along > 0, 1 / along, np.inf)
     cosine = np.abs(along) / np.sqrt((rx**2 + ry**2 + 1) * (normal**2).sum())
-
-    mask = np.zeros((height, width), dtype=np.uint8)
-    mask[rows[near], cols[near]] = 1
-    region = _region(mask > 0, np.isfinite(depth_m))
-    about = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)) > 0
-    pure = mask.sum() / max((about & np.isfinite(depth_m)).sum(), 1)
-    if pure < _LEAST_PURE:
-        raise DataError(
-            f"{name}: no plane was found; of the pixels about the best one only {100 * pure:.0f} % "
-            "lie on it. Show the camera a flat wall"
-        )
-    measured = np.where(mask > 0, depth_m, np.nan)
-    return Wall(
-        name,
-        measured,
-        plane,
-        np.degrees(np.arccos(np.clip(cosine, 0, 1))),
-        region,
-        1 / float(normal[0]) + _error_around(measured - plane, camera),
-        gap,
-    )
+    return plane, np.degrees(np.arccos(np.clip(cosine, 0, 1)))
 
 
 def level_gap(inverse: np.ndarray) -> float:

@@ -53,7 +53,7 @@ class Gloss:
 
     @property
     def refractive_index(self) -> float:
-        """Of the dielectric."""
+        """Refractive index of the dielectric."""
         root = (0.08 * self.specular) ** 0.5
         return (1 + root) / (1 - root)
 

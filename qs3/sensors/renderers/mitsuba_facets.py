@@ -47,7 +47,7 @@ class Facets:
         return self._spread(half) * seen * dr.select(self._metal, metal, dielectric)
 
     def density(self, to_light: Any) -> Any:
-        """Of `reflected` over the solid angle (Heitz, JCGT 2018, eq. 17)."""
+        """Density of `reflected` over the solid angle (Heitz, JCGT 2018, eq. 17)."""
         dr, square = self._dr, self._square
         half = dr.normalize(to_light + self._to_eye)
         masking = self.cos_o + dr.sqrt(square + (1 - square) * dr.square(self.cos_o))

@@ -214,7 +214,7 @@ def test_both_say_what_datasets_are_made_of(tmp_path, capsys):
     ids = ["a/0", "a/1", "b/0", "b/1"]
     for name, made in (("one", scans), ("other", samples)):
         store(tmp_path / name, clouds, ids, ["train"] * 4, **made.meta)
-    assert main(["inspect", f"domain={tmp_path}/one", f"out={tmp_path / 'i'}"]) == 0
+    assert main(["inspect", f"{tmp_path}/one", f"out={tmp_path / 'i'}"]) == 0
     told = "meshes of cad10, kinect_v1, 1 view, without lamp"
     assert f"made of: {told}\n" in capsys.readouterr().out
     assert json.loads((tmp_path / "i/inspection.json").read_text())["made_of"] == told
@@ -276,6 +276,7 @@ def test_one_domain_against_itself_has_no_gap(data_dir):
     ("words", "message"),
     [
         (["inspect", "domain=nothing10"], "unknown; there are"),
+        (["inspect", "nothing10"], "unknown; there are"),
         (["inspect", "domain=modelnet10", "variantt=points"], "variantt"),
         (["inspect", "domain=modelnet10", "paths.data_dir=/nowhere"], "is not there"),
         (["compare", "modelnet10"], "two domains"),

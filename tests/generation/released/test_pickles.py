@@ -190,7 +190,7 @@ def test_keys_and_shapes_take_no_time():
             data = npy({"a": 1})
             place = data.index(b"X\x01\x00\x00\x00a")
             key = pickle.EMPTY_TUPLE + pickle.TUPLE1 * depth
-            refused(data[:place] + key + data[place + 6 :], "a key that is no text")
+            refused(data[:place] + key + data[place + 6 :], "a key that is not a string")
 
 
 @pytest.mark.parametrize("header", ["(" * 4000, "{'descr': '|O', 'shape': (", "\0", "[{}]"])

@@ -1,4 +1,4 @@
-"""Pictures of a run show what its files hold; what is missing or damaged is said in words."""
+"""Pictures of a run show what its files hold; what is missing or damaged is named."""
 
 import base64
 import csv

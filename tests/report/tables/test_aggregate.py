@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.report.tables.aggregate import Stat, group, load_run, load_runs, summarise
-from qs3.runs.metrics import DataHashes
+from qs3.runs.metrics import DataHashes, Evaluated
 from tests.report.made_runs import scores, write_run
 
 
@@ -42,6 +42,25 @@ def test_groups_by_hash_not_by_seed(tmp_path):
     assert stat is not None
     assert (stat.mean, stat.n) == (pytest.approx(0.51), 3)
     assert groups["0123abcd"].problems == ()
+
+
+def test_tiers_are_averaged_where_every_seed_has_them(tmp_path):
+    def run(seed, clean, **tiers):
+        known = {"clean": scores(clean), **tiers} if clean is not None else None
+        evaluation = Evaluated(split="test", labels=True, rotations=0, norms="trained", tiers=known)
+        write_run(tmp_path, seed=seed, evaluation=evaluation)
+
+    run(0, 0.5)
+    run(1, 0.7, hard=scores(0.2))
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("accuracy_clean").mean == pytest.approx(0.6)
+    assert found.stat("balanced_accuracy_clean").mean == pytest.approx(0.5)
+    assert found.stat("accuracy_hard") is None  # of one seed alone
+    assert found.stat("accuracy_clean", "warmup") is None
+    run(2, None)
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("accuracy_clean") is None
+    assert found.stat("accuracy").n == 3
 
 
 def test_unfinished_failed_and_damaged_seeds_are_shown(tmp_path):

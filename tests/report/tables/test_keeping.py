@@ -59,7 +59,7 @@ def test_a_run_that_is_there_comes_before_a_kept_one(file, tmp_path):
     before = fill(tmp_path / "before", file, {("source only", PLACE): 10, ("DANN", PLACE): 14})
     keep(before, kept)
     now = fill(logs, file, {("DANN", PLACE): 18})
-    for folder in kept.glob("*/seed*"):  # their log folder differs, and is no part of the name
+    for folder in kept.glob("*/seed*"):  # their log folder differs, and is not part of the name
         assert (tmp_path / "before" / folder.parent.name / folder.name).is_dir()
     both = {c.row: c.group for c in build_table(file, logs, kept=kept).cells}
     alone = {c.row: c.group for c in now.cells}

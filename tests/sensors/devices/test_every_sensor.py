@@ -104,7 +104,7 @@ def test_the_projectors_shadow_is_as_wide_as_geometry_says(name, source_m, slack
     ids=["time of flight", "BlenSor's time of flight", "BlenSor's Kinect", "fringes"],
 )
 def test_both_renderers_give_the_same_depth(sensor, tolerance_m):
-    """Of sensors that match no images; the same noise is drawn."""
+    """For sensors that match no images; the same noise is drawn."""
     bodies = [square(1.0, 0.08), square(1.6, 0.3)]
     a, b = (
         scan(sensor, bodies, make(samples=4), box=box_of(bodies[1]))

@@ -80,7 +80,7 @@ def test_what_is_off_draws_nothing():
 
 
 def test_ambient_light_without_speckle_keeps_its_evenness():
-    """Of 60 grey values 50 are ambient: the projector's 10 vary by half, which is 5."""
+    """50 of 60 grey values are ambient: the projector's 10 vary by half, which is 5."""
     camera = InfraredCamera(
         electrons_at_white=1e9, read_noise_e=0.0, speckle_contrast=0.5, ambient_speckles=False
     )

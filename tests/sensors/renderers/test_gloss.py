@@ -161,7 +161,7 @@ def test_an_area_light_is_the_sum_of_its_points(gloss, side, mitsuba):
 
 
 def test_white_below_a_square_has_its_form_factor(mitsuba):
-    """Of a square of side 2h at distance h a point below its middle sees 0.5541."""
+    """A point at distance h below the middle of a square of side 2h has 0.5541."""
     light = AreaLight(moved(0.0), 3.0, radiance=2.0)
     camera = Camera(Intrinsics.centred(9, 9, 400.0), np.eye(4))
     mitsuba.settings = RendererSettings(samples=64)
