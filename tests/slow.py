@@ -109,7 +109,7 @@ PATTERNS = (
     r"data/test_gravity_axis\.py::test_a_forgotten_rotation.*\[(its|scannet10)",
     r"data/test_gravity_axis\.py::test_objects_that_lie.*\[(lying-whole|upright-seen)",
     r"data/test_gravity_axis\.py::test_each_direction_is_found\[[1-4]",
-    r"data/frames/test_(our_sensors\.py::test_clouds_lie|real_kinect\.py::test_what_lies)",
+    r"data/frames/test_(our_sensors\.py::test_(clouds_lie|what_was_placed)|real_kinect\.py::test_what_lies)",
     r"data/frames/test_nyuv2\.py::test_(the_same_again|other_settings|other_processes)",
     r"data/frames/test_sunrgbd\.py::test_a_box_that_is_none",
     r"data/inspection/test_measures\.py::test_one_domain_against_itself",

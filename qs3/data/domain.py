@@ -134,6 +134,18 @@ class Domain:
                 f"domain {self.name}: `published` is wrong: {error.__cause__ or error}"
             ) from error
 
+    def tell_of_judging(self, keys: str = "") -> None:
+        """Say so if the test clouds are to be looked at once; `keys` stands before the domain's."""
+        importer = self.importer()
+        if importer is not None and (judges := importer.judges()):
+            log.info(
+                "%s: this looks at what judges, %s; %spublished.fold=0 looks at the part for "
+                "training alone",
+                self.label,
+                judges,
+                keys,
+            )
+
     def check_scale(self, scale: str) -> None:
         """Find out whether a net can see the clouds at this scale.
 

@@ -46,7 +46,7 @@ PREDICT = Command(
         Option("up", text("AXIS|X,Y,Z"), "clouds: x y z -x -y or -z; depth: see below", ""),
         Option("floor", NUMBER, "clouds: where the floor is on that axis, in metres"),
         Option("camera_height", NUMBER, "depth: of the camera above the floor, in metres"),
-        Option("part", text("NAME"), "of an archive of objects: this part alone", ""),
+        Option("part", text("NAME"), "of an archive of objects (default: adapt; or all)", ""),
         Option("sample", whole(), "only so many, drawn at random, always the same ones"),
         Option("out", text("FILE"), ".csv or .json", "predictions.csv"),
         Option("page", FLAG, "also a page with pictures, FILE.html", True),

@@ -28,11 +28,13 @@ from qs3.inference.inputs import (
     is_archive,
     reason_of,
 )
+from qs3.inference.model_file import find_result
 from qs3.inference.page import Gallery, page
 from qs3.inference.predictor import Predictor, Prepared, load
 from qs3.inference.scores import Count, scores
 from qs3.inference.table import Row, as_csv, as_json, record
 from qs3.models.norms import norms_for, use_domain
+from qs3.runs.metrics import read_metrics
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.progress import progress_bar
 
@@ -52,7 +54,7 @@ class Settings:
         up: the axis that points up in clouds (z if ""), or a direction in the depth camera's frame.
         floor: where the floor is in clouds along that axis, in metres; None: not known.
         camera_height: of the depth images' camera above the floor, in metres; likewise.
-        part: of an archive; "" for all.
+        part: of an archive; "" for what one chooses on, "all" for all: see `archive_units`.
         sample: so many of the files, images or objects, drawn at random; None: all.
         out: .csv or .json.
         page: also write a page beside it.
@@ -98,11 +100,15 @@ class Settings:
 
 
 class Inputs(NamedTuple):
-    """What there is to read, how many files are passed over, and what a unit is called."""
+    """What there is to read, how many files are passed over, and what a unit is called.
+
+    `part` says which part of an archive they are, if it has parts.
+    """
 
     units: Sequence[Unit]
     others: int
     kind: str
+    part: str = ""
 
 
 def predict_command(settings: Settings) -> tuple[str, int]:
@@ -143,7 +149,9 @@ def predict_command(settings: Settings) -> tuple[str, int]:
                 gallery.add(row, sample)
     seconds = time.monotonic() - began
     records = [record(row, classes) for row in rows]
+    trained_on = _trained_on(settings.ckpt)
     lines = _told(rows, records, inputs, predictor, settings, seconds)
+    lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
     if out.suffix.lower() == ".json":
         text = as_json(records, classes, predictor.result.target)
     else:
@@ -151,8 +159,18 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     lines.append(_save(out, text))
     if settings.page:
         title = f"{Path(settings.input or settings.depth).name}, as {settings.ckpt} sees it"
-        lines.append(_save(out.with_suffix(".html"), page(title, rows, gallery, classes)))
+        html = page(title, rows, gallery, classes, trained_on)
+        lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _trained_on(ckpt: str) -> str:
+    """What the data of the classifier's run are made of; "" where nothing beside its file says."""
+    try:
+        metrics = read_metrics(find_result(ckpt).parent)
+    except DataError:  # it tells of the run, and no prediction depends on it
+        return ""
+    return metrics.data_text if metrics else ""
 
 
 def _camera_is_missing(predictor: Predictor, settings: Settings) -> bool:
@@ -182,7 +200,8 @@ def _clouds(settings: Settings) -> Callable[[Predictor], Inputs]:
 
     def find(predictor: Predictor) -> Inputs:
         if archive:
-            return Inputs(archive_units(files[0], settings.part, predictor.classes), 0, "objects")
+            units, part = archive_units(files[0], settings.part, predictor.classes)
+            return Inputs(units, 0, "objects", part)
         units = cloud_units(files, root, settings.up or "z", predictor.classes)
         return Inputs(units, others, "files")
 
@@ -297,6 +316,8 @@ def _told(
     lines = [
         f"{len(good)} clouds, {rate:.1f} clouds a second, from {len(inputs.units)} {inputs.kind}"
     ]
+    if inputs.part:
+        lines.append(f"taken: {inputs.part}")
     if good:
         lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
         lines += _scored(rows, predictor.classes)

@@ -22,11 +22,14 @@ from qs3.clouds.finite import measured
 from qs3.data.frames.cutting import Piece, faults
 from qs3.data.frames.given import check_intrinsics, read_depth, read_intrinsics, read_mask
 from qs3.data.frames.pointed import RULES, Caution, Pointed, point_out
-from qs3.data.importers.object_archive import Archive, read_archive
-from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
+from qs3.data.importers.object_archive import ADAPT, JUDGE, Archive, read_archive
+from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.inference.depth_list import Shown
 from qs3.inference.table import Row
 from qs3.utils.text_table import printable
+
+ALL = "all"
+"""For `part=`: every object of an archive."""
 
 Z = "z"
 _KEY = "xyz_tenth_mm.npy"  # of an archive of cut objects
@@ -127,20 +130,30 @@ def is_archive(path: Path) -> bool:
         return False  # said when it is read as clouds
 
 
-def archive_units(path: Path, part: str, classes: Sequence[str]) -> list[Unit]:
-    """One an object of the archive, of all or of one part; stray points are left out.
+def archive_units(path: Path, part: str, classes: Sequence[str]) -> tuple[list[Unit], str]:
+    """One an object of the archive, and which part of it was taken, in words; no stray points.
+
+    Without a part: `adapt` where there is one, else all but `judge`, which is looked at once.
+    `part=all` takes everything.
 
     Raises:
         DataError: it is damaged.
         ConfigError: it has no such part.
     """
     archive = read_archive(path)
-    parts = sorted({*archive.dev.tolist()} - {""})
-    if part and part not in parts:
-        has = f"its parts are {', '.join(parts)}" if parts else "it has no parts"
-        raise ConfigError(f"part={part}: {path} has none of that name; {has}")
-    chosen = np.flatnonzero(archive.dev == part) if part else range(len(archive))
-    return [functools.partial(_object, archive, int(i), classes) for i in chosen]
+    parts = archive.parts
+    part = part or (ADAPT if ADAPT in parts else "")
+    if part and (part != ALL or ALL in parts):
+        chosen, taken = archive.of_part(part), f"part {part}"
+    elif part != ALL and JUDGE in parts:
+        chosen, taken = np.flatnonzero(archive.dev != JUDGE).tolist(), f"all but part {JUDGE}"
+    else:
+        chosen, taken = list(range(len(archive))), "all objects"
+    if parts:
+        counts = ", ".join(f"{name} {count}" for name, count in parts.items())
+        taken += f" of {path.name} (its parts: {counts}; part=NAME or part={ALL} takes others)"
+    units: list[Unit] = [functools.partial(_object, archive, i, classes) for i in chosen]
+    return units, taken if parts else ""
 
 
 def depth_units(shown: Sequence[Shown], gravity: str, classes: Sequence[str]) -> list[Unit]:

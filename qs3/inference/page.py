@@ -92,7 +92,13 @@ def rank(row: Row, classes: Sequence[str]) -> tuple[float, ...]:
     return (2.0, 0.0, sure) if not correct else (1.0, 0.0, -sure)
 
 
-def page(title: str, rows: Sequence[Row], gallery: Gallery, classes: Sequence[str]) -> str:
+def page(
+    title: str,
+    rows: Sequence[Row],
+    gallery: Gallery,
+    classes: Sequence[str],
+    trained_on: str = "",
+) -> str:
     """The page as HTML.
 
     Args:
@@ -100,10 +106,13 @@ def page(title: str, rows: Sequence[Row], gallery: Gallery, classes: Sequence[st
         rows: all of them.
         gallery: those with pictures.
         classes: names in the order of the probabilities.
+        trained_on: what the net's data are made of; "" if nobody knows.
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
     parts = _head(found, rows, failed, classes)
+    if trained_on:
+        parts.append(f'<p class="soft">The net\'s data: {escape(trained_on)}</p>')
     if found:
         parts.append(f'<div class="side">{_why(found)}{_matrix(found, classes)}</div>')
     shown = gallery.shown()

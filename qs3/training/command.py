@@ -91,6 +91,7 @@ def train(cfg: DictConfig) -> RunMetrics:
             runs.clear(run.folder)
         metrics = read_metrics(run.folder)
         if metrics is None:
+            run.target.tell_of_judging("data.target.")
             with _wandb_forgotten():
                 metrics = _fit(run)
                 write_metrics(run.folder, metrics)

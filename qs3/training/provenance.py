@@ -20,7 +20,7 @@ from qs3.errors import ConfigError
 from qs3.runs import folder as runs
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
-from qs3.utils.version import VERSION
+from qs3.utils.version import VERSION, commit
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +36,7 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
             "lightning": lightning.__version__,
             "numpy": np.__version__,
         },
+        "commit": commit(),
         "config_sha256": hashing.config_sha256(run.cfg),
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -98,7 +99,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
         data=DataHashes(**loaded.started["data"]),
         made_of=loaded.made_of,
         times=built.clock.taken(),
-        versions=loaded.started["versions"],
+        versions=_versions(loaded.started),
     )
 
 
@@ -114,6 +115,12 @@ def _selection(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> Sele
         student=student if run.scheme.rounds else teacher,
         validation=run.cfg.data.val,
     )
+
+
+def _versions(started: Mapping[str, Any]) -> dict[str, str]:
+    """With the checkout's commit, if the run was begun in one."""
+    commit = started.get("commit")
+    return {**started["versions"], **({"commit": commit} if commit else {})}
 
 
 def _student(run: Run, outcome: Outcome) -> StudentChoice | None:

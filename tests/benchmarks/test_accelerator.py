@@ -25,6 +25,14 @@ ROUNDS, WARMUP, SECONDS = 30, 5, 4.0
 SIZES = ((16, 256), (16, 1024), (64, 1024))
 
 
+def _or_nan(measured: Callable[[], float]) -> float:
+    """NaN if the memory is too small."""
+    try:
+        return measured()
+    except torch.OutOfMemoryError:
+        return float("nan")
+
+
 def _milliseconds(net: nn.Module, points: torch.Tensor) -> float:
     """The median of some steps, forward and backward; NaN if the memory is too small."""
     labels = torch.arange(len(points), device=points.device) % 5
@@ -34,10 +42,7 @@ def _milliseconds(net: nn.Module, points: torch.Tensor) -> float:
         F.cross_entropy(net(points), labels).backward()
         finish()
 
-    try:
-        return _median_ms(step)
-    except torch.OutOfMemoryError:
-        return float("nan")
+    return _or_nan(lambda: _median_ms(step))
 
 
 def _median_ms(step: Callable[[], None]) -> float:
@@ -56,9 +61,15 @@ def _median_ms(step: Callable[[], None]) -> float:
 
 
 def _peak_gb(net: nn.Module, points: torch.Tensor) -> float:
-    torch.cuda.reset_peak_memory_stats()
-    F.cross_entropy(net(points), torch.arange(len(points), device=DEVICE) % 5).backward()
-    return torch.cuda.max_memory_allocated() / 1e9
+    """The most memory of a step; NaN likewise."""
+    labels = torch.arange(len(points), device=DEVICE) % 5
+
+    def peak() -> float:
+        torch.cuda.reset_peak_memory_stats()
+        F.cross_entropy(net(points), labels).backward()
+        return torch.cuda.max_memory_allocated() / 1e9
+
+    return _or_nan(peak)
 
 
 def test_steps(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:

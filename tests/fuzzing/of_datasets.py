@@ -190,7 +190,7 @@ def _read_objects(path: Path) -> None:
     archive = read_archive(path)
     for i in range(min(len(archive), 3)):
         archive.cloud(i, inliers_only=True)
-    for unit in archive_units(path, "", TWO)[:3]:
+    for unit in archive_units(path, "all", TWO)[0][:3]:
         list(unit())
 
 

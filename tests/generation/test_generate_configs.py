@@ -70,8 +70,8 @@ def test_the_stand_in_has_the_class_frequencies_of_scannet10():
         assert train[name] == max(12, round(count / 10))
 
 
-def plan(*overrides):
-    cfg = config("domain=kinectsim10", *overrides)
+def plan(*overrides, domain="kinectsim10"):
+    cfg = config(f"domain={domain}", *overrides)
     return benchmark(cfg, describe(cfg, mesh_items(cfg), {}))
 
 
@@ -81,6 +81,13 @@ def test_the_benchmark_knows_itself():
     assert plan("renderer.threads=2", "renderer.variant=scalar_rgb", "workers=1") == plan()
     for other in ("fraction=0.5", "views=3", "renderer.samples=4", "recipe.min_points=100"):
         assert plan(other).startswith("like kinectsim10 v2, but not it")
+
+
+def test_so_does_the_source_of_room_scans():
+    """Likewise: results name the version that they were measured with."""
+    assert plan(domain="roomscan10") == "roomscan10 v4"
+    for other in ("recipe.torn=0.4", "limit=3", "scans=2"):
+        assert plan(other, domain="roomscan10").startswith("like roomscan10 v4, but not it")
 
 
 def test_smaller_keeps_the_frequencies():

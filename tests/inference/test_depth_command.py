@@ -8,6 +8,7 @@ import html
 import io
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from qs3.data.frames.pointed import point_out
 from qs3.errors import DataError
 from qs3.inference.depth_list import Shown, find_shown
 from qs3.inference.model_file import write_result
+from qs3.runs.metrics import read_metrics
 from tests.commands import main
 from tests.fixtures.frame_files import Shot, Thing, kinect, write_archive
 from tests.fixtures.published import CLASSES
@@ -273,6 +275,55 @@ def test_an_archive_with_labels_shows_right_and_wrong(run, tmp_path, capsys):
     assert len(pictures) == len(rows)
     picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(pictures[0]))).convert("RGB"))
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10  # a cloud is drawn
+
+
+@pytest.mark.parametrize(
+    ("parts", "given", "taken", "said"),
+    [
+        (("adapt", "judge"), "", {"adapt"}, "part adapt of objects.npz (its parts: adapt 10, "),
+        (("adapt", "judge"), "judge", {"judge"}, "part judge of "),
+        (("adapt", "judge"), "all", {"adapt", "judge", "gap"}, "all objects of "),
+        (("mine", "judge"), "", {"mine", "gap"}, "all but part judge of "),
+        (("mine", "yours"), "", {"mine", "yours", "gap"}, "all objects of "),
+        (None, "", None, ""),
+        (None, "all", None, ""),
+    ],
+)
+def test_of_an_archive_goes_what_one_chooses_on(run, tmp_path, capsys, parts, given, taken, said):
+    arrays = write_archive(tmp_path / "objects.npz", {"train": 1, "test": 1}, points=64)
+    if parts:
+        names = dict(zip(("adapt", "judge", "gap"), (*parts, "gap"), strict=True))
+        arrays["dev"] = np.array([names[part] for part in arrays["dev"].tolist()])
+    else:
+        del arrays["dev"]
+    np.savez(tmp_path / "objects.npz", **arrays)
+    words = [f"input={tmp_path}/objects.npz", "page=false", *[f"part={given}"] * bool(given)]
+    assert predict(run, tmp_path / "said.csv", *words) == 0
+    which = [int(row["file"][12:-1]) for row in table(tmp_path / "said.csv")]
+    if taken is None:
+        assert which == list(range(len(arrays["cls"])))
+    else:
+        assert {arrays["dev"][i] for i in which} == taken
+        assert len(which) == sum(part in taken for part in arrays["dev"].tolist())
+    out = capsys.readouterr().out
+    assert ("taken: " in out) is bool(said)
+    assert said in out
+
+
+def test_page_and_text_say_what_the_net_was_trained_on(run, tmp_path, capsys):
+    """Where the run's result lies beside it."""
+    write_archive(tmp_path / "objects.npz", {"train": 1, "test": 1}, points=64)
+    words = (f"input={tmp_path}/objects.npz", "sample=2")
+    assert predict(run, tmp_path / "said.csv", *words) == 0
+    trained = read_metrics(run).data_text
+    assert "specklenet10 (" in trained
+    assert f"the classifier's data: {trained}\n" in capsys.readouterr().out
+    assert trained in html.unescape((tmp_path / "said.html").read_text())
+    shutil.copy(run / "result.pt", tmp_path / "alone.pt")
+    (tmp_path / "metrics.json").write_text("{")  # of nobody knows what
+    assert predict(tmp_path / "alone.pt", tmp_path / "said.csv", *words) == 0
+    assert "the classifier's data" not in capsys.readouterr().out
+    assert "The net's data" not in (tmp_path / "said.html").read_text()
 
 
 def test_a_sample_is_always_the_same(run, tmp_path):

@@ -19,6 +19,7 @@ from qs3.inference.model_file import read_result
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training.command import CENTRED_ONLY, UNIT_BALL_ONLY, train
 from qs3.utils.locks import owned
+from qs3.utils.version import VERSION, commit
 from tests.training.conftest import result_of
 from tests.training.toy import toy_config
 
@@ -32,6 +33,8 @@ def test_metrics_and_files(finished):
     assert metrics is not None
     assert metrics.status == "finished"
     assert (metrics.source, metrics.target) == ("specklenet10", "kinectsim10")
+    assert metrics.versions["qs3"] == VERSION
+    assert metrics.versions.get("commit", "").rstrip("+") == commit().rstrip("+")
     assert metrics.simulated is True
     assert metrics.selection.student == "last"
     assert metrics.selection.teacher.startswith("source_val, epoch ")
@@ -249,6 +252,15 @@ def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
 def test_missing_data(toy, tmp_path):
     with pytest.raises(MissingDataError, match=r"specklenet10.*\n.*meta\.yaml"):
         train(toy(f"paths.data_dir={tmp_path / 'nowhere'}"))
+
+
+def test_a_run_that_will_look_at_what_judges_says_so_first(toy, caplog, tmp_path):
+    caplog.set_level("INFO")
+    words = ("domain@data.target=objects", f"data.target.published.file={tmp_path}/none.npz")
+    for more, told in ((["data.target.published.fold=0"], False), ([], True)):
+        with pytest.raises(MissingDataError, match=r"none\.npz"):
+            train(toy(*words, *more))
+        assert ("this looks at what judges, part judge of none.npz" in caplog.text) is told
 
 
 def test_two_runs_in_one_folder(toy):

@@ -74,8 +74,17 @@ def _source(name: str, parts: list[dict[str, Any]], **more: Any) -> Source:
 
 SOURCES = tuple(_source(name, **values) for name, values in _FILE["sources"].items())
 
-BY_HAND: dict[str, str] = _FILE["by_hand"]
-"""What has to be fetched by hand, and how."""
+
+@dataclass(frozen=True)
+class ByHand:
+    """What has to be fetched by hand: `asks` for an agreement or not; sources.yaml explains."""
+
+    asks: str
+    terms: str
+    how: str
+
+
+BY_HAND = {name: ByHand(**values) for name, values in _FILE["by_hand"].items()}
 
 AGREEMENTS: dict[str, str] = _FILE["agreements"]
 """What is printed before an agreement is given, by the word of `accept_terms=`."""

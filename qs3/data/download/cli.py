@@ -23,7 +23,7 @@ def _download(words: Sequence[str], **given: Any) -> int:
         raise ConfigError(f"one dataset at a time, got {' and '.join(words)}")
     (name,) = words
     if name in BY_HAND:
-        print(BY_HAND[name])
+        print(BY_HAND[name].how)
         return 1
     from qs3.data.download.provide import AgreementError, provide
 
@@ -58,7 +58,12 @@ def listing() -> str:
             f"terms: {source.terms}{need}",
         ):
             lines += textwrap.wrap(paragraph, 96, initial_indent="    ", subsequent_indent="      ")
-    lines += ["", "By hand, after an agreement (NAME prints how): " + ", ".join(BY_HAND)]
+    for asks in dict.fromkeys(one.asks for one in BY_HAND.values()):
+        lines += ["", f"By hand, {asks} (NAME prints how)"]
+        for name, one in BY_HAND.items():
+            if one.asks == asks:
+                words = f"{name}: {one.terms}"
+                lines += textwrap.wrap(words, 96, initial_indent="    ", subsequent_indent="      ")
     return "\n".join(lines)
 
 

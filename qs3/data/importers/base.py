@@ -103,6 +103,10 @@ class Importer(abc.ABC):
         """What the store is made of; goes into its meta.yaml."""
         return MadeOf(objects="published files", published=True)
 
+    def judges(self) -> str:
+        """Which published clouds are for test and should be looked at once; "" of most datasets."""
+        return ""
+
     def object_of(self, id_: str) -> str:
         """Which object a cloud shows, where its id tells; else "".
 

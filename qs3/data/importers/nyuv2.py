@@ -86,7 +86,7 @@ class NYUv2(FrameImporter):
     def looks_for(self) -> list[str]:
         """See `Importer`."""
         return [
-            f"{self.root / self.file}   (the labelled dataset, 2.8 GB)",
+            f"{self.root / self.file}   (the labelled dataset, 3.0 GB)",
             f"{self.root / self.splits}   (trainNdxs and testNdxs)",
         ]
 

@@ -41,6 +41,8 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 log = logging.getLogger(__name__)
 
 TIERS = ("clean", "hard")
+ADAPT, JUDGE = "adapt", "judge"
+"""Parts of an archive's `dev`: what one trains and chooses on, and what is looked at once."""
 
 _METRES = 1e-4
 _KINDS = {
@@ -90,6 +92,22 @@ class Archive:
         """N."""
         return len(self.cls)
 
+    @property
+    def parts(self) -> dict[str, int]:
+        """Objects of each part of `dev`, by name."""
+        return dict(sorted(Counter(self.dev[self.dev != ""].tolist()).items()))
+
+    def of_part(self, part: str) -> list[int]:
+        """Positions of the objects of a part.
+
+        Raises:
+            ConfigError: there is none of that name.
+        """
+        if part not in self.parts:
+            has = f"its parts are {', '.join(self.parts)}" if self.parts else "it has no parts"
+            raise ConfigError(f"part={part}: {self.path} has none of that name; {has}")
+        return np.flatnonzero(self.dev == part).tolist()
+
     def size(self, index: int) -> int:
         """Points of an object, stray ones too."""
         return int(self._start[index + 1] - self._start[index])
@@ -121,8 +139,8 @@ class ObjectArchive(Importer):
     """
 
     file: str = "objects.npz"
-    train_parts: Sequence[str] = ("adapt",)
-    test_parts: Sequence[str] = ("judge",)
+    train_parts: Sequence[str] = (ADAPT,)
+    test_parts: Sequence[str] = (JUDGE,)
     fold: int | None = None
     folds: int = 5
     gap: int = 15
@@ -154,6 +172,13 @@ class ObjectArchive(Importer):
     def made_of(self) -> MadeOf:
         """See `Importer`."""
         return MadeOf(objects=f"real objects cut from depth images, archive {self.path.name}")
+
+    def judges(self) -> str:
+        """See `Importer`."""
+        if self.fold is not None:
+            return ""
+        parts = ", ".join(self.test_parts)
+        return f"part {parts} of {self.path.name} (all of it, if it has no parts)"
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

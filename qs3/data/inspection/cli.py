@@ -88,6 +88,7 @@ COMPARE = Command(
     (
         "qs3 compare modelnet10 specklenet10",
         "qs3 compare specklenet10 specklenet10 a.variant=points_clean",
+        "qs3 compare roomscan10 objects b.published.file=FILE b.published.fold=0",
     ),
     about="""
 What they are made of, class frequencies, spacing, density, coverage, distance to the true surface

@@ -4,12 +4,15 @@ A cloud is described as it would look standing on each of its six sides: what it
 from bottom to top hold. A ridge regression per class learns from shapes that are known to stand
 upright which of the six descriptions is the right one. The descriptions do not change when the
 object turns about the vertical axis, and half of the shapes to learn from are seen from above
-only and noisy, so scans can be judged as well. What was learnt from the embedded catalogue lies
-beside this file; `tests/fixtures/upright.py` made it.
+only and noisy, so scans can be judged as well. Single views, of which whole sides are missing, have
+a model of their own. What was learnt from the embedded catalogue lies beside this file;
+`tests/fixtures/upright.py` made it.
 
 Objects that lie and were then turned about z, each by its own angle, as meshes with y up are when
 they are scanned as they stand, have no axis in common that could be found. So each cloud is also
-asked whether it would look better on its side, whichever that is.
+asked whether it would look better on its side, whichever that is. Of a single view that says
+nothing: half a chair does look better on one of sixteen sides. So single views are judged by the
+axis that they have in common alone.
 """
 
 from __future__ import annotations
@@ -34,6 +37,9 @@ POINTS = 512
 LEARNT = Path(__file__).with_name("gravity.json")
 """The model of the embedded catalogue."""
 
+LEARNT_VIEWS = Path(__file__).with_name("gravity_views.json")
+"""The same of single views."""
+
 _PARTS = ("mean", "scale", "weights")
 _SLICES = 10
 _JUDGED = 100  # clouds a class
@@ -56,10 +62,11 @@ class Verdict:
         sign_share: share of the clouds that prefer `up` to its opposite.
         axis_sure: the axis is told from the other two by most clouds and beyond chance.
         sign_sure: the same of the sign; a bookshelf looks alike upside down.
-        on_z_share: share of the clouds that look better on z, either way round, than on any side.
-        stands: most clouds do, and beyond chance.
+        on_z_share: share of the clouds that look better on z, either way round, than on any side;
+            None for single views.
+        stands: most clouds do, and beyond chance; of single views, their common axis is z.
         lies: most clouds look better on one of their sides, and beyond chance; each may have
-            another one.
+            another one. Not found of single views.
     """
 
     cls: str
@@ -69,7 +76,7 @@ class Verdict:
     sign_share: float
     axis_sure: bool
     sign_sure: bool
-    on_z_share: float
+    on_z_share: float | None
     stands: bool
     lies: bool
 
@@ -85,14 +92,18 @@ class Verdict:
 
 @dataclass(frozen=True, eq=False)
 class UpModel:
-    """What upright objects look like, by class: mean, scale [F] of descriptions; weights [2F]."""
+    """What upright objects look like, by class: mean, scale [F] of descriptions; weights [2F].
+
+    With `views` they are single views, and only their common axis is judged.
+    """
 
     mean: Mapping[str, np.ndarray]
     scale: Mapping[str, np.ndarray]
     weights: Mapping[str, np.ndarray]
+    views: bool = False
 
     @staticmethod
-    def fit(upright: Mapping[str, Float[np.ndarray, "n p 3"]]) -> UpModel:
+    def fit(upright: Mapping[str, Float[np.ndarray, "n p 3"]], views: bool = False) -> UpModel:
         """Learn from clouds [n, P, 3] of each class that stand upright on z, any unit."""
         mean, scale, weights = {}, {}, {}
         for cls, clouds in upright.items():
@@ -104,7 +115,7 @@ class UpModel:
             y = np.tile(np.eye(6)[0] - 1 / 6, len(clouds))
             ridge = _RIDGE * len(clouds) / 192  # as strong for few clouds as for many
             weights[cls] = np.linalg.solve(x.T @ x + ridge * np.eye(x.shape[1]), x.T @ y)
-        return UpModel(mean, scale, weights)
+        return UpModel(mean, scale, weights, views)
 
     def scores(self, clouds: Float[np.ndarray, "n p 3"], cls: str) -> Float[np.ndarray, "n 6"]:
         """How well each direction of `UPS` does as "up"; the mean over the six is 0."""
@@ -128,20 +139,23 @@ class UpModel:
         along = score.reshape(-1, 3, 2).max(axis=2)  # [n, 3 axes]
         axis = best // 2
         rival = max((a for a in range(3) if a != axis), key=lambda a: along[:, a].mean())
+        axis_sure = prefers(along[:, axis] - along[:, rival])[1]
         sign_share, sign_sure = prefers(score[:, best] - score[:, best ^ 1])
-        on_z = self.on_z(clouds, cls)
-        on_z_share, stands = prefers(on_z)
+        on_z_share, stands, lies = None, axis_sure and axis == UPS.index("+z") // 2, False
+        if not self.views:
+            on_z = self.on_z(clouds, cls)
+            (on_z_share, stands), lies = prefers(on_z), prefers(-on_z)[1]
         return Verdict(
             cls=cls,
             clouds=len(score),
             up=UPS[best],
             axis_share=float((score.argmax(axis=1) // 2 == axis).mean()),
             sign_share=sign_share,
-            axis_sure=prefers(along[:, axis] - along[:, rival])[1],
+            axis_sure=axis_sure,
             sign_sure=sign_sure,
             on_z_share=on_z_share,
             stands=stands,
-            lies=prefers(-on_z)[1],
+            lies=lies,
         )
 
 
@@ -155,7 +169,8 @@ def judge_set(
     """A verdict for each class that occurs and that the model knows.
 
     Labels are positions in `classes`; negative ones are passed over. The model is that of the
-    embedded catalogue unless given; `seed` draws a hundred clouds of a class, if there are more.
+    embedded catalogue's whole and fused clouds unless given; `seed` draws a hundred clouds of a
+    class, if there are more.
     """
     model = model or catalogue_model()
     verdicts = []
@@ -170,11 +185,11 @@ def judge_set(
 
 
 @cache
-def catalogue_model() -> UpModel:
+def catalogue_model(views: bool = False) -> UpModel:
     """The model of the embedded catalogue, as `tests/fixtures/upright.py` learnt it."""
-    found = json.loads(LEARNT.read_text())
+    found = json.loads((LEARNT_VIEWS if views else LEARNT).read_text())
     parts = {part: {cls: np.array(of[part]) for cls, of in found.items()} for part in _PARTS}
-    return UpModel(**parts)
+    return UpModel(**parts, views=views)
 
 
 def turned(cloud: Float[np.ndarray, "*b 3"], yaw_rad: float) -> Float[np.ndarray, "*b 3"]:

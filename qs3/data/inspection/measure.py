@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from qs3.data.inspection import gap, measures
 from qs3.data.inspection.columns import columns
-from qs3.data.inspection.gravity import judge_set
+from qs3.data.inspection.gravity import catalogue_model, judge_set
 from qs3.data.inspection.open_dataset import Opened
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.errors import ConfigError
@@ -55,7 +55,9 @@ def inspect(opened: Opened, bounds: Bounds, advance: Advance = lambda: None) -> 
     data = opened.data
     chosen = measures.chosen_clouds(data, bounds.sample, bounds.seed)
     values = measures.spacing([np.asarray(data.points[i]) for i in chosen], advance)
-    verdicts = judge_set(data.points, data.labels, data.classes, seed=bounds.seed)
+    views = {row.views for row in opened.kept}
+    model = catalogue_model(views=views == {1})
+    verdicts = judge_set(data.points, data.labels, data.classes, model, bounds.seed)
     return {
         "domain": opened.label,
         "folder": str(opened.folder),
@@ -69,6 +71,7 @@ def inspect(opened: Opened, bounds: Bounds, advance: Advance = lambda: None) -> 
         "valid_points": measures.valid_points(opened.rows, data.points.shape[1]),
         "extents": measures.extents(data, chosen),
         "gravity": {
+            "single_views": None if None in views else model.views,
             "by_class": {v.cls: dataclasses.asdict(v) for v in verdicts},
             "contradicting": [v.cls for v in verdicts if v.contradicts()],
             "confirming": [v.cls for v in verdicts if v.confirms()],

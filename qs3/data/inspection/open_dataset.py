@@ -65,6 +65,7 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
         rows = tuple(read_manifest(folder, data.classes))
         return Opened(data.name, label, folder, variant, data, rows, data.made_of)
     domain = compose_domain(name, overrides)
+    domain.tell_of_judging()
     return opened_domain(domain, domain.open())
 
 

@@ -157,9 +157,16 @@ def _ups(up: Numbers) -> list[str]:
                 shown, evidence = of["up"], "clear"
         if of["lies"] and not (of["axis_sure"] and of["up"][1] != "z"):
             shown, evidence = "lies", "on its sides, each cloud its own way"
-        shares = [f"{of[share]:.0%}" for share in ("axis_share", "sign_share", "on_z_share")]
+        numbers = [of[share] for share in ("axis_share", "sign_share", "on_z_share")]
+        shares = ["-" if number is None else f"{number:.0%}" for number in numbers]
         rows.append([cls, shown, str(of["clouds"]), *shares, evidence])
-    return [_table(rows), _up_verdict(up)]
+    lines = [_table(rows), _up_verdict(up)]
+    if up["single_views"]:
+        lines.append(
+            "by single views: an axis that the clouds of a class have in common; not whether each "
+            "lies its own way"
+        )
+    return lines
 
 
 def _up_verdict(up: Numbers) -> str:
@@ -169,11 +176,17 @@ def _up_verdict(up: Numbers) -> str:
         return (
             f"WARNING: {', '.join(up['contradicting'])} do not stand upright on z{untold}. A wrong "
             "axis costs tens of points of accuracy: check the importer's `up`, or for clouds from "
-            "generate.py the `up` of the meshes"
+            "generate.py the `up` of the meshes" + f". {_OF_FUSED}" * (up["single_views"] is None)
         )
     if up["confirming"]:
         return f"z is up, by the shapes of {', '.join(up['confirming'])}{untold}"
     return "unknown: the shapes of no class tell which way is up; look at clouds.png"
+
+
+_OF_FUSED = (
+    "Nothing tells from how many views these clouds are: of single views, which lack whole sides, "
+    "this can be a false alarm; look at clouds.png"
+)
 
 
 def _copies(copies: Numbers, points: float) -> list[str]:

@@ -11,25 +11,24 @@ import glob
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.classes import known_as
-from qs3.data.importers.object_archive import TIERS, Archive, read_archive
+from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.model_file import FILE, find_result
 from qs3.inference.predictor import Predictor, load
 from qs3.report.judge.intervals import Share, difference, share
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.utils.files import sha256_file
 from qs3.utils.progress import progress_bar
+from qs3.utils.version import VERSION, commit, in_words
 
 BLOCK = 30
 """Frames in a row that make a cluster."""
-
-JUDGE = "judge"
-"""The part of an archive's `dev` that judges, if it has parts."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,7 @@ class Family:
         points: of a cloud as the nets see it.
         target: what they were adapted to.
         data: what both domains are made of; "" where not known.
+        trained_by: versions of qs3, and commits if it was a checkout; "" where not known.
         figures: by tier.
     """
 
@@ -77,6 +77,7 @@ class Family:
     points: int
     target: str
     data: str
+    trained_by: str
     figures: tuple[Figures, ...]
 
 
@@ -111,6 +112,7 @@ class Verdict:
         inliers_only: whether stray points were left out.
         families: in the order of the runs given.
         differences: of the others to the first of them.
+        judged_by: version of qs3, and the commit of a checkout.
     """
 
     data: Path
@@ -121,6 +123,7 @@ class Verdict:
     inliers_only: bool
     families: tuple[Family, ...]
     differences: tuple[Difference, ...]
+    judged_by: str
 
 
 def judge(
@@ -162,16 +165,24 @@ def judge(
     subsets = {"all": every, **{tier: tiers == tier for tier in TIERS if (tiers == tier).any()}}
     families, differences = [], []
     base: tuple[Family, np.ndarray] | None = None
-    for name, members, seeds, trained in _families(list(predictors)):
-        picked = np.stack([guesses[file] for file in members])
-        first = predictors[members[0]]
+    for known in _families(list(predictors)):
+        picked = np.stack([guesses[file] for file in known.runs])
+        first = predictors[known.runs[0]]
         figures = tuple(
             _figures(tier, picked[:, of], truth[of], blocks[of], common)
             for tier, of in subsets.items()
         )
-        families.append(
-            Family(name, members, seeds, first.points, first.result.target, trained, figures)
+        family = Family(
+            known.name,
+            known.runs,
+            known.seeds,
+            first.points,
+            first.result.target,
+            known.data,
+            known.trained_by,
+            figures,
         )
+        families.append(family)
         right = picked == truth
         base = base or (families[0], right)
         if len(families) > 1:
@@ -186,6 +197,7 @@ def judge(
         inliers_only,
         tuple(families),
         tuple(differences),
+        in_words(VERSION, commit()),
     )
 
 
@@ -279,47 +291,52 @@ def find_runs(runs: Sequence[str]) -> list[Path]:
     return list(found)
 
 
-def _families(files: Sequence[Path]) -> list[tuple[str, tuple[Path, ...], tuple[int, ...], str]]:
-    """Name, files, seeds and data of the runs of each config that saw the same data.
+class _Known(NamedTuple):
+    """Runs of one config that saw the same data, and what their results say; see `Family`."""
+
+    name: str
+    runs: tuple[Path, ...]
+    seeds: tuple[int, ...] = ()
+    data: str = ""
+    trained_by: str = ""
+
+
+def _families(files: Sequence[Path]) -> list[_Known]:
+    """The runs of each config that saw the same data.
 
     Raises:
         ConfigError: a seed is there twice.
     """
-    members: dict[tuple[str, ...], dict[int, Path]] = {}
-    trained: dict[tuple[str, ...], str] = {}
+    members: dict[tuple[str, ...], dict[int, tuple[Path, RunMetrics]]] = {}
+    found: dict[tuple[str, ...], _Known] = {}
     for file in files:
         metrics = read_metrics(file.parent)
         if metrics is None:
-            members[(str(file),)] = {-1: file}
+            found[(str(file),)] = _Known(str(file), (file,))
             continue
         key = (metrics.experiment, metrics.hash, metrics.data.source, metrics.data.target)
         of = members.setdefault(key, {})
-        trained[key] = metrics.data_text
         if metrics.seed in of:
-            raise ConfigError(
-                f"{file.parent} and {of[metrics.seed].parent} are the same run twice; give one"
-            )
-        of[metrics.seed] = file
-    found = []
-    for words, of in members.items():
-        seeds = tuple(sorted(seed for seed in of if seed >= 0))
-        name = " ".join(words[:2])
-        runs = tuple(of[seed] for seed in sorted(of))
-        found.append((name, runs, seeds, trained.get(words, "")))
-    return found
+            other = of[metrics.seed][0].parent
+            raise ConfigError(f"{file.parent} and {other} are the same run twice; give one")
+        of[metrics.seed] = file, metrics
+        found[key] = _known(of)
+    return list(found.values())
+
+
+def _known(of: Mapping[int, tuple[Path, RunMetrics]]) -> _Known:
+    seeds = tuple(sorted(of))
+    runs, metrics = zip(*(of[seed] for seed in seeds), strict=True)
+    by = {in_words(m.versions.get("qs3", "?"), m.versions.get("commit", "")) for m in metrics}
+    name = f"{metrics[0].experiment} {metrics[0].hash}"
+    return _Known(name, runs, seeds, metrics[0].data_text, "; ".join(sorted(by)))
 
 
 def _chosen(archive: Archive, part: str) -> tuple[list[int], str]:
     """Positions of the objects of a part, and the part."""
-    parts = sorted({*archive.dev.tolist()} - {""})
-    if not part and JUDGE in parts:
+    if not part and JUDGE in archive.parts:
         part = JUDGE
-    if not part:
-        return list(range(len(archive))), ""
-    if part not in parts:
-        has = f"its parts are {', '.join(parts)}" if parts else "it has no parts"
-        raise ConfigError(f"part={part}: {archive.path} has none of that name; {has}")
-    return np.flatnonzero(archive.dev == part).tolist(), part
+    return (archive.of_part(part), part) if part else (list(range(len(archive))), "")
 
 
 def _common(of_runs: Sequence[tuple[str, ...]], wanted: Sequence[str]) -> tuple[str, ...]:

@@ -33,6 +33,8 @@ def text(verdict: Verdict) -> str:
         " and, of several runs, seeds.",
     ]
     lines += [f"data of {family.name}: {family.data}" for family in v.families if family.data]
+    lines += [f"trained by, {f.name}: {f.trained_by}" for f in v.families if f.trained_by]
+    lines.append(f"judged by {v.judged_by}")
     if v.differences:
         lines += ["", f"less {v.families[0].name}, paired object by object", *aligned(_less(v))]
         if any(d.seeds < 2 for d in v.differences):
@@ -64,12 +66,16 @@ def _classes(verdict: Verdict) -> list[list[str]]:
 
 
 def csv_text(verdict: Verdict) -> str:
-    """A row a family and tier, with a recall and a count for each class; shares in [0, 1]."""
+    """A row a family and tier, with a recall and a count for each class; shares in [0, 1].
+
+    At its end what the data are made of, and what trained and judged.
+    """
     names = verdict.classes
     header = [
         "run", "seeds", "tier", "objects", "blocks", "accuracy", "accuracy_sem", "accuracy_low",
         "accuracy_high", "balanced", "balanced_sem", "balanced_low", "balanced_high", "majority",
         *(f"recall_{name}" for name in names), *(f"objects_{name}" for name in names),
+        "data", "trained_by", "judged_by",
     ]  # fmt: skip
     rows: list[list[Any]] = [header]
     for family in verdict.families:
@@ -81,6 +87,7 @@ def csv_text(verdict: Verdict) -> str:
                     a.mean, a.sem, a.low, a.high, b.mean, b.sem, b.low, b.high, f.majority,
                     *(f.recall.get(name) for name in names),
                     *(f.counts.get(name, 0) for name in names),
+                    family.data, family.trained_by, verdict.judged_by,
                 ]
             )  # fmt: skip
     return csv_of(rows)

@@ -210,6 +210,20 @@ def test_names_and_files_are_unique():
         values = [getattr(source, field) for source in SOURCES]
         assert len(set(values)) == len(values)
     assert not {source.name for source in SOURCES} & set(catalogue.BY_HAND)
+
+
+def test_what_is_fetched_by_hand_is_listed_by_what_it_asks_for():
+    """ScanNet's terms are signed; NYU asks for nothing but a citation."""
+    _, after, without = listing().split("\nBy hand, ")
+    assert after.startswith("after an agreement")
+    assert without.startswith("without an agreement")
+    for name, one in catalogue.BY_HAND.items():
+        listed = after if one.asks == "after an agreement" else without
+        assert f"\n    {name}: {one.terms.split()[0]}" in listed
+    for name in ("scannet", "shapenet", "scanobjectnn"):
+        assert name in after
+    assert "nyuv2: no licence is stated; asks for a citation" in without
+    assert "sunrgbd: asks for a citation" in without
     assert all(source.address.startswith("http") for source in SOURCES)
     assert all(source.agreement in ("", *catalogue.AGREEMENTS) for source in SOURCES)
 

@@ -8,6 +8,7 @@ import pytest
 
 from qs3.data.domain import compose_domain
 from qs3.data.importers.object_archive import read_archive
+from qs3.data.inspection.open_dataset import open_named
 from qs3.data.store import is_finished, read_manifest
 from qs3.errors import ConfigError, DataError, Qs3Error
 from tests.fixtures.frame_files import write_archive
@@ -86,6 +87,22 @@ def test_folds_part_the_training_part_and_keep_away(file, tmp_path):
         domain(path, tmp_path, fold="0", block="1000").open()
     with pytest.raises(ConfigError, match=r"fold=5 of 5"):
         domain(path, tmp_path, fold="5").importer()
+
+
+def test_what_looks_at_the_part_that_judges_says_so(file, tmp_path, caplog):
+    """Once and for all unless a fold was asked for; nothing of other datasets."""
+    path, _ = file
+    caplog.set_level("INFO")
+    keys = {"paths.data_dir": str(tmp_path), "published.file": str(path)}
+    fold = {"published.fold": "0", "published.folds": "2", "published.block": "7"}
+    open_named("objects", {**keys, **fold, "path": str(tmp_path / "fold")})
+    compose_domain("nyuv2", {}).tell_of_judging()
+    compose_domain("roomscan10", {}).tell_of_judging()
+    assert "judges" not in caplog.text
+    open_named("objects", keys)
+    assert "looks at what judges, part judge of mine.npz" in caplog.text
+    domain(path, tmp_path).tell_of_judging("data.target.")
+    assert "data.target.published.fold=0" in caplog.text
 
 
 def test_without_parts_all_of_it_judges(tmp_path):

@@ -17,6 +17,7 @@ from qs3.inference.predictor import load
 from qs3.models.pointnet import pointnet
 from qs3.report.judge.intervals import difference, share
 from qs3.report.judge.judging import find_runs, judge
+from qs3.utils.version import VERSION, commit, in_words
 from tests.fixtures.frame_files import write_archive
 from tests.report.made_runs import write_run
 
@@ -48,8 +49,8 @@ def archive(tmp_path_factory):
 def logs(tmp_path_factory):
     """Two seeds of one config, and one of another."""
     root = tmp_path_factory.mktemp("logs")
-    for seed in (0, 1):
-        add_net(write_run(root, seed=seed), seed)
+    for seed, more in ((0, {}), (1, {"commit": "c0ffee"})):
+        add_net(write_run(root, seed=seed, versions={"qs3": "0.1.0", **more}), seed)
     add_net(write_run(root, experiment="other", hash="ffff0000"), 5)
     return root
 
@@ -135,6 +136,12 @@ def test_command(archive, logs, tmp_path, capsys):
     rows = list(csv.DictReader((tmp_path / "judged.csv").read_text().splitlines()))
     assert [row["tier"] for row in rows] == ["all", "clean", "hard"] * 2
     assert rows[0]["objects_chair"] == "5"
+    made = "specklenet10 (published files), kinectsim10 (embedded catalogue, kinect_like, 4 views)"
+    assert (rows[0]["data"], rows[0]["trained_by"]) == (made, "qs3 0.1.0; qs3 0.1.0, commit c0ffee")
+    assert rows[0]["judged_by"] == in_words(VERSION, commit())
+    assert f"data of exp 0123abcd: {made}\n" in said
+    assert "trained by, exp 0123abcd: qs3 0.1.0; qs3 0.1.0, commit c0ffee\n" in said
+    assert f"judged by {rows[0]['judged_by']}\n" in said
     assert QS3([*words, f"out={tmp_path}/judged.json"]) == 0
     found = json.loads((tmp_path / "judged.json").read_text())
     assert found["families"][0]["figures"][0]["accuracy"]["mean"] == float(rows[0]["accuracy"])
