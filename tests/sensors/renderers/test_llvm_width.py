@@ -1,4 +1,4 @@
-"""Renders have the same bytes on processors that take other numbers of rays at once."""
+"""Renders have the same bytes where Dr.Jit would by itself take other numbers of rays at once."""
 
 from __future__ import annotations
 
