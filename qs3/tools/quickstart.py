@@ -1,7 +1,7 @@
 """The main job on embedded data, one command after the other: `qs3 quickstart`.
 
 Prints every command that it runs, so that they can be run and changed one by one. Sizes are
-chosen to fit into half an hour on 2 cores; the paper's are in conf/experiment/qs3_s2d.yaml.
+chosen to fit into ten minutes on 2 cores; the paper's are in conf/experiment/qs3_s2d.yaml.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from qs3.config.location import python_command, typed
 from qs3.errors import ConfigError
 from qs3.utils.cli import Command, Option, text
 
-MESHES = "limit=40 splits=[train]"
+MESHES = "limit=36 splits=[train]"
 """Objects a class of the source domains (the catalogue has 100); nobody is tested on these."""
 
 DATASETS = (
     f"generate.py domain=modelnet10 {MESHES}",
     f"generate.py domain=specklenet10 {MESHES} views=3"
     " sensor=speckle_stereo_small renderer=mitsuba renderer.samples=4",
-    "generate.py domain=kinectsim10 fraction=0.35 views=3 renderer.samples=4",
+    "generate.py domain=kinectsim10 fraction=0.2 views=3 renderer.samples=4",
 )
 
 
@@ -83,7 +83,7 @@ def _run(command: str) -> int:
 
 QUICKSTART = Command(
     "qs3 quickstart",
-    "the main job on embedded data, about half an hour on 2 cores",
+    "the main job on embedded data, about ten minutes on 2 cores",
     _quickstart,
     (Option("out", text("FOLDER"), "where it all goes", "out/quickstart"),),
     ("qs3 quickstart", "make quickstart     the same, in a checkout"),

@@ -71,6 +71,7 @@ class Cell:
         target: name of the target domain; "" if the cell is not to be run.
         simulated: whether that target is simulated.
         seeds: that it should have.
+        first: its runs are started before those of other cells.
     """
 
     row: str
@@ -83,6 +84,7 @@ class Cell:
     target: str = ""
     simulated: bool = False
     seeds: tuple[int, ...] = SEEDS
+    first: bool = False
 
     @property
     def runnable(self) -> bool:

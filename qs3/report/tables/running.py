@@ -52,6 +52,9 @@ def missing(
 ) -> list[Job]:
     """What is to be run: row by row, in each row seed by seed; what cells share, once.
 
+    Cells whose file says `first: true` come before the others: long runs that would otherwise be
+    left alone at the end of several at a time.
+
     Args:
         seeds: that each cell should have; none: those that the table wants.
         rows, columns: only those of one of these names, or, where none has that name, whose name
@@ -71,7 +74,7 @@ def missing(
                 f"{kind}s to run are {', '.join(names)}"
             )
     jobs: dict[tuple[str, ...], Job] = {}
-    for cell in cells:
+    for cell in sorted(cells, key=lambda cell: not cell.first):
         done = set(cell.group.seeds) if cell.group else set()
         for seed in seeds or cell.seeds:
             if seed not in done:

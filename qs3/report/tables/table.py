@@ -195,7 +195,8 @@ def _cell(
     overrides = () if line is None else (*shlex.split(line), *more)
     take = own.get("take", row.get("take", "final"))
     seeds = tuple(range(row["seeds"])) if "seeds" in row else SEEDS
-    return Cell(row["name"], column, overrides, paper, take, seeds=seeds)
+    first = bool(own.get("first", row.get("first", False)))
+    return Cell(row["name"], column, overrides, paper, take, seeds=seeds, first=first)
 
 
 def check_domain(key: str, name: str) -> None:

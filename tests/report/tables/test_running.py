@@ -51,6 +51,14 @@ def test_runs_that_cells_share_are_run_once(tmp_path):
     assert len({job.overrides for job in jobs}) == len(jobs)
 
 
+def test_long_runs_begin_first(tmp_path):
+    table = build_table("quickstart", tmp_path)
+    names = [job.name for job in missing(table, [0, 1])]
+    assert names[:2] == [f"QS3 = PCM + QBST, speckle scans, seed {seed}" for seed in (0, 1)]
+    assert names[2].startswith("source only, surface samples")
+    assert len(names) == 6  # PCM's row shows a part of QS3's runs
+
+
 def test_one_cell(tmp_path):
     table = build_table("factorial", tmp_path)
     every = missing(table, [0])
