@@ -1,9 +1,9 @@
 """How many rays Mitsuba's LLVM kernels take at once: the same with and without AVX-512.
 
 By itself Dr.Jit takes 16 where there is AVX-512 and 8 elsewhere. Embree resolves ties by it, of
-faces that lie in each other, as in many CAD meshes: some points in a hundred thousand change. What
-instructions the kernels are compiled to changes no byte on one processor. Python has no call for the width, so
-Dr.Jit's own library is asked.
+faces that lie in each other, as in many CAD meshes: some points in a hundred thousand change. The
+instructions that kernels are compiled to make no difference on one processor. Python has no call
+for the width, so Dr.Jit's own library is asked.
 """
 
 from __future__ import annotations
