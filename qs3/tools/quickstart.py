@@ -17,14 +17,14 @@ from qs3.config.location import python_command, typed
 from qs3.errors import ConfigError
 from qs3.utils.cli import Command, Option, text
 
-MESHES = "limit=36 splits=[train]"
+MESHES = "limit=40 splits=[train]"
 """Objects a class of the source domains (the catalogue has 100); nobody is tested on these."""
 
 DATASETS = (
     f"generate.py domain=modelnet10 {MESHES}",
     f"generate.py domain=specklenet10 {MESHES} views=3"
     " sensor=speckle_stereo_small renderer=mitsuba renderer.samples=4",
-    "generate.py domain=kinectsim10 fraction=0.2 views=3 renderer.samples=4",
+    "generate.py domain=kinectsim10 fraction=0.35 views=3 renderer.samples=4",
 )
 
 
