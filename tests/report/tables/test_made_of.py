@@ -62,8 +62,8 @@ def test_a_real_run_says_it_everywhere(finished, toy_data, table, caplog):
 
 
 def test_the_judge_says_it(finished):
-    ((_, _, _, data),) = _families([finished / "result.pt"])
-    assert data == f"specklenet10 ({SOURCE}), kinectsim10 ({TARGET})"
+    (known,) = _families([finished / "result.pt"])
+    assert known.data == f"specklenet10 ({SOURCE}), kinectsim10 ({TARGET})"
 
 
 def test_beside_published_figures_other_data_are_marked(table):
