@@ -16,7 +16,7 @@ from qs3.config.compose import choices
 from qs3.data.contact_sheets import drawn
 from qs3.data.importers.base import turned
 from qs3.data.importers.folders import UP_AXES
-from qs3.data.importers.object_archive import read_archive
+from qs3.data.importers.object_archive import JUDGE, read_archive
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.viewed import chosen, part_of
 from qs3.data.store import is_finished
@@ -126,7 +126,8 @@ def _run(place: Path, most: int, settings: Settings) -> Part:
 def _archive(path: Path, most: int, settings: Settings) -> Part:
     archive = read_archive(path)
     names = [f"{archive.cls[i]}/{i}" for i in range(len(archive))]
-    there = np.flatnonzero([settings.match in name for name in names])
+    open_ = archive.dev != JUDGE  # that one is looked at once for a rule, by `qs3 report judge`
+    there = np.flatnonzero([settings.match in name for name in names] & open_)
     _nothing_if(not len(there), settings, str(path))
     some = np.array(drawn(there, most))
     by_class = some[np.argsort(archive.cls[some], kind="stable")]
@@ -139,7 +140,9 @@ def _archive(path: Path, most: int, settings: Settings) -> Part:
         )
         for i in by_class
     ]
-    return Part(shown, f"{len(shown)} of {len(archive)} objects of {path.name}", unit="m")
+    without = "" if open_.all() else f" without the part {JUDGE}"
+    title = f"{len(shown)} of {int(open_.sum())} objects of {path.name}{without}"
+    return Part(shown, title, unit="m")
 
 
 def _files(place: Path, most: int, settings: Settings) -> Part:

@@ -126,15 +126,26 @@ def test_an_archive_of_objects(view, tmp_path):
     arrays = write_archive(tmp_path / "objects.npz", {"train": 1, "test": 1}, points=90)
     status, said, data = view("objects.npz")
     assert status == 0
-    count = len(arrays["cls"])
-    assert f"{count} of {count} objects of objects.npz" in said
+    shown = arrays["dev"] != "judge"  # which is looked at once, and not here
+    count = int(shown.sum())
+    assert 0 < count < len(shown)
+    assert f"{count} of {count} objects of objects.npz without the part judge" in said
     assert data["unit"] == "m"
-    assert [c["label"] for c in data["clouds"]] == sorted(arrays["cls"])
+    assert [c["label"] for c in data["clouds"]] == sorted(arrays["cls"][shown])
     for found in data["clouds"]:
         i = int(found["name"].split("/")[1])
         part = slice(arrays["start"][i], arrays["start"][i + 1])
         xyz = arrays["xyz_tenth_mm"][part][arrays["inlier"][part]] / 1e4
         np.testing.assert_allclose(places(found), xyz - xyz.min(axis=0), atol=1e-4)
+
+
+def test_an_archive_without_parts_is_shown_whole(view, tmp_path):
+    arrays = write_archive(tmp_path / "objects.npz", {"train": 1, "test": 1}, dev=False, points=90)
+    status, said, _ = view("objects.npz")
+    assert status == 0
+    count = len(arrays["cls"])
+    assert f"{count} of {count} objects of objects.npz" in said
+    assert "without" not in said
 
 
 def test_a_dataset(view, tmp_path):
