@@ -119,7 +119,7 @@ def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:
 
 @cache
 def _threads(number: int, process: int) -> ThreadPoolExecutor:
-    """Of this process: a fork has none of its parent's."""
+    """Threads of this process: a fork has none of its parent's."""
     return ThreadPoolExecutor(number, thread_name_prefix="qs3-kernels")
 
 
