@@ -30,6 +30,7 @@ def made_of(
         root = mesh_root(cfg).resolve()
         # Below `raw/` PyTorch Geometric and `qs3 download` keep what a dataset is made from.
         objects = f"meshes of {(root.parent if root.name == 'raw' else root).name}"
+        objects += " and the embedded catalogue" * cfg.fill_up
     there = set(classes)
     several = "\n".join(sorted(set(meshes) - {""}))
     return MadeOf(

@@ -31,10 +31,11 @@ _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
 COLLIDERS = ("skip", "keep")
 UPS = ("auto", "z", "y")
-_SWITCHES = ("provenance", "keep_views", "force", "strict")
+_SWITCHES = ("provenance", "keep_views", "force", "strict", "fill_up")
 # Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
 _OF_LOOKING = ("scene", "tracking", "crop")
 _OF_LIGHT = ("materials", "light")
+_ADDED = "catalogue-"  # before the names of objects that fill up the user's
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
 # Keys of a config that say where things lie, or that never change a byte.
 _UNSTORED = ("paths", "workers", "force", "strict")
@@ -65,6 +66,10 @@ def check(cfg: DictConfig) -> None:
         raise ConfigError(f"paths.data_dir must name a folder, got {cfg.paths.data_dir!r}")
     if cfg.meshes is None and cfg.half != "all":
         raise ConfigError("half= divides a folder of meshes: give one with meshes=PATH")
+    if cfg.meshes is None and cfg.fill_up:
+        raise ConfigError(
+            "fill_up= adds the catalogue's objects to meshes of yours: give them with meshes=PATH"
+        )
     for key in ("released", "poses"):
         if cfg.get(key) and "poses" not in cfg.recipe:
             raise ConfigError(
@@ -118,24 +123,56 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
 
     `up` has been decided (`qs3.generation.up_axis`); undecided, it is z.
     """
-    classes = tuple(cfg.classes) if cfg.classes else None
     if cfg.meshes is None:
         if cfg.up == "y":
             raise ConfigError(
                 "up=y is for meshes of yours, and the embedded catalogue has z up: give a folder "
                 "with meshes=PATH, or leave it out"
             )
-        if missing := sorted(set(classes or known_classes(cfg)) - set(CLASSES)):
+        wanted = set(cfg.classes or known_classes(cfg))
+        if missing := sorted(wanted - set(CLASSES)):
             raise ConfigError(
                 f"the embedded catalogue has no {', '.join(missing)}: give a folder of meshes with "
                 "meshes=PATH, or only classes that it has, classes=[chair,table]"
             )
-        items = build(cfg.catalogue, classes=classes or CLASSES).items()
+        items = _catalogue_items(cfg)
     else:
-        items = mesh_folder(cfg).items()
+        items = _chosen(mesh_folder(cfg).items(), cfg)
+    scans = [_scan_of(item, scan) for item in items for scan in range(cfg.scans)]
+    return _filled_up(scans, cfg) if cfg.fill_up else scans
+
+
+def _catalogue_items(cfg: DictConfig) -> list[MeshItem]:
+    wanted = set(cfg.classes or known_classes(cfg))
+    classes = tuple(name for name in CLASSES if name in wanted)
+    return _chosen(build(cfg.catalogue, classes=classes).items(), cfg)
+
+
+def _chosen(items: Sequence[MeshItem], cfg: DictConfig) -> list[MeshItem]:
+    """Those of the wanted splits, as many as `limit` and `fraction` say."""
     wanted = [item for item in items if item.split in (cfg.splits or SPLITS)]
-    kept = _first_of_each(wanted, cfg.limit, cfg.fraction)
-    return [_scan_of(item, scan) for item in kept for scan in range(cfg.scans)]
+    return _first_of_each(wanted, cfg.limit, cfg.fraction)
+
+
+def _filled_up(own: Sequence[MeshItem], cfg: DictConfig) -> list[MeshItem]:
+    """The user's scans, and of each class and split what they lack of the catalogue's number.
+
+    The catalogue's objects have ids of their own: ModelNet's files, too, are called chair_0001.
+    """
+    lacking = Counter((item.cls, item.split) for item in _catalogue_items(cfg))
+    lacking.subtract(Counter((item.cls, item.split) for item in own))
+    added = []
+    for item in _catalogue_items(cfg):
+        if lacking[item.cls, item.split] > 0:
+            lacking[item.cls, item.split] -= 1
+            folder, stem = item.id.rsplit("/", 1)
+            added.append(replace(item, id=f"{folder}/{_ADDED}{stem}"))
+    if same := sorted({item.id for item in own} & {item.id for item in added}):
+        raise ConfigError(
+            f"{same[0]} is what fill_up=true calls an object of the catalogue: rename the file"
+        )
+    order = {name: k for k, name in enumerate(known_classes(cfg))}
+    return sorted([*own, *added], key=lambda item: (order[item.cls], SPLITS.index(item.split)))
 
 
 def left_alone(cfg: DictConfig) -> list[str]:
@@ -153,6 +190,7 @@ def mesh_folder(cfg: DictConfig) -> MeshFolder:
         known=known_classes(cfg),
         keep_colliders=cfg.colliders == "keep",
         up="y" if cfg.up == "y" else "z",
+        optional=CLASSES if cfg.fill_up else (),
     )
 
 
@@ -203,13 +241,19 @@ def settings(cfg: DictConfig) -> dict[str, Any]:
         "domain": build(cfg.domain).folder.name,
         "seed": plain["seed"],
         "recipe": _with_content_of_poses(plain["recipe"]),
-        "meshes": "folder" if plain["meshes"] else plain["catalogue"],
+        "meshes": _kind_of_meshes(plain),
         "colliders": plain["colliders"],
         "up": "y" if plain["up"] == "y" else "z",
     }
     if plain["renderer"]:
         chosen["renderer"] = {k: v for k, v in plain["renderer"].items() if k not in _NOT_DECISIVE}
     return chosen
+
+
+def _kind_of_meshes(plain: dict[str, Any]) -> Any:
+    if plain["fill_up"]:
+        return {"folder, filled up by": plain["catalogue"]}
+    return "folder" if plain["meshes"] else plain["catalogue"]
 
 
 def _with_content_of_poses(recipe: dict[str, Any]) -> dict[str, Any]:

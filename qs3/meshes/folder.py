@@ -52,6 +52,8 @@ class MeshFolder:
         skip: stems of files to leave out, as if they were not there.
         known: the classes of the dataset, in label order.
         keep_colliders, up: as `load_mesh`.
+        optional: classes that need not be there: their objects come from elsewhere. One class at
+            least must be.
     """
 
     path: Path
@@ -62,6 +64,7 @@ class MeshFolder:
     known: tuple[str, ...] = CLASSES
     keep_colliders: bool = False
     up: str = "z"
+    optional: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
@@ -86,14 +89,14 @@ class MeshFolder:
         """
         folders = self._class_folders()
         found: list[MeshItem] = []
-        for cls in (name for name in self.known if name in self._wanted):
+        for cls in (name for name in self.known if name in folders):
             groups = self._groups(cls, folders[cls])
             chosen = [
                 self._item(cls, split, stem, file)
                 for split in SPLITS
                 for stem, file in self._keep(cls, groups[split])
             ]
-            if not chosen:
+            if not chosen and cls not in self.optional:
                 raise ConfigError(
                     f"no mesh of class {cls!r} in {self.path} is left with half={self.half} and "
                     f"{len(self.skip)} to skip: add some, or leave it out with classes=[...]"
@@ -116,7 +119,7 @@ class MeshFolder:
         return self.classes or self.known
 
     def _class_folders(self) -> dict[str, list[Path]]:
-        """The folders of each wanted class; each has one at least."""
+        """The folders of each wanted class that is there; each has one at least."""
         if not self.path.is_dir():
             raise MissingDataError(f"there is no folder of meshes at {self.path}")
         folders: dict[str, list[Path]] = {}
@@ -125,7 +128,8 @@ class MeshFolder:
             if entry.is_dir() and cls in self._wanted:
                 self._refuse_link_outside(entry)
                 folders.setdefault(cls, []).append(entry)
-        if missing := [name for name in self._wanted if name not in folders]:
+        missing = [name for name in self._wanted if name not in folders]
+        if not folders or not set(missing) <= set(self.optional):
             there = [name for name in self.known if name in folders]
             rest = f"leave them out with classes=[{','.join(there)}]" if there else LAYOUTS
             others = ", ".join(map(repr, self.left_alone()))

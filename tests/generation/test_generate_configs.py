@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from collections import Counter
 
 import pytest
 from omegaconf import OmegaConf
@@ -10,9 +11,9 @@ from omegaconf import OmegaConf
 from qs3.classes import CLASSES
 from qs3.config.hydra import build
 from qs3.config.location import CONF
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, MissingDataError
 from qs3.generation.camera_poses import AnchoredViews
-from qs3.generation.plan import benchmark, check, describe, mesh_items, stored_config
+from qs3.generation.plan import benchmark, check, describe, mesh_items, settings, stored_config
 from qs3.generation.scenes import Alone, Room
 from qs3.tools import quickstart
 from tests.generation.generating import ROOT
@@ -21,7 +22,7 @@ from tests.generation.generating import composed as config
 DOMAINS = (
     *("specklenet10", "specklenet10_clean", "blensor10", "kinectsim10"),
     *("modelnet10", "modelnet10_dropout"),
-    *("specklenet10_view", "specklenet10_kinect", "roomscan10"),
+    *("specklenet10_view", "specklenet10_kinect", "roomscan10", "kinectsim10_full"),
 )
 
 
@@ -83,6 +84,90 @@ def test_the_benchmark_knows_itself():
         assert plan(other).startswith("like kinectsim10 v2, but not it")
 
 
+def test_so_does_the_one_in_scannet10s_sizes():
+    assert plan(domain="kinectsim10_full") == "kinectsim10_full v1"
+    assert plan("limit=3", domain="kinectsim10_full").startswith("like kinectsim10_full v1, but")
+    items = mesh_items(config("domain=kinectsim10_full"))
+    assert Counter(item.split for item in items) == {"train": 6110, "test": 1769}
+    # PointDA's ScanNet-10, class by class; kinectsim10 is a part of it.
+    smaller = mesh_items(config("domain=kinectsim10"))
+    assert {item.id for item in smaller} <= {item.id for item in items}
+    by_id = {item.id: item.origin for item in items}
+    assert all(by_id[item.id] == item.origin for item in smaller)
+
+
+def test_a_source_can_have_the_sizes_of_the_published_one():
+    """4,183 and 856 objects: PointDA's ModelNet-10, from whose meshes the paper's S was scanned."""
+    items = mesh_items(config("domain=specklenet10", "counts=modelnet10"))
+    assert Counter(item.split for item in items) == {"train": 4183, "test": 856}
+    assert sum(item.cls == "lamp" for item in items) == 124 + 20
+
+
+def own_meshes(root, **counts):
+    """Empty files with names as in ModelNet: nothing is opened."""
+    for cls, n in counts.items():
+        for split in ("train", "test"):
+            (root / cls / split).mkdir(parents=True)
+            for i in range(n):
+                (root / cls / split / f"{cls}_{i:04d}.off").touch()
+    return f"meshes={root}"
+
+
+def test_the_catalogue_fills_up_what_own_meshes_lack(tmp_path):
+    own = own_meshes(tmp_path, chair=3, table=20)
+    words = ("domain=modelnet10", own, "fill_up=true", "scans=2", "up=z")
+    counts = {**dict.fromkeys(CLASSES, 1), "chair": 10, "plant": 0, "table": 30}
+    given = ", ".join(f"{name}: {n}" for name, n in counts.items())
+    items = mesh_items(config(*words, f"catalogue.train={{{given}}}", "catalogue.test=6"))
+    of = Counter((item.cls, item.split, item.path is not None) for item in items)
+    assert of["chair", "train", True] == 6  # three meshes, scanned twice
+    assert of["chair", "train", False] == 4
+    assert of["chair", "test", False] == 0  # six are there
+    assert of["table", "train", True] == 40  # more than the catalogue has: all of them
+    assert of["table", "train", False] == 0
+    assert of["lamp", "train", False] == 1  # a class without a folder
+    assert of["plant", "test", False] == 6
+    assert len({item.id for item in items}) == len(items)  # chair_0000 is there twice
+    assert [item.cls for item in items] == sorted((i.cls for i in items), key=CLASSES.index)
+    # They are the catalogue's first, whatever their new names.
+    plain = {i.id: i.origin for i in mesh_items(config("domain=modelnet10"))}
+    added = [item for item in items if item.path is None]
+    assert all(item.id.count("/catalogue-") == 1 for item in added)
+    assert all(plain[i.id.replace("/catalogue-", "/")] == i.origin for i in added)
+    # Small, and in parts.
+    small = mesh_items(config(*words, "limit=5", "splits=[train]"))
+    assert Counter(item.cls for item in small) == {
+        **dict.fromkeys(CLASSES, 5),
+        "chair": 6,
+        "table": 10,
+    }
+
+
+def test_filled_up_is_another_plan_and_unfilled_the_same_as_ever(tmp_path):
+    own = own_meshes(tmp_path, **dict.fromkeys(CLASSES, 1))
+    alone = settings(config("domain=modelnet10", own, "up=z"))
+    assert alone["meshes"] == "folder"
+    filled = settings(config("domain=modelnet10", own, "up=z", "fill_up=true"))
+    assert filled["meshes"]["folder, filled up by"]["train"] == 100
+    more = settings(config("domain=modelnet10", own, "up=z", "fill_up=true", "catalogue.train=5"))
+    assert more != filled
+
+
+def test_filling_up_needs_meshes_and_says_what_it_cannot_fill(tmp_path):
+    with pytest.raises(ConfigError, match="give them with meshes=PATH"):
+        check(config("domain=modelnet10", "fill_up=true"))
+    with pytest.raises(MissingDataError, match="no folder of"):  # nothing of ours at all
+        mesh_items(config("domain=modelnet10", f"meshes={tmp_path}", "fill_up=true"))
+    own = own_meshes(tmp_path, chair=1)
+    with pytest.raises(MissingDataError, match=r"no folder of .*table"):
+        mesh_items(config("domain=modelnet10", own))
+    with pytest.raises(MissingDataError, match=r"no folder of .*airplane"):
+        mesh_items(config("domain=specklenet40", own, "fill_up=true"))
+    (tmp_path / "chair" / "train" / "catalogue-chair_0003.off").touch()
+    with pytest.raises(ConfigError, match="rename the file"):
+        mesh_items(config("domain=modelnet10", own, "fill_up=true"))
+
+
 def test_so_does_the_source_of_room_scans():
     """Likewise: results name the version that they were measured with."""
     assert plan(domain="roomscan10") == "roomscan10 v4"
@@ -135,7 +220,7 @@ def test_help_is_short(help_text):
 
 GROUPS = (
     *("sensor", "sensor/matcher", "synthesis", "scene", "materials", "light", "tracking", "crop"),
-    *("renderer", "released"),
+    *("renderer", "released", "counts"),
 )
 
 

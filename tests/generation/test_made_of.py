@@ -36,6 +36,9 @@ def test_it_names_meshes_sensor_views_and_missing_classes(finished, meshes, tmp_
     assert samples() == dataclasses.replace(seen, sensor="surface samples", views=0)
     assert samples("scans=2").meshes == seen.meshes
     assert samples("half=first").meshes != seen.meshes
+    filled = samples("fill_up=true", "catalogue.train=3", "catalogue.test=1")
+    assert filled.objects == f"meshes of {meshes.name} and the embedded catalogue"
+    assert filled.meshes != seen.meshes
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,21 @@ def test_missing_classes_and_roots(tmp_path, settings):
         MeshFolder(tmp_path, **settings).items()
 
 
+def test_optional_classes_may_lack(tmp_path):
+    make(tmp_path, "chair/train/a.off", "chair/train/b.off", "lamp/train/a.off")
+    some = MeshFolder(tmp_path, optional=CLASSES)
+    assert [item.id for item in some.items()] == [
+        *("chair/train/a", "chair/train/b", "lamp/train/a"),
+    ]
+    # The odd lamp is in the first half.
+    second = MeshFolder(tmp_path, optional=CLASSES, half="second")
+    assert [item.cls for item in second.items()] == ["chair"]
+    with pytest.raises(MissingDataError, match="no folder of bed"):
+        MeshFolder(tmp_path, classes=("bed", "chair"), optional=("lamp",)).items()
+    with pytest.raises(MissingDataError, match="no folder of bed"):  # not one of them
+        MeshFolder(tmp_path, classes=("bed",), optional=CLASSES).items()
+
+
 @pytest.mark.parametrize(
     ("names", "reason"),
     [
