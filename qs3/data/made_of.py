@@ -27,6 +27,8 @@ class MadeOf:
         without: classes of the domain that have no object, such as "lamp, plant".
         benchmark: "kinectsim10 v2", or that it is like it, for domains with versions.
         meshes: digits that all datasets made of these very meshes share; "" if nobody knows.
+        recipe: digits that datasets made of the same objects by the same settings and code share,
+            on any machine; "" if nobody knows.
     """
 
     objects: str = "not known (meta.yaml does not say)"
@@ -36,6 +38,7 @@ class MadeOf:
     without: str = ""
     benchmark: str = ""
     meshes: str = ""
+    recipe: str = ""
 
     # metrics.json holds it, and is read strictly: see qs3.runs.metrics.
     __pydantic_config__: ClassVar[dict[str, Any]] = {"strict": True, "extra": "forbid"}

@@ -42,6 +42,7 @@ from qs3.generation.plan import (
     stored_config,
 )
 from qs3.generation.provenance import PROVENANCE
+from qs3.generation.recipe_digits import recipe_digits
 from qs3.generation.shards import Parts
 from qs3.generation.up_axis import with_up_axis
 from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
@@ -213,6 +214,7 @@ def _write(
         (item.cls for item in items),
         (outcome.mesh_sha256 for outcome in outcomes),
         benchmark(cfg, recipe),
+        recipe_digits(recipe),
     )
     others = left_alone(cfg)
     rows = [

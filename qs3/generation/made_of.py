@@ -15,7 +15,11 @@ from qs3.generation.plan import known_classes, mesh_root
 
 
 def made_of(
-    cfg: DictConfig, classes: Iterable[str], meshes: Iterable[str], benchmark: str
+    cfg: DictConfig,
+    classes: Iterable[str],
+    meshes: Iterable[str],
+    benchmark: str,
+    recipe: str = "",
 ) -> MadeOf:
     """The line for figures; of a folder of meshes its last name, and not where it lies.
 
@@ -24,6 +28,7 @@ def made_of(
         classes: of the objects.
         meshes: hash of each mesh that could be read.
         benchmark: see `qs3.generation.plan.benchmark`.
+        recipe: see `qs3.generation.recipe_digits`.
     """
     objects = "embedded catalogue"
     if cfg.meshes is not None:
@@ -40,6 +45,7 @@ def made_of(
         without=", ".join(name for name in known_classes(cfg) if name not in there),
         benchmark=benchmark,
         meshes=hashlib.sha256(several.encode()).hexdigest()[:12],
+        recipe=recipe,
     )
 
 

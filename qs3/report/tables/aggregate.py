@@ -2,7 +2,8 @@
 
 Runs belong together when experiment and config hash agree (the hash leaves out the seed and
 paths). A failed or unfinished seed is shown and never averaged over silently; a group whose runs
-saw different datasets has no mean at all.
+saw different datasets has no mean at all. Renderings of one recipe by different machines, which
+differ by rounding, are one dataset; a line below the table says so.
 """
 
 from __future__ import annotations
@@ -201,10 +202,30 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
         for run in finished:
             hashes[getattr(run.metrics.data, role) if run.metrics else ""].append(run.seed)
         if len(hashes) > 1:
-            comparable = False
             seen = "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in hashes.items())
+            if same_data((run.metrics for run in finished), role):
+                problems.append(
+                    f"the {role} was made by one recipe on several machines, whose bytes differ by "
+                    f"rounding ({seen}): averaged"
+                )
+                continue
+            comparable = False
             problems.append(f"the {role} dataset differs ({seen}): not averaged")
     return Group(*key, tuple(finished), tuple(problems), comparable)
+
+
+def same_data(results: Iterable[RunMetrics | None], role: str) -> bool:
+    """Whether runs saw the same dataset: the same bytes, or made by the same recipe.
+
+    Args:
+        results: of the runs; None is passed over.
+        role: "source" or "target".
+    """
+    known = [result for result in results if result]
+    recipes = {getattr(result.made_of, role).recipe for result in known}
+    return len({getattr(result.data, role) for result in known}) < 2 or (
+        len(recipes) == 1 and "" not in recipes
+    )
 
 
 def _list(seeds: Sequence[int | None]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from qs3.errors import ConfigError, DataError
 from qs3.report.clustered import LEVEL
-from qs3.report.tables.aggregate import data_lines
+from qs3.report.tables.aggregate import data_lines, same_data
 from qs3.report.tables.cells import Cell, Table
 from qs3.report.tables.formats import SIMULATED, marks
 from qs3.report.tables.made_of import data_marks, results_of
@@ -133,8 +133,7 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
         if cell.group and not cell.group.comparable:
             return Compared(name, None, f"{cell.row}, {cell.column}: not averaged, see the table")
     results = [runs[seed].metrics for runs in finished for seed in seeds]
-    targets = {result.data.target for result in results if result}
-    if len(targets) > 1:
+    if not same_data(results, "target"):
         return Compared(name, None, "the runs saw different versions of the target")
     try:
         said = [[read_predictions(runs[seed].folder / FILE) for seed in seeds] for runs in finished]

@@ -3,14 +3,15 @@
 import math
 import re
 import statistics
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.report.tables.aggregate import Stat, group, load_run, load_runs, summarise
-from qs3.runs.metrics import DataHashes, Evaluated
-from tests.report.made_runs import scores, write_run
+from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
+from tests.report.made_runs import CATALOGUE, scores, write_run
 
 
 def test_mean_and_sem_by_hand():
@@ -98,6 +99,34 @@ def test_other_data_are_not_averaged(tmp_path, role):
     write_run(tmp_path / "again", seed=0)
     (found,) = group(load_runs(tmp_path))
     assert "seeds 0 occur more than once" in found.problems[0]
+
+
+@pytest.mark.parametrize("role", ["source", "target"])
+def test_one_recipe_on_two_machines_is_averaged_and_said(tmp_path, role):
+    """Bytes of renderings differ by processor; recipes do not."""
+
+    def run(seed, sha, recipe):
+        made = {"source": CATALOGUE, "target": CATALOGUE, role: replace(CATALOGUE, recipe=recipe)}
+        data = {"source": "a" * 64, "target": "b" * 64, role: sha * 64}
+        write_run(tmp_path, seed=seed, data=DataHashes(**data), made_of=DataMadeOf(**made))
+
+    run(0, "c", "1" * 12)
+    run(1, "d", "1" * 12)
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("accuracy").n == 2
+    said = f"the {role} was made by one recipe on several machines"
+    assert said in found.problems[0]
+    assert "seeds 0: cccccccccccc; seeds 1: dddddddddddd" in found.problems[0]
+    assert said in summarise([r.folder for r in load_runs(tmp_path)])
+    run(2, "c", "2" * 12)  # by other code
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("accuracy") is None
+    run(3, "e", "")  # nobody knows
+    (found,) = group(r for r in load_runs(tmp_path) if r.seed != 2)
+    assert found.stat("accuracy") is None
+    (found,) = group(r for r in load_runs(tmp_path) if r.seed in (0, 2))
+    assert found.stat("accuracy").n == 2  # the same bytes, whoever made them
+    assert found.problems == ()
 
 
 def test_scores_that_a_seed_lacks_have_no_mean(tmp_path):

@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from qs3.report.tables.cells import Table
 from qs3.report.tables.comparison import against, csv_text, effects, text
 from qs3.report.tables.running import Job, chosen, launch, missing
 from qs3.report.tables.table import build_table
-from qs3.runs.metrics import DataHashes
+from qs3.runs.metrics import DataHashes, DataMadeOf
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
 from tests.commands import main
-from tests.report.made_runs import change
+from tests.report.made_runs import CATALOGUE, change
 from tests.report.tables.test_tables import run_cell
 from tests.training.toy import overrides, write_toy
 
@@ -168,6 +169,12 @@ def test_what_a_table_does_not_average_is_not_compared(tmp_path):
     one = compared(folders[2], "c" * 64)  # all of its seeds, but not the base's
     assert one.differences is None
     assert "different versions of the target" in one.why
+    made = DataMadeOf(source=CATALOGUE, target=replace(CATALOGUE, recipe="1" * 12))
+    for cell in cells.values():  # other bytes of one recipe are one target
+        for run in cell.group.finished:
+            change(run.folder, made_of=made)
+    one = compared(folders[2], "c" * 64)
+    assert one.differences is not None
 
 
 def test_objects_that_are_known_are_counted(tmp_path):
