@@ -194,7 +194,8 @@ def _check_settings(cfg: DictConfig) -> None:
     ):
         check_int(key, OmegaConf.select(cfg, key), least)
     for key in ("data.clouds_a_class", "data.clouds_a_split", "trainer.threads"):
-        if (value := OmegaConf.select(cfg, key)) is not None:
+        value = OmegaConf.select(cfg, key)
+        if value is not None and (key, value) != ("trainer.threads", "auto"):
             check_int(key, value, 1)
     check_bool("data.make_source", cfg.data.make_source)
     check_bool("report.pictures", cfg.report.pictures)

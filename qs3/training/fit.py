@@ -9,6 +9,7 @@ import logging
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -27,6 +28,7 @@ from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
 from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.cli import TERMINATED
+from qs3.utils.threads import cores, number_of
 
 log = logging.getLogger(__name__)
 
@@ -43,9 +45,11 @@ def fit(run: Run) -> RunMetrics:
     keep_freed_memory()
     # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
-    torch.set_num_threads(run.cfg.trainer.threads or os.cpu_count() or 1)
+    torch.set_num_threads(number_of(run.cfg.trainer.threads))
     method: Method = build(run.cfg.method)
     loaded = load_data(run, method)
+    if run.cfg.trainer.threads == "auto":
+        _take_threads_of(loaded.started)
     if not run.cfg.force:
         take_checkpoint(run, loaded.started)
     built = build_training(run, method, loaded, began)
@@ -53,6 +57,13 @@ def fit(run: Run) -> RunMetrics:
     _fit(run, loaded, built)
     outcome = evaluate(run, loaded, built)
     return write_outcome(run, loaded, built, outcome)
+
+
+def _take_threads_of(started: dict[str, Any]) -> None:
+    """Go on with as many threads as the run was begun with: sums are ordered by them."""
+    if isinstance(begun := started.get("threads"), int) and begun > 0:
+        torch.set_num_threads(begun)
+    log.info("trainer.threads=auto: %d of %d cores", torch.get_num_threads(), len(cores()))
 
 
 def _remember(run: Run, loaded: Loaded, built: Built) -> None:

@@ -37,6 +37,7 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
             "numpy": np.__version__,
         },
         "commit": commit(),
+        "threads": torch.get_num_threads(),
         "config_sha256": hashing.config_sha256(run.cfg),
     }
     if int(os.environ.get("LOCAL_RANK", 0)) > 0:

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 from qs3.errors import ConfigError, Qs3Error
+from qs3.utils.threads import let_waiting_threads_sleep
 
 # Exit status, as shells say it.
 INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
@@ -289,6 +290,7 @@ def run(command: Command | Group, argv: Sequence[str]) -> int:
     An error meant for people is one line on stderr and status 1; a reader that has seen enough
     (`| head`) ends it quietly.
     """
+    let_waiting_threads_sleep()
     try:
         status = command(argv)
         sys.stdout.flush()
@@ -311,6 +313,7 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
         if any(word.split("=")[0] in _SHOWS for word in sys.argv[1:]):
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, _terminate)
+        let_waiting_threads_sleep()
         try:
             main()
         except (KeyboardInterrupt, SystemExit) as error:

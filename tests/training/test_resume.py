@@ -16,6 +16,7 @@ import torch
 import qs3.runs.checkpoints
 import qs3.selftraining.callback
 import qs3.training.command
+import qs3.utils.threads
 from qs3.config import hashing
 from qs3.engine.classifier import Classifier
 from qs3.errors import DataError
@@ -72,6 +73,21 @@ def test_interrupted_again_and_again(toy, finished):
         interrupt(cfg, hook, count)
     train(cfg)
     assert result_of(hashing.run_folder(cfg)) == result_of(finished)
+
+
+def test_it_goes_on_with_the_threads_that_it_was_begun_with(toy, monkeypatch):
+    """Free cores are counted once: sums are ordered by threads."""
+    before = torch.get_num_threads()
+    try:
+        cfg = toy("trainer.threads=auto")
+        monkeypatch.setattr(qs3.utils.threads, "free_cores", lambda: 2)
+        interrupt(cfg, "on_train_epoch_end", 2)
+        assert torch.get_num_threads() == 2
+        monkeypatch.setattr(qs3.utils.threads, "free_cores", lambda: 1)
+        train(cfg)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("call", [1, 4, 5, 6, 10])
