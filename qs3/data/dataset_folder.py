@@ -4,6 +4,7 @@ recipe.json   what the parts were made with; another recipe is refused
 parts/        one file an object or scene, until the store is written
 views/        images and depths of every view, if they were asked for
 clouds.png, infrared.png, config.yaml
+costs.csv     seconds of each object, and the most memory that its process had taken by then
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from qs3.data.store import is_finished, read_meta
 from qs3.errors import DataError
 
 RECIPE, PARTS, VIEWS = "recipe.json", "parts", "views"
-CLOUDS, INFRARED, CONFIG = "clouds.png", "infrared.png", "config.yaml"
+CLOUDS, INFRARED, CONFIG, COSTS = "clouds.png", "infrared.png", "config.yaml", "costs.csv"
 
 
 def check_ours(folder: Path, command: str, elsewhere: str) -> None:
@@ -46,6 +47,6 @@ def delete_dataset(folder: Path) -> None:
     for name in (PARTS, VIEWS):
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
-    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG)
+    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG, COSTS)
     for path in [*(folder / name for name in names), *folder.glob("*.npy"), folder / RECIPE]:
         path.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
-from qs3.data.dataset_folder import CLOUDS, CONFIG, INFRARED, check_ours, delete_dataset
+from qs3.data.dataset_folder import CLOUDS, CONFIG, COSTS, INFRARED, check_ours, delete_dataset
 from qs3.data.domain import Domain
 from qs3.data.store import (
     ManifestRow,
@@ -49,6 +49,7 @@ from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import write_text
 from qs3.utils.locks import owned
+from qs3.utils.pool import Pool
 from qs3.utils.progress import progress_bar
 
 log = logging.getLogger(__name__)
@@ -79,6 +80,7 @@ def generate(cfg: DictConfig) -> PointSet:
     folder = domain.folder
     _check_place(domain, cfg.force)
     items = mesh_items(cfg)
+    pool: Pool = build(cfg.engine)
     parts = Parts(folder)
     job = Job(
         recipe=build(cfg.recipe),
@@ -106,11 +108,12 @@ def generate(cfg: DictConfig) -> PointSet:
             return pointset
         start = time.perf_counter()
         parts.begin(recipe)
-        passing = _scan_missing(job, items, parts, cfg.workers, domain.label)
+        passing = _scan_missing(job, items, parts, pool, domain.label)
         outcomes = _collect(items, parts, passing, folder)
         # The dataset last: with meta.yaml it counts as finished, and the parts can go.
         _draw(domain, items, outcomes, folder)
         write_text(folder / CONFIG, OmegaConf.to_yaml(cfg, resolve=True))
+        write_text(folder / COSTS, _costs(items, outcomes))
         pointset = _write(domain, items, outcomes, recipe, cfg)
         parts.clear()
     _report(pointset, items, outcomes, folder, time.perf_counter() - start)
@@ -148,7 +151,7 @@ def _check_strict(cfg: DictConfig, pointset: PointSet, items: list[MeshItem], fo
 
 
 def _scan_missing(
-    job: Job, items: list[MeshItem], parts: Parts, workers: int, label: str
+    job: Job, items: list[MeshItem], parts: Parts, pool: Pool, label: str
 ) -> dict[str, Outcome]:
     """Scan what has no part yet; the failures that are not the objects' fault, by id.
 
@@ -159,7 +162,7 @@ def _scan_missing(
     if len(missing) < len(items):
         log.info("continuing: %d of %d objects are done", len(items) - len(missing), len(items))
     with progress_bar(label, total=len(items), done=len(items) - len(missing)) as advance:
-        for outcome in scan_all(job, missing, workers):
+        for outcome in scan_all(job, missing, pool):
             if not outcome.lasting:
                 passing[outcome.item_id] = outcome
             elif not outcome.saved:
@@ -203,6 +206,15 @@ def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome], folder
     clouds_picture(folder / CLOUDS, clouds, domain.label, twin)
     if previews:
         infrared_picture(folder / INFRARED, previews, domain.label)
+
+
+def _costs(items: list[MeshItem], outcomes: list[Outcome]) -> str:
+    """costs.csv. Not in manifest.csv, which is the same whoever scanned the objects."""
+    rows = [
+        f"{item.id},{outcome.seconds:g},{outcome.memory_mb:g}"
+        for item, outcome in zip(items, outcomes, strict=True)
+    ]
+    return "\n".join(["id,seconds,peak_memory_mb", *rows, ""])
 
 
 def _write(

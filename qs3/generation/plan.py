@@ -38,7 +38,7 @@ _OF_LIGHT = ("materials", "light")
 _ADDED = "catalogue-"  # before the names of objects that fill up the user's
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
 # Keys of a config that say where things lie, or that never change a byte.
-_UNSTORED = ("paths", "workers", "force", "strict")
+_UNSTORED = ("paths", "workers", "engine", "force", "strict")
 
 
 def check(cfg: DictConfig) -> None:

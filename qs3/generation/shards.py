@@ -26,6 +26,8 @@ class Parts(PartFiles):
             "mesh_sha256": outcome.mesh_sha256,
             "reason": outcome.reason,
             "note": outcome.note,
+            "seconds": outcome.seconds,
+            "memory_mb": outcome.memory_mb,
             "views": cloud.views if cloud else 0,
             "valid_points": cloud.valid_points if cloud else 0,
         }
@@ -45,9 +47,8 @@ class Parts(PartFiles):
         cloud = None
         if arrays:
             cloud = Cloud(arrays, note["views"], note["valid_points"], preview=preview)
-        return Outcome(
-            note["item_id"], note["mesh_sha256"], cloud, note["reason"], note=note["note"]
-        )
+        same = ("item_id", "mesh_sha256", "reason", "note", "seconds", "memory_mb")
+        return Outcome(cloud=cloud, **{key: note[key] for key in same})
 
     def done(self, item_id: str) -> bool:
         """Whether an outcome is saved."""

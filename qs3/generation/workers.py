@@ -9,23 +9,27 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 from qs3.errors import Qs3Error, RenderError
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud, Recipe
+from qs3.generation.travel import check_software, sent, software
 from qs3.generation.view_files import DiskError, disk_errors_travel
 from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
-from qs3.utils.pool import Processes
+from qs3.utils.pool import Pool, Processes
 
 log = logging.getLogger(__name__)
 
 OBJECTS_PER_WORKER = 200
 _DEATHS = 3  # objects in a row
-DIED = "the worker process died twice on this object (out of memory, or a crash)"
+DIED = "the worker process died on this object each time (out of memory, or a crash)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +45,8 @@ class Outcome:
             defect of ours. Other failures are tried again at the next start.
         note: what else its manifest row should say of an object that did not fail.
         saved: the worker has saved it (`Job.save`); then `cloud` is None here.
+        seconds: that the scan took.
+        memory_mb: the most that its process had taken by then.
     """
 
     item_id: str
@@ -50,6 +56,8 @@ class Outcome:
     lasting: bool = True
     note: str = ""
     saved: bool = False
+    seconds: float = 0.0
+    memory_mb: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,16 @@ def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
     Raises:
         DiskError: the views cannot be written; it would be the same with every object.
     """
+    begin = time.perf_counter()
+    outcome = _scan(job, renderer, item)
+    seconds = time.perf_counter() - begin
+    # In kilobytes, on macOS in bytes.
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak_mb = peak / (2**20 if sys.platform == "darwin" else 2**10)
+    return replace(outcome, seconds=round(seconds, 3), memory_mb=round(peak_mb, 1))
+
+
+def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
     sha256, lasting = "", True
     try:
         mesh = item.load()
@@ -117,23 +135,28 @@ def renderer_provenance(job: Job) -> dict[str, str]:
     return provenance
 
 
-def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]:
+def scan_all(job: Job, items: list[MeshItem], pool: Pool) -> Iterator[Outcome]:
     """Outcomes in the order in which they are done.
 
     Args:
         job: what to do.
         items: with which meshes.
-        workers: processes; 0 works in this one (for tests and debuggers).
+        pool: who does it.
 
     Raises:
-        RenderError: one object after the other kills its worker; it is not the objects.
+        RenderError: one object after the other kills its worker, it is not the objects; or a
+            machine of the pool would make other clouds.
+        ConfigError: meshes or views cannot be sent between machines without a disk in common.
     """
     # Each worker can meet a deadly object at the same time; as many again are too many.
-    patience = min(max(2 * workers, _DEATHS), max(len(items), _DEATHS))
+    patience = min(max(2 * pool.workers, _DEATHS), max(len(items), _DEATHS))
     deaths = 0
-    make_worker = partial(_Scanner, job, saves=workers > 0)
+    if not pool.shared_disk:
+        items = sent(items, keep_views=job.keep.views is not None)
+    saves = pool.shared_disk and pool.workers > 0
+    make_worker = partial(_Scanner, job, saves, software() if pool.elsewhere else None)
     tasks = ((item.id, item) for item in items)
-    for outcome in Processes(workers, OBJECTS_PER_WORKER).run(make_worker, tasks):
+    for outcome in pool.run(make_worker, tasks):
         deaths = deaths + 1 if outcome.died else 0
         if deaths == patience:
             raise RenderError(
@@ -146,7 +169,9 @@ def scan_all(job: Job, items: list[MeshItem], workers: int) -> Iterator[Outcome]
 class _Scanner:
     """A worker: scans objects with a renderer of its own."""
 
-    def __init__(self, job: Job, saves: bool) -> None:
+    def __init__(self, job: Job, saves: bool, expected: Mapping[str, str] | None = None) -> None:
+        if expected is not None:
+            check_software(expected)
         self.job = job
         self.save = job.save if saves else None
         self.renderer = job.make_renderer() if job.recipe.needs_renderer else None

@@ -13,10 +13,10 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -38,6 +38,29 @@ class Outcome(Generic[Result]):
     died: bool = False
 
 
+class Pool(Protocol):
+    """Whoever does named tasks: processes of this machine, or `qs3.cluster`."""
+
+    @property
+    def workers(self) -> int:
+        """How many tasks are done at the same time, about; 0: here, one after the other."""
+
+    @property
+    def shared_disk(self) -> bool:
+        """Whether workers see the files of this process under the same paths."""
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether workers may be on machines with other software."""
+
+    def run(
+        self,
+        make_worker: Callable[[], Callable[[Task], Result]],
+        tasks: Iterable[tuple[str, Task]],
+    ) -> Iterator[Outcome[Result]]:
+        """Do the tasks; see `Processes.run`."""
+
+
 @dataclass(frozen=True)
 class Processes:
     """Does named tasks in processes of this machine, and gives each outcome as soon as it is there.
@@ -54,6 +77,8 @@ class Processes:
 
     workers: int
     tasks_per_process: int | None = None
+    shared_disk: bool = field(default=True, init=False)
+    elsewhere: bool = field(default=False, init=False)
 
     def run(
         self,
@@ -199,7 +224,7 @@ def _work(pipe: Connection, make_worker: Callable[[], Callable[[Any], Any]]) -> 
             work = work or make_worker()
             answer = pickle.dumps((True, work(pickle.loads(message))))
         except Exception as error:
-            answer = pickle.dumps((False, _portable(error)))
+            answer = pickle.dumps((False, portable(error)))
         pipe.send_bytes(answer)
 
 
@@ -210,8 +235,11 @@ def _die_with_parent() -> None:
     os._exit(1)
 
 
-def _portable(error: Exception) -> Exception:
-    """The error, with where it was raised as a note, or what it says if it cannot be pickled."""
+def portable(error: Exception) -> Exception:
+    """A worker's error for its parent, with where it was raised as a note.
+
+    Or, if it cannot be pickled, what it says.
+    """
     where = "".join(traceback.format_exception(error))
     try:
         error.add_note(f"in a worker process:\n{where}")

@@ -220,7 +220,7 @@ def test_help_is_short(help_text):
 
 GROUPS = (
     *("sensor", "sensor/matcher", "synthesis", "scene", "materials", "light", "tracking", "crop"),
-    *("renderer", "released", "counts"),
+    *("renderer", "released", "counts", "engine"),
 )
 
 
@@ -264,8 +264,10 @@ def test_meta_holds_the_whole_config_but_places_and_what_changes_no_byte():
     overrides = ("limit=3", "scene=room", "renderer=mitsuba")
     stored = stored_config(config(*overrides, "meshes=/mine", "workers=3", "paths.data_dir=/x"))
     assert stored == stored_config(config(*overrides, "meshes=/yours", "renderer.threads=2"))
+    assert stored == stored_config(config(*overrides, "meshes=/mine", "engine=slurm"))
     whole = OmegaConf.to_container(config(*overrides))
-    for key in set(whole) - {"paths", "workers", "force", "strict", "renderer", "meshes"}:
+    kept = set(whole) - {"paths", "workers", "engine", "force", "strict", "renderer", "meshes"}
+    for key in kept:
         assert stored[key] == whole[key], key
     assert stored["renderer"] == {k: v for k, v in whole["renderer"].items() if k != "threads"}
     assert not re.search("/mine|/x", str(stored))

@@ -8,9 +8,10 @@ import pytest
 
 import qs3
 from qs3.data.store import open_pointset
+from qs3.generation.code_digits import code_digits
 from qs3.generation.command import generate
 from qs3.generation.plan import describe, mesh_items
-from qs3.generation.recipe_digits import code_digits, recipe_digits
+from qs3.generation.recipe_digits import recipe_digits
 from tests.generation.generating import config
 
 VERSIONS = {"renderer": "mitsuba", "mitsuba": "3.9.1", "llvm": "15", "width": "8", "machine": "a"}

@@ -15,6 +15,7 @@ from qs3.generation.view_files import DiskError
 from qs3.generation.workers import DIED, Job, renderer_provenance, scan_all
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
+from qs3.utils.pool import Processes
 
 
 def mesh():
@@ -62,7 +63,8 @@ JOB = Job(Moody(), no_renderer, seed=3)
 def test_failures_of_objects_are_outcomes(workers):
     bad = MeshItem("bad", "chair", "train", unreadable, "bad")
     outcomes = {
-        o.item_id: o for o in scan_all(JOB, [*items("a", "odd", "dark", "b"), bad], workers)
+        o.item_id: o
+        for o in scan_all(JOB, [*items("a", "odd", "dark", "b"), bad], Processes(workers))
     }
     assert outcomes["a"].cloud is not None
     assert outcomes["b"].cloud.arrays["points"][0, 0] == ord("b") + 3
@@ -76,13 +78,13 @@ def test_a_full_disk_is_not_the_objects_fault():
     """It stops the run, from any process, and does not become one object's failure."""
     for workers in (0, 1):
         with pytest.raises(DiskError, match="No space left"):
-            list(scan_all(JOB, items("a", "full", "b"), workers))
+            list(scan_all(JOB, items("a", "full", "b"), Processes(workers)))
 
 
 def test_an_object_that_kills_its_worker_costs_only_itself():
     names = [f"object_{i}" for i in range(8)]
     names.insert(3, "deadly")
-    outcomes = {o.item_id: o for o in scan_all(JOB, items(*names), workers=2)}
+    outcomes = {o.item_id: o for o in scan_all(JOB, items(*names), Processes(2))}
     assert set(outcomes) == set(names)
     assert outcomes.pop("deadly").reason == DIED
     assert all(o.cloud is not None for o in outcomes.values())
@@ -90,7 +92,9 @@ def test_an_object_that_kills_its_worker_costs_only_itself():
 
 def test_if_every_object_kills_its_worker_it_is_not_the_objects():
     with pytest.raises(RenderError, match=r"objects in a row ended their worker.*qs3 doctor"):
-        list(scan_all(Job(Moody(deadly=""), no_renderer, 0), items("a", "b", "c", "d"), workers=1))
+        list(
+            scan_all(Job(Moody(deadly=""), no_renderer, 0), items("a", "b", "c", "d"), Processes(1))
+        )
 
 
 def die(exit_code):

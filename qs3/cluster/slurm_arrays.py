@@ -1,0 +1,249 @@
+"""Tasks as jobs of SLURM's arrays, by submitit; all nodes see the same disk.
+
+A job does a chunk of tasks, one after the other, and writes each result to a journal as soon as it
+is there. So results come in while a job runs, and when one ends early (killed, out of memory or
+time, its node lost) what it had done is kept and it is known which task it had.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import struct
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from qs3.config.checks import check_choice, check_int
+from qs3.errors import ConfigError
+from qs3.utils.pool import Outcome, Result, Task
+
+log = logging.getLogger(__name__)
+
+_STOP_S = 10.0
+_LENGTH = struct.Struct("<Q")
+
+
+@dataclass(frozen=True)
+class SlurmArrays:
+    """Does named tasks in array jobs; see `qs3.utils.pool.Pool`.
+
+    Args:
+        folder: for submitit's files and the journals; on a disk that all nodes see.
+        cluster: "slurm", or "local" for processes of this machine (to try a setting).
+        jobs: at most so many run at once.
+        tasks_per_job: how many tasks a job has.
+        minutes: that a job may take.
+        cpus, memory_gb: that a job gets.
+        partition, setup: of SLURM, and shell lines before the job; None: none.
+        attempts: a task during which so many jobs ended is given up.
+        poll_s: how often journals are read.
+
+    Raises:
+        ConfigError: a value cannot be.
+    """
+
+    folder: str
+    cluster: str = "slurm"
+    jobs: int = 50
+    tasks_per_job: int = 100
+    minutes: int = 240
+    cpus: int = 1
+    memory_gb: int = 4
+    partition: str | None = None
+    setup: tuple[str, ...] = ()
+    attempts: int = 3
+    poll_s: float = 5.0
+    shared_disk: bool = field(default=True, init=False)
+    elsewhere: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        check_choice("engine.cluster", self.cluster, ("slurm", "local"))
+        for key in ("jobs", "tasks_per_job", "minutes", "cpus", "memory_gb", "attempts"):
+            check_int(f"engine.{key}", getattr(self, key), 1)
+
+    @property
+    def workers(self) -> int:
+        """How many tasks are done at the same time."""
+        return self.jobs
+
+    def run(
+        self,
+        make_worker: Callable[[], Callable[[Task], Result]],
+        tasks: Iterable[tuple[str, Task]],
+    ) -> Iterator[Outcome[Result]]:
+        """Do the tasks; as `qs3.utils.pool.Processes.run`.
+
+        Raises:
+            ConfigError: submitit is not installed, or there is no SLURM here.
+        """
+        executor = self._executor()
+        waiting = iter(tasks)
+        again: list[tuple[str, Any]] = []
+        deaths: Counter[str] = Counter()
+        running: list[_Job] = []
+        try:
+            while True:
+                chunks: list[list[tuple[str, Any]]] = []
+                while len(running) + len(chunks) < self.jobs:
+                    # A task that has ended a job is a job of its own: it takes no other one along.
+                    chunk = [again.pop()] if again else list(islice(waiting, self.tasks_per_job))
+                    if not chunk:
+                        break
+                    chunks.append(chunk)
+                running += self._submit(executor, make_worker, chunks)
+                if not running:
+                    return
+                for job in list(running):
+                    ended = job.handle.done()  # before reading: what it wrote last is there, too
+                    yield from job.new_outcomes()
+                    if not ended:
+                        continue
+                    running.remove(job)
+                    job.journal.unlink(missing_ok=True)
+                    again += job.unfinished(deaths)
+                    for name, _ in [one for one in again if deaths[one[0]] >= self.attempts]:
+                        yield Outcome(name, None, died=True)
+                    again = [one for one in again if deaths[one[0]] < self.attempts]
+                if running:
+                    time.sleep(self.poll_s)
+        finally:
+            _cancel(running, wait_s=_STOP_S if self.cluster == "local" else 0)
+
+    def _executor(self) -> Any:
+        try:
+            import submitit
+        except ImportError as error:
+            raise ConfigError("engine=slurm needs submitit: pip install 'qs3[slurm]'") from error
+        try:
+            executor = submitit.AutoExecutor(folder=self.folder, cluster=self.cluster)
+        except RuntimeError as error:
+            raise ConfigError(f"engine=slurm: {error}; try it with engine.cluster=local") from error
+        given: dict[str, Any] = {
+            "timeout_min": self.minutes,
+            "cpus_per_task": self.cpus,
+            "mem_gb": self.memory_gb,
+            "name": "qs3",
+            "slurm_array_parallelism": self.jobs,
+        }
+        if self.partition:
+            given["slurm_partition"] = self.partition
+        if self.setup:
+            given["slurm_setup"] = list(self.setup)
+        executor.update_parameters(**given)
+        return executor
+
+    def _submit(
+        self, executor: Any, make_worker: Callable[[], Any], chunks: list[list[tuple[str, Any]]]
+    ) -> list[_Job]:
+        if not chunks:
+            return []
+        folder = Path(self.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        journals = [folder / f"{os.urandom(8).hex()}.journal" for _ in chunks]
+        with executor.batch():
+            handles = [
+                executor.submit(_do_chunk, make_worker, chunk, journal)
+                for chunk, journal in zip(chunks, journals, strict=True)
+            ]
+        return [
+            _Job(handle, chunk, journal)
+            for handle, chunk, journal in zip(handles, chunks, journals, strict=True)
+        ]
+
+
+@dataclass
+class _Job:
+    """A job of an array, as this process sees it."""
+
+    handle: Any
+    chunk: list[tuple[str, Any]]
+    journal: Path
+    read: int = 0
+    begun: str | None = None
+    done: set[str] = field(default_factory=set)
+
+    def new_outcomes(self) -> Iterator[Outcome[Any]]:
+        """What its journal has gained; a record that is being written is left for the next time."""
+        for name, found in self._records():
+            if found is None:
+                self.begun = name
+                continue
+            good, value = found
+            if not good:
+                raise value
+            self.begun = None
+            self.done.add(name)
+            yield Outcome(name, value)
+
+    def _records(self) -> Iterator[tuple[str, Any]]:
+        try:
+            with self.journal.open("rb") as file:
+                file.seek(self.read)
+                new = file.read()
+        except FileNotFoundError:
+            return
+        at = 0
+        while len(new) - at >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(new, at)
+            end = at + _LENGTH.size + length
+            if end > len(new):
+                break
+            self.read += end - at
+            record = pickle.loads(new[at + _LENGTH.size : end])  # by a job of ours
+            at = end
+            yield record
+
+    def unfinished(self, deaths: Counter[str]) -> list[tuple[str, Any]]:
+        """What is to be done again; the task during which the job ended is charged for it."""
+        left = [(name, task) for name, task in self.chunk if name not in self.done]
+        if left:
+            guilty = self.begun or left[0][0]  # before its first task: all would end as that one
+            deaths[guilty] += 1
+            log.warning("%s: its job ended early (%s)", guilty, self._why())
+        return left
+
+    def _why(self) -> str:
+        with suppress(Exception):
+            error = self.handle.exception()
+            return " ".join(str(error).split())[:200] if error else "no reason is known"
+        return "no reason is known"
+
+
+def _cancel(jobs: list[_Job], wait_s: float) -> None:
+    """End jobs; processes of this machine are waited for."""
+    for job in jobs:
+        with suppress(Exception):  # it has ended by now
+            job.handle.cancel()
+    end = time.monotonic() + wait_s
+    while time.monotonic() < end and not all(job.handle.done() for job in jobs):
+        time.sleep(0.1)
+
+
+def _do_chunk(make_worker: Callable[[], Any], chunk: list[tuple[str, Any]], journal: Path) -> int:
+    """A job: its tasks one after the other, each with two records in the journal."""
+    from qs3.utils.pool import portable
+
+    with journal.open("ab", buffering=0) as file:
+
+        def note(name: str, found: tuple[bool, Any] | None) -> None:
+            record = pickle.dumps((name, found))
+            file.write(_LENGTH.pack(len(record)) + record)
+
+        work = None
+        for name, task in chunk:
+            note(name, None)
+            try:
+                work = work or make_worker()
+                result = work(task)
+            except Exception as error:
+                note(name, (False, portable(error)))
+                return 0
+            note(name, (True, result))
+    return len(chunk)

@@ -1,0 +1,35 @@
+"""A hash of the code that makes clouds: the same for the same code, whatever its words."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+from pathlib import Path
+
+_ROOT = Path(__file__).resolve().parents[1]
+_MAKES_CLOUDS = ("clouds", "generation", "geometry", "meshes", "sensors")
+
+
+@functools.cache
+def code_digits(root: Path = _ROOT) -> str:
+    """Hash of what the packages that make clouds do."""
+    digest = hashlib.sha256()
+    for package in _MAKES_CLOUDS:
+        for path in sorted((root / package).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            digest.update(path.relative_to(root).as_posix().encode())
+            digest.update(ast.dump(_without_docstrings(tree)).encode())
+    return digest.hexdigest()
+
+
+def _without_docstrings(tree: ast.AST) -> ast.AST:
+    """The tree itself, whose constants that are statements are gone."""
+    for node in ast.walk(tree):
+        if isinstance(body := getattr(node, "body", None), list):
+            body[:] = [
+                line
+                for line in body
+                if not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant))
+            ]
+    return tree

@@ -1,0 +1,186 @@
+"""generate.py on a cluster of Ray with three nodes, whose parts are killed; and on array jobs."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from qs3.data.store import open_pointset
+from qs3.errors import ConfigError, MeshError, RenderError
+from qs3.generation import travel
+from qs3.generation.command import generate
+from qs3.meshes.folder import MeshFolder
+from tests.generation.generating import QUICK, ROOT, config, fingerprint
+
+slow = pytest.mark.slow
+SCANS = ["scans=5", "classes=[chair,table,lamp]", "renderer.samples=1"]
+
+
+class Nodes:
+    """Three nodes of Ray on this machine, each with one core."""
+
+    def __init__(self):
+        from ray.cluster_utils import Cluster
+
+        os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+        small = {"num_cpus": 1, "object_store_memory": 100 * 2**20}
+        head = {**small, "include_dashboard": False}
+        self.cluster = Cluster(initialize_head=True, head_node_args=head)
+        self.others = [self.cluster.add_node(**small) for _ in range(2)]
+
+    def kill_one(self):
+        self.cluster.remove_node(self.others.pop(), allow_graceful=False)
+
+
+@pytest.fixture
+def nodes():
+    found = Nodes()
+    yield found
+    found.cluster.shutdown()
+
+
+def at_work():
+    """Processes of Ray that are scanning now."""
+    pids = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if path.read_bytes().startswith(b"ray::_do"):
+                pids.append(int(path.parent.name))
+        except OSError:
+            continue
+    return pids
+
+
+def start(folder, meshes, *words):
+    command = [
+        sys.executable, "generate.py", "domain=specklenet10", *QUICK[:-1], *SCANS,
+        f"meshes={meshes}", f"paths.data_dir={folder}", "up=z", *words,
+    ]  # fmt: skip
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen(command, cwd=ROOT, start_new_session=True, **pipes)
+
+
+def wait_for(condition, process, what):
+    end = time.monotonic() + 240
+    while not condition():
+        if process.poll() is not None:
+            pytest.fail(f"it ended before {what}:\n{process.stdout.read()}")
+        assert time.monotonic() < end, what
+        time.sleep(0.1)
+
+
+def scanned(folder):
+    return len(list((folder / "specklenet10" / "parts").glob("*.npz")))
+
+
+def ended(process):
+    said = process.communicate(timeout=400)[0]
+    assert process.returncode == 0, said
+    return said
+
+
+@pytest.fixture(scope="module")
+def whole(meshes, tmp_path_factory):
+    """What one process of this machine makes of it."""
+    folder = tmp_path_factory.mktemp("whole")
+    generate(config(folder, meshes, *SCANS, "up=z", "workers=0"))
+    return fingerprint(folder / "specklenet10")
+
+
+@slow
+@pytest.mark.parametrize("shared", ["true", "false"])
+def test_a_node_and_a_worker_are_killed(nodes, meshes, whole, tmp_path, shared):
+    """With meshes that all nodes see, and with meshes that are sent to them."""
+    process = start(
+        tmp_path, meshes, "engine=ray", f"engine.address={nodes.cluster.address}",
+        f"engine.shared_disk={shared}",
+    )  # fmt: skip
+    wait_for(lambda: scanned(tmp_path) >= 3, process, "three objects were done")
+    nodes.kill_one()
+    done = scanned(tmp_path)
+    wait_for(lambda: scanned(tmp_path) > done and at_work(), process, "more were done")
+    os.kill(at_work()[0], signal.SIGKILL)
+    said = ended(process)
+    assert "Ray: 3 nodes, 3 cores" in said
+    assert "what it had was done again" in said
+    assert fingerprint(tmp_path / "specklenet10") == whole
+    costs = (tmp_path / "specklenet10" / "costs.csv").read_text().splitlines()
+    assert len(costs) == 1 + 45
+    assert all(float(line.split(",")[1]) > 0 for line in costs[1:])
+
+
+@slow
+def test_the_driver_is_killed_and_goes_on(nodes, meshes, whole, tmp_path):
+    words = ("engine=ray", f"engine.address={nodes.cluster.address}")
+    process = start(tmp_path, meshes, *words)
+    wait_for(lambda: scanned(tmp_path) >= 5, process, "five objects were done")
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    done = scanned(tmp_path)
+    assert 5 <= done < 45
+    process = start(tmp_path, meshes, *words)
+    said = ended(process)
+    assert "continuing: " in said
+    assert fingerprint(tmp_path / "specklenet10") == whole
+
+
+@slow
+def test_array_jobs_make_the_same(meshes, whole, tmp_path):
+    """SLURM's array jobs, by the processes with which submitit stands in for them."""
+    words = ("cluster=local", "jobs=2", "tasks_per_job=10", "poll_s=0.5")
+    process = start(tmp_path, meshes, "engine=slurm", *(f"engine.{word}" for word in words))
+    ended(process)
+    assert fingerprint(tmp_path / "specklenet10") == whole
+
+
+def test_other_software_is_refused(monkeypatch):
+    here = travel.software()
+    travel.check_software(here)
+    assert {"numpy", "mitsuba", "python", "qs3's code"} <= set(here)
+    with pytest.raises(RenderError, match=r"numpy is .* there and 0\.1 here\. Install"):
+        travel.check_software({**here, "numpy": "0.1"})
+
+
+def items_of(root):
+    return MeshFolder(root, classes=("chair",)).items()
+
+
+def test_meshes_travel_without_their_disk(meshes, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(meshes, copy)
+    (copy / "chair" / "train" / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement")
+    items = items_of(copy)
+    expected = [item.load() for item in items if "broken" not in item.id]
+    with pytest.raises(MeshError) as here:
+        next(item for item in items if "broken" in item.id).load()
+    messages = [pickle.dumps(item) for item in travel.sent(items, keep_views=False)]
+    shutil.rmtree(copy)
+    arrived = [pickle.loads(message) for message in messages]
+    whole = [item for item in arrived if "broken" not in item.id]
+    assert [item.load().sha256 for item in whole] == [mesh.sha256 for mesh in expected]
+    with pytest.raises(MeshError) as there:
+        next(item for item in arrived if "broken" in item.id).load()
+    assert str(there.value) == str(here.value)  # and not where the copy lay
+
+
+def test_what_cannot_be_sent_is_said(tmp_path):
+    (tmp_path / "chair" / "train").mkdir(parents=True)
+    (tmp_path / "chair" / "train" / "a.gltf").touch()
+    with pytest.raises(ConfigError, match=r"chair/train/a\.gltf.*\.glb"):
+        travel.sent(items_of(tmp_path), keep_views=False)
+    with pytest.raises(ConfigError, match=r"engine\.shared_disk=true"):
+        travel.sent([], keep_views=True)
+
+
+def test_the_engine_is_not_part_of_what_is_stored(meshes, tmp_path):
+    """A dataset is the same whoever scanned it, so its meta does not say."""
+    generate(config(tmp_path, meshes, "workers=0", domain="modelnet10"))
+    assert "engine" not in open_pointset(tmp_path / "modelnet10").meta["config"]
