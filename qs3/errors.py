@@ -29,5 +29,9 @@ class RenderError(Qs3Error):
     """A renderer cannot be used here, or failed."""
 
 
+class ClusterError(Qs3Error):
+    """The machines that were to work for this one cannot go on."""
+
+
 class SelectionError(Qs3Error):
     """A round of self-training selected too little to train on."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -18,7 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from qs3.config.checks import check_float, check_int
-from qs3.errors import ConfigError
+from qs3.errors import ClusterError, ConfigError
 from qs3.utils.pool import Outcome, Result, Task
 
 log = logging.getLogger(__name__)
@@ -80,6 +81,18 @@ class RayTasks:
                 f"engine.address must be local, auto or an address, got {self.address!r}"
             )
 
+    @property
+    def memory_bytes(self) -> int:
+        """That a task asks for."""
+        return int((self.memory_gb or 0) * 2**30)
+
+    @property
+    def at_once(self) -> int:
+        """Of a cluster that is connected, as many as its cores allow."""
+        if (ray := sys.modules.get("ray")) is None or not ray.is_initialized():
+            return self.workers
+        return max(1, int(ray.cluster_resources().get("CPU", 0) / self.cpus))
+
     def run(
         self,
         make_worker: Callable[[], Callable[[Task], Result]],
@@ -100,14 +113,13 @@ class _Run:
     """One call of `RayTasks.run`, with the cluster at hand."""
 
     def __init__(self, ray: ModuleType, how: RayTasks, make_worker: Callable[[], Any]) -> None:
-        self.ray, self.attempts = ray, how.attempts
-        memory = {} if how.memory_gb is None else {"memory": int(how.memory_gb * 2**30)}
+        self.ray, self.how = ray, how
+        memory = {} if how.memory_gb is None else {"memory": how.memory_bytes}
         self.remote = ray.remote(
             num_cpus=how.cpus, max_calls=how.tasks_per_process, max_retries=0, **memory
         )(_do)
         self.make_worker = ray.put(make_worker)
         self.key = os.urandom(16)  # of this run: a process of Ray may have served another one
-        self.cpus = how.cpus
         self.pending: dict[Any, _Work] = {}
         self.again: list[_Work] = []
         self.nodes: Counter[str] = Counter()
@@ -118,7 +130,7 @@ class _Run:
         try:
             while True:
                 # Twice as many as can run: a core that gets free need not wait for this process.
-                while len(self.pending) < 2 * self._at_once():
+                while len(self.pending) < 2 * self.how.at_once:
                     work = self.again.pop() if self.again else next(waiting, None)
                     if work is None:
                         break
@@ -135,9 +147,6 @@ class _Run:
                 with suppress(Exception):  # it has ended by now, or the cluster is gone
                     self.ray.cancel(ref, force=True)
 
-    def _at_once(self) -> int:
-        return max(1, int(self.ray.cluster_resources().get("CPU", 0) / self.cpus))
-
     def _outcome(self, ref: Any, work: _Work) -> Outcome[Any] | None:
         """What became of a task; None if it is to be done again."""
         errors = self.ray.exceptions
@@ -153,8 +162,13 @@ class _Run:
         except (errors.WorkerCrashedError, errors.OutOfMemoryError) as error:
             work.deaths += 1
             self._note("a process ended", work, error)
-            if work.deaths >= self.attempts:
+            if work.deaths >= self.how.attempts:
                 return Outcome(work.name, None, died=True)
+        except errors.RayError as error:
+            raise ClusterError(
+                f"Ray ended the run at {work.name}: {type(error).__name__}: "
+                f"{' '.join(str(error).split())[:300]}. Run the same command again: it goes on"
+            ) from error
         else:
             self.nodes[node] += 1
             return Outcome(work.name, result)
@@ -199,18 +213,25 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
     quiet = {"log_to_driver": False, "logging_level": logging.WARNING, "configure_logging": False}
     local = {"num_cpus": how.workers, "include_dashboard": False} if how.address == "local" else {}
     try:
-        ray.init(address=how.address, **local, **quiet)
-        nodes = sum(bool(node["Alive"]) for node in ray.nodes())
+        try:
+            ray.init(address=how.address, **local, **quiet)
+        except ConnectionError as error:
+            raise ConfigError(
+                f"there is no Ray cluster at engine.address={how.address}: start one "
+                "(`ray start --head`) or take engine.address=local"
+            ) from error
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         cpus = int(ray.cluster_resources().get("CPU", 0))
-        log.info("Ray: %d nodes, %d cores", nodes, cpus)
-        if not any(node["Resources"].get("CPU", 0) >= how.cpus for node in ray.nodes()):
-            raise ConfigError(f"no node of the cluster has engine.cpus={how.cpus} cores")
+        log.info("Ray: %d nodes, %d cores", len(nodes), cpus)
+        if not any(
+            has.get("CPU", 0) >= how.cpus and has.get("memory", 0) >= how.memory_bytes
+            for has in nodes
+        ):
+            raise ConfigError(
+                f"no node of the cluster has engine.cpus={how.cpus} cores and "
+                f"engine.memory_gb={how.memory_gb or 0} of memory"
+            )
         yield
-    except ConnectionError as error:
-        raise ConfigError(
-            f"there is no Ray cluster at engine.address={how.address}: start one "
-            "(`ray start --head`) or take engine.address=local"
-        ) from error
     finally:
         ray.shutdown()
         for name, value in kept.items():

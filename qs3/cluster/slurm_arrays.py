@@ -10,23 +10,25 @@ from __future__ import annotations
 import logging
 import os
 import pickle
+import signal
 import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-from qs3.config.checks import check_choice, check_int
+from qs3.config.checks import check_choice, check_float, check_int
 from qs3.errors import ConfigError
-from qs3.utils.pool import Outcome, Result, Task
+from qs3.utils.pool import Outcome, Result, Task, portable
 
 log = logging.getLogger(__name__)
 
 _STOP_S = 10.0
+_GRACE_S = 600.0
 _LENGTH = struct.Struct("<Q")
 
 
@@ -39,7 +41,7 @@ class SlurmArrays:
         cluster: "slurm", or "local" for processes of this machine (to try a setting).
         jobs: at most so many run at once.
         tasks_per_job: how many tasks a job has.
-        minutes: that a job may take.
+        time_limit_min: that a job may take; what it has not done by then goes to another one.
         cpus, memory_gb: that a job gets.
         partition, setup: of SLURM, and shell lines before the job; None: none.
         attempts: a task during which so many jobs ended is given up.
@@ -53,7 +55,7 @@ class SlurmArrays:
     cluster: str = "slurm"
     jobs: int = 50
     tasks_per_job: int = 100
-    minutes: int = 240
+    time_limit_min: int = 240
     cpus: int = 1
     memory_gb: int = 4
     partition: str | None = None
@@ -65,11 +67,19 @@ class SlurmArrays:
 
     def __post_init__(self) -> None:
         check_choice("engine.cluster", self.cluster, ("slurm", "local"))
-        for key in ("jobs", "tasks_per_job", "minutes", "cpus", "memory_gb", "attempts"):
+        for key in ("jobs", "tasks_per_job", "time_limit_min", "cpus", "memory_gb", "attempts"):
             check_int(f"engine.{key}", getattr(self, key), 1)
+        check_float("engine.poll_s", self.poll_s, "(0, inf)")
+        for key in ("folder", "partition"):
+            if not isinstance(value := getattr(self, key), str | None) or value == "":
+                raise ConfigError(f"engine.{key} must be a text, got {value!r}")
+        if isinstance(self.setup, str):
+            raise ConfigError(
+                f"engine.setup is a list of shell lines: engine.setup=['{self.setup}']"
+            )
 
     @property
-    def workers(self) -> int:
+    def at_once(self) -> int:
         """How many tasks are done at the same time."""
         return self.jobs
 
@@ -101,16 +111,20 @@ class SlurmArrays:
                 if not running:
                     return
                 for job in list(running):
-                    ended = job.handle.done()  # before reading: what it wrote last is there, too
-                    yield from job.new_outcomes()
+                    ended = job.ended(self.time_limit_min * 60 + _GRACE_S)
+                    yield from job.new_outcomes()  # after: what it wrote last is there, too
                     if not ended:
                         continue
                     running.remove(job)
-                    job.journal.unlink(missing_ok=True)
-                    again += job.unfinished(deaths)
-                    for name, _ in [one for one in again if deaths[one[0]] >= self.attempts]:
-                        yield Outcome(name, None, died=True)
-                    again = [one for one in again if deaths[one[0]] < self.attempts]
+                    for file in job.files():
+                        file.unlink(missing_ok=True)
+                    left = job.unfinished(deaths)
+                    waiting = chain([one for one in left if not deaths[one[0]]], waiting)
+                    for name, task in (one for one in left if deaths[one[0]]):
+                        if deaths[name] < self.attempts:
+                            again.append((name, task))
+                        else:
+                            yield Outcome(name, None, died=True)
                 if running:
                     time.sleep(self.poll_s)
         finally:
@@ -122,11 +136,13 @@ class SlurmArrays:
         except ImportError as error:
             raise ConfigError("engine=slurm needs submitit: pip install 'qs3[slurm]'") from error
         try:
-            executor = submitit.AutoExecutor(folder=self.folder, cluster=self.cluster)
+            executor = submitit.AutoExecutor(
+                folder=Path(self.folder).absolute(), cluster=self.cluster
+            )
         except RuntimeError as error:
             raise ConfigError(f"engine=slurm: {error}; try it with engine.cluster=local") from error
         given: dict[str, Any] = {
-            "timeout_min": self.minutes,
+            "timeout_min": self.time_limit_min,
             "cpus_per_task": self.cpus,
             "mem_gb": self.memory_gb,
             "name": "qs3",
@@ -144,14 +160,18 @@ class SlurmArrays:
     ) -> list[_Job]:
         if not chunks:
             return []
-        folder = Path(self.folder)
+        folder = Path(self.folder).absolute()
         folder.mkdir(parents=True, exist_ok=True)
-        journals = [folder / f"{os.urandom(8).hex()}.journal" for _ in chunks]
-        with executor.batch():
-            handles = [
-                executor.submit(_do_chunk, make_worker, chunk, journal)
-                for chunk, journal in zip(chunks, journals, strict=True)
-            ]
+        journals = [folder / f"journal-{os.urandom(8).hex()}" for _ in chunks]
+        try:
+            with executor.batch():
+                handles = [
+                    executor.submit(_do_chunk, make_worker, chunk, journal)
+                    for chunk, journal in zip(chunks, journals, strict=True)
+                ]
+        except RuntimeError as error:  # what sbatch says, as submitit's FailedJobError
+            said = " ".join(str(error).split())[-300:]
+            raise ConfigError(f"SLURM does not take the jobs (engine.*): {said}") from error
         return [
             _Job(handle, chunk, journal)
             for handle, chunk, journal in zip(handles, chunks, journals, strict=True)
@@ -165,13 +185,33 @@ class _Job:
     handle: Any
     chunk: list[tuple[str, Any]]
     journal: Path
-    read: int = 0
+    read: dict[Path, int] = field(default_factory=dict)
     begun: str | None = None
+    begun_at: float | None = None
     done: set[str] = field(default_factory=set)
+
+    def files(self) -> list[Path]:
+        """Its journal, of each of its starts: SLURM may have begun it anew."""
+        return sorted(self.journal.parent.glob(f"{self.journal.name}.*"))
+
+    def ended(self, limit_s: float) -> bool:
+        """Whether nothing more will come.
+
+        Args:
+            limit_s: from its first record on. Then it is ended, too, if SLURM does not say so:
+                where no accounting is kept, a killed job runs for ever.
+        """
+        if self.handle.done():
+            return True
+        if self.begun_at is None or time.monotonic() - self.begun_at < limit_s:
+            return False
+        _cancel([self], wait_s=0)
+        return True
 
     def new_outcomes(self) -> Iterator[Outcome[Any]]:
         """What its journal has gained; a record that is being written is left for the next time."""
         for name, found in self._records():
+            self.begun_at = self.begun_at or time.monotonic()
             if found is None:
                 self.begun = name
                 continue
@@ -179,26 +219,25 @@ class _Job:
             if not good:
                 raise value
             self.begun = None
-            self.done.add(name)
-            yield Outcome(name, value)
+            if name not in self.done:
+                self.done.add(name)
+                yield Outcome(name, value)
 
     def _records(self) -> Iterator[tuple[str, Any]]:
-        try:
-            with self.journal.open("rb") as file:
-                file.seek(self.read)
+        for path in self.files():
+            with path.open("rb") as file:
+                file.seek(self.read.get(path, 0))
                 new = file.read()
-        except FileNotFoundError:
-            return
-        at = 0
-        while len(new) - at >= _LENGTH.size:
-            (length,) = _LENGTH.unpack_from(new, at)
-            end = at + _LENGTH.size + length
-            if end > len(new):
-                break
-            self.read += end - at
-            record = pickle.loads(new[at + _LENGTH.size : end])  # by a job of ours
-            at = end
-            yield record
+            at = 0
+            while len(new) - at >= _LENGTH.size:
+                (length,) = _LENGTH.unpack_from(new, at)
+                end = at + _LENGTH.size + length
+                if end > len(new):
+                    break
+                self.read[path] = self.read.get(path, 0) + end - at
+                record = pickle.loads(new[at + _LENGTH.size : end])  # by a job of ours
+                at = end
+                yield record
 
     def unfinished(self, deaths: Counter[str]) -> list[tuple[str, Any]]:
         """What is to be done again; the task during which the job ended is charged for it."""
@@ -228,9 +267,11 @@ def _cancel(jobs: list[_Job], wait_s: float) -> None:
 
 def _do_chunk(make_worker: Callable[[], Any], chunk: list[tuple[str, Any]], journal: Path) -> int:
     """A job: its tasks one after the other, each with two records in the journal."""
-    from qs3.utils.pool import portable
-
-    with journal.open("ab", buffering=0) as file:
+    # Before the time limit submitit would raise an error within a task, which would pass for a
+    # failure of that task. The process ends instead, and the journal says what it had.
+    signal.signal(signal.SIGUSR2, signal.SIG_DFL)
+    own = journal.with_name(f"{journal.name}.{time.time_ns()}")
+    with own.open("xb", buffering=0) as file:
 
         def note(name: str, found: tuple[bool, Any] | None) -> None:
             record = pickle.dumps((name, found))

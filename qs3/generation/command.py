@@ -5,9 +5,12 @@ Light to import: renderers live in worker processes only.
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import time
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,8 +45,9 @@ from qs3.generation.plan import (
     stored_config,
 )
 from qs3.generation.provenance import PROVENANCE
-from qs3.generation.recipe_digits import recipe_digits
+from qs3.generation.recipe_fingerprint import recipe_fingerprint
 from qs3.generation.shards import Parts
+from qs3.generation.travel import software
 from qs3.generation.up_axis import with_up_axis
 from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
@@ -98,7 +102,8 @@ def generate(cfg: DictConfig) -> PointSet:
     ):
         if cfg.force:
             delete_dataset(folder)
-        recipe = describe(cfg, items, renderer_provenance(job))
+        renderer = renderer_provenance(job)
+        recipe = describe(cfg, items, renderer)
         if is_finished(folder):
             parts.check(recipe)
             parts.clear()  # a kill after the last write leaves them
@@ -108,6 +113,9 @@ def generate(cfg: DictConfig) -> PointSet:
             return pointset
         start = time.perf_counter()
         parts.begin(recipe)
+        if pool.elsewhere:
+            place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
+            job = replace(job, expected={**software(), **renderer}, check_place=place)
         passing = _scan_missing(job, items, parts, pool, domain.label)
         outcomes = _collect(items, parts, passing, folder)
         # The dataset last: with meta.yaml it counts as finished, and the parts can go.
@@ -210,11 +218,12 @@ def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome], folder
 
 def _costs(items: list[MeshItem], outcomes: list[Outcome]) -> str:
     """costs.csv. Not in manifest.csv, which is the same whoever scanned the objects."""
-    rows = [
-        f"{item.id},{outcome.seconds:g},{outcome.memory_mb:g}"
-        for item, outcome in zip(items, outcomes, strict=True)
-    ]
-    return "\n".join(["id,seconds,peak_memory_mb", *rows, ""])
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(("id", "seconds", "peak_memory_mb"))
+    for item, outcome in zip(items, outcomes, strict=True):
+        rows.writerow((item.id, f"{outcome.seconds:g}", f"{outcome.memory_mb:g}"))
+    return text.getvalue()
 
 
 def _write(
@@ -226,7 +235,7 @@ def _write(
         (item.cls for item in items),
         (outcome.mesh_sha256 for outcome in outcomes),
         benchmark(cfg, recipe),
-        recipe_digits(recipe),
+        recipe_fingerprint(recipe, (o.item_id for o in outcomes if o.cloud is not None)),
     )
     others = left_alone(cfg)
     rows = [

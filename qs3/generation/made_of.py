@@ -28,7 +28,7 @@ def made_of(
         classes: of the objects.
         meshes: hash of each mesh that could be read.
         benchmark: see `qs3.generation.plan.benchmark`.
-        recipe: see `qs3.generation.recipe_digits`.
+        recipe: see `qs3.generation.recipe_fingerprint`.
     """
     objects = "embedded catalogue"
     if cfg.meshes is not None:

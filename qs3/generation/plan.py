@@ -36,6 +36,7 @@ _SWITCHES = ("provenance", "keep_views", "force", "strict", "fill_up")
 _OF_LOOKING = ("scene", "tracking", "crop")
 _OF_LIGHT = ("materials", "light")
 _ADDED = "catalogue-"  # before the names of objects that fill up the user's
+_OTHER_HALF = 1000
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
 # Keys of a config that say where things lie, or that never change a byte.
 _UNSTORED = ("paths", "workers", "engine", "force", "strict")
@@ -145,7 +146,12 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
 def _catalogue_items(cfg: DictConfig) -> list[MeshItem]:
     wanted = set(cfg.classes or known_classes(cfg))
     classes = tuple(name for name in CLASSES if name in wanted)
-    return _chosen(build(cfg.catalogue, classes=classes).items(), cfg)
+    return _chosen(build(cfg.catalogue, classes=classes, seed=_catalogue_seed(cfg)).items(), cfg)
+
+
+def _catalogue_seed(cfg: Any) -> int:
+    """Of the other half of meshes, another catalogue: catalogues of two seeds share no mesh."""
+    return int(cfg["catalogue"]["seed"]) + (_OTHER_HALF if cfg["half"] == "second" else 0)
 
 
 def _chosen(items: Sequence[MeshItem], cfg: DictConfig) -> list[MeshItem]:
@@ -195,8 +201,8 @@ def mesh_folder(cfg: DictConfig) -> MeshFolder:
 
 
 def mesh_root(cfg: DictConfig) -> Path:
-    """The user's folder of meshes."""
-    return Path(cfg.meshes).expanduser()
+    """The user's folder of meshes; absolute, as workers may be in other folders."""
+    return Path(cfg.meshes).expanduser().absolute()
 
 
 def keep(cfg: DictConfig, items: Sequence[MeshItem], folder: Path) -> Keep:
@@ -252,7 +258,7 @@ def settings(cfg: DictConfig) -> dict[str, Any]:
 
 def _kind_of_meshes(plain: dict[str, Any]) -> Any:
     if plain["fill_up"]:
-        return {"folder, filled up by": plain["catalogue"]}
+        return {"folder, filled up by": {**plain["catalogue"], "seed": _catalogue_seed(plain)}}
     return "folder" if plain["meshes"] else plain["catalogue"]
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import ConfigError, MeshError, RenderError
-from qs3.generation.code_digits import code_digits
+from qs3.generation.code_fingerprint import code_fingerprint
 from qs3.meshes.io import load_mesh
 from qs3.meshes.source import MeshItem
 
@@ -20,30 +20,34 @@ _LIBRARIES = ("numpy", "opencv-python-headless", "fpsample", "mitsuba", "drjit",
 
 
 def software() -> dict[str, str]:
-    """What decides the bytes of a cloud, of the machine on which it is called."""
+    """What decides the bytes of a cloud beside the renderer, of this machine."""
     return {
         **{name: version(name) for name in _LIBRARIES},
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "qs3's code": code_digits()[:12],
+        "qs3's code": code_fingerprint()[:12],
     }
 
 
-def check_software(expected: Mapping[str, str]) -> None:
+def check_software(expected: Mapping[str, str], found: Mapping[str, str]) -> None:
     """Refuse to scan on a machine whose clouds would be others.
+
+    Args:
+        expected: of the machine that the command was given on.
+        found: of this one.
 
     Raises:
         RenderError: names the machine and what differs.
     """
-    here = software()
     if differs := [
-        f"{name} is {here[name]} there and {expected[name]} here"
-        for name in expected
-        if here.get(name) != expected[name]
+        f"{name} is {found.get(name)} there and {expected.get(name)} here"
+        for name in sorted({*expected, *found})
+        if found.get(name) != expected.get(name)
     ]:
         raise RenderError(
             f"{platform.node()} would make other clouds: {'; '.join(differs)}. Install the same "
-            "version of qs3 on all nodes, with constraints.txt"
+            "version of qs3 on all nodes, with constraints.txt, and name the renderer's variant "
+            "(renderer.variant=llvm_ad_mono) where some have a GPU"
         )
 
 
@@ -74,10 +78,14 @@ class _Sent:
         assert isinstance(item.load, partial)
         self.path, self.settings = item.path, item.load.keywords
         self.content: bytes | None = None
+        self.unreadable = ""
 
     def __getstate__(self) -> dict[str, Any]:
         """Read when it is sent, not before: there may be many."""
-        return {**self.__dict__, "content": self.path.read_bytes()}
+        try:
+            return {**self.__dict__, "content": self.path.read_bytes()}
+        except OSError as error:  # of one object, as if it were read where it is
+            return {**self.__dict__, "unreadable": str(error)}
 
     def __call__(self) -> Any:
         """The mesh.
@@ -85,6 +93,8 @@ class _Sent:
         Raises:
             MeshError: as of the file where it came from.
         """
+        if self.unreadable:
+            raise MeshError(f"{self.path}: {self.unreadable}")
         if self.content is None:
             return load_mesh(self.path, **self.settings)
         with tempfile.TemporaryDirectory(prefix="qs3-mesh-") as folder:

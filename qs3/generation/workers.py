@@ -2,7 +2,7 @@
 
 Each worker process makes its renderer once (Blender and Mitsuba are one a process) and is
 replaced after a few hundred objects, because their memory creeps. An object that kills its
-worker twice is reported as failed.
+worker each time is reported as failed.
 """
 
 from __future__ import annotations
@@ -71,6 +71,8 @@ class Job:
         keep: what is wanted besides the clouds.
         save: picklable; a worker process saves lasting outcomes by it, so that what is done is
             on disk whatever happens to the others.
+        expected: for workers on other machines: libraries, code and renderer of this one.
+        check_place: likewise; raises where `save` would not save for us.
     """
 
     recipe: Recipe
@@ -78,6 +80,8 @@ class Job:
     seed: int
     keep: Keep = field(default_factory=Keep)
     save: Callable[[Outcome], None] | None = None
+    expected: Mapping[str, str] | None = None
+    check_place: Callable[[], None] | None = None
 
 
 def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
@@ -148,17 +152,15 @@ def scan_all(job: Job, items: list[MeshItem], pool: Pool) -> Iterator[Outcome]:
             machine of the pool would make other clouds.
         ConfigError: meshes or views cannot be sent between machines without a disk in common.
     """
-    # Each worker can meet a deadly object at the same time; as many again are too many.
-    patience = min(max(2 * pool.workers, _DEATHS), max(len(items), _DEATHS))
     deaths = 0
     if not pool.shared_disk:
         items = sent(items, keep_views=job.keep.views is not None)
-    saves = pool.shared_disk and pool.workers > 0
-    make_worker = partial(_Scanner, job, saves, software() if pool.elsewhere else None)
+    make_worker = partial(_Scanner, job, saves=pool.shared_disk and pool.at_once > 0)
     tasks = ((item.id, item) for item in items)
     for outcome in pool.run(make_worker, tasks):
         deaths = deaths + 1 if outcome.died else 0
-        if deaths == patience:
+        # Each worker can meet a deadly object at the same time; as many again are too many.
+        if deaths == min(max(2 * pool.at_once, _DEATHS), max(len(items), _DEATHS)):
             raise RenderError(
                 f"{deaths} objects in a row ended their worker process: this machine lacks "
                 "memory, or the renderer does not work here (qs3 doctor)"
@@ -169,18 +171,23 @@ def scan_all(job: Job, items: list[MeshItem], pool: Pool) -> Iterator[Outcome]:
 class _Scanner:
     """A worker: scans objects with a renderer of its own."""
 
-    def __init__(self, job: Job, saves: bool, expected: Mapping[str, str] | None = None) -> None:
-        if expected is not None:
-            check_software(expected)
+    def __init__(self, job: Job, saves: bool) -> None:
+        if job.check_place:
+            job.check_place()
         self.job = job
         self.save = job.save if saves else None
         self.renderer = job.make_renderer() if job.recipe.needs_renderer else None
+        if job.expected is not None:
+            renderer = self.renderer.provenance() if self.renderer else {}
+            check_software(job.expected, {**software(), **renderer})
 
     def __call__(self, item: MeshItem) -> Outcome:
         outcome = scan_one(self.job, self.renderer, item)
         if self.save is None or not outcome.lasting:
             return outcome
         with disk_errors_travel():
+            if self.job.check_place:
+                self.job.check_place()
             self.save(outcome)
         return replace(outcome, cloud=None, saved=True)
 

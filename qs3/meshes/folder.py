@@ -156,7 +156,7 @@ class MeshFolder:
                 f"class {cls!r} in {self.path} mixes two layouts: {self._origin(loose[0])} and "
                 f"{self._origin(split_file)}. Move all files into train and test, or none"
             )
-        if not loose and not any(given.values()):
+        if not loose and not any(given.values()) and cls not in self.optional:
             raise MissingDataError(
                 f"class {cls!r} has no mesh in {self.path} ({LAYOUTS}, as {', '.join(SUFFIXES)}). "
                 "Add some, or leave it out with classes=[...]"

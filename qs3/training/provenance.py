@@ -47,7 +47,7 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
                 "the processes of this run have different settings (was a file of conf/ changed "
                 "while they started?); start it again"
             )
-        return now
+        return {**now, "threads": first.get("threads")}
     for folder in (run.folder, *run.folder.glob("round_*")):
         remove_leftovers(folder)
     if run.cfg.data.cache_dir:

@@ -313,6 +313,8 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
         if any(word.split("=")[0] in _SHOWS for word in sys.argv[1:]):
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)
         signal.signal(signal.SIGTERM, _terminate)
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # the terminal is gone; not nohup's
+            signal.signal(signal.SIGHUP, _terminate)
         let_waiting_threads_sleep()
         try:
             main()

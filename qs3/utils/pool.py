@@ -30,7 +30,8 @@ class Outcome(Generic[Result]):
 
     Attributes:
         result: what the worker returned; None if it died.
-        died: the task's process ended twice before it was done: out of memory, a crash, or killed.
+        died: the task's process ended each time before it was done: out of memory, a crash, or
+            killed.
     """
 
     name: str
@@ -42,7 +43,7 @@ class Pool(Protocol):
     """Whoever does named tasks: processes of this machine, or `qs3.cluster`."""
 
     @property
-    def workers(self) -> int:
+    def at_once(self) -> int:
         """How many tasks are done at the same time, about; 0: here, one after the other."""
 
     @property
@@ -79,6 +80,11 @@ class Processes:
     tasks_per_process: int | None = None
     shared_disk: bool = field(default=True, init=False)
     elsewhere: bool = field(default=False, init=False)
+
+    @property
+    def at_once(self) -> int:
+        """As many as there are workers."""
+        return self.workers
 
     def run(
         self,

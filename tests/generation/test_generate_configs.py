@@ -143,6 +143,23 @@ def test_the_catalogue_fills_up_what_own_meshes_lack(tmp_path):
     }
 
 
+def test_halves_that_are_filled_up_share_no_object_of_the_catalogue(tmp_path):
+    own = own_meshes(tmp_path, chair=4, lamp=1)
+    (tmp_path / "table" / "train").mkdir(parents=True)  # empty: as if it were not there
+    words = ("domain=modelnet10", own, "fill_up=true", "up=z", "limit=3", "splits=[train]")
+
+    def made(half):
+        items = mesh_items(config(*words, f"half={half}"))
+        assert Counter(item.cls for item in items) == dict.fromkeys(CLASSES, 3)
+        return {item.load().sha256 for item in items if item.path is None}
+
+    first, second = made("first"), made("second")
+    assert len(first) == 30 - 3
+    assert not first & second
+    plans = [settings(config(*words, f"half={half}"))["meshes"] for half in ("first", "second")]
+    assert plans[0] != plans[1]
+
+
 def test_filled_up_is_another_plan_and_unfilled_the_same_as_ever(tmp_path):
     own = own_meshes(tmp_path, **dict.fromkeys(CLASSES, 1))
     alone = settings(config("domain=modelnet10", own, "up=z"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import pickle
 import shutil
@@ -9,15 +10,20 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from qs3.data.store import open_pointset
-from qs3.errors import ConfigError, MeshError, RenderError
+from qs3.errors import ConfigError, DataError, MeshError, RenderError
 from qs3.generation import travel
 from qs3.generation.command import generate
+from qs3.generation.shards import Parts
+from qs3.generation.workers import Job, Outcome, scan_all
 from qs3.meshes.folder import MeshFolder
+from qs3.meshes.source import MeshItem
+from qs3.utils.pool import Processes
 from tests.generation.generating import QUICK, ROOT, config, fingerprint
 
 slow = pytest.mark.slow
@@ -110,7 +116,8 @@ def test_a_node_and_a_worker_are_killed(nodes, meshes, whole, tmp_path, shared):
     os.kill(at_work()[0], signal.SIGKILL)
     said = ended(process)
     assert "Ray: 3 nodes, 3 cores" in said
-    assert "what it had was done again" in said
+    assert "times a node was lost; what it had was done again" in said
+    assert "times a process ended; what it had was done again" in said
     assert fingerprint(tmp_path / "specklenet10") == whole
     costs = (tmp_path / "specklenet10" / "costs.csv").read_text().splitlines()
     assert len(costs) == 1 + 45
@@ -141,12 +148,51 @@ def test_array_jobs_make_the_same(meshes, whole, tmp_path):
     assert fingerprint(tmp_path / "specklenet10") == whole
 
 
-def test_other_software_is_refused(monkeypatch):
-    here = travel.software()
-    travel.check_software(here)
+def test_other_software_is_refused():
+    here = {**travel.software(), "variant": "llvm_ad_mono"}
+    travel.check_software(here, here)
     assert {"numpy", "mitsuba", "python", "qs3's code"} <= set(here)
     with pytest.raises(RenderError, match=r"numpy is .* there and 0\.1 here\. Install"):
-        travel.check_software({**here, "numpy": "0.1"})
+        travel.check_software({**here, "numpy": "0.1"}, here)
+    with pytest.raises(RenderError, match=r"variant is cuda_ad_mono there and llvm_ad_mono here"):
+        travel.check_software(here, {**here, "variant": "cuda_ad_mono"})
+
+
+def test_a_node_that_does_not_see_the_folder_is_refused(tmp_path):
+    """What it saved on a disk of its own would be lost."""
+    parts = Parts(tmp_path / "specklenet10")
+    (tmp_path / "specklenet10").mkdir()
+    parts.begin({"settings": 1})
+    check = pickle.loads(pickle.dumps(functools.partial(parts.check_there, parts.recipe_sha256())))
+    check()
+    job = Job(Recipe(), object, 0, save=parts.save, check_place=check)
+    item = MeshItem("chair/train/a", "chair", "train", object, "a")
+    parts.clear()
+    shutil.rmtree(tmp_path / "specklenet10")
+    for _ in range(2):
+        with pytest.raises(DataError, match=r"does not see .*specklenet10.*shared_disk=false"):
+            next(scan_all(job, [item], Processes(1)))
+        assert not (tmp_path / "specklenet10").exists()
+    (tmp_path / "specklenet10").mkdir()
+    parts.begin({"settings": 2})
+    with pytest.raises(DataError, match="begun anew with other settings"):
+        check()
+
+
+@dataclass(frozen=True)
+class Recipe:
+    needs_renderer: bool = False
+
+
+def test_what_was_done_before_costs_were_kept_is_read(tmp_path):
+    parts = Parts(tmp_path)
+    parts.begin({})
+    parts.save(Outcome("chair/train/a", "", None, "no faces", seconds=2.0, memory_mb=3.0))
+    assert parts.load("chair/train/a").seconds == 2.0
+    (file,) = (tmp_path / "parts").glob("*.npz")
+    note = {"item_id": "chair/train/a", "mesh_sha256": "", "reason": "no faces", "note": ""}
+    parts.write(file.stem, note, {})
+    assert parts.load("chair/train/a").seconds == 0.0
 
 
 def items_of(root):
@@ -164,6 +210,9 @@ def test_meshes_travel_without_their_disk(meshes, tmp_path):
     messages = [pickle.dumps(item) for item in travel.sent(items, keep_views=False)]
     shutil.rmtree(copy)
     arrived = [pickle.loads(message) for message in messages]
+    lost = pickle.loads(pickle.dumps(travel.sent(items, keep_views=False)[0]))
+    with pytest.raises(MeshError, match="No such file"):  # of one object, not of the run
+        lost.load()
     whole = [item for item in arrived if "broken" not in item.id]
     assert [item.load().sha256 for item in whole] == [mesh.sha256 for mesh in expected]
     with pytest.raises(MeshError) as there:

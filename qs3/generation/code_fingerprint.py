@@ -1,4 +1,8 @@
-"""A hash of the code that makes clouds: the same for the same code, whatever its words."""
+"""A hash of the code that makes clouds: the same for the same code, whatever its words.
+
+Of the packages that make them and of what these take from others; what only checks, reads
+settings, shows or stores is left out (`HARMLESS`, which a test compares with the imports).
+"""
 
 from __future__ import annotations
 
@@ -8,15 +12,19 @@ import hashlib
 from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[1]
-_MAKES_CLOUDS = ("clouds", "generation", "geometry", "meshes", "sensors")
+MAKES_CLOUDS = (
+    *("clouds", "generation", "geometry", "meshes", "sensors"),
+    *("classes.py", "data/frames", "utils/seeding.py"),
+)
+HARMLESS = ("cluster", "config", "data", "errors", "utils")
 
 
 @functools.cache
-def code_digits(root: Path = _ROOT) -> str:
+def code_fingerprint(root: Path = _ROOT) -> str:
     """Hash of what the packages that make clouds do."""
     digest = hashlib.sha256()
-    for package in _MAKES_CLOUDS:
-        for path in sorted((root / package).rglob("*.py")):
+    for name in MAKES_CLOUDS:
+        for path in [root / name] if name.endswith(".py") else sorted((root / name).rglob("*.py")):
             tree = ast.parse(path.read_text(encoding="utf-8"))
             digest.update(path.relative_to(root).as_posix().encode())
             digest.update(ast.dump(_without_docstrings(tree)).encode())
