@@ -3,8 +3,8 @@
 OpenMP's threads (torch's) wait for the slowest of them in a loop that keeps the processor, because
 waking a sleeper takes some microseconds. Where another process has the core that the slowest one
 needs, they spin away the time in which it could run: a step of DGCNN with two threads beside one
-busy process a core took 6 to 12 times as long as alone, and 1 to 3 times where threads sleep;
-alone, sleeping costs up to a fifth (`tests/benchmarks/test_busy_machine.py`).
+busy process a core took 5 to 12 times as long as alone, and 1 to 3 times where threads sleep;
+alone, a step is up to a quarter longer (`tests/benchmarks/test_busy_machine.py`).
 """
 
 from __future__ import annotations
