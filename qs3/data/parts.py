@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import platform
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +18,13 @@ import numpy as np
 
 from qs3.data.dataset_folder import PARTS, RECIPE
 from qs3.errors import ConfigError, DataError
-from qs3.utils.files import make_folder, remove_leftovers, write_bytes, write_json
+from qs3.utils.files import (
+    make_folder,
+    remove_leftovers,
+    sha256_file,
+    write_bytes,
+    write_json,
+)
 from qs3.utils.memory import JSON_PEAK, read_whole
 
 _MOST_LINES = 12
@@ -77,6 +84,29 @@ class PartFiles:
             write_json(self.folder / RECIPE, recipe)
         make_folder(self._parts)
         self.tidy()
+
+    def recipe_sha256(self) -> str:
+        """Hash of what the parts are made with, as it is stored."""
+        return sha256_file(self.folder / RECIPE)
+
+    def check_there(self, recipe_sha256: str) -> None:
+        """On another machine: that it sees this folder, and with the recipe that it works by.
+
+        Raises:
+            DataError: it does not, and what it saved would be lost, or mixed with other objects.
+        """
+        try:
+            found = self.recipe_sha256()
+        except OSError as error:
+            raise DataError(
+                f"{platform.node()} does not see {self.folder} ({error.strerror}): give a "
+                f"{self._elsewhere} that all nodes see, or engine.shared_disk=false (engine=ray)"
+            ) from error
+        if found != recipe_sha256:
+            raise DataError(
+                f"{self.folder} was begun anew with other settings while {platform.node()} worked "
+                "by the old ones"
+            )
 
     def tidy(self) -> None:
         """Remove what killed processes left half written; nobody may be writing."""

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import platform
 from pathlib import Path
 
-from qs3.data.dataset_folder import RECIPE
 from qs3.data.parts import PartFiles
-from qs3.errors import DataError
 from qs3.generation.recipes import Cloud
 from qs3.generation.workers import Outcome
-from qs3.utils.files import sha256_file
 
 _PREVIEW = "preview_"
 
@@ -54,29 +50,6 @@ class Parts(PartFiles):
         same = {key: note[key] for key in ("item_id", "mesh_sha256", "reason", "note")}
         costs = {key: note.get(key, 0.0) for key in ("seconds", "memory_mb")}
         return Outcome(cloud=cloud, **same, **costs)
-
-    def recipe_sha256(self) -> str:
-        """Hash of what the parts are made with, as it is stored."""
-        return sha256_file(self.folder / RECIPE)
-
-    def check_there(self, recipe_sha256: str) -> None:
-        """On another machine: that it sees this folder, and with the recipe that it works by.
-
-        Raises:
-            DataError: it does not, and what it saved would be lost, or mixed with other objects.
-        """
-        try:
-            found = self.recipe_sha256()
-        except OSError as error:
-            raise DataError(
-                f"{platform.node()} does not see {self.folder} ({error.strerror}): give a "
-                "paths.data_dir that all nodes see, or, with engine=ray, engine.shared_disk=false"
-            ) from error
-        if found != recipe_sha256:
-            raise DataError(
-                f"{self.folder} was begun anew with other settings while {platform.node()} worked "
-                "by the old ones"
-            )
 
     def done(self, item_id: str) -> bool:
         """Whether an outcome is saved."""

@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Any
 
 from qs3.data.scannet.settings import Extraction
-from qs3.utils.cli import FLAG, NUMBER, Command, Kind, Option, path, text, whole
+from qs3.utils.cli import FLAG, NUMBER, Command, Kind, Option, one_of, path, text, whole
 
 _PATHS = {
     "scans": "folder of scenes; in scene0000_00/ lie scene0000_00.sens, "
@@ -24,11 +24,13 @@ _SETTINGS = tuple(
 )
 
 
-def _extract(workers: int, force: bool, **given: Any) -> None:
+def _extract(workers: int, engine: str, more: list[str], **given: Any) -> None:
+    from qs3.cluster.choice import pool_of
     from qs3.data.scannet.extraction import extract
 
     settings = Extraction(**{option.key: given.pop(option.key) for option in _SETTINGS})
-    extract(**given, workers=workers, force=force, settings=settings)
+    pool = pool_of(engine, workers, more, given["out"].absolute().parent)
+    extract(**given, pool=pool, settings=settings)
 
 
 SCANNET = Command(
@@ -38,6 +40,7 @@ SCANNET = Command(
     (
         *(Option(key, path(), meaning, required=True) for key, meaning in _PATHS.items()),
         Option("workers", whole(0), "processes; their number changes no byte", 1),
+        Option("engine", one_of("local", "ray", "slurm"), "on which machines", "local"),
         Option("force", FLAG, "delete the dataset at out first", False),
         *_SETTINGS,
     ),
@@ -46,6 +49,7 @@ SCANNET = Command(
         "    train=SCANNET/scannetv2_train.txt val=SCANNET/scannetv2_val.txt "
         "out=data/depthscannet10",
     ),
+    others={"engine.": "settings of conf/engine/ray.yaml or slurm.yaml: engine.address=auto"},
     about="""
 Accept ScanNet's terms of use first, http://www.scan-net.org. Defaults are those of the paper where
 it names one.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import logging
+import platform
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -38,10 +39,10 @@ from qs3.data.store import (
     read_meta,
     write_pointset,
 )
-from qs3.errors import DataError, Qs3Error
+from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.utils.files import make_folder, sha256_file, write_text
 from qs3.utils.locks import locked
-from qs3.utils.pool import Processes
+from qs3.utils.pool import Pool, Processes
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
@@ -50,7 +51,7 @@ log = logging.getLogger(__name__)
 
 SCENES = "scenes.csv"
 _FAILURES_SHOWN = 5
-_DIED = "the worker process died twice on this scene (out of memory, or a crash)"
+_DIED = "the worker process died on this scene each time (out of memory, or a crash)"
 _COLUMNS = (
     "scene", "split", "status", "objects", "clouds",
     "frames", "frames_used", "frames_lost", "frames_unmasked", "sha256", "notes",
@@ -67,6 +68,7 @@ def extract(
     settings: Extraction | None = None,
     workers: int = 1,
     force: bool = False,
+    pool: Pool | None = None,
 ) -> PointSet:
     """Make the dataset at `out`, continue it, add scenes that came since, or find it finished.
 
@@ -82,6 +84,7 @@ def extract(
         settings: None is the defaults.
         workers: processes; 0 works in this one.
         force: delete first what an earlier call left at `out`.
+        pool: who does it, with all files on a disk that its machines see; None: `workers`.
 
     Raises:
         ConfigError: `out` was made with other settings.
@@ -89,7 +92,9 @@ def extract(
         DataError: no object gave a cloud, or `out` holds a dataset of other origin.
     """
     settings = settings or Extraction()
-    check_int("workers", workers, 0)
+    pool = pool or Processes(check_int("workers", workers, 0))
+    if not pool.shared_disk:
+        raise ConfigError("scenes are not sent: engine.shared_disk=true, on a disk that all see")
     scans, out = scans.absolute(), out.absolute()
     label_map = read_label_map(labels, settings.column)
     scenes = find_scenes(scans, read_scene_list(train), read_scene_list(val))
@@ -110,8 +115,10 @@ def extract(
             log.info("%s is finished, and its parts were deleted: nothing to do", out)
             return open_pointset(out)
         parts.begin(recipe)
-        make = partial(_worker, label_map, settings, parts, alone=workers == 0)
-        results = _results(make, parts, scenes, workers)
+        make = partial(_worker, label_map, settings, parts, alone=pool.at_once == 0)
+        if pool.elsewhere:
+            make = partial(_checked, make, parts, parts.recipe_sha256(), recipe["versions"])
+        results = _results(make, parts, scenes, pool)
         pointset = _write(out, scans, results, recipe)
         _report(pointset, results, out)
     return pointset
@@ -124,6 +131,19 @@ def _worker(
     if not alone:
         cv2.setNumThreads(1)
     return partial(_try_scene, label_map, settings, parts)
+
+
+def _checked(
+    make: Callable[[], Callable[[SceneFiles], str]],
+    parts: SceneParts,
+    recipe_sha256: str,
+    versions: dict[str, str],
+) -> Callable[[SceneFiles], str]:
+    """A worker on another machine, which must see the parts and have the same libraries."""
+    parts.check_there(recipe_sha256)
+    if (here := _versions()) != versions:
+        raise DataError(f"{platform.node()} has {here}, and this machine {versions}")
+    return make()
 
 
 def _try_scene(
@@ -147,14 +167,14 @@ def _results(
     make_worker: Callable[[], Callable[[SceneFiles], str]],
     parts: SceneParts,
     scenes: Sequence[SceneFiles],
-    workers: int,
+    pool: Pool,
 ) -> list[SceneResult]:
     """One a scene, by name: from the parts, which are made where they are not there yet."""
     tasks = [(files.scene, files) for files in scenes if not parts.done(files)]
     total = len(scenes)
     failed = {}
     with progress_bar("scenes", total=total, done=total - len(tasks)) as advance:
-        for outcome in Processes(workers).run(make_worker, tasks):
+        for outcome in pool.run(make_worker, tasks):
             if reason := _DIED if outcome.died else outcome.result:
                 log.warning("%s: %s", outcome.name, reason)
                 failed[outcome.name] = reason

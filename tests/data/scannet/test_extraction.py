@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
+from qs3.cluster.ray_tasks import RayTasks
 from qs3.data.domain import Domain
 from qs3.data.inspection.surface import distance_to_mesh
 from qs3.data.scannet.extraction import extract
@@ -263,6 +264,26 @@ def test_the_command(written, finished, tmp_path, capsys):
     assert contents(out) == contents(finished[0])
     assert main([*words, "views=3"]) == 1
     assert "ConfigError" in capsys.readouterr().err
+    assert main([*words, "engine=slurm", "engine.cluser=local"]) == 1
+    assert "engine=slurm: " in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_array_jobs_change_no_byte(written, finished, tmp_path):
+    out = tmp_path / finished[0].name
+    words = [
+        "scannet", f"scans={written}/scans", f"labels={written}/labels.tsv",
+        f"train={written}/train.txt", f"val={written}/val.txt", f"out={out}", "min_points=600",
+        "engine=slurm", "engine.cluster=local", "engine.jobs=2", "engine.tasks_per_job=1",
+        "engine.poll_s=0.2",
+    ]  # fmt: skip
+    assert main(words) == 0
+    assert contents(out) == contents(finished[0])
+
+
+def test_scenes_are_not_sent(written, tmp_path):
+    with pytest.raises(ConfigError, match=r"engine\.shared_disk=true"):
+        run(written, tmp_path / "out", pool=RayTasks(shared_disk=False))
 
 
 @pytest.mark.parametrize(
