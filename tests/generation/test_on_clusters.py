@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -116,8 +117,10 @@ def test_a_node_and_a_worker_are_killed(nodes, meshes, whole, tmp_path, shared):
     os.kill(at_work()[0], signal.SIGKILL)
     said = ended(process)
     assert "Ray: 3 nodes, 3 cores" in said
-    assert "times a node was lost; what it had was done again" in said
-    assert "times a process ended; what it had was done again" in said
+    # A task on a node that goes away is one of a lost node or of a process that ended, whichever
+    # Ray notices first.
+    again = re.findall(r"(\d+) times a \w+ (?:was lost|ended); what it had was done again", said)
+    assert sum(map(int, again)) >= 2, said
     assert fingerprint(tmp_path / "specklenet10") == whole
     costs = (tmp_path / "specklenet10" / "costs.csv").read_text().splitlines()
     assert len(costs) == 1 + 45
