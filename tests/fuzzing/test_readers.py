@@ -42,6 +42,10 @@ OWN = {
     "utils/memory.py": "bytes, for those that read them",
     "utils/pool.py": "what processes of our own send each other",
     "utils/seeding.py": "a hash",
+    "utils/threads.py": "/proc/stat, the kernel's",
+    "cluster/slurm_arrays.py": "journals of jobs of our own",
+    "generation/code_fingerprint.py": "this program's own files",
+    "generation/travel.py": "bytes of meshes, for the reader of meshes",
 }
 """Modules that open what nobody else has made, or what the user wants to be run."""
 

@@ -50,6 +50,7 @@ def test_force_takes_old_pictures_and_views_away(meshes, tmp_path):
     assert {path.name for path in folder.iterdir()} == {
         ".lock", "clouds.png", "config.yaml", "manifest.csv", "meta.yaml", "mine.txt", "points.npy",
         "recipe.json",
+        "costs.csv",
     }  # fmt: skip
     assert len(open_pointset(folder)) == 9
 
