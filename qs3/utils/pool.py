@@ -21,6 +21,7 @@ from typing import Any, Generic, Protocol, TypeVar
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+_HELD_BACK = (signal.SIGINT, signal.SIGTERM)
 _STOP_S = 10.0  # how long a worker may take to end before it is killed
 
 
@@ -180,6 +181,9 @@ class _Worker:
         self.done = 0
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=_work, args=(theirs, make_worker), daemon=True)
+        # A Ctrl-C in the middle would leave the child without the half of what it is to be told,
+        # and it says so in a traceback. It comes after the start; the child unblocks what it got.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
         try:
             self._process.start()
         except BaseException:
@@ -187,6 +191,7 @@ class _Worker:
             raise
         finally:
             theirs.close()
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def give(self, name: str, task: Any) -> None:
         self.task = (name, task)
@@ -219,6 +224,7 @@ class _Worker:
 def _work(pipe: Connection, make_worker: Callable[[], Callable[[Any], Any]]) -> None:
     """The process: answers each task with (True, result) or (False, error)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C means
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD_BACK)
     threading.Thread(target=_die_with_parent, daemon=True).start()
     work = None
     while True:
