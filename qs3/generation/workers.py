@@ -27,7 +27,6 @@ from qs3.utils.pool import Pool, Processes
 
 log = logging.getLogger(__name__)
 
-OBJECTS_PER_WORKER = 200
 _DEATHS = 3  # objects in a row
 DIED = "the worker process died on this object each time (out of memory, or a crash)"
 
