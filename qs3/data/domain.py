@@ -18,7 +18,14 @@ from qs3.config.location import typed
 from qs3.data.importers import Importer, import_into
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import read_manifest
-from qs3.data.store import PointSet, is_begun, is_finished, open_pointset, read_meta
+from qs3.data.store import (
+    PointSet,
+    has_variant,
+    is_begun,
+    is_finished,
+    open_pointset,
+    read_meta,
+)
 from qs3.errors import ConfigError, DataError, MissingDataError
 
 log = logging.getLogger(__name__)
@@ -112,8 +119,7 @@ class Domain:
         if self.twin_of is None or is_finished(own) or is_begun(own):
             return own
         other = Path(self.twin_of).absolute()
-        there = is_finished(other) and (other / f"{self.variant}.npy").is_file()
-        return other if there else own
+        return other if has_variant(other, self.variant) else own
 
     @property
     def label(self) -> str:

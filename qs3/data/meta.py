@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped,unused-ignore]
 
+from qs3.data.array_files import shards_fit
 from qs3.data.manifest import AGAIN
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.files import write_text
@@ -81,7 +82,12 @@ def read_meta(folder: str | Path) -> dict[str, Any]:
             f"{path} has format version {version}, this qs3 reads "
             f"{FORMAT_VERSION}; use the qs3 that wrote it ({meta.get('created_by')}) or {AGAIN}"
         )
-    if odd := next((key for key, fits in _META_FITS.items() if not fits(meta.get(key))), ""):
+    odd = next((key for key, fits in _META_FITS.items() if not fits(meta.get(key))), "")
+    if not odd and not shards_fit(
+        meta.get("shards"), meta["clouds"], {*meta["sha256"]} - {"manifest"}
+    ):
+        odd = "shards"
+    if odd:
         raise DataError(f"{path} has no {odd} as `write_pointset` writes it; {AGAIN}")
     return meta
 

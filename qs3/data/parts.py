@@ -6,11 +6,12 @@ parts/         <name>.npz: the arrays, and a line of JSON with the rest
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import platform
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,13 +124,15 @@ class PartFiles:
 
     def read(self, name: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """The note and the arrays of one part; DataError if it is damaged or not there."""
+        note, arrays = self.open(name)
+        return note, dict(arrays)
+
+    def open(self, name: str) -> tuple[dict[str, Any], ArraysOnDisk]:
+        """The same, but an array is read, each time, when it is asked for; it raises then, too."""
         path = self._path(name)
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                note = json.loads(file["note"].tobytes())
-                return note, {key: file[key] for key in file.files if key != "note"}
-        except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-            raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
+        with _opened(path) as file:
+            note = json.loads(file["note"].tobytes())
+            return note, ArraysOnDisk(path, [key for key in file.files if key != "note"])
 
     def has(self, name: str) -> bool:
         """Whether a part is written."""
@@ -146,6 +149,38 @@ class PartFiles:
 
     def _path(self, name: str) -> Path:
         return self._parts / f"{name}.npz"
+
+
+class ArraysOnDisk(Mapping[str, np.ndarray]):
+    """The arrays of one part, by their names; see `PartFiles.open`."""
+
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
+        self._path, self._names = path, list(names)
+
+    def only(self, names: Sequence[str]) -> ArraysOnDisk:
+        """Some of them."""
+        return ArraysOnDisk(self._path, names)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._names:
+            raise KeyError(name)
+        with _opened(self._path) as file:
+            return np.asarray(file[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            yield file
+    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+        raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
 
 
 def _differences(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]]:

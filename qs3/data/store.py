@@ -3,6 +3,7 @@ r"""Point clouds on disk: one folder a dataset, written atomically, checked when
     points.npy         float32 [N, P, 3], C order, metres or the published unit; read as a memmap
     points_clean.npy   optional further arrays of the same shape (here the clean twin)
     provenance.npy     optional tables, float32 [N, P, columns]: what is known of each point
+    points-00000.npy, ...  instead, where a file would exceed `array_files.SHARD_MB`
     manifest.csv       one row an object; those with status "ok" are the N clouds, in order
     meta.yaml          name, classes, hashes, and how it was made; written last
 
@@ -14,9 +15,7 @@ give the same bytes.
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +23,17 @@ from typing import Any
 
 import numpy as np
 
+from qs3.data.array_files import (
+    SHARD_MB,
+    Column,
+    check_finite,
+    clouds_each,
+    open_array,
+    shard_name,
+    write_array,
+)
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import (
-    AGAIN,
     MANIFEST,
     OK,
     SPLITS,
@@ -44,9 +51,10 @@ from qs3.data.meta import (
     sha256_of,
     write_meta,
 )
+from qs3.data.sharded import ShardedArray
 from qs3.errors import DataError
 from qs3.utils import text_table
-from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
+from qs3.utils.files import make_folder, remove_leftovers, sha256_file, write_text
 from qs3.utils.version import VERSION
 
 __all__ = [
@@ -55,6 +63,7 @@ __all__ = [
     "PointSet",
     "counts_text",
     "evenly",
+    "has_variant",
     "is_begun",
     "is_finished",
     "open_pointset",
@@ -64,8 +73,6 @@ __all__ = [
     "write_pointset",
 ]
 
-_CHUNK_CLOUDS = 512
-
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
@@ -73,7 +80,8 @@ class PointSet:
 
     Attributes:
         classes: names; a label is a position in this tuple.
-        points: [N, P, 3] float32, read only (a memmap, or a copy after `split`).
+        points: [N, P, 3] float32, read only (a memmap, or a copy after `split`; of a dataset in
+            shards what answers like an array, also after `split`).
         labels: [N] int64; all -1 if the dataset has no labels.
         splits: [N] str.
         ids: N unique strings.
@@ -85,7 +93,7 @@ class PointSet:
 
     name: str
     classes: tuple[str, ...]
-    points: np.ndarray
+    points: np.ndarray | ShardedArray
     labels: np.ndarray
     splits: np.ndarray
     ids: tuple[str, ...]
@@ -132,9 +140,10 @@ class PointSet:
 
     def at(self, rows: slice | np.ndarray) -> PointSet:
         """Some clouds, by their positions; the hash is still that of the whole dataset."""
+        points = self.points
         return dataclasses.replace(
             self,
-            points=self.points[rows],
+            points=points.at(rows) if isinstance(points, ShardedArray) else points[rows],
             labels=self.labels[rows],
             splits=self.splits[rows],
             ids=tuple(self.ids[i] for i in np.arange(len(self))[rows]),
@@ -191,6 +200,7 @@ def write_pointset(
     rows: Sequence[ManifestRow],
     meta: Mapping[str, Any],
     tables: Mapping[str, Sequence[str]] | None = None,
+    shard_mb: float = SHARD_MB,
 ) -> PointSet:
     """Write a dataset and open it again, checked.
 
@@ -202,11 +212,14 @@ def write_pointset(
         name: of the dataset.
         classes: names in label order.
         arrays: by file stem; "points" is required. Each is [N, P, 3] or N arrays of [P, 3];
-            stored as float32.
+            stored as float32. A sequence that reads its clouds when asked keeps memory small: it
+            is asked twice for each, to check and to write.
         rows: one an object; the k-th one with status "ok" describes cloud k.
         meta: plain values (numbers, strings, lists, dicts): sensor, renderer, versions, config.
         tables: which of the arrays are not clouds but say something of each point, with the names
             of their columns: they are [N, P, columns], and no variant to train on.
+        shard_mb: no file of clouds exceeds so many MB (10^6 bytes), unless by one cloud; larger
+            arrays are cut. The dataset's hash does not depend on it.
 
     Raises:
         DataError: arrays and rows do not fit together, or a value is not finite.
@@ -215,19 +228,15 @@ def write_pointset(
     folder = Path(folder)
     rows, classes, tables = number(rows), tuple(classes), dict(tables or {})
     check_rows(rows, classes, where=f"rows of dataset {name!r}")
-    stacked = {key: _stack(name, key, value) for key, value in arrays.items()}
-    clouds = sum(row.status == OK for row in rows)
-    clouds, points = _check_arrays(name, stacked, clouds, tables)
+    columns = {key: Column(name, key, value) for key, value in arrays.items()}
+    clouds, points = _check_arrays(name, columns, sum(row.status == OK for row in rows), tables)
+    # All arrays are cut at the same clouds, where the widest has to be.
+    each = min(clouds_each(shard_mb, column.shape) for column in columns.values())
 
     make_folder(folder)
     (folder / META).unlink(missing_ok=True)
     remove_leftovers(folder)
-    hashes = {}
-    for key, array in stacked.items():
-        with atomic_path(folder / f"{key}.npy") as temporary, open(temporary, "wb") as file:
-            file.write(_header(array.shape))
-            file.write(array.data.cast("B"))
-        hashes[key] = sha256_file(folder / f"{key}.npy")
+    written = {key: write_array(folder, key, column, each) for key, column in columns.items()}
     write_text(folder / MANIFEST, to_csv(rows))
     document = {
         "created_by": f"qs3 {VERSION}",
@@ -236,8 +245,14 @@ def write_pointset(
         "clouds": clouds,
         "points": points,
         "failed": len(rows) - clouds,
-        "sha256": {**hashes, "manifest": sha256_file(folder / MANIFEST)},
+        "sha256": {
+            **{key: one.sha256 for key, one in written.items()},
+            "manifest": sha256_file(folder / MANIFEST),
+        },
     }
+    if clouds > each:
+        hashes = {key: list(one.shards) for key, one in written.items()}
+        document["shards"] = {"clouds": each, "sha256": hashes}
     if not any(row.cls for row in rows if row.status == OK):
         document["labelled"] = False
     if tables:
@@ -275,8 +290,8 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
             f"{folder / MANIFEST} has {len(kept)} rows with status ok, but {META} promises "
             f"{meta['clouds']} clouds; generate or import the dataset again"
         )
-    points = _open_array(folder, variant, meta, 3, verify)
-    _check_finite(folder / f"{variant}.npy", points, [row.id for row in kept])
+    points = open_array(folder, variant, meta, 3, verify)
+    check_finite(folder / f"{variant}.npy", points, [row.id for row in kept])
     position = {name: label for label, name in enumerate(classes)}
     return PointSet(
         name=meta["name"],
@@ -290,7 +305,16 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     )
 
 
-def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray, tuple[str, ...]]:
+def has_variant(folder: str | Path, variant: str) -> bool:
+    """Whether a finished dataset lies there that has this array of clouds, by its files' names."""
+    return is_finished(folder) and any(
+        (Path(folder) / name).is_file() for name in (f"{variant}.npy", shard_name(variant, 0))
+    )
+
+
+def open_table(
+    folder: str | Path, name: str = "provenance"
+) -> tuple[np.ndarray | ShardedArray, tuple[str, ...]]:
     """Open what a dataset knows of each point of its variant "points".
 
     Returns:
@@ -310,29 +334,7 @@ def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray
             "with it (for provenance: provenance=true)"
         )
     columns = tuple(tables[name])
-    return _open_array(folder, name, meta, len(columns), verify=True), columns
-
-
-def _open_array(
-    folder: Path, name: str, meta: Mapping[str, Any], columns: int, verify: bool
-) -> np.ndarray:
-    """[N, P, columns] float32 memmap; its header, size and hash must be what they were."""
-    path, shape = folder / f"{name}.npy", (meta["clouds"], meta["points"], columns)
-    header = _header(shape)
-    expected = len(header) + 4 * math.prod(shape)
-    try:
-        with open(path, "rb") as file:
-            found = file.read(len(header))
-        size = path.stat().st_size
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
-    if size != expected:
-        raise DataError(f"{path} has {size} bytes, expected {expected} for {shape}; {AGAIN}")
-    if found != header:
-        raise DataError(f"{path} does not have the header of a float32 array {shape}; {AGAIN}")
-    if verify and sha256_file(path) != meta["sha256"][name]:
-        raise DataError(f"{path} is damaged (its SHA-256 is not the one in {META}); {AGAIN}")
-    return np.memmap(path, dtype="<f4", mode="r", offset=len(header), shape=shape)
+    return open_array(folder, name, meta, len(columns), verify=True), columns
 
 
 def _content_hash(array: str, classes: Sequence[str], rows: Sequence[ManifestRow]) -> str:
@@ -341,17 +343,9 @@ def _content_hash(array: str, classes: Sequence[str], rows: Sequence[ManifestRow
     return sha256_of(json.dumps(seen, ensure_ascii=True))
 
 
-def _stack(name: str, key: str, value: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
-    """[N, P, 3] little-endian float32 in C order."""
-    if not isinstance(value, np.ndarray) and len({np.shape(cloud) for cloud in value}) > 1:
-        shapes = sorted({np.shape(cloud) for cloud in value})
-        raise DataError(f"array {key!r} of dataset {name!r} has clouds of several shapes {shapes}")
-    return np.ascontiguousarray(value, dtype="<f4")
-
-
 def _check_arrays(
     name: str,
-    arrays: Mapping[str, np.ndarray],
+    arrays: Mapping[str, Column],
     clouds: int,
     tables: Mapping[str, Sequence[str]],
 ) -> tuple[int, int]:
@@ -367,7 +361,7 @@ def _check_arrays(
         if not key.isidentifier() or key in ("manifest", "meta"):
             raise DataError(f"an array of dataset {name!r} cannot be called {key!r}")
         width = len(tables[key]) if key in tables else 3
-        if array.ndim != 3 or array.shape[2] != width or 0 in array.shape:
+        if len(array.shape) != 3 or array.shape[2] != width or 0 in array.shape:
             raise DataError(
                 f"array {key!r} of dataset {name!r} has shape {array.shape}, expected "
                 f"[N, P, {width}] with at least one cloud of one point"
@@ -377,25 +371,6 @@ def _check_arrays(
                 f"array {key!r} of dataset {name!r} has shape {array.shape}, 'points' has "
                 f"{arrays['points'].shape}, and {clouds} rows have status ok"
             )
-        if not np.isfinite(array).all():
-            bad = int(np.flatnonzero(~np.isfinite(array).all(axis=(1, 2)))[0])
-            raise DataError(f"array {key!r} of dataset {name!r}: cloud {bad} is not finite")
+        array.check_finite()
     n, p, _ = arrays["points"].shape
     return n, p
-
-
-def _header(shape: tuple[int, ...]) -> bytes:
-    """The .npy header of a float32 C-order array: the only one this format has."""
-    file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        file, {"descr": "<f4", "fortran_order": False, "shape": shape}
-    )
-    return file.getvalue()
-
-
-def _check_finite(path: Path, points: np.ndarray, ids: Sequence[str]) -> None:
-    for start in range(0, len(points), _CHUNK_CLOUDS):
-        finite = np.isfinite(points[start : start + _CHUNK_CLOUDS]).all(axis=(1, 2))
-        if not finite.all():
-            bad = start + int(np.flatnonzero(~finite)[0])
-            raise DataError(f"{path}, cloud {bad} (id {ids[bad]!r}) is not finite; {AGAIN}")

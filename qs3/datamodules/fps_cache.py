@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from qs3.data.sharded import ShardedArray
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample_all
 from qs3.errors import ConfigError, Qs3Error
@@ -32,7 +33,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def prepare(
-    points: Float[np.ndarray, "n p 3"],
+    points: Float[np.ndarray, "n p 3"] | Float[ShardedArray, "n p 3"],
     count: int,
     *,
     starts: int = 1,

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.data.sharded import ShardedArray
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
 from qs3.utils.pool import Processes
 from qs3.utils.progress import shown
@@ -56,7 +57,10 @@ def sample(
 
 
 def sample_all(
-    points: Float[np.ndarray, "n p 3"], count: int, starts: int, processes: int | None = None
+    points: Float[np.ndarray, "n p 3"] | Float[ShardedArray, "n p 3"],
+    count: int,
+    starts: int,
+    processes: int | None = None,
 ) -> Int[np.ndarray, "n starts count"]:
     """The same, with a progress bar on a terminal, and by several processes if it takes long.
 
@@ -78,7 +82,9 @@ def sample_all(
     return result
 
 
-def _fill(result: np.ndarray, points: np.ndarray, begins: Sequence[int], processes: int) -> None:
+def _fill(
+    result: np.ndarray, points: np.ndarray | ShardedArray, begins: Sequence[int], processes: int
+) -> None:
     chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
     _, starts, count = result.shape
     outcomes = Processes(processes).run(partial(_sampler, count, starts), chunks)

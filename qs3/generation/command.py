@@ -32,6 +32,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
 from qs3.generation.disk import check_folder, disk_errors_explained
 from qs3.generation.made_of import made_of
+from qs3.generation.object_parts import InParts, Parts
 from qs3.generation.plan import (
     benchmark,
     check,
@@ -46,7 +47,6 @@ from qs3.generation.plan import (
 )
 from qs3.generation.provenance import PROVENANCE
 from qs3.generation.recipe_fingerprint import recipe_fingerprint
-from qs3.generation.shards import Parts
 from qs3.generation.travel import software
 from qs3.generation.up_axis import with_up_axis
 from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
@@ -257,7 +257,7 @@ def _write(
         domain.folder,
         name=domain.folder.name,
         classes=domain.names,
-        arrays={name: [cloud.arrays[name] for cloud in good] for name in good[0].arrays},
+        arrays={name: InParts(good, name) for name in good[0].arrays},
         rows=rows,
         meta={
             "simulated": domain.simulated,
@@ -268,6 +268,7 @@ def _write(
             "config": stored_config(cfg),
         },
         tables={"provenance": PROVENANCE} if cfg.provenance else None,
+        shard_mb=cfg.shard_mb,
     )
     if domain.variant == "points":
         return made_here

@@ -27,7 +27,7 @@ from qs3.meshes.source import MeshItem
 from qs3.utils.files import sha256_file
 from qs3.utils.version import VERSION
 
-_WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
+_WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0, "shard_mb": 1}
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
 COLLIDERS = ("skip", "keep")
 UPS = ("auto", "z", "y")
@@ -39,7 +39,7 @@ _ADDED = "catalogue-"  # before the names of objects that fill up the user's
 _OTHER_HALF = 1000
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
 # Keys of a config that say where things lie, or that never change a byte.
-_UNSTORED = ("paths", "workers", "engine", "force", "strict")
+_UNSTORED = ("paths", "workers", "engine", "shard_mb", "force", "strict")
 
 
 def check(cfg: DictConfig) -> None:

@@ -8,6 +8,7 @@ written into a dataset's recipe file.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -51,7 +52,7 @@ class Cloud:
         preview: small pictures of the first view by name, where they were asked for.
     """
 
-    arrays: dict[str, np.ndarray]
+    arrays: Mapping[str, np.ndarray]
     views: int
     valid_points: int
     frames: tuple[DepthFrame, ...] = ()

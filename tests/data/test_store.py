@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from qs3.data import array_files, store
 from qs3.data import meta as described
-from qs3.data import store
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.errors import DataError, MissingDataError, Qs3Error
 
@@ -176,7 +176,7 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path, name, shape, message):
 
 @pytest.mark.parametrize("bad", [(0,), (1, 2), (3,), (4, 5), (5,)])
 def test_the_first_cloud_that_is_not_finite_is_named(tmp_path, monkeypatch, bad):
-    monkeypatch.setattr(store, "_CHUNK_CLOUDS", 2)
+    monkeypatch.setattr(array_files, "_CHUNK_CLOUDS", 2)
     points = np.zeros((6, 5, 3), dtype="f4")
     points[list(bad), 4, 1] = np.inf
     with pytest.raises(DataError, match=f"cloud {bad[0]} is not finite"):

@@ -15,8 +15,8 @@ import trimesh
 from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.command import generate
+from qs3.generation.object_parts import Parts
 from qs3.generation.recipes import Cloud
-from qs3.generation.shards import Parts
 from qs3.generation.workers import Outcome
 from tests.generation.generating import ROOT, command, composed, config, fingerprint
 
@@ -186,6 +186,22 @@ def test_looking_needs_a_sensor_and_a_renderer(tmp_path, key):
 def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(MissingDataError, match="nowhere"):
         generate(config(tmp_path, tmp_path / "nowhere", "workers=0"))
+
+
+def test_files_of_a_size_that_one_names_hold_the_same_dataset(tmp_path):
+    """1.2 MB of clouds; a second call, with another size, finds them there."""
+    lamps = ("classes=[lamp,table]", "limit=12", "splits=[train]", "recipe.points=4096")
+    whole = generate(config(tmp_path / "a", None, *lamps, domain="modelnet10"))
+    assert len(whole) == 24
+    cut = generate(config(tmp_path / "b", None, *lamps, "shard_mb=1", domain="modelnet10"))
+    folder = tmp_path / "b" / "modelnet10"
+    assert sorted(path.name for path in folder.glob("*.npy")) == [
+        "points-00000.npy",
+        "points-00001.npy",
+    ]
+    again = generate(config(tmp_path / "b", None, *lamps, domain="modelnet10"))
+    assert whole.sha256 == cut.sha256 == again.sha256
+    np.testing.assert_array_equal(np.asarray(again.points), whole.points)
 
 
 def test_surface_samples_lie_on_the_surface_and_dropout_takes_regions(meshes, tmp_path):

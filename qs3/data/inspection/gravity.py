@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from qs3.data.sharded import ShardedArray
 from qs3.geometry.sampling import unit_ball
 
 UPS: tuple[str, ...] = ("+z", "-z", "+x", "-x", "+y", "-y")
@@ -160,7 +161,7 @@ class UpModel:
 
 
 def judge_set(
-    points: Float[np.ndarray, "n p 3"],
+    points: Float[np.ndarray, "n p 3"] | Float[ShardedArray, "n p 3"],
     labels: Int[np.ndarray, " n"],
     classes: Sequence[str],
     model: UpModel | None = None,

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from qs3.data.contact_sheets import drawn
 from qs3.data.inspection.open_dataset import Opened
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
+from qs3.data.sharded import ShardedArray
 from qs3.data.store import PointSet, open_table
 from qs3.data.viewer.page import Part, Shown
 
@@ -78,7 +79,7 @@ class _Table:
     """What the store's table "provenance" says, if it has one."""
 
     def __init__(self, opened: Opened) -> None:
-        self._table: np.ndarray | None = None
+        self._table: np.ndarray | ShardedArray | None = None
         columns: tuple[str, ...] = ()
         if opened.variant == "points" and "provenance" in opened.data.meta.get("tables", {}):
             self._table, columns = open_table(opened.folder)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from qs3.data.dataset_folder import VIEWS
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.data.manifest import read_manifest
-from qs3.data.store import open_pointset, read_meta
+from qs3.data.store import has_variant, open_pointset, read_meta
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.provenance import Keep
 from qs3.generation.view_files import KeptView, load_views
@@ -187,7 +187,7 @@ def kept_object(
         )
     at = data.ids.index(name)
     clean = None
-    if (folder / "points_clean.npy").is_file():
+    if has_variant(folder, "points_clean"):
         clean = np.array(open_pointset(folder, "points_clean").points[at])
     surfaces, why = surfaces_of(dict(meta), None if meshes is None else Path(meshes))
     rows = {row.id: row for row in read_manifest(folder, data.classes)}

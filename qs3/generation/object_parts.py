@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import overload
+
+import numpy as np
 
 from qs3.data.parts import PartFiles
 from qs3.generation.recipes import Cloud
@@ -37,13 +41,16 @@ class Parts(PartFiles):
         self.write(_name(outcome.item_id), note, arrays)
 
     def load(self, item_id: str) -> Outcome | None:
-        """One outcome, or None if it is not there yet."""
+        """One outcome, or None if it is not there yet.
+
+        Its arrays stay on disk until they are asked for: all objects' need not fit into memory.
+        """
         if not self.done(item_id):
             return None
-        note, found = self.read(_name(item_id))
-        seen = {name: array for name, array in found.items() if name.startswith(_PREVIEW)}
-        arrays = {name: array for name, array in found.items() if name not in seen}
-        preview = {name.removeprefix(_PREVIEW): array for name, array in seen.items()}
+        note, found = self.open(_name(item_id))
+        seen = [name for name in found if name.startswith(_PREVIEW)]
+        arrays = found.only([name for name in found if name not in seen])
+        preview = {name.removeprefix(_PREVIEW): found[name] for name in seen}
         cloud = None
         if arrays:
             cloud = Cloud(arrays, note["views"], note["valid_points"], preview=preview)
@@ -58,6 +65,27 @@ class Parts(PartFiles):
     def state(self, total: int) -> str:
         """How much is done, as a sentence."""
         return f"{self.count()} of {total} objects are done and kept."
+
+
+class InParts(Sequence[np.ndarray]):
+    """One array of many clouds, each read when it is asked for."""
+
+    def __init__(self, clouds: Sequence[Cloud], name: str) -> None:
+        self._clouds, self._name = clouds, name
+
+    def __len__(self) -> int:
+        return len(self._clouds)
+
+    @overload
+    def __getitem__(self, key: int) -> np.ndarray: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> list[np.ndarray]: ...
+
+    def __getitem__(self, key: int | slice) -> np.ndarray | list[np.ndarray]:
+        if isinstance(key, slice):
+            return [cloud.arrays[self._name] for cloud in self._clouds[key]]
+        return self._clouds[key].arrays[self._name]
 
 
 def _name(item_id: str) -> str:
