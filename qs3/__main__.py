@@ -11,6 +11,7 @@ QS3 = Group(
     {
         "quickstart": "qs3.tools.quickstart:QUICKSTART",
         "doctor": "qs3.tools.doctor:DOCTOR",
+        "plan": "qs3.tools.large_jobs:PLAN",
         "download": "qs3.data.download.cli:DOWNLOAD",
         "inspect": "qs3.data.inspection.cli:INSPECT",
         "compare": "qs3.data.inspection.cli:COMPARE",

@@ -15,6 +15,7 @@ from qs3.errors import ConfigError, MeshError, RenderError
 from qs3.generation.code_fingerprint import code_fingerprint
 from qs3.meshes.io import load_mesh
 from qs3.meshes.source import MeshItem
+from qs3.utils.memory import check_memory
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "fpsample", "mitsuba", "drjit", "bpy", "trimesh")
 
@@ -83,8 +84,9 @@ class _Sent:
     def __getstate__(self) -> dict[str, Any]:
         """Read when it is sent, not before: there may be many."""
         try:
+            check_memory(self.path.stat().st_size, "", MeshError)
             return {**self.__dict__, "content": self.path.read_bytes()}
-        except OSError as error:  # of one object, as if it were read where it is
+        except (OSError, MeshError) as error:  # of one object, as if it were read where it is
             return {**self.__dict__, "unreadable": str(error)}
 
     def __call__(self) -> Any:

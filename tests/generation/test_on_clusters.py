@@ -223,6 +223,21 @@ def test_meshes_travel_without_their_disk(meshes, tmp_path):
     assert str(there.value) == str(here.value)  # and not where the copy lay
 
 
+def test_a_mesh_that_is_too_large_is_not_even_read(tmp_path, monkeypatch):
+    (tmp_path / "chair" / "train").mkdir(parents=True)
+    with open(tmp_path / "chair" / "train" / "a.stl", "wb") as file:
+        file.truncate(5_000_000_000)  # takes no disk, but would take the memory
+    (item,) = travel.sent(items_of(tmp_path), keep_views=False)
+    message = pickle.dumps(item)
+    assert len(message) < 10_000
+    with pytest.raises(MeshError, match=r"a\.stl: takes 5 GB of memory, more than 2 GB"):
+        pickle.loads(message).load()
+    monkeypatch.setenv("QS3_MEMORY_GB", "0.000001")
+    (tmp_path / "chair" / "train" / "a.stl").write_bytes(bytes(2000))
+    with pytest.raises(MeshError, match="takes 2e-06 GB"):
+        pickle.loads(pickle.dumps(item)).load()
+
+
 def test_what_cannot_be_sent_is_said(tmp_path):
     (tmp_path / "chair" / "train").mkdir(parents=True)
     (tmp_path / "chair" / "train" / "a.gltf").touch()
