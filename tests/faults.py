@@ -175,12 +175,13 @@ def generation(folder: Path) -> None:
 
 
 def generated(folder: Path) -> Any:
-    """The names of all files that are there, and the bytes of all that do not say where."""
+    """The names of all files that are there, and the bytes of all that do not say where or when."""
+    from qs3.data.dataset_folder import CONFIG, COSTS
     from qs3.utils.files import sha256_file
 
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log")
     return {
-        str(path.relative_to(folder)): path.name != "config.yaml" and sha256_file(path)
+        str(path.relative_to(folder)): path.name not in (CONFIG, COSTS) and sha256_file(path)
         for path in files
         if path.stat().st_size
     }

@@ -82,12 +82,7 @@ def read_meta(folder: str | Path) -> dict[str, Any]:
             f"{path} has format version {version}, this qs3 reads "
             f"{FORMAT_VERSION}; use the qs3 that wrote it ({meta.get('created_by')}) or {AGAIN}"
         )
-    odd = next((key for key, fits in _META_FITS.items() if not fits(meta.get(key))), "")
-    if not odd and not shards_fit(
-        meta.get("shards"), meta["clouds"], {*meta["sha256"]} - {"manifest"}
-    ):
-        odd = "shards"
-    if odd:
+    if odd := _odd(meta):
         raise DataError(f"{path} has no {odd} as `write_pointset` writes it; {AGAIN}")
     return meta
 
@@ -110,6 +105,17 @@ _META_FITS: dict[str, Callable[[Any], bool]] = {
         value is None or (isinstance(value, dict) and all(map(_words, value.values())))
     ),
 }
+
+
+def _odd(meta: Mapping[str, Any]) -> str:
+    """The first key whose value is not as `write_pointset` writes it; "" if there is none."""
+    for key, fits in _META_FITS.items():
+        if not fits(meta.get(key)):
+            return key
+    arrays = {*meta["sha256"]} - {"manifest"}
+    if not {*(meta.get("tables") or {})} <= arrays:
+        return "tables"
+    return "" if shards_fit(meta.get("shards"), meta["clouds"], arrays) else "shards"
 
 
 def sha256_of(text: str) -> str:

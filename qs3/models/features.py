@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +165,7 @@ def features(
     num_classes: int,
     file: str,
     sha256: str,
-    hidden: tuple[int, ...] = (256,),
+    hidden: Sequence[int] = (256,),
     dropout: float = 0.5,
     norm: str = "batch",
 ) -> PointClassifier:

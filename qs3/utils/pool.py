@@ -6,13 +6,14 @@ of a message therefore spoils nobody else's, and which task it had is known.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
 import signal
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
@@ -185,7 +186,8 @@ class _Worker:
         # and it says so in a traceback. It comes after the start; the child unblocks what it got.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
         try:
-            self._process.start()
+            with _a_method_that_it_knows():
+                self._process.start()
         except BaseException:
             self.pipe.close()
             raise
@@ -219,6 +221,23 @@ class _Worker:
         self._process.join(_STOP_S)
         self._process.kill()
         self._process.join()
+
+
+@contextmanager
+def _a_method_that_it_knows() -> Iterator[None]:
+    """A process is told which start method is the default here, and takes it over.
+
+    In a job of joblib's (a run of a sweep) that is one of joblib's own, at which it would end.
+    """
+    method = multiprocessing.get_start_method(allow_none=True)
+    if method is None or method in multiprocessing.get_all_start_methods():
+        yield
+        return
+    multiprocessing.set_start_method("spawn", force=True)
+    try:
+        yield
+    finally:
+        multiprocessing.set_start_method(method, force=True)
 
 
 def _work(pipe: Connection, make_worker: Callable[[], Callable[[Any], Any]]) -> None:

@@ -159,16 +159,16 @@ def _read_journal(path: Path) -> None:
 
 
 def _caches(folder: Path) -> list[bytes]:
-    from qs3.datamodules.fps_cache import _kept
+    from qs3.datamodules.fps_cache import keep_array
 
-    _kept(folder / "a.npy", np.arange(8, dtype=np.uint16).reshape(2, 4), "made")
+    keep_array(folder / "a.npy", np.arange(8, dtype=np.uint16).reshape(2, 4), "made")
     return bytes_of(folder / "a.npy")
 
 
 def _read_cache(path: Path) -> None:
-    from qs3.datamodules.fps_cache import _read
+    from qs3.datamodules.fps_cache import read_array
 
-    _read(path, (2, 4), "made")
+    read_array(path, (2, 4), "made")
 
 
 READERS: tuple[Reader, ...] = (

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from joblib import Parallel, delayed
 
 from qs3.errors import DataError
 from qs3.utils.pool import Processes
@@ -192,3 +193,21 @@ def test_processes_end_with_their_parent_while_they_work(tmp_path, how):
         process.kill()
     assert until(lambda: not any(map(alive, workers)))
     assert errors.count("Traceback") == (how == signal.SIGINT)  # the parent's
+
+
+def pids_in_a_job(tasks):
+    """In a process of joblib's, as a run of a sweep is."""
+    import multiprocessing
+
+    before = multiprocessing.get_start_method()
+    found = list(Processes(2).run(make, tasks))
+    return before, multiprocessing.get_start_method(), found
+
+
+def test_processes_start_in_a_job_of_joblibs(capfd):
+    """Where the default start method is one that a new process does not know."""
+    tasks = [("a", ("square", 3)), ("b", ("square", 4))]
+    for before, after, found in Parallel(n_jobs=2)(delayed(pids_in_a_job)(tasks) for _ in range(2)):
+        assert (before, after) == ("loky", "loky")
+        assert sorted((one.name, one.result) for one in found) == [("a", 9), ("b", 16)]
+    assert capfd.readouterr().err == ""
