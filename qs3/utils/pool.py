@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -17,6 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
+from types import ModuleType
 from typing import Any, Generic, Protocol, TypeVar
 
 Task = TypeVar("Task")
@@ -186,7 +188,7 @@ class _Worker:
         # and it says so in a traceback. It comes after the start; the child unblocks what it got.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
         try:
-            with _a_method_that_it_knows():
+            with _a_method_that_it_knows(), _no_script(make_worker):
                 self._process.start()
         except BaseException:
             self.pipe.close()
@@ -238,6 +240,24 @@ def _a_method_that_it_knows() -> Iterator[None]:
         yield
     finally:
         multiprocessing.set_start_method(method, force=True)
+
+
+@contextmanager
+def _no_script(make_worker: Callable[[], Any]) -> Iterator[None]:
+    """A process runs the script that started it, unless nobody tells it which one that was.
+
+    Work that does not come from the script has no need of it, and a script that asks for a dataset
+    in its first lines, without `if __name__ == "__main__"`, would do so again in each process.
+    """
+    if b"__main__" in pickle.dumps(make_worker):
+        yield
+        return
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 def _work(pipe: Connection, make_worker: Callable[[], Callable[[Any], Any]]) -> None:

@@ -211,3 +211,31 @@ def test_processes_start_in_a_job_of_joblibs(capfd):
         assert (before, after) == ("loky", "loky")
         assert sorted((one.name, one.result) for one in found) == [("a", 9), ("b", 16)]
     assert capfd.readouterr().err == ""
+
+
+UNGUARDED = """
+from qs3.utils.pool import Processes
+from tests.utils.test_pool import make
+print("begun")
+print([outcome.result for outcome in Processes(2).run(make, [("a", ("square", 3))])])
+"""
+OF_ITS_OWN = """
+from qs3.utils.pool import Processes
+def double(x):
+    return 2 * x
+def make():
+    return double
+if __name__ == "__main__":
+    print([outcome.result for outcome in Processes(2).run(make, [("a", 3)])])
+"""
+
+
+@pytest.mark.parametrize(("script", "said"), [(UNGUARDED, "begun\n[9]\n"), (OF_ITS_OWN, "[6]\n")])
+def test_a_script_runs_once_and_what_it_defines_is_found(tmp_path, script, said):
+    (tmp_path / "script.py").write_text(script)
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py"], env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == (said, "")
