@@ -9,6 +9,7 @@ times is given up, one whose node was lost is not to blame.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 from collections import Counter
@@ -48,11 +49,12 @@ class RayTasks:
             that this machine belongs to; else its address, such as "10.0.0.1:6379" or, from
             outside, "ray://10.0.0.1:10001".
         workers: of a local cluster, the number of processes.
-        cpus: cores that a task takes.
+        cpus, gpus: cores and graphics cards that a task takes; a card may be shared: 0.25.
         memory_gb: that a task asks for, so that a node takes no more of them than fit; None: not
             said.
         attempts: a task that has ended its process so often is given up.
         tasks_per_process: after so many a process is replaced.
+        place: of these settings, for messages.
         shared_disk: all nodes see the files of this machine under the same paths, so that workers
             read meshes and write results themselves; else they are sent.
 
@@ -63,22 +65,25 @@ class RayTasks:
     address: str = "local"
     workers: int = 2
     cpus: float = 1
+    gpus: float = 0
     memory_gb: float | None = None
     attempts: int = 3
     tasks_per_process: int = 200
     shared_disk: bool = True
+    place: str = "engine"
     elsewhere: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
         check_int("workers", self.workers, 1)
-        check_int("engine.attempts", self.attempts, 1)
-        check_int("engine.tasks_per_process", self.tasks_per_process, 1)
-        check_float("engine.cpus", self.cpus, "(0, inf)")
+        check_int(f"{self.place}.attempts", self.attempts, 1)
+        check_int(f"{self.place}.tasks_per_process", self.tasks_per_process, 1)
+        check_float(f"{self.place}.cpus", self.cpus, "(0, inf)")
+        check_float(f"{self.place}.gpus", self.gpus, "[0, inf)")
         if self.memory_gb is not None:
-            check_float("engine.memory_gb", self.memory_gb, "(0, inf)")
+            check_float(f"{self.place}.memory_gb", self.memory_gb, "(0, inf)")
         if not isinstance(self.address, str) or not self.address.strip():
             raise ConfigError(
-                f"engine.address must be local, auto or an address, got {self.address!r}"
+                f"{self.place}.address must be local, auto or an address, got {self.address!r}"
             )
 
     @property
@@ -91,7 +96,9 @@ class RayTasks:
         """Of a cluster that is connected, as many as its cores allow."""
         if (ray := sys.modules.get("ray")) is None or not ray.is_initialized():
             return self.workers
-        return max(1, int(ray.cluster_resources().get("CPU", 0) / self.cpus))
+        has = ray.cluster_resources()
+        most = has.get("CPU", 0) / self.cpus
+        return max(1, int(min(most, has.get("GPU", 0) / self.gpus) if self.gpus else most))
 
     def run(
         self,
@@ -116,7 +123,11 @@ class _Run:
         self.ray, self.how = ray, how
         memory = {} if how.memory_gb is None else {"memory": how.memory_bytes}
         self.remote = ray.remote(
-            num_cpus=how.cpus, max_calls=how.tasks_per_process, max_retries=0, **memory
+            num_cpus=how.cpus,
+            num_gpus=how.gpus,
+            max_calls=how.tasks_per_process,
+            max_retries=0,
+            **memory,
         )(_do)
         self.make_worker = ray.put(make_worker)
         self.key = os.urandom(16)  # of this run: a process of Ray may have served another one
@@ -211,25 +222,30 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
     kept = {name: os.environ.get(name) for name in _QUIET}
     os.environ.update({name: os.environ.get(name, value) for name, value in _QUIET.items()})
     quiet = {"log_to_driver": False, "logging_level": logging.WARNING, "configure_logging": False}
-    local = {"num_cpus": how.workers, "include_dashboard": False} if how.address == "local" else {}
+    local: dict[str, Any] = {}
+    if how.address == "local":
+        local = {"num_cpus": math.ceil(how.workers * how.cpus), "include_dashboard": False}
     try:
         try:
             ray.init(address=how.address, **local, **quiet)
         except ConnectionError as error:
             raise ConfigError(
-                f"there is no Ray cluster at engine.address={how.address}: start one "
-                "(`ray start --head`) or take engine.address=local"
+                f"there is no Ray cluster at {how.place}.address={how.address}: start one "
+                f"(`ray start --head`) or take {how.place}.address=local"
             ) from error
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         cpus = int(ray.cluster_resources().get("CPU", 0))
         log.info("Ray: %d nodes, %d cores", len(nodes), cpus)
         if not any(
-            has.get("CPU", 0) >= how.cpus and has.get("memory", 0) >= how.memory_bytes
+            has.get("CPU", 0) >= how.cpus
+            and has.get("GPU", 0) >= how.gpus
+            and has.get("memory", 0) >= how.memory_bytes
             for has in nodes
         ):
             raise ConfigError(
-                f"no node of the cluster has engine.cpus={how.cpus} cores and "
-                f"engine.memory_gb={how.memory_gb or 0} of memory"
+                f"no node of the cluster has {how.place}.cpus={how.cpus} cores, "
+                f"{how.place}.gpus={how.gpus} cards and {how.place}.memory_gb={how.memory_gb or 0} "
+                "of memory"
             )
         yield
     finally:
@@ -243,6 +259,6 @@ def _ray() -> ModuleType:
     try:
         import ray
     except ImportError as error:
-        raise ConfigError("engine=ray needs Ray: pip install 'qs3[cluster]'") from error
+        raise ConfigError("this needs Ray: pip install 'qs3[cluster]'") from error
     module: ModuleType = ray
     return module

@@ -29,6 +29,7 @@ from qs3.config.checks import check_int
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.listed_jobs import ListedJobs, OverLauncher
+from qs3.sweeps.ray_launcher import RayLauncher
 from qs3.sweeps.search_report import FAILED, Tried, report
 from qs3.sweeps.search_space import distribution, overrides, split, words
 
@@ -177,11 +178,11 @@ def _any(study: Study, state: str) -> bool:
 
 
 def register() -> None:
-    """Put our sweepers into Hydra's list of plugins, before it looks for one.
+    """Put our sweepers and launcher into Hydra's list of plugins, before it looks for one.
 
     Their names must begin with `hydra_plugins`. Hydra's own way, a namespace package of that name,
     would be a second top-level package next to qs3.
     """
     known: dict[str, Any] = Plugins.instance().class_name_to_class
-    for sweeper in (ListedJobs, LabelFreeSearch):
-        known[f"hydra_plugins.qs3.{sweeper.__name__}"] = sweeper
+    for plugin in (ListedJobs, LabelFreeSearch, RayLauncher):
+        known[f"hydra_plugins.qs3.{plugin.__name__}"] = plugin

@@ -20,6 +20,7 @@ LAUNCHERS = {
     "basic": [],
     "joblib": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
     "submitit_local": ["hydra/launcher=submitit_local"],
+    "ray": ["hydra/launcher=ray"],
 }
 
 
@@ -54,6 +55,35 @@ def test_a_killed_job_is_listed(tmp_path):
     assert result.returncode == 1
     assert "1 of 2 jobs failed:\n  did not end: killed" in result.stdout
     assert len(light_runs(tmp_path)) == 1
+
+
+@pytest.mark.slow
+def test_a_job_of_rays_whose_process_is_killed_begins_again(tmp_path):
+    """Once is made good, three times is listed; neither harms the others."""
+    result = light(tmp_path, "seed=6,8,1", "hydra/launcher=ray", "hydra.launcher.jobs=1")
+    assert result.returncode == 1
+    assert "1 of 3 jobs failed:\n  did not end: killed" in result.stdout
+    assert re.search(r"seed=8  \(/", result.stdout)
+    assert {name[:5]: run["times"] for name, run in light_runs(tmp_path).items()} == {
+        "seed1": 1, "seed6": 1,
+    }  # fmt: skip
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("hydra.launcher.attempts=0", "hydra.launcher.attempts must be"),
+        ("hydra.launcher.gpus=99", r"no node of the cluster has .*hydra.launcher.gpus=99 cards"),
+    ],
+)
+@pytest.mark.slow
+def test_what_ray_cannot_do_is_said(tmp_path, word, message):
+    result = light(tmp_path, "seed=1", "hydra/launcher=ray", word)
+    assert result.returncode == 1
+    assert re.search(message, result.stderr)
+    assert "Traceback" not in result.stderr
+    assert light_runs(tmp_path) == {}
 
 
 def test_gpus_are_counted():

@@ -22,6 +22,7 @@ from qs3.report.tables.cells import Table
 LAUNCHERS: Mapping[str, str | None] = {
     "basic": None,
     "joblib": "hydra.launcher.n_jobs",
+    "ray": "hydra.launcher.jobs",
     "submitit_local": "hydra.sweeper.at_once",
     "submitit_slurm": "hydra.launcher.array_parallelism",
     "slurm": "hydra.launcher.array_parallelism",

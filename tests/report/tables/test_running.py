@@ -82,7 +82,7 @@ def test_one_cell(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["launcher=ray"], "launcher=ray; set launcher=basic|joblib|"),
+        (["launcher=dask"], "launcher=dask; set launcher=basic|joblib|"),
         (["hydra.launcher.partition=gpu"], "partition=gpu needs a launcher; set"),
         (["jobs=0", "launcher=joblib"], "jobs must be a whole number of at least 1"),
     ],
