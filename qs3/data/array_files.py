@@ -15,8 +15,7 @@ import hashlib
 import io
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -156,12 +155,11 @@ def open_array(
             ]
         )
     if verify:
-        with ThreadPoolExecutor(_THREADS) as threads:
-            for path, sha256 in zip(files, threads.map(sha256_file, files), strict=True):
-                if sha256 != files[path]:
-                    raise DataError(
-                        f"{path} is damaged (its SHA-256 is not the one in meta.yaml); {AGAIN}"
-                    )
+        for path, sha256 in zip(files, _hashes(list(files)), strict=True):
+            if sha256 != files[path]:
+                raise DataError(
+                    f"{path} is damaged (its SHA-256 is not the one in meta.yaml); {AGAIN}"
+                )
     return found
 
 
@@ -225,6 +223,16 @@ def _open_file(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
     if found != head:
         raise DataError(f"{path} does not have the header of a float32 array {shape}; {AGAIN}")
     return np.memmap(path, dtype="<f4", mode="r", offset=len(head), shape=shape)
+
+
+def _hashes(paths: Sequence[Path]) -> Iterable[str]:
+    if len(paths) == 1:
+        return [sha256_file(paths[0])]
+    # Here, because its import fails in a process that is ending, where sweeps are summarised.
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(_THREADS) as threads:
+        return list(threads.map(sha256_file, paths))
 
 
 def _remove(folder: Path, key: str) -> None:

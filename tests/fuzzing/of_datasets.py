@@ -198,12 +198,13 @@ def _stores(folder: Path) -> list[bytes]:
     from qs3.data.store import ManifestRow, write_pointset
 
     rows = [ManifestRow(f"{c}/train/0", c, "train", seed=1, more={"tier": "a"}) for c in TWO]
-    write_pointset(
-        folder / "store", name="made", classes=TWO, rows=rows, meta={"labels": {"a": [1, None]}},
-        arrays={"points": np.ones((2, 3, 3)), "provenance": np.ones((2, 3, 1))},
-        tables={"provenance": ["view"]},
-    )  # fmt: skip
-    return [folder_of(folder / "store")]
+    for name, shard_mb in (("store", 1), ("shards", 40e-6)):  # of one cloud each
+        write_pointset(
+            folder / name, name="made", classes=TWO, rows=rows, meta={"labels": {"a": [1, None]}},
+            arrays={"points": np.ones((2, 3, 3)), "provenance": np.ones((2, 3, 1))},
+            tables={"provenance": ["view"]}, shard_mb=shard_mb,
+        )  # fmt: skip
+    return [folder_of(folder / "store"), folder_of(folder / "shards")]
 
 
 def _read_store(path: Path) -> None:
@@ -352,7 +353,7 @@ READERS: tuple[Reader, ...] = (
     Reader("cut objects .npz", _objects, _read_objects, "a.npz", PACKED,
            ("data/importers/object_archive.py",)),
     Reader("store", _stores, _read_store, "a.zip", ZIP,
-           ("data/store.py", "data/meta.py", "data/manifest.py")),
+           ("data/store.py", "data/meta.py", "data/manifest.py", "data/array_files.py")),
     Reader("parts of a store", _parts, _read_parts, "a.zip", ZIP, ("data/parts.py",)),
     Reader("kept views .npz", _views, _read_views, "view_0.npz", PACKED,
            ("generation/view_files.py",)),

@@ -37,6 +37,7 @@ OWN = {
     "sensors/renderers/exr.py": "what Blender has just written",
     "sensors/renderers/llvm.py": "what a child has just said",
     "sweeps/listed_jobs.py": "what the parent has just written",
+    "tools/large_jobs.py": "sizes; costs.csv is read whole by utils/memory.py, and numbers parsed",
     "utils/files.py": "bytes that are hashed",
     "utils/locks.py": "nothing is read",
     "utils/memory.py": "bytes, for those that read them",
