@@ -241,6 +241,7 @@ PLAN = Command(
         "qs3 plan data=trial/specklenet10 objects=100000 nodes=8 life_h=24 slow_share=0.1 price=2",
     ),
     about="The dataset: qs3-generate domain=specklenet10 meshes=PATH limit=5 "
-    "paths.data_dir=trial\n\nObjects are drawn from the measured ones, so measure some of every kind. A node is paid "
+    "paths.data_dir=trial\n\n"
+    "Objects are drawn from the measured ones, so measure some of every kind. A node is paid "
     "for from the\nbeginning to the end. docs/how-to/cluster.md plans a job with it.",
 )
