@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 
+import pytest
 import torch
 
 from qs3.config import hashing
+from qs3.engine import checkpointing
+from qs3.engine.checkpointing import AtomicCheckpointIO, Clock
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from qs3.utils.files import sha256_file
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.watching import interrupt
 
+GB = 1_000_000_000
 LONG = 1e6  # seconds; no test takes as long
 
 
@@ -39,3 +43,48 @@ def test_a_shared_warmup_counts(toy, tmp_path):  # noqa: F811
     content["files"]["last.ckpt"] = sha256_file(shared)
     mark.write_text(json.dumps(content))
     assert LONG < train(toy()).times.seconds < 2 * LONG
+
+
+@pytest.fixture
+def meters(monkeypatch):
+    """The clock's time, and what process and GPU have had at most, as a test sets them."""
+    found = {"time": 100.0, "memory": None, "gpu": None}
+    monkeypatch.setattr(checkpointing.time, "time", lambda: found["time"])
+    monkeypatch.setattr(checkpointing, "peak_bytes", lambda: found["memory"])
+    monkeypatch.setattr(checkpointing, "forget_peak", lambda: None)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: found["gpu"] is not None)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda: found["gpu"])
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda: None)
+    return found
+
+
+def test_a_clock_says_seconds_and_gigabytes(meters):
+    clock = Clock(began=90.0)
+    assert clock.state_dict() == {"seconds": 10.0, "peaks": {"memory": 0, "gpu": 0}}
+    taken = clock.taken()
+    assert (taken.seconds, taken.memory_gb, taken.gpu_memory_gb) == (10.0, None, None)
+    meters |= {"time": 102.34, "memory": 1_500_500_000_000 // 1000, "gpu": 2_250_000}
+    taken = clock.taken()
+    assert (taken.seconds, taken.memory_gb, taken.gpu_memory_gb) == (12.3, 1.5, 0.002)
+    meters |= {"memory": 1234 * 10**9 + 1_600_000}  # where a billion and one would be another
+    assert clock.taken().memory_gb == 1234.002
+
+
+def test_a_clock_goes_on_with_the_greater_peak_and_both_times(meters):
+    meters |= {"memory": 2 * GB, "gpu": GB}
+    clock = Clock(began=100.0)
+    clock.load_state_dict({"seconds": 50, "peaks": {"memory": 3 * GB, "gpu": GB // 2}})
+    meters["time"] = 101.0
+    assert clock.state_dict() == {"seconds": 51.0, "peaks": {"memory": 3 * GB, "gpu": GB}}
+    meters |= {"memory": None, "gpu": None}
+    assert clock.state_dict()["peaks"] == {"memory": 3 * GB, "gpu": GB // 2}
+
+
+def test_a_checkpoint_goes_where_it_is_asked_for(tmp_path):
+    files, path = AtomicCheckpointIO(), tmp_path / "a.ckpt"
+    files.save_checkpoint({"x": torch.ones(2)}, path)
+    assert files.load_checkpoint(path)["x"].device.type == "cpu"
+    assert files.load_checkpoint(path, map_location="meta")["x"].device.type == "meta"
+    files.remove_checkpoint(path)
+    assert not path.exists()
+    files.remove_checkpoint(path)  # another process may have been quicker
