@@ -259,6 +259,6 @@ def _ray() -> ModuleType:
     try:
         import ray
     except ImportError as error:
-        raise ConfigError("this needs Ray: pip install 'qs3[cluster]'") from error
+        raise ConfigError("Ray is not installed: pip install 'qs3[cluster]'") from error
     module: ModuleType = ray
     return module

@@ -28,7 +28,7 @@ from qs3.errors import DataError
 from qs3.utils.files import atomic_path, sha256_file
 
 SHARD_MB = 1024
-"""Where a file ends by default: 43,690 clouds of 2,048 points."""
+"""Where a file ends by default: 41,666 clouds of 2,048 points."""
 
 _CHUNK_CLOUDS = 512
 _SHARD = re.compile(r"(?P<key>.+)-\d{5}\.npy")
