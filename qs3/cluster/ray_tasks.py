@@ -224,7 +224,9 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
     quiet = {"log_to_driver": False, "logging_level": logging.WARNING, "configure_logging": False}
     local: dict[str, Any] = {}
     if how.address == "local":
-        local = {"num_cpus": math.ceil(how.workers * how.cpus), "include_dashboard": False}
+        # More processes than cores are the caller's choice; a task with more than all is an error.
+        cores = math.ceil(how.workers * how.cpus) if how.cpus <= (os.cpu_count() or 1) else None
+        local = {"num_cpus": cores, "include_dashboard": False}
     try:
         try:
             ray.init(address=how.address, **local, **quiet)

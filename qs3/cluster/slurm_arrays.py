@@ -12,10 +12,11 @@ import os
 import pickle
 import signal
 import struct
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
@@ -164,7 +165,7 @@ class SlurmArrays:
         folder.mkdir(parents=True, exist_ok=True)
         journals = [folder / f"journal-{os.urandom(8).hex()}" for _ in chunks]
         try:
-            with executor.batch():
+            with _interruptible(), executor.batch():
                 handles = [
                     executor.submit(_do_chunk, make_worker, chunk, journal)
                     for chunk, journal in zip(chunks, journals, strict=True)
@@ -253,6 +254,23 @@ class _Job:
             error = self.handle.exception()
             return " ".join(str(error).split())[:200] if error else "no reason is known"
         return "no reason is known"
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Processes that start meanwhile end at SIGINT, by which submitit cancels those of this machine.
+
+    A command that a script runs by `&` ignores it, and so would they.
+    """
+    ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    if not ignored or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda *_: None)  # ignored still, but handlers are not inherited
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _cancel(jobs: list[_Job], wait_s: float) -> None:

@@ -107,8 +107,18 @@ def alive(pid):
 
 @slow
 @engines
-def test_nothing_goes_on_when_the_caller_stops(engine, tmp_path):
-    """As with Ctrl-C, which ends the loop over the outcomes."""
+@pytest.mark.parametrize("by", [signal.default_int_handler, signal.SIG_IGN], ids=["", "script &"])
+def test_nothing_goes_on_when_the_caller_stops(engine, by, tmp_path):
+    """As with Ctrl-C, which ends the loop; also of a command that ignores it, as by `&`."""
+    before = signal.signal(signal.SIGINT, by)
+    try:
+        stop_in_the_middle(engine, tmp_path)
+        assert signal.getsignal(signal.SIGINT) == by
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def stop_in_the_middle(engine, tmp_path):
     tasks = [("first", 1), ("a", ("sleep", "a")), ("b", ("sleep", "b"))]
     outcomes = engine(tmp_path / "own").run(make_worker(tmp_path), tasks)
     assert next(outcomes).name == "first"
