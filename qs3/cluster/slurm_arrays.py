@@ -258,7 +258,7 @@ class _Job:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Processes that start meanwhile end at SIGINT, by which submitit cancels those of this machine.
+    """Processes that start meanwhile end at SIGINT, by which submitit cancels this machine's.
 
     A command that a script runs by `&` ignores it, and so would they.
     """
