@@ -20,6 +20,29 @@ def _zip(name: str, data: bytes) -> bytes:
     return file.getvalue()
 
 
+class Harm:
+    """A pickle of it runs what its reader did not write."""
+
+    def __init__(self, path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_nothing_is_unpickled(tmp_path):
+    parts = PartFiles(tmp_path, "path")
+    parts.begin({"a": 1})
+    parts.write("x", {"n": 1}, {"points": np.zeros(3)})
+    (path,) = tmp_path.rglob("x.npz")
+    with np.load(path, allow_pickle=False) as file:
+        harmful = {name: np.array(Harm(tmp_path / "harm"), dtype=object) for name in file.files}
+    np.savez(path, **harmful)
+    with pytest.raises(DataError, match=r"x\.npz is damaged .*pickle"):
+        parts.read("x")
+    assert not (tmp_path / "harm").exists()
+
+
 @pytest.mark.parametrize(
     "content",
     [
@@ -47,6 +70,7 @@ BEGUN = {
     "settings": {"sensor": {"baseline_m": 0.1, "name": "a"}, "views": 5},
     "objects": ["a", "b", "c"],
     "poses": [1, 2],
+    "looks": [1, 2],
     "note": "x",
 }
 
@@ -84,7 +108,8 @@ def test_what_differs_is_named_by_its_key(tmp_path):
     assert refusal(tmp_path, {**BEGUN, "objects": "all"}) == [
         '  objects: ["a", "b", "c"] there, "all" now'
     ]
-    assert refusal(tmp_path, {**BEGUN, "poses": [2, 1]}) == ["  poses: [1, 2] there, [2, 1] now"]
+    for key in ("poses", "looks"):  # before and after "objects"
+        assert refusal(tmp_path, {**BEGUN, key: [2, 1]}) == [f"  {key}: [1, 2] there, [2, 1] now"]
     short, long = "y" * 78, "y" * 79  # of which the quotes make 80 and 81 letters
     assert refusal(tmp_path, {**BEGUN, "note": short}) == [f'  note: "x" there, "{short}" now']
     assert refusal(tmp_path, {**BEGUN, "note": long}) == [f'  note: "x" there, "{long[:76]}... now']

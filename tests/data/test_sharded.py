@@ -1,6 +1,7 @@
 """Clouds in several files answer as one array would; a dataset is the same however it is cut."""
 
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from qs3.data.store import ManifestRow, has_variant, open_pointset, open_table, 
 from qs3.datamodules.fps_cache import prepare
 from qs3.errors import DataError
 
+CONF = Path(__file__).parents[2] / "conf"
 ROWS = [
     ManifestRow(f"{cls}/{i}", cls, "train" if i % 3 else "test")
     for cls in ("bed", "chair")
@@ -36,7 +38,7 @@ def cut(array: np.ndarray, each: int) -> ShardedArray:
 def test_it_answers_as_the_array_would(each, rows, bounds):
     shards, index = cut(POINTS, each), np.array(rows, dtype=np.int64)
     assert shards.shape == POINTS.shape
-    assert len(shards) == 10
+    assert (len(shards), shards.ndim, shards.dtype) == (10, POINTS.ndim, POINTS.dtype)
     np.testing.assert_array_equal(np.asarray(shards), POINTS)
     np.testing.assert_array_equal(np.stack(list(shards)), POINTS)
     np.testing.assert_array_equal(shards[index], POINTS[index])
@@ -60,7 +62,8 @@ def test_a_slice_reads_nothing_and_the_rest_cannot_be_written():
     shards = cut(POINTS.copy(), 4)
     assert isinstance(shards[2:9], ShardedArray)
     assert isinstance(shards.at(np.array([1, 8])), ShardedArray)
-    assert np.asarray(shards, dtype=np.float64).dtype == np.float64
+    assert np.asarray(shards).dtype == np.float32
+    assert shards.__array__(np.float64).dtype == np.float64  # numpy would mend it afterwards
     for wrong in (10, -11):
         with pytest.raises(IndexError):
             shards[wrong]
@@ -140,13 +143,18 @@ def test_batches_are_those_of_one_file(tmp_path):
 
 
 def test_a_new_cut_leaves_nothing_of_the_old(tmp_path):
-    (tmp_path / "points-extra.npy").touch()
+    others = {"points-extra.npy", "points-noisy-00000.npy", "points_noisy-00007.npy"}
+    others |= {"points_own.npy", "points_own-00000.npy", "older-00001.npy"}
+    for name in others:
+        (tmp_path / name).touch()
     for each in (3, 10, 4):
         written(tmp_path, each)
         shards = [shard_name("points", i) for i in range(-(-10 // each))]
         expected = {"points.npy"} if each == 10 else set(shards)
-        found = {path.name for path in tmp_path.glob("points*.npy")}
-        assert {name for name in found if "clean" not in name} == {*expected, "points-extra.npy"}
+        found = {path.name for path in tmp_path.glob("*.npy")}
+        assert others < found
+        of_clouds = {name for name in found - others if name.startswith("points")}
+        assert {name for name in of_clouds if "clean" not in name} == expected
         assert has_variant(tmp_path, "points")
         assert has_variant(tmp_path, "points_clean")
         assert not has_variant(tmp_path, "points_noisy")
@@ -187,6 +195,9 @@ def test_a_damaged_shard_is_named(tmp_path, damage):
         {"clouds": 9, "sha256": {"points": ["a"] * 3, "points_clean": ["a"] * 2}},
         {"clouds": 9, "sha256": {"points": ["a"] * 2, "points_clean": [1] * 2}},
         {"clouds": 9, "sha256": {"points": "aa", "points_clean": ["a"] * 2}},
+        {"clouds": 9, "sha256": {"points": ["a"] * 2, "points_clean": ["a"]}},
+        {"clouds": 9, "sha256": {k: ["a"] * 2 for k in ("points", "points_clean", "other")}},
+        {"clouds": 9, "sha256": {k: ["a"] * 2 for k in ("points", "points_clean")}, "each": 9},
         ["points"],
     ],
 )
@@ -208,6 +219,10 @@ def test_where_a_file_ends():
     assert clouds_each(1024, (1, 2048, 3)) == 41_666
     assert clouds_each(1, (1, 2048, 3)) == 40
     assert clouds_each(1, (1, 1_000_000, 3)) == 1  # one cloud is never cut
+    assert clouds_each(1000, (1, 1, 1)) == 250_000_000
+    assert clouds_each(array_files.SHARD_MB, (9, 2048, 3)) == 41_666
+    default = yaml.safe_load((CONF / "generate.yaml").read_text())["shard_mb"]
+    assert default == array_files.SHARD_MB
 
 
 class Asked:
@@ -252,6 +267,17 @@ def test_writing_and_reading_need_no_memory_for_the_whole(tmp_path):
         assert peak < 20e6
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_first_cloud_gives_the_shape(n):
+    assert Column("made", "points", Asked(n, 4)).shape == (n, 4, 3)
+    assert Column("made", "points", []).shape == (0,)
+
+
+def test_what_was_written_cannot_be_changed():
+    with pytest.raises(AttributeError):
+        array_files.Written("a", ()).sha256 = "b"
 
 
 def test_clouds_of_several_shapes_are_refused_when_they_are_read(tmp_path):

@@ -2,6 +2,8 @@
 
 import csv
 import dataclasses
+import hashlib
+import json
 import shutil
 
 import numpy as np
@@ -24,6 +26,7 @@ def make(folder, n=6, p=5, seed=0, meta=None, **changes):
         for i in range(n)
     ]
     rows.insert(1, ManifestRow("bed/bad", "bed", "train", status="failed", reason="empty mesh"))
+    rows.insert(4, ManifestRow("bed/out", "", "test", status="skipped", reason="no mesh"))
     arguments = {
         "name": "tiny",
         "classes": CLASSES,
@@ -52,13 +55,13 @@ def test_round_trip(tmp_path):
     assert found.classes == CLASSES
     assert found.counts() == {"train": {"bed": 2, "chair": 2}, "test": {"bed": 1, "chair": 1}}
     assert found.meta["config"] == {"views": 5}
-    assert found.meta["failed"] == 1
+    assert found.meta["failed"] == 2
     assert found.sha256 == made.sha256
     clean = open_pointset(tmp_path / "d", "points_clean")
     assert clean.sha256 != found.sha256
     assert not np.array_equal(clean.points, found.points)
     rows = store.read_manifest(tmp_path / "d", CLASSES)
-    assert [row.index for row in rows] == [0, None, 1, 2, 3, 4, 5]
+    assert [row.index for row in rows] == [0, None, 1, 2, None, 3, 4, 5]
     assert rows[1].reason == "empty mesh"
 
 
@@ -221,6 +224,7 @@ def test_the_number_of_clouds_is_checked_against_the_manifest(tmp_path):
         ("sha256:", "sha256: [manifest]\nhashes:", "has no sha256 as"),
         ("sha256:", "sha256: {points: abc}\nhashes:", "has no sha256 as"),
         ("clouds: 6", "clouds: 6\ntables: [a]", "has no tables as"),
+        ("clouds: 6", "clouds: 6\ntables: {seen: [a]}", "has no tables as"),
         ("clouds: 6", "clouds: [6", "was written by something else"),
         (None, "- 1\n", "was written by something else"),
         (None, "", "was written by something else"),
@@ -254,6 +258,21 @@ def test_content_hash_sees_what_training_sees_and_nothing_else(tmp_path):
     for change in ({"cls": "chair"}, {"split": "test"}, {"id": "new"}):
         changed = [dataclasses.replace(rows[0], **change), *rows[1:]]
         assert make(tmp_path / "4", rows=changed).sha256 != base.sha256
+
+
+def test_the_content_hash_is_that_of_its_definition(tmp_path):
+    rows = [ManifestRow("bed/é", "bed", "train"), ManifestRow("chair/椅", "chair", "test")]
+    made = make(tmp_path, arrays={"points": np.ones((2, 1, 3))}, rows=rows)
+    array = hashlib.sha256((tmp_path / "points.npy").read_bytes()).hexdigest()
+    seen = [array, ["bed", "chair"], [[row.id, row.cls, row.split] for row in rows]]
+    assert made.sha256 == hashlib.sha256(json.dumps(seen).encode("ascii")).hexdigest()
+
+
+def test_hundreds_of_clouds(tmp_path):
+    made = make(tmp_path, n=300, p=1, shard_mb=1e-9)  # each in its own file
+    assert len(list(tmp_path.glob("points-*.npy"))) == 300
+    assert open_pointset(tmp_path).ids == made.ids
+    assert len(made.points) == 300
 
 
 def test_unfinished_and_missing(tmp_path):
@@ -301,6 +320,8 @@ def test_unknown_variant(tmp_path):
         ({"arrays": {"points": [np.zeros((5, 3)), np.zeros((4, 3))]}}, "several shapes"),
         ({"meta": {"name": 1}}, "may not use the keys"),
         ({"classes": ("bed",)}, "unknown class 'chair'"),
+        ({"tables": {"points": ("x", "y", "z")}}, r"tables \['points'\] are not arrays beyond"),
+        ({"tables": {"seen": ("a",)}}, r"tables \['seen'\] are not arrays beyond"),
         ({"rows": [ManifestRow("a", "bed", "dev")]}, "unknown split 'dev'"),
         ({"rows": [ManifestRow("a", "bed", "test")] * 2}, "same id is already in line 2"),
         ({"rows": [ManifestRow("", "bed", "test")]}, "id is empty"),
@@ -401,8 +422,21 @@ def test_manifest_errors_name_the_line(tmp_path):
     assert "line 4: index is 'x', not a number" in error(4, "index", "x")
     assert "line 5 (id 'bed/2'): unknown class 'cat'" in error(5, "class", "cat")
     assert "line 5 (id 'bed/0'): the same id is already in line 2" in error(5, "id", "bed/0")
+    assert "line 4 (id 'chair/1'): index is 0, expected 1" in error(4, "index", "0")
+    assert "line 4 (id 'chair/1'): unknown class ''" in error(4, "class", "")
+    assert "line 3 (id 'bed/bad'): unknown class 'cat'" in error(3, "class", "cat")
+    assert "line 6 (id 'bed/out'): unknown class 'cat'" in error(6, "class", "cat")
+    assert "an object that is not ok has no index" in error(6, "index", "3")
+    assert "an object that is not ok has no index" in error(3, "reason", "")
     assert "line 2 (id 'bed/0'): unknown split ''" in error(2, "split", "")
     assert "line 1: the columns are not" in error(1, "split", "part")
+    assert "line 1: the columns are not" in error(1, "split", "zone")
+    path.write_text(path.read_text().replace("bed/bad", '"bed/bad'))
+    with pytest.raises(DataError, match=r"manifest\.csv is empty or damaged \("):
+        store.read_manifest(tmp_path / "d", CLASSES)
+    path.write_text("")
+    with pytest.raises(DataError, match=r"manifest\.csv is empty or damaged \("):
+        store.read_manifest(tmp_path / "d", CLASSES)
 
 
 def test_another_version_of_the_format(tmp_path, monkeypatch):

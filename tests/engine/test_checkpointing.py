@@ -66,7 +66,7 @@ def test_a_clock_says_seconds_and_gigabytes(meters):
     meters |= {"time": 102.34, "memory": 1_500_500_000_000 // 1000, "gpu": 2_250_000}
     taken = clock.taken()
     assert (taken.seconds, taken.memory_gb, taken.gpu_memory_gb) == (12.3, 1.5, 0.002)
-    meters |= {"memory": 1234 * 10**9 + 1_600_000}  # where a billion and one would be another
+    meters |= {"memory": 1234 * 10**9 + 1_500_600}  # where a billion and one would be another
     assert clock.taken().memory_gb == 1234.002
 
 

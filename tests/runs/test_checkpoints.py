@@ -73,6 +73,25 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
     assert blind == 24  # or torch has learnt it, and ours can go
 
 
+class Harm:
+    """A pickle of it runs what its reader did not write."""
+
+    def __init__(self, path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_nothing_is_unpickled(tmp_path):
+    torch.save({"w": torch.zeros(9), "harm": Harm(tmp_path / "harm")}, tmp_path / "a.pt")
+    with pytest.raises(DataError) as refused:
+        load(tmp_path / "a.pt")
+    assert str(refused.value).startswith(f"{tmp_path / 'a.pt'} cannot be read (UnpicklingError: ")
+    assert len(str(refused.value).splitlines()) == 1
+    assert not (tmp_path / "harm").exists()
+
+
 def test_a_full_disk_is_told_in_words(tmp_path):
     """The kernel refuses files of more than 50 kB."""
     path = tmp_path / "a.pt"

@@ -9,12 +9,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from omegaconf import OmegaConf
 
 from qs3.config import hashing
+from qs3.engine.checkpointing import SaveLast
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
-from qs3.training.shared_warmup import SharedWarmup
+from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
+from qs3.utils.files import sha256_file
 from tests.training.conftest import result_of
 
 
@@ -31,6 +35,143 @@ def flipped(data: bytes) -> bytes:
     """One bit in the middle is another."""
     middle = len(data) // 2
     return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+
+
+# Lightning asks torch for what torch gives up; nothing here is on a GPU or in several processes.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*LeafSpec.* is deprecated:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
+]
+SHA256 = "0123456789abcdef" * 4
+
+
+class Epochs(Callback):
+    """The history of a run: the epochs that are over."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / "history.csv"
+
+    def on_train_epoch_end(self, trainer, pl_module):
+        with self.file.open("a") as file:
+            file.write(f"{trainer.current_epoch}\n")
+
+
+class Quick(LightningModule):
+    """One weight, one step an epoch."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = torch.nn.Linear(1, 1)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+    def training_step(self, batch, i):
+        return self.net(batch).sum()
+
+
+def trained(folder: Path, shared: SharedWarmup, epochs: int = 6) -> None:
+    """A run of some net, with the callbacks in the order of `fit`."""
+    folder.mkdir(exist_ok=True)
+    callbacks = [Epochs(folder), SaveLast(folder), shared]
+    quiet = dict.fromkeys(("logger", "enable_progress_bar", "enable_model_summary"), False)
+    Trainer(
+        max_epochs=epochs,
+        callbacks=callbacks,
+        accelerator="cpu",
+        default_root_dir=folder,
+        log_every_n_steps=1,
+        **quiet,
+    ).fit(Quick(), torch.utils.data.DataLoader(torch.ones(1, 1)))
+
+
+@pytest.mark.parametrize("warmup", [1, 2, 3, 5, 6])
+def test_it_is_shared_one_epoch_before_its_end_and_once(tmp_path, warmup, caplog):
+    (tmp_path / "b").mkdir()
+    where = tmp_path / "warmups" / "01234567-seed7"
+    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", where.parent, SHA256, 7, warmup))
+    other = SharedWarmup(tmp_path / "b", where.parent, SHA256, 7, warmup)
+    if warmup == 1:
+        assert not where.exists()
+        assert not other.take()
+        return
+    assert (where / "history.csv").read_text().split() == [str(i) for i in range(warmup - 1)]
+    files = {name: sha256_file(where / name) for name in ("history.csv", "last.ckpt")}
+    mark = {"warmup_sha256": SHA256, "files": files}
+    assert json.loads((where / "started.json").read_text()) == mark
+    assert load(where / "last.ckpt")["epoch"] == warmup - 2
+    assert other.take()
+    assert f"going on from {where}" in caplog.text
+    for name in files:
+        assert (tmp_path / "b" / name).read_bytes() == (where / name).read_bytes()
+    assert not other.take()  # it has begun
+    changed = where.stat().st_mtime_ns, (where / "last.ckpt").stat().st_mtime_ns
+    trained(tmp_path / "c", SharedWarmup(tmp_path / "c", where.parent, SHA256, 7, warmup))
+    assert (where.stat().st_mtime_ns, (where / "last.ckpt").stat().st_mtime_ns) == changed
+
+
+@pytest.mark.parametrize("different", ["sha256", "seed", "nothing is shared"])
+def test_nobody_elses_is_taken(tmp_path, different, caplog):
+    (tmp_path / "b").mkdir()
+    warmups = tmp_path / "warmups"
+    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", warmups, SHA256, 7, 3), epochs=3)
+    given = {
+        "sha256": (warmups, SHA256[:-1] + "0", 7, 3),  # of the same name
+        "seed": (warmups, SHA256, 8, 3),
+        "nothing is shared": (None, SHA256, 7, 3),
+    }[different]
+    mine = SharedWarmup(tmp_path / "b", *given)
+    assert not mine.take()
+    assert not any((tmp_path / "b").iterdir())
+    assert ("is damaged" in caplog.text) == (different == "sha256")
+    trained(tmp_path / "b", mine, epochs=3)
+    assert len(list(warmups.iterdir())) == (2 if different == "seed" else 1)
+    assert mine.take() is False
+
+
+def test_without_its_mark_it_is_half_a_copy_and_replaced(tmp_path, caplog):
+    (tmp_path / "b").mkdir()
+    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", tmp_path / "w", SHA256, 7, 2), epochs=2)
+    (mark,) = (tmp_path / "w").rglob("started.json")
+    mark.unlink()
+    mine = SharedWarmup(tmp_path / "b", tmp_path / "w", SHA256, 7, 2)
+    assert not mine.take()
+    assert "damaged" not in caplog.text
+    trained(tmp_path / "b", mine, epochs=2)
+    assert mark.is_file()
+
+
+def test_the_hash_covers_what_comes_before():
+    plain = {
+        "paths": {"scratch": "a"},
+        "model": {"k": 20, "notes": "${paths.scratch}"},
+        "selection": {"teacher": "last", "student": "last"},
+        "selftraining": {"rounds": 3},
+        "evaluation": {"turns": 4},
+        "experiment_name": "a",
+    }
+    started = {"data": {"source": {"sha256": "a"}, "target": 1}, "versions": {"a": 1, "b": 2}}
+
+    def of(key="", value=None, started=started):
+        cfg = OmegaConf.create(plain)
+        if key:
+            OmegaConf.update(cfg, key, value)
+        return warmup_sha256(cfg, started)
+
+    for key, value in (
+        ("paths.scratch", "b"),
+        ("selection.student", "best"),
+        ("selftraining.rounds", 4),
+        ("evaluation", None),
+        ("experiment_name", "b"),
+    ):
+        assert of(key, value) == of(), key
+    turned = {"versions": {"b": 2, "a": 1}, "data": {"target": 1, "source": {"sha256": "a"}}}
+    assert of(started=turned) == of()
+    others = [of("model.k", 10), of("selection.teacher", "best"),
+              of(started={**started, "versions": {"a": 1, "b": 3}}),
+              of(started={**started, "data": {"source": {"sha256": "b"}, "target": 1}})]  # fmt: skip
+    assert len({of(), *others}) == 5
 
 
 def shared_folders(folder: Path) -> list[Path]:
