@@ -168,9 +168,12 @@ def test_the_hash_covers_what_comes_before():
         assert of(key, value) == of(), key
     turned = {"versions": {"b": 2, "a": 1}, "data": {"target": 1, "source": {"sha256": "a"}}}
     assert of(started=turned) == of()
-    others = [of("model.k", 10), of("selection.teacher", "best"),
-              of(started={**started, "versions": {"a": 1, "b": 3}}),
-              of(started={**started, "data": {"source": {"sha256": "b"}, "target": 1}})]  # fmt: skip
+    others = [
+        of("model.k", 10),
+        of("selection.teacher", "best"),
+        of(started={**started, "versions": {"a": 1, "b": 3}}),
+        of(started={**started, "data": {"source": {"sha256": "b"}, "target": 1}}),
+    ]
     assert len({of(), *others}) == 5
 
 
