@@ -44,11 +44,12 @@ class Nodes:
         self.others = [self.cluster.add_node(**small) for _ in range(2)]
 
     def kill_one(self, process):
-        """One that is scanning: its worker is held first, so that it cannot end just before."""
+        """One that is scanning, with its worker, which is held first: it cannot end just before."""
         raylets = [node.all_processes["raylet"][0].process.pid for node in self.others]
         worker = held_at_work(process, raylets)
         node = self.others.pop(raylets.index(parent(worker)))
         self.cluster.remove_node(node, allow_graceful=False)
+        os.kill(worker, signal.SIGKILL)  # being held it does not see that its node is gone
 
 
 @pytest.fixture
