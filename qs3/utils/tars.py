@@ -19,6 +19,7 @@ DAMAGE = (EOFError, OSError, ValueError, lzma.LZMAError, tarfile.TarError, zlib.
 """What damaged ones raise."""
 
 _MOST = 1 << 20  # bytes at once: more than this no header of a member has
+_FARTHEST = 1 << 62  # no file is longer, and no place in one has more bits
 _PACKED = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ": lzma.open}
 
 
@@ -35,6 +36,8 @@ class _Pieces(io.RawIOBase):
         return found
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        if offset > _FARTHEST:
+            raise DataError(f"{self._path}: a member of {offset} bytes and more; refused")
         return int(self._file.seek(offset, whence))
 
     def tell(self) -> int:

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from qs3.clouds.hdf5 import HDF5_DAMAGE, open_hdf5
 from qs3.data.frames.images import MAX_SIDE_PX, Pinhole
 from qs3.data.frames.matlab import AGAIN, load_v5, own_array, variable, words
 from qs3.errors import DataError, MissingDataError
@@ -61,13 +62,11 @@ class LabelledFrames:
             MissingDataError: there is no such file.
             DataError: it is broken off, damaged, or something else.
         """
-        import h5py
-
         self.path = path
         if not path.is_file():
             raise MissingDataError(f"there is no {path}")
         try:
-            self._file: Any = h5py.File(path, "r")
+            self._file: Any = open_hdf5(path)
         except OSError as error:
             raise DataError(
                 f"{path} cannot be opened as HDF5, which nyu_depth_v2_labeled.mat is: it is broken "
@@ -78,7 +77,7 @@ class LabelledFrames:
             self.names = words(self._file, "names", path)
             self.scenes = self._scenes()
             self.accelerations = self._accelerations()
-        except (OSError, RuntimeError, KeyError, ValueError, MemoryError) as error:
+        except HDF5_DAMAGE as error:
             self._file.close()
             raise DataError(f"{path} is damaged ({error}); {AGAIN}") from error
         except BaseException:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.hdf5 import own_dataset
+from qs3.clouds.hdf5 import HDF5_DAMAGE, open_hdf5, own_dataset
 from qs3.data.importers.base import Importer, Item, cloud_id, inside, turned
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
@@ -95,10 +95,8 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         DataError: truncated, other shapes, a label out of range, or contents that lie elsewhere.
     """
-    import h5py
-
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             data, label = (own_dataset(file, (key,), path) for key in ("data", "label"))
             for key, found in (("data", data), ("label", label)):
                 if found is None:
@@ -117,7 +115,7 @@ def read_h5(path: Path, classes: int) -> tuple[np.ndarray, np.ndarray]:
             check_memory(2 * data.size * data.dtype.itemsize, path)
             points = np.asarray(data[..., :3], dtype=np.float32)
             labels = np.asarray(label[...], dtype=np.int64).reshape(n)
-    except (OSError, RuntimeError, ValueError, KeyError, MemoryError) as error:
+    except HDF5_DAMAGE as error:
         raise DataError(f"{path}: not a readable HDF5 file ({error})") from error
     if bad := np.flatnonzero((labels < 0) | (labels >= classes)).tolist():
         raise DataError(f"{path}, cloud {bad[0]}: label {labels[bad[0]]} is not 0..{classes - 1}")
