@@ -36,8 +36,8 @@ class _Pieces(io.RawIOBase):
         return found
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        if offset > _FARTHEST:
-            raise DataError(f"{self._path}: a member of {offset} bytes and more; refused")
+        if abs(offset) > _FARTHEST:
+            raise DataError(f"{self._path}: a member that ends at {offset}; refused")
         return int(self._file.seek(offset, whence))
 
     def tell(self) -> int:
