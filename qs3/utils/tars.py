@@ -15,7 +15,10 @@ from typing import IO, Any
 
 from qs3.errors import DataError
 
-DAMAGE = (EOFError, OSError, ValueError, lzma.LZMAError, tarfile.TarError, zlib.error)
+DAMAGE = (
+    *(EOFError, OSError, OverflowError, ValueError),
+    *(lzma.LZMAError, tarfile.TarError, zlib.error),
+)
 """What damaged ones raise."""
 
 _MOST = 1 << 20  # bytes at once: more than this no header of a member has

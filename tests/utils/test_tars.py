@@ -7,7 +7,7 @@ import tarfile
 import pytest
 
 from qs3.errors import DataError
-from qs3.utils.tars import is_whole, members_of, open_tar
+from qs3.utils.tars import DAMAGE, is_whole, members_of, open_tar
 
 
 def header(name, size):
@@ -38,5 +38,19 @@ def test_members_one_after_the_other(tmp_path, pack):
 def test_a_member_longer_than_any_file_is_refused(tmp_path, pack, size):
     path = tmp_path / "a.tar"
     path.write_bytes(pack(header("a", size) + bytes(2048)))
-    with open_tar(path) as archive, pytest.raises(DataError, match=r"a\.tar: a member that ends at -?\d{19,}"):
+    with (
+        open_tar(path) as archive,
+        pytest.raises(DataError, match=r"a\.tar: a member that ends at -?\d{19,}"),
+    ):
+        list(members_of(archive))
+
+
+def test_a_header_whose_lines_have_no_end_is_damage(tmp_path):
+    lines = f"{10**30} path=a\n".encode()
+    about = tarfile.TarInfo("PaxHeaders/a")
+    about.type, about.size = tarfile.XHDTYPE, len(lines)
+    path = tmp_path / "a.tar"
+    padding = bytes(-len(lines) % 512)
+    path.write_bytes(about.tobuf(tarfile.USTAR_FORMAT) + lines + padding + header("a", 0))
+    with pytest.raises(DAMAGE), open_tar(path) as archive:
         list(members_of(archive))
