@@ -26,7 +26,7 @@ QS3 = Group(
     },
     (
         "qs3 quickstart",
-        "qs3 predict ckpt=logs/own_scans/seed0-5f0c2a71 input=scans",
+        "qs3 predict input=scans",
         "qs3 report table=uda",
         "qs3 COMMAND --help",
     ),

@@ -116,7 +116,8 @@ def load(
 
     Args:
         run: its folder, or the file result.pt of it, which needs nothing beside it; or a folder
-            that `qs3 export out=FOLDER` wrote.
+            that `qs3 export out=FOLDER` wrote; or the name of a classifier that comes with qs3,
+            "dgcnn-speckle".
         device: where to run it: "cpu", "cuda", "cuda:1".
         packages: where the net of the file may be defined. For a net of your own add your
             package, if you trust it to be built with any arguments.

@@ -39,6 +39,8 @@ _UNHASHED = (
         )
     ),
 )
+# Left out where they are null, as they were before there were such keys: kept results stay valid.
+_NEW = ("weights",)
 _FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
@@ -56,6 +58,9 @@ def config_sha256(cfg: DictConfig) -> str:
             plain[group]["sha256"] = cfg[group].sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
+    for key in _NEW:
+        if plain.get(key) is None:
+            _leave_out(plain, key)
     if (plain.get("data") or {}).get("scale") != "above_floor":
         for key in _FLOORS:
             _leave_out(plain, key)

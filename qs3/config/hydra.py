@@ -113,6 +113,12 @@ def _files(group: str) -> list[Path]:
     return sorted(path for path in (CONF / group).glob("*.yaml") if path.stem != "none")
 
 
+def _packaged() -> str:
+    """The folder of what comes with qs3: classifiers, and scans for training beside."""
+    return str(Path(__file__).resolve().parents[1] / "pretrained")
+
+
+OmegaConf.register_new_resolver("qs3.packaged", _packaged, replace=True)
 OmegaConf.register_new_resolver("qs3.choices", _choices, replace=True)
 OmegaConf.register_new_resolver("qs3.described", _described, replace=True)
 OmegaConf.register_new_resolver("qs3.gpu_in_turn", _gpu_in_turn, replace=True)

@@ -42,6 +42,7 @@ class Classifier(LightningModule):
         smoothing: of class labels, see `qs3.methods.base.class_loss`.
         metres: whether clouds keep their size.
         regulariser_weight: of what a backbone wants in the loss (`Features.regulariser`).
+        weights: of the net, to begin with; None: new ones.
     """
 
     def __init__(
@@ -56,11 +57,14 @@ class Classifier(LightningModule):
         smoothing: float = 0.0,
         metres: bool = False,
         regulariser_weight: float = 0.0,
+        weights: Mapping[str, Tensor] | None = None,
     ) -> None:
         super().__init__()
         self.build_net, self.build_optimizer = build_net, build_optimizer
         self.phases, self.seed, self.schedule = phases, seed, schedule
         self.net = self.fresh_net(phase=0)
+        if weights is not None:
+            self.net.load_state_dict(weights)
         self.method, self.student = method, student
         method.smoothing = student.smoothing = smoothing
         method.metres = student.metres = metres

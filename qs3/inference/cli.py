@@ -10,21 +10,25 @@ from qs3.utils.cli import FLAG, NUMBER, Command, Option, text, whole
 _CKPT = Option(
     "ckpt", text("RUN"), "a finished run's or an exported folder, or result.pt", required=True
 )
+_CKPT_OR_OWN = Option(
+    "ckpt", text("RUN"), "a run's or exported folder, result.pt, or a name (default: see below)", ""
+)
 _THREADS = Option("threads", whole(), "batches at the same time (default: one a processor)")
 
 
 def _predict(threads: int | None, **given: Any) -> int:
-    from qs3.inference.command import Settings, predict_command
+    from qs3.inference.command import predict_command
+    from qs3.inference.settings import Settings
 
     said, failed = predict_command(Settings(threads=threads or _processors(), **given))
     print(said)
     return 1 if failed else 0
 
 
-def _export(ckpt: str, out: str, threads: int | None) -> None:
+def _export(threads: int | None, **given: Any) -> None:
     from qs3.inference.export import export_command
 
-    print(export_command(ckpt, out, threads or _processors()))
+    print(export_command(threads=threads or _processors(), **given))
 
 
 def _processors() -> int:
@@ -36,7 +40,13 @@ PREDICT = Command(
     "classes and confidences of your clouds, or of objects in your depth images",
     _predict,
     (
-        _CKPT,
+        _CKPT_OR_OWN,
+        Option(
+            "second",
+            text("RUN"),
+            "another one to ask, or none (default: see below)",
+            "",
+        ),
         Option("input", text("PATH"), "clouds: a file, a folder, or an archive of objects", ""),
         Option("depth", text("PATH"), "or depth images: a .png or .npy, a folder, or a list", ""),
         Option("mask", text("PATH"), "image of objects' numbers; a folder if depth is one", ""),
@@ -55,12 +65,17 @@ PREDICT = Command(
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
     ),
     (
+        "qs3 predict input=scans",
         "qs3 predict ckpt=logs/own_scans/seed0-5f0c2a71 input=scans",
         "qs3 predict ckpt=RUN depth=frame.png mask=mask.png intrinsics=525,525,319.5,239.5",
         "qs3 predict ckpt=RUN depth=a.npy box=210,95,480,430 intrinsics=cam.yaml up=0,-0.97,-0.24",
         "qs3 predict ckpt=result.pt depth=objects.csv intrinsics=camera.json out=said.json",
     ),
     about="""
+Without ckpt= a classifier of the ten classes that comes with qs3 is taken, and what it is worth on
+real objects is said: dgcnn-speckle, for clouds in any unit; dgcnn-rooms, which knows sizes and
+heights, where floor= or camera_height= is given; pointnet-speckle is another net for any unit.
+
 CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of points,
 any unit, any place. A net that knows sizes takes them as metres; one that knows heights wants
 floor=, which is 0 if objects stand on z = 0. Other files are passed over. Which way is up is not
@@ -99,6 +114,8 @@ EXPORT = Command(
     (
         _CKPT,
         Option("out", text("PATH"), ".onnx, .pt2 for torch.export.load, or a folder", "model.onnx"),
+        Option("judged", text("FILE"), "folder: .json of qs3 report judge, for the card", ""),
+        Option("half", FLAG, "folder: matrices in 16 bits, half the size", False),
         _THREADS,
     ),
     (

@@ -3,112 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
-from qs3.config.checks import check_choice, check_float
-from qs3.data.frames.pointed import LEVEL, PLANES
-from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError, DataError
+from qs3.inference import pretrained
 from qs3.inference.depth_list import Shown, direction, find_shown, numbers
 from qs3.inference.inputs import (
-    Sample,
-    Unit,
     archive_units,
     cloud_units,
     depth_units,
     find_files,
     is_archive,
-    reason_of,
 )
 from qs3.inference.model_file import find_result
 from qs3.inference.page import Gallery, page
-from qs3.inference.predictor import Predictor, Prepared, load
-from qs3.inference.scores import Count, scores
-from qs3.inference.table import Row, as_csv, as_json, record
-from qs3.models.norms import norms_for, use_domain
+from qs3.inference.predictor import Predictor, load
+from qs3.inference.settings import Inputs, Settings, Source
+from qs3.inference.table import as_csv, as_json, record
+from qs3.inference.told import agreement, chosen, told
+from qs3.inference.units import predict_units
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.progress import progress_bar
 
 _SHOWN = 10  # failures in the text for the terminal
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of one call.
-
-    Attributes:
-        ckpt: a run's folder or result.pt.
-        input: a file or folder of clouds, or an archive of cut objects; "" if `depth` is given.
-        depth: a depth image, a folder or list of them; "" if `input` is given.
-        mask, box, intrinsics: of depth images; see `qs3.inference.depth_list`.
-        depth_scale: metres a unit; None: by the kind of numbers.
-        up: the axis that points up in clouds (z if ""), or a direction in the depth camera's frame.
-        floor: where the floor is in clouds along that axis, in metres; None: not known.
-        camera_height: of the depth images' camera above the floor, in metres; likewise.
-        part: of an archive; "" for what one chooses on, "all" for all: see `archive_units`.
-        sample: so many of the files, images or objects, drawn at random; None: all.
-        out: .csv or .json.
-        page: also write a page beside it.
-        batch_size: clouds that the net sees at a time.
-        threads: batches that are worked on at the same time.
-        device: of the net.
-    """
-
-    ckpt: str
-    input: str = ""
-    depth: str = ""
-    mask: str = ""
-    box: str = ""
-    intrinsics: str = ""
-    depth_scale: float | None = None
-    up: str = ""
-    floor: float | None = None
-    camera_height: float | None = None
-    part: str = ""
-    sample: int | None = None
-    out: str = "predictions.csv"
-    page: bool = True
-    batch_size: int = 16
-    threads: int = 1
-    device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        if bool(self.input) == bool(self.depth):
-            raise ConfigError("give input=PATH for clouds, or depth=PATH for depth images")
-        of_depth = {"mask", "box", "intrinsics", "depth_scale", "camera_height"}
-        if odd := [key for key in sorted(of_depth) if getattr(self, key) and not self.depth]:
-            raise ConfigError(f"{odd[0]}= is for depth images; give depth=IMAGE, not input=")
-        if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
-            raise ConfigError(f"depth_scale={self.depth_scale:g}: metres a unit, in (0, 1]")
-        if self.depth and self.floor is not None:
-            raise ConfigError("floor= is for clouds; of depth images give camera_height=METRES")
-        if self.camera_height is not None:
-            check_float("camera_height", self.camera_height, ">= 0")
-        if self.input:
-            check_choice("up", self.up or "z", UP_AXES)
-        if Path(self.out).suffix.lower() not in (".csv", ".json"):
-            raise ConfigError(f"out={self.out} must end in .csv or .json")
-
-
-class Inputs(NamedTuple):
-    """What there is to read, how many files are passed over, and what a unit is called.
-
-    `part` says which part of an archive they are, if it has parts.
-    """
-
-    units: Sequence[Unit]
-    others: int
-    kind: str
-    part: str = ""
 
 
 def predict_command(settings: Settings) -> tuple[str, int]:
@@ -120,10 +40,12 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     Raises:
         ConfigError, MissingDataError, DataError: nothing could be done at all.
     """
-    find = _depth_images(settings) if settings.depth else _clouds(settings)
-    predictor = load(settings.ckpt, device=settings.device)
+    source = _depth_images(settings) if settings.depth else _clouds(settings)
+    ckpt = settings.ckpt or pretrained.usual(source.floor_known)
+    predictor = load(ckpt, device=settings.device)
+    second = _second(settings, ckpt, predictor)
     classes = predictor.classes
-    inputs = find(predictor)
+    inputs = source.find(predictor)
     if predictor.needs_floor and inputs.kind == "files" and settings.floor is None:
         raise ConfigError(
             "the classifier knows heights above the floor, and nothing in these clouds tells where "
@@ -143,23 +65,28 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     make_folder(out.parent)
     began, gallery, rows = time.monotonic(), Gallery(classes), []
     with progress_bar(f"{inputs.kind} read", total=len(inputs.units)) as advance:
-        for row, sample in predict_units(predictor, inputs.units, settings, advance):
+        for row, sample in predict_units(predictor, inputs.units, settings, advance, second):
             rows.append(row)
             if sample and settings.page:
                 gallery.add(row, sample)
     seconds = time.monotonic() - began
     records = [record(row, classes) for row in rows]
-    trained_on = _trained_on(settings.ckpt)
-    lines = _told(rows, records, inputs, predictor, settings, seconds)
+    trained_on, worth = _trained_on(ckpt), predictor.result.worth
+    lines = told(rows, records, inputs, predictor, settings, seconds)
+    if not settings.ckpt:
+        lines.append(chosen(ckpt, source))
+    if second:
+        lines.append(agreement(rows, classes))
     lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
+    lines += [f"what it is worth: {worth}"] * bool(worth)
     if out.suffix.lower() == ".json":
         text = as_json(records, classes, predictor.result.target)
     else:
         text = as_csv(records, classes)
     lines.append(_save(out, text))
     if settings.page:
-        title = f"{Path(settings.input or settings.depth).name}, as {settings.ckpt} sees it"
-        html = page(title, rows, gallery, classes, trained_on)
+        title = f"{Path(settings.input or settings.depth).name}, as {ckpt} sees it"
+        html = page(title, rows, gallery, classes, trained_on, worth)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
 
@@ -171,6 +98,24 @@ def _trained_on(ckpt: str) -> str:
     except DataError:  # it tells of the run, and no prediction depends on it
         return ""
     return metrics.data_text if metrics else ""
+
+
+def _second(settings: Settings, ckpt: str, first: Predictor) -> Predictor | None:
+    """The classifier that is asked, too."""
+    name = settings.second or ("none" if settings.ckpt else pretrained.other_than(ckpt))
+    if name == "none":
+        return None
+    second = load(name, device=settings.device)
+    if sorted(second.classes) != sorted(first.classes):
+        raise ConfigError(
+            f"second={name} tells {', '.join(second.classes)} apart, the first classifier "
+            f"{', '.join(first.classes)}"
+        )
+    if second.result.gravity != first.result.gravity:
+        raise ConfigError(f"second={name} wants clouds in another frame than the first classifier")
+    if second.needs_floor and settings.floor is None and settings.camera_height is None:
+        raise ConfigError(f"second={name} knows heights: give floor= or camera_height=")
+    return second
 
 
 def _camera_is_missing(predictor: Predictor, settings: Settings) -> bool:
@@ -189,8 +134,8 @@ def saved(out: str | Path, replaces: bool) -> str:
     return f"saved {out}" + " (replaced what was there)" * replaces
 
 
-def _clouds(settings: Settings) -> Callable[[Predictor], Inputs]:
-    """What finds the clouds for a net; what is not there is told before the net is read."""
+def _clouds(settings: Settings) -> Source:
+    """Clouds of files or of an archive; what is not there is told before the net is read."""
     files, root, others = find_files(settings.input)
     archive = len(files) == 1 and files[0].is_file() and is_archive(files[0])
     if archive and settings.up not in ("", "z"):
@@ -205,11 +150,11 @@ def _clouds(settings: Settings) -> Callable[[Predictor], Inputs]:
         units = cloud_units(files, root, settings.up or "z", predictor.classes)
         return Inputs(units, others, "files")
 
-    return find
+    return Source(find, settings.floor is not None, "floor=Z, if they are in metres,")
 
 
-def _depth_images(settings: Settings) -> Callable[[Predictor], Inputs]:
-    """What finds the depth images for a net; likewise."""
+def _depth_images(settings: Settings) -> Source:
+    """Objects of depth images; likewise."""
     common = Shown(
         "",
         box=numbers(settings.box, 4, "box") if settings.box else None,
@@ -229,152 +174,4 @@ def _depth_images(settings: Settings) -> Callable[[Predictor], Inputs]:
         units = depth_units(shown, predictor.result.gravity, predictor.classes)
         return Inputs(units, others, "depth images")
 
-    return find
-
-
-def predict_units(
-    predictor: Predictor,
-    units: Iterable[Unit],
-    settings: Settings,
-    advance: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[Row, Sample | None]]:
-    """A row for each cloud, in order, and what it was made of; `advance` is called after a unit.
-
-    Each of `settings.threads` threads has a batch of its own: the work between products of
-    matrices does not gain from several threads in one batch. A few batches are in memory.
-    """
-    threads_before = torch.get_num_threads()
-    pool = ThreadPoolExecutor(settings.threads, initializer=torch.set_num_threads, initargs=(1,))
-    running: deque[Future[list[tuple[Row, Sample | None]]]] = deque()
-    net, height = predictor.net, settings.camera_height
-    floor = settings.floor if height is None else -height
-    try:
-        # Once for all: threads that change and restore a net's domain would do it to one another.
-        with use_domain(net, norms_for(net, "target")):
-            for batch in _batches(units, settings.batch_size, advance):
-                running.append(pool.submit(_judged, predictor, batch, floor))
-                if len(running) > 2 * settings.threads:
-                    yield from running.popleft().result()
-            while running:
-                yield from running.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-        torch.set_num_threads(threads_before)  # libraries below torch keep one number for all
-
-
-def _batches(
-    units: Iterable[Unit], size: int, advance: Callable[[], None]
-) -> Iterator[list[Row | Sample]]:
-    """The clouds of all units, `size` at a time; what cannot be read is a row already."""
-    batch: list[Row | Sample] = []
-    for unit in units:
-        for item in unit():
-            batch.append(item)
-            if len(batch) == size:
-                yield batch
-                batch = []
-        advance()
-    if batch:
-        yield batch
-
-
-def _judged(
-    predictor: Predictor, batch: Sequence[Row | Sample], floor: float | None
-) -> list[tuple[Row, Sample | None]]:
-    """The rows of a batch: each cloud prepared, and one pass of the net."""
-    prepared: dict[int, tuple[Sample, Prepared]] = {}
-    rows: dict[int, tuple[Row, Sample | None]] = {}
-    for i, item in enumerate(batch):
-        if isinstance(item, Row):
-            rows[i] = item, None
-            continue
-        try:
-            prepared[i] = item, predictor.prepare(item.cloud, item.name, item.axis, floor)
-        except DataError as error:
-            rows[i] = item.row(reason_of(error, item.name), None), None
-    if prepared:
-        points = torch.stack([each.points for _, each in prepared.values()])
-        found = predictor.probabilities(points, len(points))
-        for (i, (item, each)), probabilities in zip(prepared.items(), found, strict=True):
-            rows[i] = item.row("; ".join(each.strange), probabilities), item
-    return [rows[i] for i in range(len(batch))]
-
-
-def _told(
-    rows: Sequence[Row],
-    records: Sequence[Mapping[str, Any]],
-    inputs: Inputs,
-    predictor: Predictor,
-    settings: Settings,
-    seconds: float,
-) -> list[str]:
-    """What was done, for the terminal."""
-    good = [one for one in records if one["status"] == "ok"]
-    failed = [one for one in records if one["status"] == "failed"]
-    counts = Counter(one["class"] for one in good)
-    rate = len(good) / max(seconds, 1e-9)
-    lines = [
-        f"{len(good)} clouds, {rate:.1f} clouds a second, from {len(inputs.units)} {inputs.kind}"
-    ]
-    if inputs.part:
-        lines.append(f"taken: {inputs.part}")
-    if good:
-        lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
-        lines += _scored(rows, predictor.classes)
-        strange = sum(one["out_of_range"] for one in good)
-        lines.append(f"{strange} of them out of range (column out_of_range)")
-    if cautioned := sum(one["caution"] is not None for one in good):
-        lines.append(f"{cautioned} of them with a caution (column caution)")
-    lines += _vertical(rows)
-    if holed := [one["dropped"] for one in good if one["dropped"]]:
-        lines.append(
-            f"{sum(holed)} points of {len(holed)} clouds are NaN or infinite and were left out "
-            "(column dropped)"
-            if inputs.kind == "files"
-            else f"{sum(holed)} points of {len(holed)} objects have no depth or are stray (column "
-            "dropped)"
-        )
-    if predictor.in_metres and inputs.kind == "files":
-        lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
-    if predictor.needs_floor and settings.floor is None and settings.camera_height is None:
-        lines.append(
-            f"the classifier knows heights: the camera counts as {predictor.camera_height:g} m "
-            "above the floor ("
-            + ("camera_height=" if settings.depth else "floor=")
-            + " says otherwise)"
-        )
-    if predictor.result.gravity == "none" and inputs.kind != "depth images":
-        lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
-    if inputs.others:
-        lines.append(f"{inputs.others} files of other kinds passed over")
-    if failed:
-        lines.append(f"{len(failed)} failed:")
-        lines += [f"  {one['file']}: {one['reason']}" for one in failed[:_SHOWN]]
-        lines += [f"  and {len(failed) - _SHOWN} more, see the table"] * (len(failed) > _SHOWN)
-    return lines
-
-
-def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
-    """Right and wrong, if somebody gave labels."""
-    found = scores(rows, classes)
-    if found is None:
-        return []
-
-    def of(count: Count) -> str:
-        return f"{count.right} of {count.of} ({count.share:.1%})"
-
-    tiers = "".join(f"; {tier} {of(count)}" for tier, count in found.tiers.items())
-    label, times = found.majority
-    return [f"right {of(found.all)}{tiers}; always {label}: {times / found.all.of:.1%}"]
-
-
-def _vertical(rows: Sequence[Row]) -> list[str]:
-    """Where up was not given."""
-    counts = Counter(row.up for row in rows)
-    words = {
-        PLANES: "fitted to the planes of the picture",
-        LEVEL: "not known, so the camera counts as level",
-    }
-    return [
-        f"up of {counts[how]}: {says}; up= tells it" for how, says in words.items() if counts[how]
-    ]
+    return Source(find, settings.camera_height is not None, "camera_height=METRES")

@@ -11,7 +11,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.inference.judgement import read_judgement
 from qs3.inference.model_card import card
 from qs3.inference.model_file import build_net, find_result, read_result, values_of
 from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
@@ -88,12 +89,23 @@ class Comparison:
         return text
 
 
-def export_command(ckpt: str | Path, out: str | Path, threads: int = 1) -> str:
-    """Export the classifier of a run (or its result.pt) and compare; text for the terminal."""
+def export_command(
+    ckpt: str | Path,
+    out: str | Path,
+    threads: int = 1,
+    judged: str | Path = "",
+    half: bool = False,
+) -> str:
+    """Export the classifier of a run (or its result.pt) and compare; text for the terminal.
+
+    `judged` and `half` as of `export_folder`.
+    """
     from qs3.inference.command import saved
 
     if not Path(out).suffix:
-        return export_folder(ckpt, Path(out).expanduser())
+        return export_folder(ckpt, Path(out).expanduser(), judged, half)
+    if judged or half:
+        raise ConfigError(f"judged= and half= are for a folder; out={out} is a file")
     before = torch.get_num_threads()
     torch.set_num_threads(check_int("threads", threads, 1))
     try:
@@ -116,21 +128,35 @@ def export_command(ckpt: str | Path, out: str | Path, threads: int = 1) -> str:
     )
 
 
-def export_folder(ckpt: str | Path, folder: Path) -> str:
+def export_folder(
+    ckpt: str | Path, folder: Path, judged: str | Path = "", half: bool = False
+) -> str:
     """Write a model's folder (see `qs3.inference.model_folder`); text for the terminal.
+
+    Args:
+        ckpt: what is exported.
+        folder: where to.
+        judged: a table of `qs3 report judge runs=CKPT out=TABLE.csv`, for the card.
+        half: matrices as numbers of 16 bits: half the size, and other probabilities in the fourth
+            digit. They count as 32 bits again when the net is built.
 
     Raises:
         ConfigError: the folder holds a README.md or config.json of something else, or the result.
-        MissingDataError, DataError: no result there, or damaged.
+        MissingDataError, DataError: no result there, or damaged, or `judged` is not of this run.
     """
     file, result = find_result(ckpt), read_result(ckpt)
+    judgement = read_judgement(Path(judged).expanduser(), file) if judged else None
+    if judgement:
+        result = replace(result, worth=judgement.sentence)
+    if half:
+        result = replace(result, weights=_halved(result.weights))
     if file.parent.resolve() == folder.resolve():
         raise ConfigError(f"out={folder} is where it comes from; give another folder")
     if not (folder / WEIGHTS).exists():
         for name in (CARD, CONFIG):
             if (folder / name).exists():
                 raise ConfigError(f"out={folder}: a {name} of something else is there; refused")
-    text = card(result, read_metrics(file.parent), _command(file.parent))
+    text = card(result, read_metrics(file.parent), _command(file.parent), judgement)
     write_folder(folder, values_of(result), text)
     again = read_result(folder)
     same = again.weights.keys() == result.weights.keys() and all(
@@ -144,6 +170,14 @@ def export_folder(ckpt: str | Path, folder: Path) -> str:
         f"and {CARD}\nqs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it; read "
         f"{CARD}, which is the model's card, before you publish it"
     )
+
+
+def _halved(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Matrices in 16 bits; vectors, of which running variances may be tiny, as they are."""
+    return {
+        name: value.half() if value.is_floating_point() and value.ndim > 1 else value
+        for name, value in weights.items()
+    }
 
 
 def _command(run: Path) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 
+from qs3.inference.judgement import Judgement, percent
 from qs3.inference.model_file import Result
 from qs3.runs.metrics import RunMetrics
 from qs3.utils.version import VERSION
@@ -11,13 +13,19 @@ from qs3.utils.version import VERSION
 _Z = 1.959964  # of a normal distribution: 95 % lie within so many standard deviations
 
 
-def card(result: Result, metrics: RunMetrics | None, command: str = "") -> str:
+def card(
+    result: Result,
+    metrics: RunMetrics | None,
+    command: str = "",
+    judgement: Judgement | None = None,
+) -> str:
     """The card as Markdown, with YAML at its top.
 
     Args:
         result: the classifier.
         metrics: of its run; None if only its file is at hand: then no figures are stated.
         command: that trained it; "" likewise.
+        judgement: what it was found to be worth on real objects; None if nobody looked.
     """
     net = result.model["_target_"].rpartition(".")[2]
     title = f"{net}, {metrics.source} to {metrics.target}" if metrics else f"{net}"
@@ -58,6 +66,7 @@ def card(result: Result, metrics: RunMetrics | None, command: str = "") -> str:
         "",
         _accuracy(metrics),
         "",
+        *([*_judged(judgement), ""] if judgement else []),
         "## Limits",
         "",
         "- Every object gets one of these classes, also one of no class, often with high "
@@ -111,6 +120,29 @@ def _accuracy(metrics: RunMetrics | None) -> str:
     )
 
 
+def _judged(judgement: Judgement) -> list[str]:
+    """On real objects: a table by tier, and recalls."""
+    part = f", part {_text(judgement.part)}" if judgement.part else ""
+    every = judgement.tiers[0]
+    recalls = (
+        f"{_text(name)} {percent(value)} (of {every.counts.get(name, 0)})"
+        for name, value in every.recall.items()
+    )
+    return [
+        f"On real objects of {_file(judgement.data)}{part}:",
+        "",
+        "| objects | number | accuracy, 95 % interval | balanced | commonest class % |",
+        "|---|---|---|---|---|",
+        *(
+            f"| {_text(one.tier)} | {one.n} | {one.accuracy} | {one.balanced} | "
+            f"{percent(one.majority)} |"
+            for one in judgement.tiers
+        ),
+        "",
+        f"Recall %: {', '.join(recalls)}.",
+    ]
+
+
 def wilson(right: int, of: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share (Wilson, "Probable inference", JASA 22, 1927)."""
     share, spread = right / of, _Z * _Z / of
@@ -122,3 +154,8 @@ def wilson(right: int, of: int) -> tuple[float, float]:
 def _text(name: str) -> str:
     """A name as it stands: Markdown and HTML mean nothing in it."""
     return "".join(c if c.isalnum() or c in " -" else f"&#{ord(c)};" for c in name)
+
+
+def _file(name: str) -> str:
+    """A file's name, as code where it is a usual one."""
+    return f"`{name}`" if re.fullmatch(r"[\w.-]+", name) else _text(name)

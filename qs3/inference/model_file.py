@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.ood import ALL as MEASURES_OF_CLOUDS
+from qs3.inference import pretrained
 from qs3.inference.model_folder import CONFIG, WEIGHTS, read_folder
 from qs3.runs.checkpoints import load, save
 from qs3.utils.memory import check_memory
@@ -78,6 +79,14 @@ def _ranges(value: dict[str, list[float]]) -> dict[str, list[float]]:
     return value
 
 
+def _printable(value: str) -> str:
+    """It is printed on terminals."""
+    if not value.isprintable():
+        raise ValueError("should be a line of printable text")
+    return value
+
+
+_LONGEST = 1000  # characters of a sentence
 _Points = Annotated[int, Field(strict=True, ge=1, le=1 << 20)]  # more is a damaged number
 _Ends = Annotated[list[Annotated[float, Field(strict=True)]], Field(min_length=2, max_length=2)]
 
@@ -98,6 +107,7 @@ class Result:
         usual: of each measure of `qs3.evaluation.ood` the range in training, [low, high].
         weights: of the net.
         floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
+        worth: what it was found to be worth on real objects, in a sentence; "" if nobody looked.
     """
 
     model: Annotated[dict[str, Any], AfterValidator(_model)]
@@ -110,6 +120,7 @@ class Result:
     usual: Annotated[dict[str, _Ends], AfterValidator(_ranges)]
     weights: Annotated[dict[str, Tensor], Field(min_length=1)]
     floor_m: Annotated[float, Field(strict=True, allow_inf_nan=False)] | None = None
+    worth: Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable)] = ""
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
 
@@ -128,14 +139,17 @@ def values_of(result: Result) -> dict[str, Any]:
 def find_result(path: str | Path) -> Path:
     """The file meant by the folder of a run or of an exported model, or by the file itself.
 
+    Also by the name of a classifier that comes with qs3.
+
     Raises:
         MissingDataError: there is none; says what lies there instead.
     """
-    path = Path(path).expanduser()
+    path = pretrained.folder_of(path) or Path(path).expanduser()
     if path.is_file():
         return path
     if not path.is_dir():
-        raise MissingDataError(f"{path} is not there; give the folder of a finished run")
+        own = f", or one of {', '.join(names)}" if (names := pretrained.names()) else ""
+        raise MissingDataError(f"{path} is not there; give the folder of a finished run{own}")
     for name in (FILE, WEIGHTS):
         if (path / name).is_file():
             return path / name

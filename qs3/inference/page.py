@@ -15,7 +15,7 @@ import numpy as np
 
 from qs3.evaluation.ood import MEASURES
 from qs3.inference.inputs import Sample
-from qs3.inference.scores import STRANGE, Count, Scores, kinds, right, scores
+from qs3.inference.scores import DISPUTED, STRANGE, Count, Scores, disputed, kinds, right, scores
 from qs3.inference.table import Row
 from qs3.inference.thumbnails import cloud_png, depth_png
 from qs3.utils import html
@@ -88,7 +88,7 @@ def rank(row: Row, classes: Sequence[str]) -> tuple[float, ...]:
     assert row.probabilities is not None
     sure, correct = float(np.max(row.probabilities)), right(row, classes)
     if correct is None:
-        return (0.0, float(bool(kinds(row))), -sure)
+        return (0.0, float(bool(kinds(row, classes))), -sure)
     return (2.0, 0.0, sure) if not correct else (1.0, 0.0, -sure)
 
 
@@ -98,6 +98,7 @@ def page(
     gallery: Gallery,
     classes: Sequence[str],
     trained_on: str = "",
+    worth: str = "",
 ) -> str:
     """The page as HTML.
 
@@ -107,12 +108,15 @@ def page(
         gallery: those with pictures.
         classes: names in the order of the probabilities.
         trained_on: what the net's data are made of; "" if nobody knows.
+        worth: what it was found to be worth on real objects; likewise.
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
     parts = _head(found, rows, failed, classes)
     if trained_on:
         parts.append(f'<p class="soft">The net\'s data: {escape(trained_on)}</p>')
+    if worth:
+        parts.append(f'<p class="note">What the net is worth: {escape(worth)}</p>')
     if found:
         parts.append(f'<div class="side">{_why(found)}{_matrix(found, classes)}</div>')
     shown = gallery.shown()
@@ -238,6 +242,8 @@ def _card(row: Row, sample: Sample, classes: Sequence[str]) -> str:
     second = f"{escape(classes[order[1]])} {row.probabilities[order[1]]:.0%}"
     tags = [f'<span class="tag">{escape(caution.words)}</span>' for caution in row.cautions]
     tags += [_strange(words) for words in row.reason.split("; ") if words]
+    if disputed(row, classes):
+        tags.append(f'<span class="tag">{DISPUTED}: {escape(row.second)}</span>')
     tier = f", {row.tier}" if row.tier else ""
     size = f"<br>{_size(_z_up(sample))}" if sample.tier or sample.picture else ""
     return (

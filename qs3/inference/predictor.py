@@ -296,7 +296,7 @@ def load(
 
     Args:
         run: its folder, or the file result.pt of it, which needs nothing else; or a folder of
-            `qs3.inference.model_folder`.
+            `qs3.inference.model_folder`; or a name of `qs3.inference.pretrained`.
         device: where to run it: "cpu", "cuda", "cuda:1".
         packages: where the net of the file may be defined. For a net of your own add your
             package, if you trust it to be built with any arguments.

@@ -15,6 +15,9 @@ from qs3.inference.table import Row
 STRANGE = "unlike training"
 """The kind of what is out of the range of training's clouds."""
 
+DISPUTED = "another classifier disagrees"
+"""The kind of what a second classifier calls otherwise."""
+
 
 class Count(NamedTuple):
     """So many right of so many."""
@@ -60,10 +63,18 @@ def right(row: Row, classes: Sequence[str]) -> bool | None:
     return classes[int(row.probabilities.argmax())] == row.label
 
 
-def kinds(row: Row) -> list[str]:
-    """What was wrong with a cloud, in a word or two each."""
+def disputed(row: Row, classes: Sequence[str]) -> bool:
+    """Whether a second classifier was asked, and names another class."""
+    if row.probabilities is None or not row.second:
+        return False
+    return classes[int(row.probabilities.argmax())] != row.second
+
+
+def kinds(row: Row, classes: Sequence[str]) -> list[str]:
+    """What was wrong with a cloud, or with what is said of it, in a few words each."""
     found = [caution.kind for caution in row.cautions]
-    return found + [STRANGE] * bool(row.probabilities is not None and row.reason)
+    found += [STRANGE] * bool(row.probabilities is not None and row.reason)
+    return found + [DISPUTED] * disputed(row, classes)
 
 
 def scores(rows: Iterable[Row], classes: Sequence[str]) -> Scores | None:
@@ -78,7 +89,7 @@ def scores(rows: Iterable[Row], classes: Sequence[str]) -> Scores | None:
         confusion[classes.index(row.label), int(row.probabilities.argmax())] += 1
     (label, times), *_ = Counter(row.label for row, _ in judged).most_common(1)
     tiers = sorted({row.tier for row, _ in judged} - {""})
-    every = Counter(kind for row, _ in judged for kind in {*kinds(row)})
+    every = Counter(kind for row, _ in judged for kind in {*kinds(row, classes)})
     return Scores(
         _count(r for _, r in judged),
         (label, times),
@@ -86,8 +97,8 @@ def scores(rows: Iterable[Row], classes: Sequence[str]) -> Scores | None:
         {tier: _count(r for row, r in judged if row.tier == tier) for tier in tiers},
         {
             kind: (
-                _count(r for row, r in judged if kind in kinds(row)),
-                _count(r for row, r in judged if kind not in kinds(row)),
+                _count(r for row, r in judged if kind in kinds(row, classes)),
+                _count(r for row, r in judged if kind not in kinds(row, classes)),
             )
             for kind, _ in every.most_common()
         },

@@ -14,8 +14,8 @@ from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
 
 COLUMNS = (
-    *("file", "status", "class", "confidence", "label", "points", "dropped", "tier", "caution"),
-    *("up", "out_of_range", "reason"),
+    *("file", "status", "class", "confidence", "second", "label", "points", "dropped", "tier"),
+    *("caution", "up", "out_of_range", "reason"),
 )
 
 
@@ -34,6 +34,7 @@ class Row(NamedTuple):
         tier: of an object cut from a depth image: "clean", "hard" or "poor"; "" of other clouds.
         cautions: what was wrong when it was cut.
         up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
+        second: the class that another classifier names; "" if none was asked.
     """
 
     file: str
@@ -45,6 +46,7 @@ class Row(NamedTuple):
     tier: str = ""
     cautions: tuple[Caution, ...] = ()
     up: str = ""
+    second: str = ""
 
 
 def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
@@ -68,6 +70,7 @@ def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
             "status": "ok",
             "class": classes[best],
             "confidence": each[best],
+            "second": row.second or None,
             "out_of_range": bool(row.reason),
             "probabilities": dict(zip(classes, each, strict=True)),
         }

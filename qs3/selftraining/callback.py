@@ -60,13 +60,22 @@ class WarmupSelection(Callback):
     Args:
         folder: of the run.
         phases: of the run.
-        rule: "source_val" as above, or "last".
+        rule: "source_val" as above, "last", or "given": those that the warm-up began with.
+
+    Attributes:
+        epoch: of the weights that are kept; -1: from before the first one.
     """
 
     def __init__(self, folder: Path, phases: Phases, rule: str) -> None:
         self.folder, self.phases, self.rule = folder, phases, rule
         self.epoch, self.accuracy = -1, -1.0
         self._weights: dict[str, Any] | None = None  # only during the warm-up
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Keep what was given, before a step is taken."""
+        assert isinstance(pl_module, Classifier)
+        if self.rule == "given" and trainer.current_epoch == 0:
+            self._weights = copy_weights(pl_module.net)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Compare this epoch with the best so far."""
@@ -75,7 +84,7 @@ class WarmupSelection(Callback):
         if self.phases.phase(epoch) != 0:
             return
         accuracy = float(trainer.callback_metrics[f"{pl_module.method.labels}_val/acc"])
-        if self.rule == "last" or accuracy > self.accuracy:
+        if self.rule != "given" and (self.rule == "last" or accuracy > self.accuracy):
             self.epoch, self.accuracy = epoch, accuracy
             self._weights = copy_weights(pl_module.net)
         if self.phases.ends(epoch):

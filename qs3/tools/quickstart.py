@@ -24,7 +24,7 @@ DATASETS = (
     f"generate.py domain=modelnet10 {MESHES}",
     f"generate.py domain=specklenet10 {MESHES} views=3"
     " sensor=speckle_stereo_small renderer=mitsuba renderer.samples=4",
-    "generate.py domain=kinectsim10 fraction=0.35 views=3 renderer.samples=4",
+    "generate.py domain=kinectsim10 fraction=0.35 views=3 renderer=mitsuba renderer.samples=4",
 )
 
 
@@ -83,7 +83,7 @@ def _run(command: str) -> int:
 
 QUICKSTART = Command(
     "qs3 quickstart",
-    "the main job on embedded data, some eleven minutes on 2 cores",
+    "the main job on embedded data, eight to eleven minutes on 2 cores",
     _quickstart,
     (Option("out", text("FOLDER"), "where it all goes", "out/quickstart"),),
     ("qs3 quickstart", "make quickstart     the same, in a checkout"),

@@ -17,6 +17,7 @@ from qs3.methods.base import Method
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.student_loss import Student
 from qs3.selftraining.student_selection import StudentSelection
+from qs3.training.given import Given
 from qs3.training.load import Loaded
 from qs3.training.run import Run
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
@@ -35,14 +36,16 @@ class Built:
     clock: Clock
 
 
-def build_training(run: Run, method: Method, loaded: Loaded, began: float) -> Built:
+def build_training(
+    run: Run, method: Method, loaded: Loaded, given: Given | None, began: float
+) -> Built:
     """Everything that `Trainer.fit` needs but the data.
 
-    `loaded`: for class names, and the hash of what the warm-up depends on; `began`: `time.time()`
-    when the run started.
+    `loaded`: for class names, and the hash of what the warm-up depends on; `given`: the classifier
+    to begin with; `began`: `time.time()` when the run started.
     """
     cfg, folder, phases = run.cfg, run.folder, run.phases
-    classifier = _classifier(run, method)
+    classifier = _classifier(run, method, given)
     classes = loaded.evaluation.classes
     warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
     rounds = SelfTraining(folder, phases, run.scheme, classes)
@@ -70,7 +73,7 @@ def build_training(run: Run, method: Method, loaded: Loaded, began: float) -> Bu
     return Built(trainer, classifier, warmup, rounds, student, shared, clock)
 
 
-def _classifier(run: Run, method: Method) -> Classifier:
+def _classifier(run: Run, method: Method, given: Given | None) -> Classifier:
     cfg, scheme = run.cfg, run.scheme
     classifier = Classifier(
         build_net=lambda: build(cfg.model),
@@ -83,6 +86,7 @@ def _classifier(run: Run, method: Method) -> Classifier:
         smoothing=cfg.protocol.smoothing,
         metres=cfg.data.scale == "metres",
         regulariser_weight=cfg.protocol.regulariser,
+        weights=given.weights if given else None,
     )
     if cfg.compile:
         classifier.net.compile()  # in place; nets that are only evaluated stay as they are

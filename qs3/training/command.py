@@ -20,6 +20,7 @@ from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
+from qs3.inference import pretrained
 from qs3.runs import folder as runs
 from qs3.runs.metrics import METRICS, DataHashes, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
@@ -28,7 +29,7 @@ from qs3.utils.locks import owned
 
 log = logging.getLogger(__name__)
 
-TEACHERS = ("source_val", "last")
+TEACHERS = ("source_val", "last", "given")
 SCHEDULES = ("cosine", "plateau")
 UNIT_BALL_ONLY = {
     "qs3.models.simpleview.simpleview": "its cameras stand 1.4 from the cloud's middle and would "
@@ -184,6 +185,11 @@ def _wandb_forgotten() -> Iterator[None]:
 def _check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
     check_choice("selection.teacher", cfg.selection.teacher, TEACHERS)
+    if cfg.selection.teacher == "given" and cfg.weights is None:
+        raise ConfigError(
+            "selection.teacher=given: weights= names no classifier; give a run's folder, or one "
+            f"that comes with qs3 ({', '.join(pretrained.names())})"
+        )
     check_choice("selection.student", cfg.selection.student, STUDENT_RULES)
     for key, least in (
         ("data.points", 1),

@@ -22,6 +22,7 @@ from qs3.runs.checkpoints import LAST, copy_weights, save
 from qs3.runs.metrics import RunMetrics
 from qs3.training.build import Built, build_training
 from qs3.training.evaluate import evaluate
+from qs3.training.given import read_given
 from qs3.training.load import Loaded, load_data
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
@@ -47,12 +48,13 @@ def fit(run: Run) -> RunMetrics:
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     torch.set_num_threads(number_of(run.cfg.trainer.threads))
     method: Method = build(run.cfg.method)
-    loaded = load_data(run, method)
+    given = read_given(run.cfg)
+    loaded = load_data(run, method, given)
     if run.cfg.trainer.threads == "auto":
         _take_threads_of(loaded.started)
     if not run.cfg.force:
         take_checkpoint(run, loaded.started)
-    built = build_training(run, method, loaded, began)
+    built = build_training(run, method, loaded, given, began)
     _remember(run, loaded, built)
     _fit(run, loaded, built)
     outcome = evaluate(run, loaded, built)

@@ -16,6 +16,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf
+from qs3.training.given import Given
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
 
@@ -43,10 +44,11 @@ class Loaded:
     made_of: DataMadeOf
 
 
-def load_data(run: Run, method: Method) -> Loaded:
+def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     """Open both domains, compare them with what the run was begun with, and load their clouds.
 
-    Target labels go to the method that asks for them by name, and to the evaluation.
+    Target labels go to the method that asks for them by name, and to the evaluation. `given`: the
+    classifier that the run begins with.
 
     Raises:
         DataError, ConfigError: data and settings do not fit, or are not those of an earlier start.
@@ -64,7 +66,9 @@ def load_data(run: Run, method: Method) -> Loaded:
     data.prepare_data()
     source, target = run.source.open(verify=False), run.target.open(verify=False)
     _check_classes(source, target, cfg.num_classes)
-    started = note_start(run, source, target)
+    if given:
+        given.check_classes(target.classes)
+    started = note_start(run, source, target, given)
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")

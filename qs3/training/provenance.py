@@ -18,6 +18,7 @@ from qs3.data.store import PointSet
 from qs3.datamodules.fps_cache import remove_old_leftovers
 from qs3.errors import ConfigError
 from qs3.runs import folder as runs
+from qs3.training.given import Given
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
 from qs3.utils.version import VERSION, commit
@@ -25,7 +26,9 @@ from qs3.utils.version import VERSION, commit
 log = logging.getLogger(__name__)
 
 
-def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
+def note_start(
+    run: Run, source: PointSet, target: PointSet, given: Given | None = None
+) -> dict[str, Any]:
     """Read `started.json` and compare it with today's data, or write it."""
     now: dict[str, Any] = {
         "data": {"source": source.sha256, "target": target.sha256},
@@ -35,6 +38,7 @@ def note_start(run: Run, source: PointSet, target: PointSet) -> dict[str, Any]:
             "torch": torch.__version__,
             "lightning": lightning.__version__,
             "numpy": np.__version__,
+            **({"weights": f"{given.name} {given.sha256}"} if given else {}),
         },
         "commit": commit(),
         "threads": torch.get_num_threads(),

@@ -109,6 +109,8 @@ def _selection(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> Sele
     if rule == "source_val":
         rule = f"{loaded.data.owner}_val"
     teacher = f"{rule}, epoch {built.warmup.epoch}"
+    if rule == "given":
+        teacher = f"given, {loaded.started['versions']['weights'].rpartition(' ')[0]}"
     student = outcome.choice.in_words if outcome.choice else LAST
     return Selection(
         teacher=teacher,

@@ -22,7 +22,7 @@ DAMAGE = (
 """What damaged ones raise."""
 
 _MOST = 1 << 20  # bytes at once: more than this no header of a member has
-_FARTHEST = 1 << 62  # no file is longer, and no place in one has more bits
+_FARTHEST = 1 << 62  # bytes: no file is longer, and places in files have 63 bits
 _PACKED = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ": lzma.open}
 
 

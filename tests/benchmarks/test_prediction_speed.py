@@ -10,10 +10,11 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.inference.command import Settings, predict_units
 from qs3.inference.inputs import cloud_units
 from qs3.inference.model_file import Result
 from qs3.inference.predictor import Predictor
+from qs3.inference.settings import Settings
+from qs3.inference.units import predict_units
 from qs3.models.dgcnn import dgcnn
 from tests.models.reference import NaiveDGCNN
 

@@ -18,13 +18,15 @@ from tests.composing import compose
 from tests.fixtures import published as fixtures
 
 CONF = Path(__file__).parents[2] / "conf"
-NAMES = sorted(path.stem for path in (CONF / "domain").glob("*.yaml"))
+PACKAGED = "source_sample"  # its files come with qs3
+NAMES = sorted({path.stem for path in (CONF / "domain").glob("*.yaml")} - {PACKAGED})
 SPLITS = {"train": 2, "test": 1}
 
 
 GRASPNET = ("graspnetpc10", "graspnetpc10_kinect", "graspnetpc10_realsense")
 FORTY = ("specklenet40", "modelnet40_meshes")
-WITHOUT_STAND_IN = (*GRASPNET, "modelnet40_meshes")  # classes that cannot be generated
+# Classes that cannot be generated, or what is yours to name.
+WITHOUT_STAND_IN = (*GRASPNET, "modelnet40_meshes", "joined")
 
 
 def domain(name, data_dir, *overrides):
@@ -32,6 +34,18 @@ def domain(name, data_dir, *overrides):
     mounted = [f"+domain@data.source={name}", "+paths=default", f"paths.data_dir={data_dir}"]
     cfg = compose(None, [*mounted, *(f"data.source.{o}" for o in overrides)])
     return instantiate(cfg.data.source)
+
+
+def test_what_comes_with_qs3_opens_without_more(tmp_path):
+    found = domain(PACKAGED, tmp_path)
+    found.check()
+    data = found.open()
+    assert data.classes == CLASSES
+    counts = data.counts()["train"]
+    assert min(counts.values()) > 30
+    assert np.abs(data.points).max() < 4  # metres
+    assert data.points[..., 2].min() > -0.5  # on a floor
+    found.check_scale("above_floor")
 
 
 def test_fixtures_cover_every_domain():

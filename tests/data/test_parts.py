@@ -11,6 +11,7 @@ import pytest
 
 from qs3.data.parts import PartFiles
 from qs3.errors import ConfigError, DataError
+from tests.fixtures.harm import Harm
 
 
 def _zip(name: str, data: bytes) -> bytes:
@@ -18,16 +19,6 @@ def _zip(name: str, data: bytes) -> bytes:
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr(name, data)
     return file.getvalue()
-
-
-class Harm:
-    """A pickle of it runs what its reader did not write."""
-
-    def __init__(self, path) -> None:
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
 
 
 def test_nothing_is_unpickled(tmp_path):

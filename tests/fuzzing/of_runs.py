@@ -132,6 +132,27 @@ def _read_model(path: Path) -> None:
     _read_result(folder)
 
 
+def _judgements(folder: Path) -> list[bytes]:
+    share = {"mean": 0.5, "sem": None, "low": 0.25, "high": None}
+    figures = {
+        "tier": "all", "n": 2, "blocks": 1, "accuracy": share, "balanced": share, "majority": 0.5,
+        "counts": {"a": 1, "b": 1}, "recall": {"a": 0.5, "b": 1}, "predicted": {"a": 1.5, "b": 1},
+    }  # fmt: skip
+    family = {"runs": ["result.pt"], "figures": [figures, {**figures, "tier": "clean"}]}
+    found = {"data": "a.npz", "sha256": "0" * 64, "part": "judge", "families": [family]}
+    return [json.dumps(found).encode()]
+
+
+def _read_judgement(path: Path) -> None:
+    from qs3.inference.judgement import read_judgement
+    from qs3.inference.model_card import card
+
+    judgement = read_judgement(path, Path("result.pt"))
+    assert len(judgement.sentence) < 1000
+    assert judgement.sentence.isprintable()
+    card(_result(), None, judgement=judgement)
+
+
 def _tables(folder: Path) -> list[bytes]:
     table = "title: mine\nmetrics: [accuracy]\ncolumns: [a]\nrows:\n- name: b\n  a:\n    paper: 1\n"
     return [table.encode(), b"&a {title: x, metrics: [accuracy], columns: [*a], rows: []}"]
@@ -179,6 +200,8 @@ READERS: tuple[Reader, ...] = (
     Reader("result .pt", _results, _read_result, "result.pt", ZIP, ("inference/model_file.py",)),
     Reader("model folder", _models, _read_model, "a.zip", MODEL_FOLDER,
            ("inference/model_folder.py", "inference/tensor_file.py")),
+    Reader("judgement .json", _judgements, _read_judgement, "a.json", None,
+           ("inference/judgement.py",)),
     Reader("table .yaml", _tables, _read_table, "a.yaml", None, ("report/tables/table.py",)),
     Reader("journal of a sweep", _journals, _read_journal, "a.txt", None, ("sweeps/summary.py",)),
     Reader("cache of samples", _caches, _read_cache, "a.npy", None, ("datamodules/fps_cache.py",)),

@@ -228,7 +228,7 @@ def test_up_and_flags(run, clouds, tmp_path):
     ("words", "message"),
     [
         (["predict", "ckpt={run}"], "give input=PATH for clouds, or depth=PATH"),
-        (["predict", "ckpt={run}", "{clouds}"], "is not key=value; keys are ckpt, input"),
+        (["predict", "ckpt={run}", "{clouds}"], "is not key=value; keys are ckpt, second, input"),
         (
             ["predict", "ckpt={run}", "input={clouds}", "gravity=z"],
             "unknown key 'gravity'; keys are",

@@ -11,6 +11,7 @@ import torch
 
 from qs3.errors import DataError, Qs3Error
 from qs3.runs.checkpoints import check, load, save
+from tests.fixtures.harm import Harm
 from tests.training.conftest import finished, toy_data  # noqa: F401 (fixtures)
 
 KINDS = {"last.ckpt", "result.pt", "student.pt", "warmup_last.pt", "warmup_selected.pt"}
@@ -71,16 +72,6 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
         with pytest.raises(DataError, match=r"checksum of .*data/0 does not match\); get another"):
             check(file, "get another")
     assert blind == 24  # or torch has learnt it, and ours can go
-
-
-class Harm:
-    """A pickle of it runs what its reader did not write."""
-
-    def __init__(self, path) -> None:
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
 
 
 def test_nothing_is_unpickled(tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import ConfigError
-from qs3.utils.cli import FLAG, Command, Option, path, several, text
+from qs3.utils.cli import FLAG, NUMBER, Command, Option, path, several, text
 
 _SUFFIXES = (".csv", ".json")
 
@@ -41,6 +41,7 @@ JUDGE = Command(
         Option("classes", several(text("NAME")), "only objects of these (default: all)", ()),
         Option("part", text("NAME"), "of the archive (default: judge, if it has one)", ""),
         Option("inliers_only", FLAG, "leave out points that the archive marks as stray", True),
+        Option("floor", NUMBER, "where it is on z, in metres (default: as in each run's target)"),
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
         Option("out", path("FILE"), ".csv or .json, with all digits"),
     ),

@@ -110,6 +110,7 @@ class Verdict:
         classes: that were judged.
         left_out: objects of other classes.
         inliers_only: whether stray points were left out.
+        floor: z of the floor, for nets that know heights; None: as in the target of each.
         families: in the order of the runs given.
         differences: of the others to the first of them.
         judged_by: version of qs3, and the commit of a checkout.
@@ -121,6 +122,7 @@ class Verdict:
     classes: tuple[str, ...]
     left_out: int
     inliers_only: bool
+    floor: float | None
     families: tuple[Family, ...]
     differences: tuple[Difference, ...]
     judged_by: str
@@ -133,6 +135,7 @@ def judge(
     classes: Sequence[str] = (),
     part: str = "",
     inliers_only: bool = True,
+    floor: float | None = None,
     device: str = "cpu",
 ) -> Verdict:
     """Judge saved runs on an archive of objects.
@@ -143,6 +146,8 @@ def judge(
         classes: only objects of these; none: of all that every run knows.
         part: of its `dev`; none: "judge", where it has one, else all.
         inliers_only: leave points out that the archive marks as stray.
+        floor: z of the floor in the archive, minus its camera's height, for nets that know heights;
+            None: as in the target of each.
         device: of the nets.
 
     Raises:
@@ -150,7 +155,7 @@ def judge(
         DataError: one is damaged.
         ConfigError: nothing is left to judge on, or runs that cannot be judged so.
     """
-    predictors = _loaded(find_runs(runs), device)
+    predictors = _loaded(find_runs(runs), floor, device)
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
     common = _common([one.classes for one in predictors.values()], classes)
@@ -160,7 +165,7 @@ def judge(
         raise ConfigError(f"{data}: no object of {', '.join(common)} in what was asked for")
     truth = np.array([common.index(str(names[i])) for i in kept])
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
-    guesses = _guesses(predictors, archive, kept, inliers_only, common)
+    guesses = _guesses(predictors, archive, kept, inliers_only, floor, common)
     every = np.ones(len(kept), dtype=bool)
     subsets = {"all": every, **{tier: tiers == tier for tier in TIERS if (tiers == tier).any()}}
     families, differences = [], []
@@ -195,6 +200,7 @@ def judge(
         common,
         left_out,
         inliers_only,
+        floor,
         tuple(families),
         tuple(differences),
         in_words(VERSION, commit()),
@@ -232,7 +238,7 @@ def _differences(
     ]
 
 
-def _loaded(files: Sequence[Path], device: str) -> dict[Path, Predictor]:
+def _loaded(files: Sequence[Path], floor: float | None, device: str) -> dict[Path, Predictor]:
     """The classifiers, all for clouds with z up; and a camera's, if they know heights."""
     found = {file: load(file, device=device) for file in files}
     for file, one in found.items():
@@ -241,11 +247,11 @@ def _loaded(files: Sequence[Path], device: str) -> dict[Path, Predictor]:
                 f"{file} was trained on clouds in the frame of their camera; the archive's have z "
                 "up, so it cannot be judged on them"
             )
-        if one.needs_floor and one.camera_height is None:
+        if one.needs_floor and one.camera_height is None and floor is None:
             raise ConfigError(
                 f"{file} knows heights above the floor, and its target's clouds stand at "
-                f"{one.result.floor_m:g}: the archive's have the camera at the origin, so it "
-                "cannot be judged on them"
+                f"{one.result.floor_m:g}: the archive's have the camera at the origin; give "
+                "floor=-METRES, minus the camera's height"
             )
     return found
 
@@ -255,6 +261,7 @@ def _guesses(
     archive: Archive,
     kept: Sequence[int],
     inliers_only: bool,
+    floor: float | None,
     common: Sequence[str],
 ) -> dict[Path, np.ndarray]:
     """What each run calls each object: a position in `common`, or -1 for another class."""
@@ -264,7 +271,7 @@ def _guesses(
     with progress_bar("judging runs", total=len(predictors)) as advance:
         for file, one in predictors.items():
             place = np.array([common.index(c) if c in common else -1 for c in one.classes])
-            found[file] = place[one(clouds, names=said).argmax(axis=1)]
+            found[file] = place[one(clouds, names=said, floor=floor).argmax(axis=1)]
             advance()
     return found
 

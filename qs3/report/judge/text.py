@@ -26,8 +26,10 @@ def text(verdict: Verdict) -> str:
                 ]
             )  # fmt: skip
     part = f", part {v.part}" if v.part else ""
+    stray = "left out" if v.inliers_only else "kept"
+    floor = "" if v.floor is None else f"; the floor lies at {v.floor:g} m"
     lines = [
-        f"{v.data}{part}: real objects; stray points " + ("left out" if v.inliers_only else "kept"),
+        f"{v.data}{part}: real objects; stray points {stray}{floor}",
         *aligned(rows),
         "Mean ± SEM over seeds; in brackets the interval at 95 %, with blocks of frames as clusters"
         " and, of several runs, seeds.",

@@ -17,6 +17,7 @@ from qs3.inference.predictor import load
 from qs3.models.pointnet import pointnet
 from qs3.report.judge.intervals import difference, share
 from qs3.report.judge.judging import find_runs, judge
+from qs3.report.judge.text import text
 from qs3.utils.version import VERSION, commit, in_words
 from tests.fixtures.frame_files import write_archive
 from tests.report.made_runs import write_run
@@ -104,6 +105,9 @@ def test_runs_of_other_classes_are_judged_on_what_all_know(archive, logs, tmp_pa
     standing = add_net(tmp_path, 3, scale="above_floor", floor_m=0.0)
     with pytest.raises(ConfigError, match=r"heights above the floor, .* clouds stand at 0"):
         judge([str(standing)], archive)
+    low, high = (judge([str(standing)], archive, floor=floor) for floor in (-1.2, -40.0))
+    assert low.families[0].figures != high.families[0].figures
+    assert "the floor lies at -1.2 m" in text(low)
     camera = add_net(tmp_path, 3, gravity="none")
     with pytest.raises(ConfigError, match="frame of their camera"):
         judge([str(camera)], archive)

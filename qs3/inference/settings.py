@@ -1,0 +1,104 @@
+"""What one call of `qs3 predict` is asked, and where its clouds come from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from qs3.config.checks import check_choice, check_float
+from qs3.data.importers.folders import UP_AXES
+from qs3.errors import ConfigError
+from qs3.inference.inputs import (
+    Unit,
+)
+from qs3.inference.predictor import Predictor
+
+_SHOWN = 10  # failures in the text for the terminal
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of one call.
+
+    Attributes:
+        ckpt: a run's folder or result.pt, or the name of a classifier that comes with qs3; "": the
+            one of these that fits what is known of the clouds.
+        second: another classifier that is asked, too, likewise; "none"; "": of those that come with
+            qs3 if `ckpt` is "", else none.
+        input: a file or folder of clouds, or an archive of cut objects; "" if `depth` is given.
+        depth: a depth image, a folder or list of them; "" if `input` is given.
+        mask, box, intrinsics: of depth images; see `qs3.inference.depth_list`.
+        depth_scale: metres a unit; None: by the kind of numbers.
+        up: the axis that points up in clouds (z if ""), or a direction in the depth camera's frame.
+        floor: where the floor is in clouds along that axis, in metres; None: not known.
+        camera_height: of the depth images' camera above the floor, in metres; likewise.
+        part: of an archive; "" for what one chooses on, "all" for all: see `archive_units`.
+        sample: so many of the files, images or objects, drawn at random; None: all.
+        out: .csv or .json.
+        page: also write a page beside it.
+        batch_size: clouds that the net sees at a time.
+        threads: batches that are worked on at the same time.
+        device: of the net.
+    """
+
+    ckpt: str = ""
+    second: str = ""
+    input: str = ""
+    depth: str = ""
+    mask: str = ""
+    box: str = ""
+    intrinsics: str = ""
+    depth_scale: float | None = None
+    up: str = ""
+    floor: float | None = None
+    camera_height: float | None = None
+    part: str = ""
+    sample: int | None = None
+    out: str = "predictions.csv"
+    page: bool = True
+    batch_size: int = 16
+    threads: int = 1
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        if bool(self.input) == bool(self.depth):
+            raise ConfigError("give input=PATH for clouds, or depth=PATH for depth images")
+        of_depth = {"mask", "box", "intrinsics", "depth_scale", "camera_height"}
+        if odd := [key for key in sorted(of_depth) if getattr(self, key) and not self.depth]:
+            raise ConfigError(f"{odd[0]}= is for depth images; give depth=IMAGE, not input=")
+        if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
+            raise ConfigError(f"depth_scale={self.depth_scale:g}: metres a unit, in (0, 1]")
+        if self.depth and self.floor is not None:
+            raise ConfigError("floor= is for clouds; of depth images give camera_height=METRES")
+        if self.camera_height is not None:
+            check_float("camera_height", self.camera_height, ">= 0")
+        if self.input:
+            check_choice("up", self.up or "z", UP_AXES)
+        if Path(self.out).suffix.lower() not in (".csv", ".json"):
+            raise ConfigError(f"out={self.out} must end in .csv or .json")
+
+
+class Inputs(NamedTuple):
+    """What there is to read, how many files are passed over, and what a unit is called.
+
+    `part` says which part of an archive they are, if it has parts.
+    """
+
+    units: Sequence[Unit]
+    others: int
+    kind: str
+    part: str = ""
+
+
+class Source(NamedTuple):
+    """Where clouds come from.
+
+    `find` gives them for a net; `floor_known`: whether they are in metres, and the height of the
+    floor or of the camera is known; `tells` is the option that would say it.
+    """
+
+    find: Callable[[Predictor], Inputs]
+    floor_known: bool
+    tells: str

@@ -1,0 +1,125 @@
+"""What `qs3 predict` says on the terminal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from qs3.data.frames.pointed import LEVEL, PLANES
+from qs3.inference.predictor import Predictor
+from qs3.inference.scores import Count, disputed, right, scores
+from qs3.inference.settings import Inputs, Settings, Source
+from qs3.inference.table import Row
+
+_SHOWN = 10  # failures in the text for the terminal
+
+
+def told(
+    rows: Sequence[Row],
+    records: Sequence[Mapping[str, Any]],
+    inputs: Inputs,
+    predictor: Predictor,
+    settings: Settings,
+    seconds: float,
+) -> list[str]:
+    """What was done, for the terminal."""
+    good = [one for one in records if one["status"] == "ok"]
+    failed = [one for one in records if one["status"] == "failed"]
+    counts = Counter(one["class"] for one in good)
+    rate = len(good) / max(seconds, 1e-9)
+    lines = [
+        f"{len(good)} clouds, {rate:.1f} clouds a second, from {len(inputs.units)} {inputs.kind}"
+    ]
+    if inputs.part:
+        lines.append(f"taken: {inputs.part}")
+    if good:
+        lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
+        lines += _scored(rows, predictor.classes)
+        strange = sum(one["out_of_range"] for one in good)
+        lines.append(f"{strange} of them out of range (column out_of_range)")
+    if cautioned := sum(one["caution"] is not None for one in good):
+        lines.append(f"{cautioned} of them with a caution (column caution)")
+    lines += _vertical(rows)
+    if holed := [one["dropped"] for one in good if one["dropped"]]:
+        lines.append(
+            f"{sum(holed)} points of {len(holed)} clouds are NaN or infinite and were left out "
+            "(column dropped)"
+            if inputs.kind == "files"
+            else f"{sum(holed)} points of {len(holed)} objects have no depth or are stray (column "
+            "dropped)"
+        )
+    if predictor.in_metres and inputs.kind == "files":
+        lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
+    if predictor.needs_floor and settings.floor is None and settings.camera_height is None:
+        lines.append(
+            f"the classifier knows heights: the camera counts as {predictor.camera_height:g} m "
+            "above the floor ("
+            + ("camera_height=" if settings.depth else "floor=")
+            + " says otherwise)"
+        )
+    if predictor.result.gravity == "none" and inputs.kind != "depth images":
+        lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
+    if inputs.others:
+        lines.append(f"{inputs.others} files of other kinds passed over")
+    if failed:
+        lines.append(f"{len(failed)} failed:")
+        lines += [f"  {one['file']}: {one['reason']}" for one in failed[:_SHOWN]]
+        lines += [f"  and {len(failed) - _SHOWN} more, see the table"] * (len(failed) > _SHOWN)
+    return lines
+
+
+def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
+    """Right and wrong, if somebody gave labels."""
+    found = scores(rows, classes)
+    if found is None:
+        return []
+
+    def of(count: Count) -> str:
+        return f"{count.right} of {count.of} ({count.share:.1%})"
+
+    tiers = "".join(f"; {tier} {of(count)}" for tier, count in found.tiers.items())
+    label, times = found.majority
+    return [f"right {of(found.all)}{tiers}; always {label}: {times / found.all.of:.1%}"]
+
+
+def _vertical(rows: Sequence[Row]) -> list[str]:
+    """Where up was not given."""
+    counts = Counter(row.up for row in rows)
+    words = {
+        PLANES: "fitted to the planes of the picture",
+        LEVEL: "not known, so the camera counts as level",
+    }
+    return [
+        f"up of {counts[how]}: {says}; up= tells it" for how, says in words.items() if counts[how]
+    ]
+
+
+def agreement(rows: Sequence[Row], classes: Sequence[str]) -> str:
+    """How often the second classifier says the same, and, with labels, what that was worth."""
+    asked = [row for row in rows if row.second]
+    apart = [row for row in asked if disputed(row, classes)]
+    same = len(asked) - len(apart)
+    text = (
+        f"a second classifier says the same of {same} of {len(asked)} (column second); where it "
+        "does not, look yourself"
+    )
+    known = [(right(row, classes), disputed(row, classes)) for row in asked]
+    for words, wanted in (("same", False), ("not", True)):
+        judged = [
+            correct for correct, differs in known if differs is wanted and correct is not None
+        ]
+        if judged:
+            share = sum(judged) / len(judged)
+            text += f"; {words}: {sum(judged)} of {len(judged)} right ({share:.1%})"
+    return text
+
+
+def chosen(name: str, source: Source) -> str:
+    """Which classifier was taken because none was named, and what would take another one."""
+    if source.floor_known:
+        return f"classifier: {name}, which comes with qs3 and knows sizes and heights (ckpt=)"
+    return (
+        f"classifier: {name}, which comes with qs3 (ckpt=); {source.tells} takes one that knows "
+        "sizes and heights, too"
+    )

@@ -1,0 +1,82 @@
+"""`weights`: a trained classifier that a run begins with, and that may be its first teacher."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from qs3.errors import ConfigError, DataError
+from qs3.inference.model_file import read_result
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """A classifier that somebody trained.
+
+    Attributes:
+        name: of its folder or file, for people.
+        classes: in the order of its logits.
+        weights: of its net, float32 where they are floats.
+        sha256: of them.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    weights: dict[str, Tensor]
+    sha256: str
+
+    def check_classes(self, classes: Sequence[str]) -> None:
+        """Raise DataError if the run's are others."""
+        if self.classes != tuple(classes):
+            raise DataError(
+                f"weights={self.name} tells {', '.join(self.classes)} apart, and these data have "
+                f"the classes {', '.join(classes)}, in this order"
+            )
+
+
+def read_given(cfg: DictConfig) -> Given | None:
+    """What `weights` names; None where it names nothing.
+
+    Raises:
+        MissingDataError, DataError: it is not there, or damaged.
+        ConfigError: its net or its clouds are not those of the config.
+    """
+    if cfg.weights is None:
+        return None
+    result = read_result(cfg.weights)
+    name = Path(cfg.weights).name
+    model: Any = OmegaConf.to_container(cfg.model, resolve=True)
+    keys = sorted({*model, *result.model})
+    if odd := [key for key in keys if model.get(key) != result.model.get(key)]:
+        was, wanted = result.model.get(odd[0]), model.get(odd[0])
+        raise ConfigError(
+            f"weights={name}: its net has {odd[0]}={was}, the config says {wanted}; set "
+            f"model.{odd[0]}={was}, or choose its model"
+            if odd[0] != "_target_"
+            else f"weights={name} is a {was}, model= chooses {wanted}"
+        )
+    if result.scale != cfg.data.scale:
+        raise ConfigError(
+            f"weights={name}: its clouds have data.scale={result.scale}, the config says "
+            f"{cfg.data.scale}"
+        )
+    weights = {
+        key: value.float() if value.is_floating_point() else value
+        for key, value in result.weights.items()
+    }
+    return Given(name, result.classes, weights, _sha256(weights))
+
+
+def _sha256(weights: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for key in sorted(weights):
+        digest.update(key.encode())
+        digest.update(np.ascontiguousarray(weights[key].cpu().numpy()).tobytes())
+    return digest.hexdigest()

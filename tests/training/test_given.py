@@ -1,0 +1,100 @@
+"""`weights`: a run begins with a trained classifier, which may be its first teacher as it is."""
+
+import csv
+from dataclasses import replace
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from qs3.config import hashing
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.inference.model_file import read_result, values_of, write_result
+from qs3.inference.model_folder import write_folder
+from qs3.runs.checkpoints import load
+from qs3.runs.metrics import read_metrics
+from qs3.training.command import train
+from tests.training.conftest import result_of
+from tests.training.watching import interrupt
+
+ONLY_ROUNDS = ("selection.teacher=given", "protocol.epochs=1", "selftraining.init=continue")
+
+
+def test_the_teacher_is_what_was_given(toy, finished):
+    cfg = toy(*ONLY_ROUNDS, f"weights={finished}")
+    metrics = train(cfg)
+    folder, before = hashing.run_folder(cfg), read_metrics(finished)
+    given, kept = read_result(finished).weights, load(folder / "warmup_selected.pt")
+    assert all(torch.equal(value, kept[name]) for name, value in given.items())
+    assert metrics.warmup.selected.epoch == -1
+    assert metrics.warmup.selected.scores == before.final
+    assert metrics.selection.teacher == f"given, {finished.name}"
+    assert metrics.versions["weights"].startswith(f"{finished.name} ")
+    last = load(folder / "warmup_last.pt")  # an epoch was trained, and counts for nothing
+    assert any(not torch.equal(value, last[name]) for name, value in given.items())
+    assert len(metrics.rounds) == 2
+
+
+def test_weights_alone_are_trained_on(toy, finished):
+    words = ("selftraining=none", "protocol.epochs=2", "experiment_name=two")
+    given, fresh = toy(*words, f"weights={finished}"), toy(*words)
+    assert train(given).warmup.selected.epoch >= 0
+    train(fresh)
+
+    def first_loss(cfg):
+        with (hashing.run_folder(cfg) / "history.csv").open() as file:
+            return float(next(csv.DictReader(file))["train/loss"])
+
+    assert first_loss(given) < 0.9 * first_loss(fresh)
+
+
+def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
+    words = (*ONLY_ROUNDS, f"weights={finished}")
+    whole = toy(*words)
+    train(whole)
+    again = toy(*words, f"paths.log_dir={tmp_path / 'again'}")
+    for epoch in (0, 1, 3):
+        interrupt(again, epoch=epoch)
+    train(again)
+    assert result_of(hashing.run_folder(again)) == result_of(hashing.run_folder(whole))
+
+
+def test_a_folder_of_half_precision_is_another_teacher(toy, finished, tmp_path):
+    result = read_result(finished)
+    half = {name: value.half() for name, value in result.weights.items()}
+    write_folder(tmp_path / "half", values_of(replace(result, weights=half)), "card")
+    metrics = train(toy(*ONLY_ROUNDS, f"weights={tmp_path / 'half'}", "selftraining.rounds=1"))
+    assert metrics.selection.teacher == "given, half"
+    assert metrics.warmup.selected.scores.n == read_metrics(finished).final.n
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "error", "message"),
+    [
+        ({}, ("data.scale=metres", "data.source.unit=metres"), ConfigError, "data.scale=unit_ball"),
+        ({"classes": ("rod", "ball", "slab")}, (), DataError, "tells rod, ball, slab apart"),
+        ({"model": {"_target_": "tests.x.Y", "num_classes": 3}}, (), ConfigError, "is a tests.x.Y"),
+        ({"more": 5}, (), ConfigError, r"its net has more=5, the config says None; set model.more"),
+    ],
+)
+def test_what_does_not_fit_is_told(toy, finished, tmp_path, change, words, error, message):
+    result = read_result(finished)
+    if more := change.pop("more", None):
+        change = {"model": {**result.model, "more": more}}
+    write_result(tmp_path / "result.pt", replace(result, **change))
+    with pytest.raises(error, match=message):
+        train(toy(*words, f"weights={tmp_path / 'result.pt'}"))
+
+
+def test_mistakes_are_told(toy, tmp_path):
+    with pytest.raises(ConfigError, match="weights= names no classifier"):
+        train(toy("selection.teacher=given"))
+    with pytest.raises(MissingDataError, match="nothing is not there"):
+        train(toy("weights=nothing"))
+
+
+def test_without_it_the_hash_is_as_before_there_was_such_a_key(toy):
+    cfg = toy()
+    before = OmegaConf.to_container(cfg, resolve=False)
+    assert before.pop("weights", "") is None
+    assert hashing.config_sha256(OmegaConf.create(before)) == hashing.config_sha256(cfg)
