@@ -93,7 +93,7 @@ def test_mistakes_are_one_line_and_status_1(words, message, capsys):
 
 
 def test_words_are_refused_where_none_belong():
-    with pytest.raises(ConfigError, match="'scans' is not key=value; keys are ckpt, second, input, depth"):
+    with pytest.raises(ConfigError, match="'scans' is not key=value; keys are ckpt, second, input"):
         QS3.command("predict").parse(["ckpt=x", "scans"])
 
 
