@@ -83,7 +83,7 @@ def _run(command: str) -> int:
 
 QUICKSTART = Command(
     "qs3 quickstart",
-    "the main job on embedded data, eight to eleven minutes on 2 cores",
+    "the main job on embedded data, seven to eleven minutes on 2 cores",
     _quickstart,
     (Option("out", text("FOLDER"), "where it all goes", "out/quickstart"),),
     ("qs3 quickstart", "make quickstart     the same, in a checkout"),

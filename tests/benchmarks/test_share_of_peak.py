@@ -7,9 +7,10 @@ rest is by torch's profiler: time inside an operation, without what it calls.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 import torch
@@ -36,9 +37,15 @@ def best_of(step: Callable[[], object], rounds: int = ROUNDS) -> float:
     return min(found[1:])
 
 
+def linear_flops(points: Sequence[int], weight: Sequence[int], *_: object, **__: object) -> int:
+    """Of oneDNN's layer: points [..., K], weight [N, K]; torch's counter does not know it."""
+    return 2 * math.prod(points) * weight[0]
+
+
 def flops(step: Callable[[], object]) -> int:
     """Of products and convolutions, two for each multiplication with its addition."""
-    with FlopCounterMode(display=False) as counter:
+    linear = {torch.ops.mkldnn._linear_pointwise: linear_flops}
+    with FlopCounterMode(display=False, custom_mapping=linear) as counter:
         step()
     return int(counter.get_total_flops())
 
@@ -78,6 +85,9 @@ def row(name: str, what: str, step: Callable[[], object], most: float) -> str:
 def test_flops_of_a_product_are_counted() -> None:
     a, b = torch.randn(8, 16), torch.randn(16, 32)
     assert flops(lambda: a @ b) == 2 * 8 * 16 * 32
+    weight = torch.randn(32, 16)
+    fused = torch.ops.mkldnn._linear_pointwise
+    assert flops(lambda: fused(a, weight, None, "none", [], "")) == 2 * 8 * 16 * 32
     found = shares(lambda: (a @ b).relu())
     assert found["products"] > 0
     assert abs(sum(found.values()) - 1) < 1e-6
