@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -56,7 +57,9 @@ def judge(result: SensorResult) -> list[Verdict]:
         out += _bias(result) + _levels(result)
     if name.startswith("kinect_v1"):
         out += _nguyen(result)
-    if "d4" in name:
+    if "d415" in name:
+        out += _real_d415(result)
+    elif "d4" in name:
         out += _d400(result)
     out += _own_law(result) + _fill(result) + _edge(result)
     return [Verdict(name, *band) for band in out]
@@ -88,8 +91,13 @@ def exponent(result: SensorResult) -> tuple[float, float]:
 
 
 def _bias(result: SensorResult) -> list[_Band]:
-    """Pooled over phases: 0.02 px for a D400, else a quarter of a step of the disparity."""
+    """Pooled over phases: 0.02 px for a D400, else a quarter of a step of the disparity.
+
+    What a device's calibration leaves is a bias too: of such a sensor the data sheet's is asked.
+    """
     facing = [m for m in result.facing() if m["bias_px"] is not None]
+    if getattr(getattr(result.subject.sensor, "misalignment", None), "columns_px", 0):
+        return _accuracy(facing)
     worst = max(facing, key=lambda m: abs(m["bias_px"]), default=None)
     if worst is None:
         return [("median bias", "nothing measured", 0, 0, None)]
@@ -101,6 +109,19 @@ def _bias(result: SensorResult) -> list[_Band]:
         band = f"median bias under a quarter of a step ({limit:.4f} px) at every distance"
     text = f"{worst['bias_px']:+.4f} px at {worst['condition']['depth_m']:g} m"
     return [(band, text, -limit, limit, worst["bias_px"])]
+
+
+def _accuracy(facing: list[dict[str, Any]]) -> list[_Band]:
+    """Median error over depth, as librealsense's tool has it."""
+    most, reach = laws.D400_ACCURACY
+    near = [m for m in facing if m["condition"]["depth_m"] <= reach]
+    worst = max(near, key=lambda m: abs(m["accuracy"]), default=None)
+    band = f"Z accuracy within {most:.0%} up to {reach:g} m"
+    if worst is None:
+        return [(band, "nothing measured", 0, 0, None)]
+    value = worst["accuracy"]
+    text = f"{value:+.2%} at {worst['condition']['depth_m']:g} m"
+    return [(band, text, -most, most, value)]
 
 
 def _levels(result: SensorResult) -> list[_Band]:
@@ -139,6 +160,33 @@ def _d400(result: SensorResult) -> list[_Band]:
     middle = (low + high) / 2
     worst = max(good, key=lambda v: abs(v - middle)) if len(good) == len(values) else None
     return [(band, text, low, high, worst)]
+
+
+_D415_WORDS = {
+    "subpixel_rms_px": ("sub-pixel RMS", "px"),
+    "correlation_px": ("correlation length of the noise", "px"),
+    "contrast": ("contrast of 9 x 9 infrared pixels", ""),
+    "autocorrelation": ("correlation of infrared pixels 2 px apart", ""),
+    "dots_over_ambient": ("brightest dots over ambient light", ""),
+    "fill": ("fill", ""),
+}
+
+
+def _real_d415(result: SensorResult) -> list[_Band]:
+    """A real device's figures, at one distance."""
+    rows = (m for m in result.facing() if m["condition"]["depth_m"] == laws.D415_AT_M)
+    found: dict[str, Any] = {**next(rows, {}), **(result.infrared or {})}
+    if lags := found.get("autocorrelation"):
+        found["autocorrelation"] = lags[1]
+    out: list[_Band] = []
+    for key, (low, high) in laws.REAL_D415.items():
+        words, unit = _D415_WORDS[key]
+        value = found.get(key)
+        band = f"{words} in {low:g} to {high:g} {unit}".strip() + f" at {laws.D415_AT_M:g} m"
+        out.append(
+            (band, "-" if value is None else f"{value:.3g} {unit}".strip(), low, high, value)
+        )
+    return out
 
 
 def _fill(result: SensorResult) -> list[_Band]:

@@ -8,6 +8,7 @@ Z accuracy the median of the signed error.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +118,32 @@ def locking_px(phase: np.ndarray, error_px: np.ndarray) -> float:
     basis = np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
     found = np.linalg.lstsq(basis, error_px[good], rcond=None)[0]
     return float(np.hypot(found[1], found[2]))
+
+
+def correlation_px(residuals: Sequence[np.ndarray]) -> float:
+    """Over how many pixels noise is shared: where its correlation has fallen to one half.
+
+    `residuals` are [h, w] with NaN and mean 0; rows and columns of all are pooled, and the
+    correlation is interpolated between whole pixels. NaN if it does not fall so far.
+    """
+    before = 1.0
+    power = np.concatenate([image.ravel() ** 2 for image in residuals])
+    if not np.isfinite(power).any():
+        return float("nan")
+    variance = float(np.nanmean(power))
+    longest = min(min(image.shape) for image in residuals) - 1
+    for lag in range(1, longest + 1):
+        pairs = []
+        for image in residuals:
+            pairs += [image[:, lag:] * image[:, :-lag], image[lag:] * image[:-lag]]
+        products = np.concatenate([pair.ravel() for pair in pairs])
+        if not np.isfinite(products).any():
+            break
+        here = float(np.nanmean(products)) / max(variance, 1e-30)
+        if here <= 0.5:
+            return lag - 1 + (before - 0.5) / (before - here)
+        before = here
+    return float("nan")
 
 
 def runs(mask: np.ndarray) -> np.ndarray:

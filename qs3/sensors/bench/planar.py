@@ -60,12 +60,16 @@ class PlanarCondition:
 
 @dataclass(frozen=True)
 class _Part:
-    """What one frame says: [N] errors, disparities, the fitted plane, the noise that is stated."""
+    """What one frame says: [N] errors, disparities, the fitted plane, the noise that is stated.
+
+    `residual` [h, w] is the disparity less that of the fitted plane, NaN where there is none.
+    """
 
     error_m: np.ndarray
     error_px: np.ndarray
     disparity: np.ndarray
     plane: metrics.PlaneFit
+    residual: np.ndarray
     wanted: int
     reasons: np.ndarray
     law_m: float | None
@@ -96,29 +100,31 @@ def measure(
         if k < 3 and condition.repeats:
             still = StillRenderer(renderer, seed=k)
             noise = [np.random.default_rng([seed, k, i]) for i in range(condition.repeats)]
-            frames = [_take(subject, plane, condition, still, rng) for rng in noise]
+            frames = [take(subject, plane, condition.half_px, still, rng) for rng in noise]
             stills.append(np.stack([frame.depth_m[part] for frame, part in frames]))
         rng = np.random.default_rng([seed, k])
-        parts.append(_part(*_take(subject, plane, condition, renderer, rng), subject, plane))
+        seen = take(subject, plane, condition.half_px, renderer, rng)
+        parts.append(_part(*seen, subject, plane))
     return _summary(subject, condition, parts, depths, stills)
 
 
-def _take(
+def take(
     subject: Subject,
     plane: TiltedPlane,
-    condition: PlanarCondition,
+    half_px: int,
     renderer: Renderer,
     rng: np.random.Generator,
 ) -> tuple[DepthFrame, tuple[slice, slice]]:
-    """A frame, and the samples of it that lie in the region."""
+    """A frame of a plane, and the samples of it (rows, columns) that lie in the region."""
     k, step = subject.intrinsics, subject.step_px
-    region = plane.region(k, condition.half_px * step, step)
+    region = plane.region(k, half_px * step, step)
     bodies, box = plane.scene(k, region, subject.margin_px)
     if isinstance(renderer, StillRenderer):
         renderer.rewind()
     frame = subject.sensor.scan(bodies, box, POSE, renderer, rng)
     if frame is None:
-        raise ConfigError(f"{condition.name}: the plane is outside the sensor's view")
+        where = f"a plane at {plane.depth_m:g} m, {plane.tilt_deg:g} degrees"
+        raise ConfigError(f"{where}, is outside the view of sensor={subject.name}")
     rows = _samples(region.top, region.height, frame.top, frame.step_px)
     cols = _samples(region.left, region.width, frame.left, frame.step_px)
     return frame, (rows, cols)
@@ -142,11 +148,16 @@ def _part(
     y = (frame.top + (rows + part[0].start) * frame.step_px - k.cy_px) / k.focal_px
     z, truth = depth[valid], clean[valid]
     facing = plane.tilt_deg == 0
+    fitted = metrics.fit_plane(z, x, y, fb)
+    residual = np.full(depth.shape, np.nan)
+    if fb is not None:
+        residual[valid] = fb / z - fb * (fitted.inverse @ np.stack([x, y, np.ones_like(x)]))
     return _Part(
         error_m=z - truth,
         error_px=np.zeros(0) if fb is None else fb / z - fb / truth,
         disparity=np.zeros(0) if fb is None else fb / z,
-        plane=metrics.fit_plane(z, x, y, fb),
+        plane=fitted,
+        residual=residual,
         wanted=int(wanted.sum()),
         reasons=np.bincount(frame.reason[part][wanted], minlength=32),
         law_m=stated_sigma_m(subject.sensor, plane.depth_m, frame) if facing else None,
@@ -222,6 +233,9 @@ def _summary(
             "locking_px": metrics.locking_px(phase, mean) if condition.tilt_deg == 0 else None,
             "phase_histogram": _histogram(disparity - subject.whole_px),
         }
+        if condition.tilt_deg == 0:
+            maps = [part.residual for part in parts]
+            out["correlation_px"] = metrics.correlation_px(maps) * subject.step_px
         out |= _levels(subject, disparity, fb / depths)
     return without_nan(out)
 

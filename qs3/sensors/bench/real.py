@@ -44,6 +44,7 @@ def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         holes: share of pixels without depth within the outline of what has depth.
         run_median_px, run_90_px: median and 90 % quantile of the holes' lengths.
         left_share: see `shadow_side`.
+        mixed: see `mixed_share`.
     """
     flat = depth_m[np.isfinite(depth_m)].astype(np.float64)
     values = np.unique(np.rint(flat[flat > 0.8] * 1000)) / 1000
@@ -63,6 +64,7 @@ def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         "run_median_px": metrics.median(runs),
         "run_90_px": float(np.quantile(runs, 0.9)) if runs.size else float("nan"),
         "left_share": shadow_side(depth_m, gaps),
+        "mixed": mixed_share(depth_m),
     }, runs
 
 
@@ -132,6 +134,27 @@ def shadow_side(depth_m: np.ndarray, gaps: np.ndarray) -> float:
                 right_px += end - start
     total = left_px + right_px
     return left_px / total if total else float("nan")
+
+
+def mixed_share(depth_m: np.ndarray, step_m: float = 0.1, apart_m: float = 0.02) -> float:
+    """Share of the steps in depth, along rows and columns, with a pixel that lies between.
+
+    A step is two neighbours that differ by more than `step_m`, or two pixels that do with one
+    between them that is farther than `apart_m` from both: a mixed or flying pixel.
+    """
+    steps = mixed = 0
+    for depth in (depth_m, depth_m.T):
+        first, middle, last = depth[:, :-2], depth[:, 1:-1], depth[:, 2:]
+        low, high = np.minimum(first, last), np.maximum(first, last)
+        with np.errstate(invalid="ignore"):
+            between = (high - low > step_m) & (middle > low + apart_m) & (middle < high - apart_m)
+            sharp = np.abs(np.diff(depth, axis=1)) > step_m
+        # The sides of a mixed pixel are no steps of their own.
+        sharp[:, :-1] &= ~between
+        sharp[:, 1:] &= ~between
+        mixed += int(between.sum())
+        steps += int(sharp.sum()) + int(between.sum())
+    return mixed / steps if steps else float("nan")
 
 
 def table_noise(depth_m: np.ndarray, block: int = 24) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from qs3.config.compose import choices, composed
 from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
-from qs3.sensors.bench import edges, planar
+from qs3.sensors.bench import edges, infrared_images, planar
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.files import write_json
@@ -25,6 +25,9 @@ DEFAULT_SENSORS = (
     "time_of_flight", "fringe", "kinect_like", "blensor_kinect", "blensor_tof",
 )  # fmt: skip
 """On the page. Not on it: copies of others, and those that repeat a defect on purpose."""
+
+
+Condition = planar.PlanarCondition | edges.EdgeCondition | infrared_images.InfraredCondition
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,11 @@ class Plan:
         """Less of everything: seconds a sensor."""
         return Plan(tilts_deg=(45, 75), phases=8, repeats=6, half_px=16, edge_frames=3)
 
-    def conditions(self, subject: Subject) -> list[planar.PlanarCondition | edges.EdgeCondition]:
-        """All of one sensor: the distances, the tilts both ways, the edge."""
+    def conditions(self, subject: Subject) -> list[Condition]:
+        """All of one sensor: the distances, the tilts both ways, the edge, infrared images."""
         depths = subject.depths_m()
         common: dict[str, Any] = {"phases": self.phases, "half_px": self.half_px}
-        out: list[planar.PlanarCondition | edges.EdgeCondition] = [
+        out: list[Condition] = [
             planar.PlanarCondition(z, repeats=self.repeats, **common) for z in depths
         ]
         tilted = min(depths, key=lambda z: abs(z - self.tilt_depth_m))
@@ -65,6 +68,8 @@ class Plan:
                 planar.PlanarCondition(tilted, float(t), across, **common) for t in self.tilts_deg
             ]
         out.append(edges.default_condition(subject, self.edge_frames))
+        if infrared_images.applies(subject):
+            out.append(infrared_images.InfraredCondition())
         return out
 
 
@@ -77,12 +82,14 @@ class SensorResult:
         config: its resolved settings.
         planes: results of `planar.measure`, in the order of the plan.
         edge: result of `edges.measure`.
+        infrared: result of `infrared_images.measure`; None of a sensor without such images.
     """
 
     subject: Subject
     config: dict[str, Any]
     planes: list[dict[str, Any]] = field(default_factory=list)
     edge: dict[str, Any] = field(default_factory=dict)
+    infrared: dict[str, Any] | None = None
 
     def facing(self) -> list[dict[str, Any]]:
         """Conditions without tilt, by depth."""
@@ -137,15 +144,24 @@ def run(
         path = cache / subject.name / f"{condition.name}-{key[:12]}.json"
         found = read_cached(path)
         if found is None:
-            module: Any = edges if isinstance(condition, edges.EdgeCondition) else planar
-            found = module.measure(subject, condition, renderer)
+            found = _measured(subject, condition, renderer)
             write_json(path, found)
         if isinstance(condition, edges.EdgeCondition):
             result.edge = found
+        elif isinstance(condition, infrared_images.InfraredCondition):
+            result.infrared = found
         else:
             result.planes.append(found)
         advance()
     return result
+
+
+def _measured(subject: Subject, condition: Condition, renderer: Renderer) -> dict[str, Any]:
+    if isinstance(condition, edges.EdgeCondition):
+        return edges.measure(subject, condition, renderer)
+    if isinstance(condition, infrared_images.InfraredCondition):
+        return infrared_images.measure(subject, condition, renderer)
+    return planar.measure(subject, condition, renderer)
 
 
 def fingerprint(*parts: Any) -> str:

@@ -11,6 +11,7 @@ after its down-sampling, by up to two), and StereoBM's bias of 0.029 px.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
 from qs3.sensors.matching import Match, Matcher, StereoBlockMatcher
 from qs3.sensors.optics.blender_filmic import FilmicCamera
 from qs3.sensors.optics.infrared import InfraredCamera
+from qs3.sensors.optics.misalignment import Misalignment
 from qs3.sensors.optics.patterns import Slide, Speckle
 from qs3.sensors.pixel_status import Reason
 from qs3.sensors.renderers.base import Image, Projector
@@ -48,6 +50,7 @@ class SpeckleStereo(TriangulatingSensor):
         blind_left_px: columns at the left of the image that give no depth. OpenCV's StereoBM
             leaves num_disparities - 1 + block_size // 2 (168 px) empty; here the images are
             padded, so it loses none.
+        misalignment: what the calibration of the two cameras leaves; by default nothing.
     """
 
     width_px: int = 1080
@@ -66,6 +69,7 @@ class SpeckleStereo(TriangulatingSensor):
     sample_offset_px: int | None = None
     centre_error_px: float = 0.0
     blind_left_px: int = 0
+    misalignment: Misalignment = field(default_factory=Misalignment)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -96,8 +100,8 @@ class SpeckleStereo(TriangulatingSensor):
 
     @property
     def margin_px(self) -> int:
-        """Fattening puts values up to half a block outside the silhouette."""
-        return self.matcher.reach_px
+        """Fattening puts values up to half a block outside the silhouette; misalignment more."""
+        return self.matcher.reach_px + self.misalignment.reach_px(self.intrinsics)
 
     def take(self, shot: Shot) -> DepthFrame | None:
         """See `DepthSensor.take`."""
@@ -114,14 +118,15 @@ class SpeckleStereo(TriangulatingSensor):
         windows = (shot.window, window)
         canvas = self._canvas(*windows)
         gain = self.infrared.gain(images[0].radiance, images[0].label > 0)
-        radiance = [_place(*seen, canvas) for seen in zip(images, windows, strict=True)]
+        radiance = self._seen(images, windows, canvas)
         if isinstance(self.infrared, InfraredCamera) and self.infrared.needs_ambient:
             # The same seed: the same places in each pixel.
             dim = shot.scene(None, self.ambient)
             others = shot.renderer.render(dim, cameras, seed=seed, geometry=[False, False])
+            ambient = self._seen(others, windows, canvas)
             grey = [
-                self.infrared.expose(total, gain, shot.rng, _place(other, at, canvas))
-                for total, other, at in zip(radiance, others, windows, strict=True)
+                self.infrared.expose(total, gain, shot.rng, other)
+                for total, other in zip(radiance, ambient, strict=True)
             ]
         else:
             grey = [self.infrared.expose(total, gain, shot.rng) for total in radiance]
@@ -139,6 +144,14 @@ class SpeckleStereo(TriangulatingSensor):
         at = shot.samples(self.step_px, self.sample_offset_px)
         depth = at.of(depth[inside])
         return shot.frame(depth, at.of(reason), images[0], pictures, at, self._believed)
+
+    def _seen(
+        self, images: Sequence[Image], windows: Sequence[Window], canvas: Window
+    ) -> list[np.ndarray]:
+        """The radiance [h, w] of the left and the right image on the canvas, through the lenses."""
+        placed = [_place(*seen, canvas) for seen in zip(images, windows, strict=True)]
+        lens, k = self.misalignment, self.intrinsics
+        return [lens.seen(one, canvas, k, right=i == 1) for i, one in enumerate(placed)]
 
     def _match(self, left: np.ndarray, right: np.ndarray, first_column: int) -> Match:
         """What the matcher finds; `first_column` is the canvas's first in the whole image."""

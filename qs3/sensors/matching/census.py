@@ -14,6 +14,7 @@ from qs3.sensors.matching.base import Match, columns_of
 from qs3.sensors.matching.hamming import census, count_ones
 from qs3.sensors.matching.semiglobal import aggregate
 from qs3.sensors.matching.subpixel import Fit, linearised, offset
+from qs3.sensors.matching.texture import TextureOverNoise, window_moments
 from qs3.sensors.pixel_status import Reason, first_reason
 
 A_FACTORS = {Fit.V: 0.03, Fit.PARABOLA: 0.57}
@@ -53,6 +54,7 @@ class CensusMatcher:
         max_difference_px: how far the whole disparities found from `image` and from `other` may
             be apart; -1 switches the check off.
         min_texture: standard deviation of the grey values that the census window needs.
+        texture: what it needs relative to the camera's noise; null asks for nothing more.
         fit: curve through three costs.
         a_factor: see `linearised`; null is the measured one of the fit.
         path_phase: take sub-pixels from the path sums, with the locking said above.
@@ -71,6 +73,7 @@ class CensusMatcher:
     uniqueness_percent: float = 5.0
     max_difference_px: int = 1
     min_texture: float = 2.0
+    texture: TextureOverNoise | None = None
     fit: Fit = Fit.V
     a_factor: float | None = None
     path_phase: bool = False
@@ -128,7 +131,10 @@ class CensusMatcher:
 
         columns = begin + np.arange(width) + best
         within = (columns >= 1) & (columns < other.shape[1] - 1)
-        textured = _spread(image, self.window_px) >= self.min_texture
+        mean, variance = window_moments(image, self.window_px)
+        textured = np.sqrt(variance) >= self.min_texture
+        if self.texture is not None:
+            textured &= self.texture.enough(mean, variance)
         inner = (best > 0) & (best < count - 1)
         consistent = np.ones_like(inner)
         if self.max_difference_px >= 0:
@@ -220,12 +226,3 @@ def _best_of_other(total: np.ndarray) -> np.ndarray:
         padded[count - 1 : count - 1 + width] = total[row]
         diagonals.argmin(axis=1, out=out[row])
     return out
-
-
-def _spread(image: np.ndarray, window_px: int) -> np.ndarray:
-    """[h, w] float32 standard deviation of the grey values in the window."""
-    grey = image.astype(np.float32)
-    size, border = (window_px, window_px), cv2.BORDER_REFLECT_101
-    mean = cv2.boxFilter(grey, cv2.CV_32F, size, borderType=border)
-    square = cv2.boxFilter(grey * grey, cv2.CV_32F, size, borderType=border)
-    return np.sqrt(np.maximum(square - mean * mean, 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -114,6 +115,49 @@ class NeighbourCheck:
         others = self.size_px**2 - 1
         enough = near.sum(axis=0) - 1 >= self.min_share * others
         return np.where(enough, disparity, np.float32(np.nan)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class SpatialFilter:
+    """Smooth along rows and columns, stopping at steps, as the RealSense SDK's spatial filter.
+
+    A recursive domain transform (Gastal and Oliveira, SIGGRAPH 2011; librealsense,
+    rs2::spatial_filter): each value becomes alpha times itself and 1 - alpha times the value
+    before it, forwards and backwards along rows, then along columns. Where two neighbours differ by
+    more than `max_step_px`, or one is missing, it starts anew. Steps that are lower are smeared: a
+    flying pixel is a value between the two surfaces.
+
+    Attributes:
+        alpha: 1 leaves everything as it is.
+        max_step_px: of the disparity between neighbours.
+        iterations: how often all four directions are gone.
+    """
+
+    alpha: float = 0.5
+    max_step_px: float = 1.0
+    iterations: int = 2
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "SpatialFilter.", alpha="(0, 1]", max_step_px="> 0", iterations=">= 1")
+
+    def apply(self, disparity: np.ndarray) -> np.ndarray:
+        """See `PostFilter.apply`."""
+        out = np.array(disparity, dtype=np.float32)
+        for _ in range(self.iterations):
+            for axis in (1, 0):
+                lines = np.ascontiguousarray(np.moveaxis(out, axis, 0))
+                for ordered in (lines, lines[::-1]):
+                    self._along(ordered)
+                out = np.moveaxis(lines, 0, axis)
+        return np.ascontiguousarray(out)
+
+    def _along(self, lines: np.ndarray) -> None:
+        """[n, m]: row i from row i - 1, in place."""
+        alpha = np.float32(self.alpha)
+        for before, here in itertools.pairwise(lines):
+            with np.errstate(invalid="ignore"):
+                near = np.abs(here - before) <= self.max_step_px  # false for NaN
+            np.copyto(here, alpha * here + (1 - alpha) * before, where=near)
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,14 @@
 
 import itertools
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from qs3.geometry.cameras import Intrinsics
-from qs3.sensors.bench import laws, metrics, real
+from qs3.sensors.bench import infrared_images, laws, metrics, real
 from qs3.sensors.bench.tabletop import Tabletop
 from qs3.sensors.bench.targets import POSE, TiltedPlane
 
@@ -16,6 +17,41 @@ from qs3.sensors.bench.targets import POSE, TiltedPlane
 def plane_grid(inverse, half=0.08, count=60):
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-half, half, count)] * 2))
     return x, y, 1 / (inverse[0] * x + inverse[1] * y + inverse[2])
+
+
+@pytest.mark.parametrize("size", [1, 4, 9])
+def test_the_correlation_length_of_a_moving_average_is_half_its_window(size):
+    """The correlation of a mean over n falls by 1 / n a pixel."""
+    rng = np.random.default_rng(size)
+    noise = [cv2.blur(rng.standard_normal((200, 210)), (size, size)) for _ in range(2)]
+    maps = [image[20:-20, 20:-20] for image in noise]
+    assert metrics.correlation_px(maps) == pytest.approx(size / 2, rel=0.1)
+    holes = [np.where(rng.random(image.shape) < 0.2, np.nan, image) for image in maps]
+    assert metrics.correlation_px(holes) == pytest.approx(size / 2, rel=0.1)
+    assert np.isnan(metrics.correlation_px([np.full((5, 5), np.nan)]))
+    assert np.isnan(metrics.correlation_px([np.ones((5, 5))]))
+
+
+def test_contrast_and_correlation_of_known_pictures():
+    stripes = np.tile([10.0, 30.0], (40, 20))
+    # Of the 81 pixels 36 or 45 are bright: p (1 - p) is 0.2469.
+    means = [10 + 20 * n / 81 for n in (36, 45)]
+    low, high = sorted(20 * np.sqrt(36 * 45 / 81**2) / mean for mean in means)
+    assert low <= infrared_images.contrast(stripes) <= high
+    assert infrared_images.contrast(np.full((20, 20), 7.0)) == 0
+    rng = np.random.default_rng(0)
+    blurred = cv2.GaussianBlur(rng.standard_normal((300, 300)), (0, 0), 1.5)
+
+    def shared(lag, variance):  # a product of Gaussians of white noise in the plane
+        return np.exp(-(lag**2) / (2 * variance)) / variance
+
+    def left(lag):  # of a Gaussian of 1.5 px less the same through another of 10
+        wide = 2 * 1.5**2
+        return shared(lag, wide) - 2 * shared(lag, wide + 100) + shared(lag, wide + 200)
+
+    for lag in (1, 2, 3):
+        expected = left(lag) / left(0)
+        assert infrared_images.autocorrelation(blurred, lag) == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 50.0])
@@ -162,3 +198,15 @@ def test_moving_to_the_colour_camera_keeps_depth_and_opens_a_gap_behind_the_near
 def test_a_trimmed_normal_error_is_smaller_by_the_factor_stated():
     values = np.random.default_rng(0).standard_normal(400_000)
     assert metrics.trimmed(values).std() == pytest.approx(metrics.TRIMMED_NORMAL, rel=0.003)
+
+
+def test_a_mixed_pixel_is_one_between_two_surfaces():
+    depth = np.full((4, 9), 1.0)
+    depth[:, 5:] = 2.0
+    assert real.mixed_share(depth) == 0
+    depth[1, 5] = 1.5  # along the row between both; in its column 1.5 beside 2.0 twice
+    # Rows: 3 sharp steps and the mixed one. Column 5: two steps, on the sides of the pixel.
+    assert real.mixed_share(depth) == pytest.approx(1 / 6)
+    depth[1, 5] = np.nan
+    assert real.mixed_share(depth) == 0
+    assert np.isnan(real.mixed_share(np.ones((5, 5))))

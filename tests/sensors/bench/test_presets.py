@@ -5,7 +5,7 @@ The whole bench is qs3.sensors.bench; here are a few of its conditions, the same
 
 import pytest
 
-from qs3.sensors.bench import bands, edges, planar, runner
+from qs3.sensors.bench import bands, edges, infrared_images, planar, runner
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 
 GEOMETRY = {
@@ -52,12 +52,47 @@ def test_a_preset_holds_its_bands(name, renderer):
         condition = planar.PlanarCondition(*place, half_px=20)
         result.planes.append(planar.measure(subject, condition, renderer))
     result.edge = edges.measure(subject, edges.default_condition(subject, frames=2), renderer)
+    if name == "realsense_d415":  # held against a real one's infrared images
+        condition = infrared_images.InfraredCondition()
+        result.infrared = infrared_images.measure(subject, condition, renderer)
     assert failures(result, skip=("sigma_Z at 1.5 m", "sigma_Z at 3 m")) == []
     assert len(bands.judge(result)) >= 6
     if name in KINECTS:
         # Steps of 1/8 px alone give 0.036 px; the rest is matching, below Nguyen's total.
         sigma = [m["sigma_px"] for m in result.facing()]
         assert 0.036 < min(sigma) <= max(sigma) < 0.11
+
+
+OLD_LIGHT = [
+    "sensor.ambient=0.01", "sensor.infrared.psf_px=0.4", "sensor.filters=[]",
+    "sensor.misalignment.columns_px=0",
+]  # fmt: skip
+
+
+def test_without_its_light_and_smoothing_a_d415_is_not_the_real_one(renderer):
+    """What it was before: dots in the dark, sharp, and noise of a few pixels."""
+    subject, config = runner.load("realsense_d415", OLD_LIGHT)
+    result = runner.SensorResult(subject, config)
+    plane = planar.PlanarCondition(1.0, phases=8, half_px=20)
+    result.planes.append(planar.measure(subject, plane, renderer))
+    condition = infrared_images.InfraredCondition()
+    result.infrared = infrared_images.measure(subject, condition, renderer)
+    said = " ".join(failures(result))
+    for words in ("sub-pixel RMS", "correlation length", "contrast", "2 px apart", "dots over"):
+        assert words in said
+    assert result.infrared["dots_over_ambient"] > 100
+
+
+def test_a_d415_loses_planes_that_are_nearly_edge_on(renderer):
+    """As devices do, by the contrast that is left; the plane at 60 degrees is whole."""
+    subject, _ = runner.load("realsense_d415")
+    fill = [
+        planar.measure(subject, planar.PlanarCondition(2.0, tilt, phases=4), renderer)["fill"]
+        for tilt in (60.0, 80.0, 85.0)
+    ]
+    assert fill[0] > 0.99
+    assert fill[1] < 0.97
+    assert fill[2] < 0.5
 
 
 def test_a_sensor_that_is_too_noisy_fails_its_bands(renderer):

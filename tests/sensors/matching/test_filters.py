@@ -5,7 +5,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from qs3.sensors.matching import Match
-from qs3.sensors.matching.filters import FillHoles, Median, NeighbourCheck, Quantiser, SmallRegions
+from qs3.sensors.matching.filters import (
+    FillHoles,
+    Median,
+    NeighbourCheck,
+    Quantiser,
+    SmallRegions,
+    SpatialFilter,
+)
 from qs3.sensors.matching.triangulation import Triangulation
 from qs3.sensors.pixel_status import Reason
 
@@ -42,6 +49,50 @@ def test_neighbour_check_counts_who_agrees(image):
             kept = np.isfinite(value) and agree >= 3  # of 8
             assert np.isfinite(out[row, col]) == kept
             assert not kept or out[row, col] == value
+
+
+def smoothed(image, alpha, step, iterations):
+    """Value by value, forwards and backwards along rows, then along columns."""
+    out = image.astype(float)
+    for _ in range(iterations):
+        for turned in (False, True):
+            lines = out.T if turned else out
+            for line in lines:
+                for order in (range(1, len(line)), range(len(line) - 2, -1, -1)):
+                    for i in order:
+                        before = line[i - 1 if order.step > 0 else i + 1]
+                        if abs(line[i] - before) <= step:  # not for NaN
+                            line[i] = alpha * line[i] + (1 - alpha) * before
+    return out
+
+
+@given(MAPS, st.sampled_from([0.2, 0.5, 1.0]), st.sampled_from([0.3, 5.0]), st.integers(1, 2))
+@settings(max_examples=60, deadline=None)
+def test_the_spatial_filter_equals_a_loop_over_pixels(image, alpha, step, iterations):
+    kept = image.copy()
+    out = SpatialFilter(alpha, step, iterations).apply(image)
+    np.testing.assert_allclose(out, smoothed(image, alpha, step, iterations), rtol=1e-5)
+    np.testing.assert_array_equal(image, kept)
+    if alpha == 1:
+        np.testing.assert_array_equal(out, image)
+
+
+def test_the_spatial_filter_smooths_noise_and_keeps_steps():
+    rng = np.random.default_rng(0)
+    flat = np.where(np.arange(80) < 40, 10.0, 20.0) + rng.normal(0, 0.1, (80, 80))
+    out = SpatialFilter(0.4).apply(flat.astype(np.float32))
+    assert out[:, :40].std() < 0.4 * flat[:, :40].std()
+    assert out[:, :40].max() < 11
+    assert out[:, 40:].min() > 19
+
+
+def test_the_spatial_filter_makes_flying_pixels_of_low_steps():
+    low = np.where(np.arange(40) < 20, 10.0, 10.8).astype(np.float32)[None].repeat(9, 0)
+    out = SpatialFilter(0.4, max_step_px=1.0).apply(low)
+    between = (out > 10.2) & (out < 10.6)
+    assert between.any(axis=1).all()
+    kept = SpatialFilter(0.4, max_step_px=0.5).apply(low)
+    np.testing.assert_allclose(kept, low, atol=1e-5)
 
 
 def regions(image, step):
