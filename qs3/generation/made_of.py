@@ -62,11 +62,14 @@ def _sensor(cfg: DictConfig) -> str:
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
-    return _preset(cfg) + "".join(
-        words
-        for key, words in (("materials", ", mixed materials"), ("light", ", light above"))
-        if cfg.get(key)
-    )
+    words = [_preset(cfg)]
+    if kinds := cfg.get("materials"):
+        clear = any(kind.get("transmission") for kind in kinds.kinds.values())
+        words.append("mixed and clear materials" if clear else "mixed materials")
+    if light := cfg.get("light"):
+        words += ["light above"] * ("height_m" in light)
+        words += ["light between surfaces"] * bool(light.get("bounces"))
+    return ", ".join(words)
 
 
 def _preset(cfg: DictConfig) -> str:

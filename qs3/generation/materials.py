@@ -26,7 +26,7 @@ class Kind:
     Attributes:
         weight: how often it is drawn, relative to the others.
         albedo: in the near infrared, where most dyes are clear and carbon black is not.
-        roughness, specular, metal: see `Gloss`.
+        roughness, specular, metal, transmission: see `Gloss`.
     """
 
     weight: float
@@ -34,13 +34,16 @@ class Kind:
     roughness: tuple[float, float]
     specular: tuple[float, float] = (0.5, 0.5)
     metal: bool = False
+    transmission: tuple[float, float] | None = None
 
     def draw(self, rng: np.random.Generator) -> tuple[float, Gloss]:
         """Albedo and gloss of one surface."""
         albedo, roughness, specular = (
             float(rng.uniform(*ends)) for ends in (self.albedo, self.roughness, self.specular)
         )
-        return albedo, Gloss(roughness, specular, self.metal)
+        # Drawn only where it is asked for: kinds without it are drawn as they were.
+        clear = 0.0 if self.transmission is None else float(rng.uniform(*self.transmission))
+        return albedo, Gloss(roughness, specular, self.metal, clear)
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,10 @@ def _kind(name: str, fields: Any) -> Kind:
         raise ConfigError(f"{place}: {error}") from error
     check_float(f"{place}.weight", kind.weight, ">= 0")
     check_bool(f"{place}.metal", kind.metal)
-    for key, allowed in (("albedo", "[0, 1]"), ("roughness", "[0.1, 1]"), ("specular", "[0, 1]")):
+    ranges = {"albedo": "[0, 1]", "roughness": "[0.1, 1]", "specular": "[0, 1]"}
+    if kind.transmission is not None:
+        ranges["transmission"] = "[0, 0.95]"
+    for key, allowed in ranges.items():
         ends = getattr(kind, key)
         if not isinstance(ends, Sequence) or len(ends) != 2 or not ends[0] <= ends[1]:
             raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r}")

@@ -18,7 +18,7 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
-from qs3.generation.lights import LightAbove
+from qs3.generation.lights import Light
 from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep, preview_of, provenance_of
 from qs3.generation.released.placement import PoseFile
@@ -163,7 +163,7 @@ class Mesh2Point:
     min_clean_points: int | None = None
     poses: PoseFile | None = None
     materials: MixedMaterials | None = None
-    light: LightAbove | None = None
+    light: Light | None = None
     box_of_corners: bool = False
     needs_renderer: bool = True
 

@@ -21,7 +21,7 @@ from qs3.data.frames.rules import Rules
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
-from qs3.generation.lights import LightAbove
+from qs3.generation.lights import Light
 from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep, preview_of, provenance_of
 from qs3.generation.recipes import Cloud, MaskCrop, TooFewPointsError
@@ -151,7 +151,7 @@ class RoomScan:
     clean: bool = True
     views: int = 1
     materials: MixedMaterials | None = None
-    light: LightAbove | None = None
+    light: Light | None = None
     needs_renderer: bool = True
 
     def __post_init__(self) -> None:

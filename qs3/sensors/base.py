@@ -89,10 +89,12 @@ class Lighting:
         area: a light with shadows.
         ambient: radiance of light from all sides, in place of the sensor's `ambient`; None: that.
             Both are in the units of the sensor's.
+        bounces: see `Scene.bounces`.
     """
 
-    area: AreaLight
+    area: AreaLight | None = None
     ambient: float | None = None
+    bounces: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,8 @@ class Shot:
             return Scene(self.bodies, projector, ambient)
         if self.lighting.ambient is not None:
             ambient = self.lighting.ambient
-        return Scene(self.bodies, projector, ambient, self.lighting.area)
+        place = self.lighting
+        return Scene(self.bodies, projector, ambient, place.area, place.bounces)
 
     def image(self, projector: Projector | None = None, ambient: float = 0.0) -> Image:
         """What the camera sees, with the geometry; draws a seed."""

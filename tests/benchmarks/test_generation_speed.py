@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from qs3.sensors.base import DepthFrame, window_of
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
+from qs3.sensors.renderers.gloss import Gloss
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 
 SENSOR = SpeckleStereo()
@@ -165,3 +167,33 @@ def test_all_but_the_render(benchmark, capsys):
 
         ours, both = benchmark.stats.stats.min, best_s(render_too)
         report(benchmark, capsys, "an object without the render", ours, "with Mitsuba's", both)
+
+
+LIT = {
+    "one matt body": (Gloss(1.0, 0.0), 0),
+    "gloss": (Gloss(0.5, 0.5), 0),
+    "light between surfaces": (None, 1),
+    "a clear body": (Gloss(0.2, 0.5, transmission=0.7), 0),
+}
+
+
+@pytest.mark.parametrize("what", LIT)
+def test_what_light_costs(what, benchmark, capsys):
+    """Against a matt body in direct light, at the 16 samples of the default."""
+    renderer = MitsubaRenderer(samples=16)
+    if renderer.variant.startswith("scalar_"):
+        pytest.skip("no compiled variant works here")
+    gloss, bounces = LIT[what]
+    plain, cameras = paper_pair(windowed=True)
+    lit = replace(
+        plain, bodies=tuple(replace(body, gloss=gloss) for body in plain.bodies), bounces=bounces
+    )
+
+    def one(scene):
+        return lambda: renderer.render(scene, cameras, seed=0, geometry=[True, False])
+
+    benchmark.pedantic(one(lit), rounds=4, warmup_rounds=1)
+    if benchmark.enabled:
+        one(plain)()
+        direct = best_s(one(plain))
+        report(benchmark, capsys, what, benchmark.stats.stats.min, "matt and direct", direct)

@@ -13,6 +13,7 @@ from qs3.config.location import CONF
 from qs3.errors import ConfigError
 from qs3.generation.command import generate
 from qs3.generation.lights import LightAbove
+from qs3.generation.made_of import _sensor
 from qs3.generation.materials import Kind, MixedMaterials, parts_of
 from qs3.generation.plan import check, check_recipe
 from qs3.generation.plan import settings as plan_settings
@@ -137,7 +138,9 @@ def test_kinds_are_drawn_by_their_weights_from_their_ranges():
         ("materials", "kinds.metal.weight=-1", r"materials\.kinds\.metal\.weight must be >= 0"),
         ("materials", "kinds.wood.colour=3", r"materials\.kinds\.wood: .*colour"),
         ("materials", "max_materials=0", r"materials\.max_materials must be"),
+        ("materials", "kinds.wood.transmission=[0,1]", r"wood\.transmission must be .*0\.95"),
         ("light", "side_m=0", r"light\.side_m must be > 0"),
+        ("light", "bounces=2", r"light\.bounces must be in \[0, 1\]"),
         ("light", "ambient=-1", r"light\.ambient must be >= 0"),
     ],
 )
@@ -201,6 +204,50 @@ def test_an_object_s_bytes_depend_on_its_id_and_not_on_the_others():
     matt = qs3.generate({"b": stool().to_trimesh()}, *words[:-2])["b"]
     np.testing.assert_array_equal(matt.clean, alone.clean)  # it stands where it stood
     assert (matt.frames[0].images["left"] != alone.frames[0].images["left"]).mean() > 0.05
+
+
+def test_clear_materials_and_light_between_surfaces():
+    """Glass lets the camera see what is behind; the inside of a box gets light from its sides."""
+    words = ("domain=specklenet10", *QUICK, "views=1", "renderer=mitsuba")
+    sides = [block((0.04, 0.4, 0.4), (x, 0, 0.2)) for x in (-0.2, 0.2)]
+    crate = [*sides, *(block((0.4, 0.04, 0.4), (0, y, 0.2)) for y in (-0.2, 0.2))]
+    solid = {"a": merge([*crate, block((0.4, 0.4, 0.04), (0, 0, 0.02))]).to_trimesh()}
+    glass = [f"materials.kinds.{kind}.weight=0" for kind in MIXED.kinds]
+    lit = {
+        "plain": (),
+        "bounced": ("light=bounced", "sensor.infrared.fixed_gain=200"),
+        "direct": ("light=bounced", "light.bounces=0", "sensor.infrared.fixed_gain=200"),
+        "clear": ("materials=clear", *glass),
+    }
+    scans = {name: qs3.generate(solid, *words, *more)["a"] for name, more in lit.items()}
+    for scan in scans.values():
+        np.testing.assert_array_equal(scan.clean, scans["plain"].clean)
+    grey = {name: scan.frames[0].images["left"].astype(float) for name, scan in scans.items()}
+    assert grey["bounced"].mean() > 1.004 * grey["direct"].mean()
+    assert np.isfinite(scans["clear"].frames[0].depth_m).sum() > 0
+
+
+def test_what_a_dataset_is_made_of_names_clear_materials_and_the_bounce():
+    cfg = composed("domain=specklenet10", "materials=clear", "light=bounced")
+    said = _sensor(cfg)
+    assert said == "speckle_stereo, mixed and clear materials, light between surfaces"
+    assert "transmission" in plan_settings(cfg)["recipe"]["materials"]["kinds"]["glass"]
+    both = composed("domain=specklenet10", "light=area", "light.bounces=1")
+    assert _sensor(both) == "speckle_stereo, light above, light between surfaces"
+
+
+def test_kinds_without_transmission_are_drawn_as_they_were():
+    glass = {"weight": 0.0, "albedo": [0, 0], "roughness": [0.1, 0.1], "transmission": [0.5, 0.9]}
+    bodies = [Body(block((1, 1, 1)))] * 20
+    kinds = {"a": Kind(1.0, (0.1, 0.9), (0.3, 0.9))}
+    plain, beside = (
+        MixedMaterials(some).dress(bodies, np.random.default_rng(0))
+        for some in (kinds, kinds | {"glass": glass})
+    )
+    assert [(b.albedo, b.gloss) for b in plain] == [(b.albedo, b.gloss) for b in beside]
+    alone = MixedMaterials({"glass": glass | {"weight": 1.0}})
+    dressed = alone.dress(bodies, np.random.default_rng(0))
+    assert all(0.5 <= body.gloss.transmission <= 0.9 for body in dressed)
 
 
 @pytest.mark.slow

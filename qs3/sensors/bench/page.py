@@ -50,8 +50,8 @@ _DIFFERENCES = """## Known differences from the devices
   only relative to ambient light. A device with one exposure for the room loses more.
 - Semi-global matching carries the D435 preset over planes that are nearly edge-on, where devices
   lose pixels. The D415 preset asks for texture above its noise, and loses them as well.
-- Light goes straight from projector to surface to camera: matt targets here, no light from one
-  surface on another, no warming up.
+- Light goes straight from projector to surface to camera: matt targets, no light from one surface
+  on another here (`light=bounced` has that for datasets), no warming up.
 """
 
 

@@ -92,25 +92,34 @@ class Scene:
         projector: None for a camera that needs no pattern.
         ambient: radiance of the surroundings, which reaches every surface from all sides,
             never occluded: a surface gains albedo x ambient, glossy or not. So it carries no
-            sampling noise and is the same in every renderer. Surfaces do not light each other
-            (direct light only), and the background of an image, where no body is, is 0.
+            sampling noise and is the same in every renderer. The background of an image, where no
+            body is, is 0.
         area: sampled once for each sample of a pixel, so it has a little sampling noise.
+        bounces: 0, direct light only; 1, surfaces in the projector's light also light each other,
+            by what they scatter evenly (their shine is left out).
     """
 
     bodies: tuple[Body, ...]
     projector: Projector | None = None
     ambient: float = 0.0
     area: AreaLight | None = None
+    bounces: int = 0
 
     @property
     def plain(self) -> bool:
-        """Whether all is matt and no area light is on: what every variant can render."""
-        return self.area is None and all(body.gloss is None for body in self.bodies)
+        """Whether all is matt and lit directly, by no area: what every variant can render."""
+        direct = self.area is None and not self.bounces
+        return direct and all(body.gloss is None for body in self.bodies)
+
+    @property
+    def clear(self) -> bool:
+        """Whether light passes through any body."""
+        return any(body.gloss is not None and body.gloss.transmission for body in self.bodies)
 
     def __post_init__(self) -> None:
         if not self.bodies:
             raise ConfigError("a scene needs at least one body")
-        check_ranges(self, ambient=">= 0")
+        check_ranges(self, ambient=">= 0", bounces="[0, 1]")
 
 
 @dataclass(frozen=True, eq=False)

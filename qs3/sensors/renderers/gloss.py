@@ -36,14 +36,18 @@ class Gloss:
         specular: of a dielectric, reflectance at normal incidence over 0.08; 0.5 is glass or
             plastic (refractive index 1.5), 0 leaves the Lambertian part alone.
         metal: the albedo is the reflectance at normal incidence, nothing is scattered below.
+        transmission: share of the light that passes straight through, as through a thin clear
+            sheet; the rest meets the surface. Depth and label are the sheet's.
     """
 
     roughness: float = 0.5
     specular: float = 0.5
     metal: bool = False
+    transmission: float = 0.0
 
     def __post_init__(self) -> None:
-        check_ranges(self, "gloss.", roughness="[0.1, 1]", specular="[0, 1]")
+        clear = "[0, 0.95]"
+        check_ranges(self, "gloss.", roughness="[0.1, 1]", specular="[0, 1]", transmission=clear)
         check_bool("gloss.metal", self.metal)
 
     @property

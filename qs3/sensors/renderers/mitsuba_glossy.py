@@ -1,4 +1,4 @@
-"""What `mitsuba_jit` leaves out: surfaces that shine, and an area light with its shadows."""
+"""What `mitsuba_jit` leaves out: surfaces that shine or are clear, area lights, bounced light."""
 
 from __future__ import annotations
 
@@ -16,10 +16,13 @@ _MATT = Gloss(roughness=1.0, specular=0.0)
 # Fractional parts of the roots of 2, 3, 5 and 7 in 32 bit fixed point: a sequence in four
 # dimensions, which beside the pixel's R2 is one in six.
 _STEPS = (1779033703, 3144134277, 1013904242, 2773480762)
+_BOUNCE_STEPS = (1359893119, 2600822924)  # of 11 and 13
+_CLEAR_STEP = 528734636  # of 17
+_SHEETS = 4  # a ray passes through so many clear faces; the next one is as good as opaque
 
 
 class GlossyScene(JitScene):
-    """A scene for the compiled variants with `Body.gloss` and `Scene.area`.
+    """A scene for the compiled variants with `Body.gloss`, `Scene.area` and `Scene.bounces`.
 
     Its kernel is another one, so that scenes without either keep theirs, and its bytes.
     """
@@ -37,6 +40,13 @@ class GlossyScene(JitScene):
         self._metal = each([float(kind.metal) for kind in kinds])
         tables = np.concatenate([kept_back(kind) for kind in kinds])
         self._kept_back = mi.Float(tables.astype(np.float32))
+        self._clear = scene.clear
+        self._transmission = each([kind.transmission for kind in kinds])
+        self._bounces = scene.bounces
+        if scene.bounces and scene.projector is not None:
+            # What lights a surface from another one is blurred by far: the slide's mean will do,
+            # and carries no noise of dots.
+            self._slide_mean = self._opaque(float(scene.projector.slide.mean()))
         self._area = scene.area
         if scene.area is not None:
             self._area_axes, self._area_origin = self._pose(scene.area.world_from_light)
@@ -44,27 +54,33 @@ class GlossyScene(JitScene):
             self._area_radiance = self._opaque(scene.area.radiance)
 
     def _lamp_samples(self, place: Any, seed: int) -> Callable[[Any], Any]:
-        """Four numbers in 0..1 for each sample: a place on the light, and a facet."""
-        if self._area is None:
-            return super()._lamp_samples(place, seed)
+        """Numbers in 0..1 for each sample, by what they are for: see `_uses`."""
         mi, dr = self._mi, self._dr
-        shifts = [
-            shift
-            for salt in (1, 2)  # neither is the pixel's own
-            for shift in mi.sample_tea_32(place, dr.opaque(mi.UInt32, (seed ^ ~salt) % 2**32))
-        ]
 
-        def at(index: Any) -> Any:
-            pairs = zip(shifts, _STEPS, strict=True)
-            return [mi.Float(shift + index * mi.UInt32(step)) * TO_UNIT for shift, step in pairs]
+        def shifts(salt: int) -> Any:  # none of the salts is the pixel's own
+            return mi.sample_tea_32(place, dr.opaque(mi.UInt32, (seed ^ ~salt) % 2**32))
+
+        steps: dict[str, list[tuple[Any, int]]] = {}
+        if self._area is not None:  # a place on the light, and a facet
+            four = [*shifts(1), *shifts(2)]
+            steps["area"] = list(zip(four, _STEPS, strict=True))
+        if self._bounces:
+            steps["bounce"] = list(zip(shifts(3), _BOUNCE_STEPS, strict=True))
+        if self._clear:
+            steps["clear"] = [(shifts(4)[0], _CLEAR_STEP)]
+
+        def at(index: Any) -> dict[str, list[Any]]:
+            return {
+                use: [mi.Float(shift + index * mi.UInt32(step)) * TO_UNIT for shift, step in pairs]
+                for use, pairs in steps.items()
+            }
 
         return at
 
     def _shade(self, ray: Any, lamp: Any) -> Any:
         mi, dr = self._mi, self._dr
-        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        hit, point = self._first(ray, lamp)
         valid = hit.is_valid()
-        point = ray.o + hit.t * ray.d
         normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, valid)
         to_eye = dr.normalize(-ray.d)
         facing = mi.Vector3f(normal * dr.sign(dr.dot(normal, to_eye)))
@@ -76,9 +92,87 @@ class GlossyScene(JitScene):
             shine = facets.times_pi(dr.normalize(self._slide_origin - point))
             # Where nothing is hit, or the light is opposite to the eye, there is no half-way.
             total += dr.select(projected > 0, (diffuse + shine) * projected, 0)
+        if self._bounces and self._projector is not None:
+            total += diffuse * self._from_surfaces(point, facing, valid, lamp["bounce"])
         if self._area is not None:
-            total += self._from_area(point, facing, valid, lamp, diffuse, facets)
+            total += self._from_area(point, facing, valid, lamp["area"], diffuse, facets)
         return total
+
+    def _first(self, ray: Any, lamp: Any) -> tuple[Any, Any]:
+        """What a camera's ray meets, and where; it passes a clear face as often as light does."""
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        if not self._clear:
+            return hit, ray.o + hit.t * ray.d
+        mi, dr = self._mi, self._dr
+        # One number for all faces: what it is beyond a face's share is spread over 0..1 again.
+        number, begin, far = lamp["clear"][0], mi.Point3f(ray.o), mi.Float(hit.t)
+        for _ in range(_SHEETS):
+            valid = hit.is_valid()
+            share = self._share(hit.prim_index, valid)
+            passes = valid & (number < share)
+            number = dr.select(passes, number / dr.select(share > 0, share, 1), number)
+            begin = dr.select(passes, begin + (far + self._epsilon) * ray.d, begin)
+            further = self._scene.ray_intersect_preliminary(
+                mi.Ray3f(begin, ray.d), coherent=True, active=passes
+            )
+            hit.t = dr.select(passes, further.t, hit.t)
+            hit.prim_index = dr.select(passes, further.prim_index, hit.prim_index)
+            far = mi.Float(hit.t)
+        return hit, begin + far * ray.d
+
+    def _share(self, face: Any, valid: Any) -> Any:
+        """How much of the light passes through a face."""
+        mi, dr = self._mi, self._dr
+        body = dr.gather(mi.UInt32, self._body, face, valid)
+        return dr.select(valid, dr.gather(mi.Float, self._transmission, body, valid), 0)
+
+    def _arriving(self, light: Any, source: Any, start: Any, active: Any) -> Any:
+        """As in `JitScene`, and clear faces hold back a part."""
+        if not self._clear:
+            return super()._arriving(light, source, start, active)
+        mi, dr = self._mi, self._dr
+        way, passed = source - start, mi.Float(1)
+        step = self._epsilon * dr.rsqrt(dr.squared_norm(way))
+        done, looking = mi.Float(0), mi.Bool(active)  # done: of the way, 0..1
+        for _ in range(_SHEETS + 1):
+            ray = mi.Ray3f(start + done * way, way)
+            ray.maxt = 1 - 1e-4 - done
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=True, active=looking)
+            looking &= hit.is_valid()
+            share = self._share(hit.prim_index, looking)
+            passed = dr.select(looking, passed * share, passed)
+            done = dr.select(looking, done + hit.t + step, done)
+            looking &= (share > 0) & (done < 1 - 1e-4)
+        # Where it still looks there are more sheets than it counts.
+        return dr.select(active & ~looking, light * passed, 0)
+
+    def _from_surfaces(self, point: Any, facing: Any, valid: Any, lamp: Any) -> Any:
+        """Light that a point gets from one surface in the projector's light, times 1 / pi.
+
+        The direction is drawn by the cosine, so that the mean over samples is the integral.
+        """
+        mi, dr = self._mi, self._dr
+        radius, angle = dr.sqrt(lamp[0]), 2 * dr.pi * lamp[1]
+        across, aside = mi.coordinate_system(facing)
+        up = dr.sqrt(clip(dr, 1 - lamp[0], 0, 1))
+        sin, cos = dr.sincos(angle)
+        way = mi.Vector3f(across * (radius * cos) + aside * (radius * sin) + facing * up)
+        ray = mi.Ray3f(point + facing * self._epsilon, way)
+        hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=valid)
+        met = valid & hit.is_valid()
+        normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, met)
+        albedo = dr.gather(mi.Float, self._albedo, hit.prim_index, met)
+        scattered = self._scattered(hit.prim_index, met, albedo)
+        light = self._projected(ray, ray.o + hit.t * ray.d, normal, met, even=True)
+        return dr.select(met, scattered * light, 0)
+
+    def _scattered(self, face: Any, valid: Any, albedo: Any) -> Any:
+        """Albedo of what a face scatters evenly: nothing of a metal, little of a clear face."""
+        mi, dr = self._mi, self._dr
+        body = dr.gather(mi.UInt32, self._body, face, valid)
+        metal = dr.gather(mi.Float, self._metal, body, valid)
+        clear = dr.gather(mi.Float, self._transmission, body, valid)
+        return dr.select(metal > 0, 0, albedo * (1 - clear))
 
     def _surface(
         self, face: Any, valid: Any, albedo: Any, normal: Any, to_eye: Any
@@ -125,9 +219,8 @@ class GlossyScene(JitScene):
         way = dr.normalize(there)
         cosine = dr.dot(facing, way)
         lit = before & (cosine > 0) & (solid_angle > 0)
-        lit &= self._free(start, start + there, lit)
         shine = facets.times_pi(way) / (1 + solid_angle * facets.density(way))
-        total = dr.select(lit, cosine * solid_angle * (diffuse + shine), 0)
+        total = self._arriving(cosine * solid_angle * (diffuse + shine), start + there, start, lit)
 
         way = facets.reflected(lamp[2], lamp[3])
         cosine = dr.dot(facing, way)
@@ -136,9 +229,8 @@ class GlossyScene(JitScene):
         u, v = dr.dot(ax, there), dr.dot(ay, there)
         met = before & (cosine > 0) & (along > 1e-6)
         met &= (u >= ends[0]) & (u <= ends[1]) & (v >= ends[2]) & (v <= ends[3])
-        met &= self._free(start, start + there, met)
         shine = facets.times_pi(way) * solid_angle / (1 + solid_angle * facets.density(way))
-        total += dr.select(met, cosine * shine, 0)
+        total += self._arriving(cosine * shine, start + there, start, met)
         return total * self._area_radiance / dr.pi
 
     def _on_square(self, ends: list[Any], z: Any, s: Any, t: Any) -> tuple[Any, Any, Any]:

@@ -109,28 +109,32 @@ class JitScene:
         normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, valid)
         return albedo * (light + self._projected(ray, ray.o + hit.t * ray.d, normal, valid))
 
-    def _projected(self, ray: Any, point: Any, normal: Any, valid: Any) -> Any:
-        """Radiance that the projector gives a white matt surface at `point`."""
+    def _projected(self, ray: Any, point: Any, normal: Any, valid: Any, even: bool = False) -> Any:
+        """Radiance that the projector gives a white matt surface at `point`.
+
+        `even`: as if the slide were its own mean everywhere, which `_slide_mean` is.
+        """
         mi, dr = self._mi, self._dr
         to_light = self._slide_origin - point
         x, y, z = (-dr.dot(axis, to_light) for axis in self._slide_axes)
         place = mi.Point2f(x, y) / z * self._slide_scale + 0.5
         lit = valid & (z > 0) & dr.all((place >= 0) & (place <= 1))
-        slide = self._slide.eval(place, lit)[0]
+        slide = self._slide_mean if even else self._slide.eval(place, lit)[0]
         cosine = dr.dot(normal, to_light)  # times the distance
         lit &= (slide > 0) & (cosine * dr.dot(normal, -ray.d) > 0)
 
         start = point + normal * (self._epsilon * dr.sign(cosine))
-        lit &= self._free(start, self._slide_origin, lit)
         # strength / z^2 on a plane that faces the projector, elsewhere times the cosine of
         # incidence (cosine / distance) over that plane's (z / distance).
-        return dr.select(lit, self._strength * slide * dr.abs(cosine) / (z * z * z), 0)
+        light = self._strength * slide * dr.abs(cosine) / (z * z * z)
+        return self._arriving(light, self._slide_origin, start, lit)
 
-    def _free(self, start: Any, end: Any, active: Any) -> Any:
-        """Whether nothing lies between two points."""
-        shadow_ray = self._mi.Ray3f(start, end - start)
+    def _arriving(self, light: Any, source: Any, start: Any, active: Any) -> Any:
+        """What of the light from a point gets to another one: all if nothing lies between."""
+        shadow_ray = self._mi.Ray3f(start, source - start)
         shadow_ray.maxt = 1 - 1e-4
-        return ~self._scene.ray_test(shadow_ray, coherent=True, active=active)
+        active &= ~self._scene.ray_test(shadow_ray, coherent=True, active=active)
+        return self._dr.select(active, light, 0)
 
     def _pixels(self, camera: Camera) -> tuple[Any, Any, Callable[[Any, Any], Any]]:
         """Pixel centres (u, v) of the window, row by row, and the ray through a place (u, v)."""
