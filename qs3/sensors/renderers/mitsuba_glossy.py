@@ -163,7 +163,7 @@ class GlossyScene(JitScene):
         normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, met)
         albedo = dr.gather(mi.Float, self._albedo, hit.prim_index, met)
         scattered = self._scattered(hit.prim_index, met, albedo)
-        light = self._projected(ray, ray.o + hit.t * ray.d, normal, met, even=True)
+        light = self._projected(ray, ray.o + hit.t * ray.d, normal, met, self._slide_mean)
         return dr.select(met, scattered * light, 0)
 
     def _scattered(self, face: Any, valid: Any, albedo: Any) -> Any:
