@@ -1,0 +1,273 @@
+"""The speckle-stereo sensor in torch: images, exposure, matching and depth with gradients.
+
+The scene is fixed (`views.Pair`: a plane for each pixel), so gradients hold away from silhouettes
+and shadow edges, which a change of the baseline would move. Everything else is the formula of the
+ordinary sensor: `renderers.base` for the projector's light, `optics.infrared` for the exposure.
+Hard choices have soft ones in their place: the matcher is normalised correlation with a
+soft argmax (Kendall et al., GC-Net, ICCV 2017, section 3.4) near the best whole disparity, and
+rounding to grey values passes gradients through.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+
+from qs3.errors import ConfigError
+from qs3.sensors.gradients.views import Pair, View
+from qs3.sensors.optics.infrared import InfraredCamera
+
+_REACH = 4.0  # of the lens's Gaussian, in standard deviations
+_STEPS = 4  # of the disparity to a pixel
+_NEAR = 4  # of these steps to each side of the best one
+
+Settings = Mapping[str, torch.Tensor]
+"""Numbers (0-d tensors) by the keys of the sensor's config: see `settings_of`."""
+
+
+def settings_of(pair: Pair, gain: float) -> dict[str, torch.Tensor]:
+    """The sensor's own numbers, each a float64 tensor without gradient, and `gain`.
+
+    Keys: projector_strength, ambient, baseline_m, focal_px, gain (grey values per radiance),
+    infrared.psf_px, infrared.electrons_at_white, infrared.read_noise_e,
+    infrared.speckle_contrast; and albedo, a factor of all albedos (1).
+    """
+    sensor = pair.sensor
+    if not isinstance(sensor.infrared, InfraredCamera):
+        raise ConfigError("the differentiable twin needs a linear infrared camera")
+    camera = sensor.infrared
+    numbers = {
+        "projector_strength": sensor.projector_strength,
+        "ambient": sensor.ambient,
+        "baseline_m": sensor.baseline_m,
+        "focal_px": sensor.focal_px,
+        "gain": gain,
+        "infrared.psf_px": camera.psf_px,
+        "infrared.electrons_at_white": camera.electrons_at_white,
+        "infrared.read_noise_e": camera.read_noise_e,
+        "infrared.speckle_contrast": camera.speckle_contrast,
+        "albedo": 1.0,
+    }
+    return {key: torch.tensor(float(value), dtype=torch.float64) for key, value in numbers.items()}
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A differentiable speckle-stereo sensor before one scene.
+
+    Attributes:
+        pair: what its cameras see.
+        fine: samples along each side of a pixel; 4 is the 16 samples of the renderers.
+        slide: [H, W] float64 in 0..1; None: the sensor's. May want a gradient.
+    """
+
+    pair: Pair
+    fine: int = 4
+    slide: torch.Tensor | None = None
+
+    def radiance(self, settings: Settings) -> tuple[torch.Tensor, torch.Tensor]:
+        """Both images [h, w] float64 before the lens, over the windows of the views."""
+        return self._seen(self.pair.left, settings, 0), self._seen(self.pair.right, settings, 1)
+
+    def _seen(self, view: View, settings: Settings, which: int) -> torch.Tensor:
+        sensor, window = self.pair.sensor, view.window
+        k = sensor.intrinsics
+        focal, baseline = settings["focal_px"], settings["baseline_m"]
+        slide = self.slide
+        if slide is None:
+            slide = torch.from_numpy(sensor.pattern.slide.astype("float64"))
+        a, b, c = view.plane.unbind(-1)
+        # The surface stays where it is when the right camera moves along x.
+        moved = (baseline - sensor.baseline_m) * which
+        rest = 1 - a * moved
+        a, b, c = a / rest, b / rest, c / rest
+        to_projector = baseline / 2 - baseline * which
+        length = torch.sqrt(a * a + b * b + c * c + 1e-12)
+        total = torch.zeros_like(view.albedo)
+        offsets = [(i + 0.5) / self.fine - 0.5 for i in range(self.fine)]
+        u = window.left + torch.arange(window.width, dtype=torch.float64) - k.cx_px
+        v = (window.top + torch.arange(window.height, dtype=torch.float64) - k.cy_px)[:, None]
+        there = view.albedo > 0
+        for dv in offsets:
+            for du in offsets:
+                x, y = (u + du) / focal, (v + dv) / focal
+                inverse = a * x + b * y + c
+                inverse = torch.where(there & (inverse > 1e-6), inverse, 1.0)
+                z = 1 / inverse
+                px, py = to_projector - x * z, -y * z
+                facing = torch.abs(a * px + b * py - c * z) / length
+                light = _slide_at(slide, -px / z, -py / z, sensor.tan_half_width)
+                total = total + light * facing / z**3
+        projected = settings["projector_strength"] * view.lit * total / self.fine**2
+        return settings["albedo"] * view.albedo * (settings["ambient"] + projected)
+
+    def grey(
+        self, settings: Settings, noise: torch.Generator | None = None, whole: bool = True
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Both exposures [h, w] float64, 0..255.
+
+        Args:
+            settings: see `settings_of`.
+            noise: of speckle, photons and read-out, drawn anew at each call; None: none, and
+                no rounding either.
+            whole: noisy images are rounded to grey values; gradients pass as if they were not.
+        """
+        first, second = (
+            self._exposed(image, settings, noise, whole) for image in self.radiance(settings)
+        )
+        return first, second
+
+    def _exposed(
+        self, radiance: torch.Tensor, settings: Settings, noise: torch.Generator | None, whole: bool
+    ) -> torch.Tensor:
+        contrast = settings["infrared.speckle_contrast"]
+        if noise is not None and float(contrast.detach()) > 0:
+            radiance = radiance * _gamma_like(radiance, contrast, noise)
+        image = blurred(radiance, settings["infrared.psf_px"])
+        per_grey = settings["infrared.electrons_at_white"] / 255
+        electrons = image * settings["gain"] * per_grey
+        if noise is None:
+            return (electrons / per_grey).clamp(0, 255)
+        variance = electrons.clamp_min(0) + settings["infrared.read_noise_e"] ** 2
+        spread = torch.sqrt(variance + 1e-9)  # the root of 0 has no gradient
+        drawn = torch.randn(electrons.shape, generator=noise, dtype=electrons.dtype)
+        grey = ((electrons + spread * drawn) / per_grey).clamp(0, 255)
+        return grey + (grey.round() - grey).detach() if whole else grey
+
+    def disparity(
+        self,
+        left: torch.Tensor,
+        right: torch.Tensor,
+        lowest: int,
+        highest: int,
+        block_px: int = 15,
+        sharpness: float = 80.0,
+    ) -> torch.Tensor:
+        """[h, w] float64 disparity of the left image's pixels, px.
+
+        Args:
+            left, right: exposures over the views' windows.
+            lowest, highest: whole disparities; looked at from the one to the other in quarters.
+            block_px: side of the block that is correlated, odd.
+            sharpness: of the soft argmax, per unit of correlation.
+        """
+        offset = self.pair.left.window.left - self.pair.right.window.left
+        rows = self.pair.left.window.top - self.pair.right.window.top
+        if rows:
+            raise ConfigError("the two views have other rows: they are of another pair")
+        cost = correlations(left, right, offset, lowest, highest, block_px)
+        return lowest + soft_argmax(cost, sharpness) / _STEPS
+
+    def depth_m(self, disparity: torch.Tensor, settings: Settings) -> torch.Tensor:
+        """Metres along the optical axis: f b / disparity, by the numbers in `settings`."""
+        return settings["focal_px"] * settings["baseline_m"] / disparity
+
+
+def _slide_at(
+    slide: torch.Tensor, x: torch.Tensor, y: torch.Tensor, tan_half_width: float
+) -> torch.Tensor:
+    """[h, w] brightness in direction (x, y, 1), linear between the slide's pixels; 0 outside."""
+    rows, columns = slide.shape
+    place_x = x / tan_half_width
+    place_y = y / (tan_half_width * rows / columns)
+    grid = torch.stack([place_x, place_y], dim=-1)[None]
+    inside = (place_x.abs() <= 1) & (place_y.abs() <= 1)
+    picture = slide[None, None].to(grid.dtype)
+    found = F.grid_sample(picture, grid, padding_mode="border", align_corners=False)[0, 0]
+    return found * inside
+
+
+def blurred(image: torch.Tensor, sigma_px: torch.Tensor) -> torch.Tensor:
+    """[h, w] through a Gaussian whose width may want a gradient; 0 outside the image."""
+    width = float(sigma_px.detach())
+    if width <= 0:
+        return image
+    reach = max(1, math.ceil(_REACH * width))
+    place = torch.arange(-reach, reach + 1, dtype=image.dtype)
+    kernel = torch.exp(-(place**2) / (2 * sigma_px**2))
+    kernel = kernel / kernel.sum()
+    rows = F.conv2d(image[None, None], kernel[None, None, None], padding=(0, reach))
+    return F.conv2d(rows, kernel[None, None, :, None], padding=(reach, 0))[0, 0]
+
+
+def _gamma_like(
+    image: torch.Tensor, contrast: torch.Tensor, noise: torch.Generator
+) -> torch.Tensor:
+    """Gamma variables with mean 1, whose gradient by the contrast is an implicit one."""
+    shape = 1 / contrast**2
+    seed = int(torch.randint(2**31, (), generator=noise))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        drawn = torch.distributions.Gamma(shape, shape).rsample(image.shape)
+    return drawn
+
+
+def correlations(
+    left: torch.Tensor,
+    right: torch.Tensor,
+    offset: int,
+    lowest: int,
+    highest: int,
+    block_px: int,
+) -> torch.Tensor:
+    """[D, h, w] normalised correlation of blocks, -1..1, in steps of 1 / `_STEPS` px.
+
+    Column u of `left` is column u + offset - d of `right`; what is outside is dark, and between two
+    pixels is the cubic through four (Catmull and Rom).
+    """
+    width = left.shape[1]
+    begin = offset - highest - 1  # a pixel more on both sides for the cubics
+    before = max(0, -begin)
+    after = max(0, begin + width + highest - lowest + 4 - right.shape[1])
+    wide = F.pad(right, (before, after))[:, max(0, begin) :]
+    half = block_px // 2
+    cubics = [_catmull_rom(step / _STEPS) for step in range(_STEPS)]
+
+    def mean(image: torch.Tensor) -> torch.Tensor:
+        padded = F.pad(image[None], (half, half, half, half), mode="reflect")
+        return F.avg_pool2d(padded, block_px, stride=1)[0]
+
+    mean_left = mean(left)
+    spread_left = mean(left * left) - mean_left**2
+    found = []
+    for step in range((highest - lowest) * _STEPS + 1):
+        # A larger disparity lies farther left: d = low + part is between low and low + 1.
+        low, part = lowest + step // _STEPS, step % _STEPS
+        at = highest - low + 1
+        around = [wide[:, at + 1 - i : at + 1 - i + width] for i in range(4)]
+        other = around[1]
+        if part:
+            other = torch.stack([w * one for w, one in zip(cubics[part], around, strict=True)])
+            other = other.sum(dim=0)
+        mean_other = mean(other)
+        spread = spread_left * (mean(other * other) - mean_other**2)
+        shared = mean(left * other) - mean_left * mean_other
+        found.append(shared / torch.sqrt(spread.clamp_min(1e-6)))
+    return torch.stack(found)
+
+
+def _catmull_rom(t: float) -> tuple[float, float, float, float]:
+    """Weights of four neighbours for a place `t` from the second to the third."""
+    return (
+        (-t + 2 * t**2 - t**3) / 2,
+        (2 - 5 * t**2 + 3 * t**3) / 2,
+        (t + 4 * t**2 - 3 * t**3) / 2,
+        (-(t**2) + t**3) / 2,
+    )
+
+
+def soft_argmax(score: torch.Tensor, sharpness: float) -> torch.Tensor:
+    """[h, w] mean place of [D, h, w] scores, weighed by exp(sharpness x score) near the best.
+
+    The best is chosen without a gradient.
+    """
+    count = len(score)
+    place = torch.arange(count, dtype=score.dtype)[:, None, None]
+    best = score.detach().argmax(dim=0).clamp(_NEAR, count - 1 - _NEAR)
+    near = (place - best).abs() <= _NEAR
+    weight = torch.softmax(torch.where(near, sharpness * score, -torch.inf), dim=0)
+    return (weight * place).sum(dim=0)
