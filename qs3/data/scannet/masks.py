@@ -10,6 +10,7 @@ size is read and judged before the picture is unpacked.
 
 from __future__ import annotations
 
+import lzma
 import re
 import struct
 import zipfile
@@ -25,7 +26,7 @@ INSTANCES, LABELS = "instance-filt", "label-filt"
 
 _MAX_MEMBERS = 1_000_000
 _BROKEN = (
-    zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error,
+    zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, lzma.LZMAError, struct.error,
     OSError, EOFError, NotImplementedError, RuntimeError, ValueError, OverflowError,
     LookupError,  # a name that begins with NUL
 )  # fmt: skip

@@ -54,6 +54,22 @@ def test_two_masks_of_a_frame_or_none_at_all_are_told(tmp_path):
         MaskArchive(tmp_path / "a.zip", LABELS)
 
 
+@pytest.mark.parametrize("method", [12, 14, 99])
+def test_a_member_that_claims_to_be_packed_otherwise_is_refused(tmp_path, method):
+    """bzip2, LZMA, or nothing that zips know."""
+    path = tmp_path / "a.zip"
+    write_zip(path, INSTANCES, images())
+    data = bytearray(path.read_bytes())
+    for mark, place in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
+        at = data.find(mark)
+        while at >= 0:
+            data[at + place] = method
+            at = data.find(mark, at + 1)
+    path.write_bytes(data)
+    with MaskArchive(path, INSTANCES) as masks, pytest.raises(DataError, match="unpacked"):
+        masks.read(min(masks.frames))
+
+
 def test_a_zip_cannot_unpack_without_end(tmp_path):
     """A member of 200 MB in a small file: no more than the limit is ever unpacked."""
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as file:
