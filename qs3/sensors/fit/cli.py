@@ -14,7 +14,23 @@ if TYPE_CHECKING:
     from qs3.sensors.fit.preset import FittedPreset
 
 
-def _fit(words: Sequence[str], line: str, out: str, plot: str | None, **given: Any) -> None:
+def _fit(
+    words: Sequence[str],
+    line: str,
+    out: str,
+    plot: str | None,
+    images: str | None,
+    base: str | None,
+    distance: float | None,
+    **given: Any,
+) -> None:
+    if images is not None:
+        if words or plot is not None:
+            raise ConfigError("images= fits a stereo preset: leave frames and plot= out")
+        fit_images(Path(images), base, distance, given["unit"], Path(out).expanduser(), line)
+        return
+    if base is not None or distance is not None:
+        raise ConfigError("base= and distance= belong to images=FOLDER")
     preset = fit(words, **given)
     file = Path(out).expanduser()
     preset.save(file, line)
@@ -81,9 +97,39 @@ def fit(
     )
 
 
+def fit_images(
+    folder: Path, base: str | None, distance_m: float | None, unit: str | None, out: Path, line: str
+) -> None:
+    """Fit a stereo preset's light, lens and noise to infrared pictures, and write it.
+
+    Raises:
+        ConfigError, DataError: say which argument or file is to blame.
+    """
+    from qs3.config.compose import choices, composed
+    from qs3.config.hydra import build
+    from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+    from qs3.sensors.gradients.image_fit import fit_pictures
+    from qs3.sensors.gradients.pictures import read_pictures
+    from qs3.sensors.gradients.preset import report, save
+
+    name = base or "realsense_d415"
+    known = [choice for choice in choices("sensor") if choice != "none"]
+    if name not in known:
+        raise ConfigError(f"base={name} is unknown; there are {', '.join(known)}")
+    sensor = build(composed(None, f"+sensor={name}").sensor)
+    if not isinstance(sensor, SpeckleStereo):
+        raise ConfigError(f"base={name} is no active stereo camera with two infrared pictures")
+    scenes = read_pictures(folder, unit)
+    found = fit_pictures(scenes, sensor, distance_m)
+    for said in report(found, sensor, len(scenes)):
+        print(said)
+    save(out, found, name, sensor, line)
+    print(f"wrote {out}")
+
+
 FIT = Command(
     "qs3 fit",
-    "a preset for your own depth camera, from a few frames of a flat wall",
+    "a preset for your own depth camera, from a few frames of a wall, or from infrared pictures",
     _fit,
     (
         Option("out", text("FILE"), "the preset, conf/sensor/NAME.yaml", required=True),
@@ -94,10 +140,14 @@ FIT = Command(
         Option("distances", several(NUMBER), "true ones of each frame's middle, m: for the bias"),
         Option("baseline", NUMBER, "m to the projector along x (negative: to the left): shadows"),
         Option("power", one_of("1", "2"), "fixes the law of the noise"),
+        Option("images", text("FOLDER"), "of infrared pictures, in place of frames"),
+        Option("base", text("NAME"), "stereo preset to begin with (default realsense_d415)"),
+        Option("distance", NUMBER, "m to pictured scenes without a depth image"),
     ),
     (
         "qs3 fit frames/*.png intrinsics=580,580,319.5,239.5 baseline=0.075 \\",
         "    out=conf/sensor/my_camera.yaml plot=my_camera.png",
+        "qs3 fit images=pictures base=realsense_d415 out=conf/sensor/my_stereo.yaml",
         "qs3-generate domain=specklenet10 renderer=mitsuba sensor=my_camera",
     ),
     about="""
@@ -111,6 +161,12 @@ What is found: noise against distance (before the quantiser; growing with Z^2 as
 triangulate, or with Z, whichever fits better), its smoothness, steps of 1/Z or of Z, fill rate
 against the angle of incidence, and, with distances=, the bias. A preset adds these to the true
 depth; see qs3.sensors.devices.fitted.FittedDepth. The plot shows data and model: look at it.
+
+images=FOLDER holds rectified pictures of an active stereo camera: SCENE_left.png, and where there
+are any SCENE_right.png, SCENE_off.png (projector off, the same exposure) and SCENE_depth.png (the
+left camera's). Several frames of a still scene, SCENE_left_0.png and so on, tell noise from
+texture. Found, with their errors: ambient light, blur, exposure, noise and speckle, and f B. What
+the pictures do not tell is said, and left as it is in base=.
 """,
     words="FRAMES",
     line=True,

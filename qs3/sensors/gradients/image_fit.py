@@ -1,0 +1,333 @@
+"""A stereo preset's light, lens and noise from a camera's own infrared pictures, by gradient.
+
+The dots of a real projector are not ours, so pictures are compared by what does not depend on where
+dots lie (`statistics`): the twin's picture of a plane at the pictures' distance is made like them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.autograd.forward_ad as forward_ad
+from scipy.optimize import least_squares
+
+from qs3.errors import ConfigError, DataError
+from qs3.geometry.cameras import Window
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.gradients.statistics import BRIGHTNESSES, SMOOTH_PX, inner, smooth, statistics
+from qs3.sensors.gradients.twin import Twin, blurred, settings_of
+from qs3.sensors.gradients.views import Pair, View
+from qs3.sensors.optics.infrared import InfraredCamera
+
+_SIDE_PX = 480  # of the plane that the twin shows
+_FAR = 5.0  # the search ends at factors of e to this power
+_TEXTURE_ERROR = 0.02  # of what two pictures of other dots differ by
+_CLIPPED = 0.01
+_PRIOR = 1.5  # standard deviation of a number's logarithm before any picture is seen
+UNKNOWN = 0.2  # a number that is less sure than this share is said to be unknown
+
+KEYS = (
+    "ambient", "infrared.psf_px", "infrared.speckle_contrast", "infrared.electrons_at_white",
+    "infrared.read_noise_e",
+)  # fmt: skip
+NOISE = KEYS[2:]
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """One still scene. Images [h, w], grey values 0..255, rectified.
+
+    Attributes:
+        name: for messages.
+        left: one or more frames; two or more tell noise from texture.
+        right: the same of the other camera, or none.
+        off: frames of the left camera with the projector off, at the same exposure; may be empty.
+        depth_m: [h, w] of the left camera, NaN where there is none; None: not known.
+    """
+
+    name: str
+    left: Sequence[np.ndarray]
+    right: Sequence[np.ndarray] = ()
+    off: Sequence[np.ndarray] = ()
+    depth_m: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class InfraredFit:
+    """What pictures say of a preset.
+
+    Attributes:
+        values: by the keys of the sensor's config, `KEYS` and infrared.white_level, the grey value
+            at the quantile that the preset's exposure goes by; those that no picture tells are
+            the base preset's.
+        errors: standard error of each over its value, from the curvature of the fit.
+        unknown: keys that the pictures do not tell, with the reason.
+        focal_baseline: f B in px m by disparity and depth; None without both.
+        dots_over_ambient: at `distance_m`, as `qs3 bench` has it.
+        distance_m: median over the scenes.
+        misfit: RMS of what is left, in standard errors; about 1 is good.
+    """
+
+    values: Mapping[str, float]
+    errors: Mapping[str, float]
+    unknown: Mapping[str, str]
+    focal_baseline: float | None
+    dots_over_ambient: float
+    distance_m: float
+    misfit: float
+
+
+@dataclass
+class _Target:
+    """What one scene's pictures say, and how sure that is."""
+
+    distance_m: float
+    shared: torch.Tensor
+    skewness: torch.Tensor
+    noise: torch.Tensor  # [B] variance over time, grey values squared; empty: one frame
+    level: torch.Tensor  # [B]
+    pixels: int
+    frames: int
+    white: float  # grey value at the exposure's quantile
+    added: torch.Tensor | None  # mean of on - off over mean of off
+    clipped: bool  # too many pixels are black or white for the texture to be what it was
+    projected: torch.Tensor  # [h, w] radiance of white by the base's projector there
+    shading: torch.Tensor  # [h, w] the same without its dots
+    grain: torch.Tensor  # [h, w] laser speckle: mean 0, variance 1, skewed as a Gamma variable
+
+
+def fit_pictures(
+    scenes: Sequence[Pictures], base: SpeckleStereo, distance_m: float | None = None
+) -> InfraredFit:
+    """Fit ambient light, blur and noise of `base` to pictures; see `InfraredFit`.
+
+    Args:
+        scenes: at least one; matt things without much print on them show what dots do.
+        base: the preset to begin with: pattern, projector and geometry stay.
+        distance_m: of the scenes without a depth image.
+
+    Raises:
+        DataError: pictures are too small, dark, or without dots.
+        ConfigError: the base has no linear camera, or a scene's distance is not known.
+    """
+    _camera(base)
+    targets = [_target(scene, base, distance_m) for scene in scenes]
+    start = {key: _first(key, base) for key in KEYS}
+
+    def residuals(logs: torch.Tensor) -> torch.Tensor:
+        values = {key: start[key] * torch.exp(log) for key, log in zip(KEYS, logs, strict=True)}
+        parts = [_residuals(target, values) for target in targets]
+        return torch.cat([*parts, logs / _PRIOR])
+
+    def at(logs: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return residuals(torch.from_numpy(logs)).numpy()
+
+    def slopes(logs: np.ndarray) -> np.ndarray:
+        # Forward mode: as many passes as numbers, where backward would take one for each residual.
+        at, columns = torch.from_numpy(logs), []
+        for step in torch.eye(len(KEYS), dtype=torch.float64):
+            with forward_ad.dual_level():
+                out = residuals(forward_ad.make_dual(at, step))
+                slope = forward_ad.unpack_dual(out).tangent
+            columns.append(torch.zeros_like(out) if slope is None else slope)
+        return torch.stack(columns, dim=1).detach().numpy()
+
+    solved = least_squares(at, np.zeros(len(KEYS)), jac=slopes, bounds=(-_FAR, _FAR))
+    found = torch.from_numpy(solved.x)
+    covariance = torch.linalg.inv(torch.from_numpy(solved.jac.T @ solved.jac))
+    rest = torch.from_numpy(solved.fun[: -len(KEYS)])
+    scale = max(1.0, float(rest.square().sum() / max(len(rest) - len(KEYS), 1)))
+    spread = torch.sqrt(covariance.diagonal()) * math.sqrt(scale)
+    errors = {key: float(one) for key, one in zip(KEYS, spread, strict=True)}
+    unknown = _unknown(errors, covariance, targets)
+    values = {
+        key: start[key] if key in unknown else start[key] * math.exp(float(log))
+        for key, log in zip(KEYS, found, strict=True)
+    }
+    values["infrared.white_level"] = float(np.median([target.white for target in targets]))
+    middle = float(np.median([target.distance_m for target in targets]))
+    return InfraredFit(
+        values,
+        errors,
+        unknown,
+        _focal_baseline(scenes, base),
+        _dots_over_ambient(base, middle, values),
+        middle,
+        float(rest.square().mean().sqrt()),
+    )
+
+
+def facing(base: SpeckleStereo, distance_m: float, side_px: int) -> Pair:
+    """A white plane that faces a sensor's cameras, a square of pixels in the middle of the view."""
+    k = base.intrinsics
+    high, wide = min(side_px, k.height_px), min(side_px, k.width_px)
+    window = Window((k.width_px - wide) // 2, (k.height_px - high) // 2, wide, high)
+    one = torch.ones(high, wide, dtype=torch.float64)
+    plane = torch.zeros(high, wide, 3, dtype=torch.float64)
+    plane[..., 2] = 1 / distance_m
+    view = View(window, plane, one, one, one > 0, one * distance_m)
+    return Pair(base, view, view)
+
+
+def _camera(base: SpeckleStereo) -> InfraredCamera:
+    if not isinstance(base.infrared, InfraredCamera):
+        raise ConfigError("base= must be a preset with a linear infrared camera")
+    return base.infrared
+
+
+def _first(key: str, base: SpeckleStereo) -> float:
+    """Where the search begins: the preset's value, or a small one where that is 0."""
+    found: object = base
+    for word in key.split("."):
+        found = getattr(found, word)
+    assert isinstance(found, int | float)
+    return float(found) or {"ambient": 0.01, "infrared.psf_px": 0.5}.get(key, 1.0)
+
+
+def _target(scene: Pictures, base: SpeckleStereo, distance_m: float | None) -> _Target:
+    images = [np.asarray(image, dtype=np.float64) for image in scene.left]
+    if len({image.shape for image in (*images, *scene.off)}) != 1:
+        raise DataError(f"{scene.name}: its pictures have different sizes")
+    if min(images[0].shape) < 8 * SMOOTH_PX:
+        raise DataError(f"{scene.name}: {images[0].shape} is too small; 100 px are the least")
+    if images[0].mean() < 3:
+        raise DataError(f"{scene.name}: the picture is black")
+    depth = scene.depth_m
+    where = distance_m if depth is None else float(np.nanmedian(depth))
+    if where is None or not where > 0:
+        raise ConfigError(f"{scene.name} has no depth image: say its distance with distance=METRES")
+    tensors = [torch.from_numpy(image) for image in images]
+    each = [statistics(tensor) for tensor in tensors]
+    shared = torch.stack([one.shared for one in each]).mean(dim=0)
+    if shared[0] <= 0:
+        raise DataError(f"{scene.name}: no dots are seen, neighbours are not alike")
+    noise, level = _over_time(tensors)
+    added = None
+    if scene.off:
+        off = np.mean([np.asarray(image, dtype=np.float64) for image in scene.off], axis=0)
+        added = torch.tensor((np.mean(images, axis=0).mean() - off.mean()) / max(off.mean(), 0.1))
+    skewness = torch.stack([one.skewness for one in each]).mean()
+    white = float(np.quantile(images[0], _camera(base).white_quantile))
+    patch = Twin(facing(base, where, _SIDE_PX), fine=3)
+    dark = settings_of(patch.pair, 1.0) | {"ambient": torch.zeros((), dtype=torch.float64)}
+    projected = patch.radiance(dark)[0]
+    contrast = _camera(base).speckle_contrast or 0.2
+    drawn = np.random.default_rng(0).gamma(1 / contrast**2, contrast**2, projected.shape)
+    grain = torch.from_numpy((drawn - 1) / contrast)
+    ends = np.mean([(image <= 0) | (image >= 255) for image in images])
+    return _Target(
+        where, shared, skewness, noise, level, each[0].pixels, len(images), white, added,
+        bool(ends > _CLIPPED), projected, smooth(projected), grain,
+    )  # fmt: skip
+
+
+def _over_time(frames: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Variance of a pixel over the frames of a still scene, by brightness, and the brightness."""
+    if len(frames) < 2:
+        return torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    stack = torch.stack(list(frames))
+    mean, variance = stack.mean(dim=0).flatten(), stack.var(dim=0).flatten()
+    parts = torch.tensor_split(mean.argsort(), BRIGHTNESSES)
+    noise = torch.stack([variance[part].mean() for part in parts])
+    level = torch.stack([mean[part].mean() for part in parts])
+    # Noise that reaches black or white is cut off there.
+    whole = (level > 3 * noise.sqrt()) & (level < 255 - 3 * noise.sqrt())
+    return torch.where(whole, noise, torch.nan), level
+
+
+def _residuals(target: _Target, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """What the twin's statistics are off by, in standard errors."""
+    ambient, width = values["ambient"], values["infrared.psf_px"]
+    # Light from all sides stays what it is through the lens; only the middle counts.
+    grains = 1 + values["infrared.speckle_contrast"] * target.grain
+    picture = ambient + blurred(target.projected * grains, width)
+    parts = []
+    if not target.clipped:
+        ours, theirs = statistics(picture, ambient + target.shading), target
+        parts.append((ours.shared - theirs.shared) / (_TEXTURE_ERROR * theirs.shared[0]))
+        third = (ours.skewness - theirs.skewness) / (3 * _TEXTURE_ERROR * theirs.skewness.abs())
+        parts.append(third[None])
+    if target.added is not None:
+        added = inner(picture).mean() / ambient - 1
+        parts.append(((added / target.added - 1) / _TEXTURE_ERROR)[None])
+    if len(target.noise):
+        per_grey = values["infrared.electrons_at_white"] / 255
+        read = values["infrared.read_noise_e"] / per_grey
+        speckle = values["infrared.speckle_contrast"] ** 2 * _speckle(target, picture, width)
+        expected = target.level / per_grey + read**2 + 1 / 12 + speckle
+        each = target.pixels / BRIGHTNESSES * (target.frames - 1)
+        error = math.sqrt(2 / each) + 0.002
+        known = torch.isfinite(target.noise)
+        parts.append(torch.log(target.noise[known] / expected[known]) / error)
+    return torch.cat([torch.zeros(0, dtype=torch.float64), *parts])
+
+
+def _speckle(target: _Target, picture: torch.Tensor, width: torch.Tensor) -> torch.Tensor:
+    """[B] variance in grey values that speckle of contrast 1 has, by brightness.
+
+    Speckle lies on the dots before the lens, which averages it: the squares of the Gaussian's
+    weights are 1 / (4 pi width^2) times a Gaussian that is narrower by the root of 2.
+    """
+    squares = blurred(target.projected**2, width / math.sqrt(2)) / (4 * math.pi * width**2)
+    brightness, squares = inner(picture).flatten(), inner(squares).flatten()
+    order = brightness.detach().argsort()
+    out = []
+    for part, level in zip(torch.tensor_split(order, BRIGHTNESSES), target.level, strict=True):
+        gain = level / brightness[part].mean()
+        out.append(squares[part].mean() * gain**2)
+    return torch.stack(out)
+
+
+def _unknown(
+    errors: Mapping[str, float], covariance: torch.Tensor, targets: Sequence[_Target]
+) -> dict[str, str]:
+    """Keys that pictures do not tell, and why."""
+    out = {}
+    electrons, read = KEYS[3], KEYS[4]
+    if not any(len(target.noise) for target in targets):
+        return dict.fromkeys(NOISE, "needs two or more frames of a still scene") | {
+            key: "the pictures hold too few dots" for key in KEYS[:2] if errors[key] > UNKNOWN
+        }
+    for key in KEYS:
+        if errors[key] > UNKNOWN:
+            out[key] = "its effect on the pictures is smaller than their own scatter"
+    if electrons in out and read in out:
+        i, j = KEYS.index(electrons), KEYS.index(read)
+        shared = float(covariance[i, j] / torch.sqrt(covariance[i, i] * covariance[j, j]))
+        if abs(shared) > 0.9:
+            why = "cannot be told apart: take frames of dark and of bright surfaces"
+            out[electrons] = out[read] = f"{electrons} and {read} {why}"
+    return out
+
+
+def _focal_baseline(scenes: Sequence[Pictures], base: SpeckleStereo) -> float | None:
+    """Median of disparity times depth over the pixels that have both."""
+    found = []
+    for scene in scenes:
+        if scene.depth_m is None or not scene.right:
+            continue
+        pair = [
+            np.clip(np.rint(np.mean(images, axis=0)), 0, 255).astype(np.uint8)
+            for images in (scene.left, scene.right)
+        ]
+        match = base.matcher.match(*pair)
+        product = match.disparity * scene.depth_m
+        found.append(product[np.isfinite(product)])
+    every = np.concatenate(found) if found else np.zeros(0)
+    return float(np.median(every)) if every.size else None
+
+
+def _dots_over_ambient(
+    base: SpeckleStereo, distance_m: float, values: Mapping[str, float]
+) -> float:
+    """The brightest percent of the projector's light over the ambient light."""
+    patch = Twin(facing(base, distance_m, _SIDE_PX), fine=3)
+    dark = settings_of(patch.pair, 1.0) | {"ambient": torch.zeros((), dtype=torch.float64)}
+    width = torch.tensor(values["infrared.psf_px"], dtype=torch.float64)
+    added = inner(blurred(patch.radiance(dark)[0], width))
+    return float(torch.quantile(added.flatten(), 0.99)) / values["ambient"]

@@ -1,0 +1,64 @@
+"""What pictures say of a preset, in words and as a file under conf/sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.gradients.image_fit import InfraredFit
+from qs3.utils.files import write_text
+
+_WORDS = {
+    "ambient": "ambient light; a lit dot on white at 4 m has 1 at projector_strength 16",
+    "infrared.psf_px": "blur of the lens, px",
+    "infrared.speckle_contrast": "contrast of the laser's speckle",
+    "infrared.electrons_at_white": "electrons at grey value 255",
+    "infrared.read_noise_e": "read-out noise, electrons",
+    "infrared.white_level": "grey value that the exposure aims at",
+}
+
+
+def report(found: InfraredFit, base: SpeckleStereo, scenes: int) -> list[str]:
+    """A line for each number, and for each that is not known."""
+    lines = [f"{scenes} scene{'s' if scenes > 1 else ''}, {found.distance_m:.2f} m away"]
+    for key, words in _WORDS.items():
+        if key in found.unknown:
+            lines.append(f"{key:28} unknown: {found.unknown[key]}; {found.values[key]:.4g} stays")
+            continue
+        error = f" +- {found.errors[key]:.0%}" if key in found.errors else ""
+        lines.append(f"{key:28} {found.values[key]:.4g}{error}   ({words})")
+    dots = f"{found.dots_over_ambient:.3g} at {found.distance_m:.2f} m"
+    lines.append(f"{'dots over ambient':28} {dots}")
+    if found.focal_baseline is not None:
+        lines.append(
+            f"{'f B':28} {found.focal_baseline:.4g} px m; with f = {base.focal_px:g} px a baseline "
+            f"of {found.focal_baseline / base.focal_px:.5g} m: f and B alone cannot be told apart"
+        )
+    if found.misfit > 3:
+        lines.append(
+            f"doubtful: the model is {found.misfit:.1f} standard errors off: other dots than the "
+            "base's, printed surfaces, or things that move"
+        )
+    return lines
+
+
+def save(path: Path, found: InfraredFit, name: str, base: SpeckleStereo, command: str) -> None:
+    """Write the preset: the base's, with what was found in its place."""
+    known = {key: value for key, value in found.values.items() if key not in found.unknown}
+    lines = [
+        f"# Fitted to infrared pictures from {found.distance_m:.2f} m.",
+        f"# {command}",
+        *(f"# not known: {key}: {why}" for key, why in found.unknown.items()),
+        "defaults:",
+        f"  - {name}",
+        "  - _self_",
+        "",
+    ]
+    if "ambient" in known:
+        lines.append(f"ambient: {known['ambient']:.6g}")
+    if found.focal_baseline is not None:
+        lines.append(f"baseline_m: {found.focal_baseline / base.focal_px:.6g} # f B over f")
+    inside = {key: value for key, value in known.items() if key.startswith("infrared.")}
+    lines.append("infrared:")
+    lines += [f"  {key.partition('.')[2]}: {value:.6g}" for key, value in inside.items()]
+    write_text(path, "\n".join(lines) + "\n")

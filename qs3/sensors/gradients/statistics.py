@@ -1,0 +1,84 @@
+"""What infrared images are compared by when the pattern of dots itself is not known.
+
+Two pictures of other dots are never alike pixel by pixel; how bright dots are over what is
+around them, how far they are blurred and how much noise lies on them is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+
+SMOOTH_PX = 12.0
+"""Standard deviation of the Gaussian that is taken for shading."""
+
+LAGS = 6
+FRAME_PX = math.ceil(2 * SMOOTH_PX)
+"""Left out around a picture, where its shading is not known."""
+
+BRIGHTNESSES = 4
+"""Bins of brightness, as many pixels in each, in which the variance is taken."""
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of pictures of one camera; all relative to the local mean. Tensors float64.
+
+    Attributes:
+        shared: [LAGS] covariance of pixels 1, 2, ... apart, over rows and columns: texture
+            alone, because a camera's noise is each pixel's own.
+        variance: [B] of pixels by brightness: texture and noise.
+        skewness: third moment of the texture; noise has none.
+        level: [B] mean grey value of each bin.
+        pixels: how many there were.
+    """
+
+    shared: torch.Tensor
+    variance: torch.Tensor
+    skewness: torch.Tensor
+    level: torch.Tensor
+    pixels: int
+
+
+def statistics(
+    grey: torch.Tensor, mean: torch.Tensor | None = None, bins: int = BRIGHTNESSES
+) -> Statistics:
+    """Of one image [h, w] float64, but for a frame of `FRAME_PX` around it.
+
+    Args:
+        grey: grey values.
+        mean: [h, w] its shading; None: `smooth(grey)`.
+        bins: of brightness.
+    """
+    grey, mean = inner(grey), inner(smooth(grey) if mean is None else mean)
+    texture = (grey - mean) / mean.clamp_min(1e-9)
+    shared = [
+        torch.stack([(one[:, lag:] * one[:, :-lag]).mean() for one in (texture, texture.T)]).mean()
+        for lag in range(1, LAGS + 1)
+    ]
+    values, levels = texture.flatten(), mean.flatten()
+    order = levels.detach().argsort()
+    parts = torch.tensor_split(order, bins)
+    variance = torch.stack([values[part].square().mean() for part in parts])
+    level = torch.stack([levels[part].mean() for part in parts])
+    third = values.pow(3).mean()
+    return Statistics(torch.stack(shared), variance, third, level, values.numel())
+
+
+def inner(image: torch.Tensor) -> torch.Tensor:
+    """[h, w] without the frame."""
+    return image[FRAME_PX:-FRAME_PX, FRAME_PX:-FRAME_PX]
+
+
+def smooth(grey: torch.Tensor) -> torch.Tensor:
+    """[h, w] without its dots, mirrored at the edges."""
+    reach = math.ceil(3 * SMOOTH_PX)
+    place = torch.arange(-reach, reach + 1, dtype=grey.dtype)
+    kernel = torch.exp(-(place**2) / (2 * SMOOTH_PX**2))
+    kernel = (kernel / kernel.sum()).to(grey.dtype)
+    padded = F.pad(grey[None, None], (reach,) * 4, mode="reflect")
+    rows = F.conv2d(padded, kernel[None, None, None])
+    return F.conv2d(rows, kernel[None, None, :, None])[0, 0]

@@ -1,0 +1,206 @@
+"""A preset from infrared pictures: what a simulated camera hides is found again."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from qs3.config.compose import composed
+from qs3.config.hydra import build
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.sensors.bench.cached_renderer import StillRenderer
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.gradients.image_fit import Pictures, fit_pictures
+from qs3.sensors.gradients.pictures import read_pictures
+from qs3.sensors.gradients.statistics import statistics
+from qs3.sensors.matching import StereoBlockMatcher
+from qs3.sensors.optics.infrared import InfraredCamera
+from qs3.sensors.optics.misalignment import Misalignment
+from qs3.sensors.optics.patterns import Speckle
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.commands import main
+from tests.sensors.scenery import POSE, box_of, square
+
+BASE = build(composed(None, "+sensor=realsense_d415").sensor)
+HIDDEN = {
+    "ambient": 1.2,
+    "infrared.psf_px": 1.2,
+    "infrared.electrons_at_white": 2500.0,
+    "infrared.read_noise_e": 40.0,
+}
+
+
+def camera(**more):
+    """The preset with other light, lens and noise, and other dots of the same kind."""
+    infrared = replace(
+        BASE.infrared,
+        psf_px=HIDDEN["infrared.psf_px"],
+        electrons_at_white=HIDDEN["infrared.electrons_at_white"],
+        read_noise_e=HIDDEN["infrared.read_noise_e"],
+        speckle_contrast=0.0,
+        **more,
+    )
+    return replace(
+        BASE,
+        ambient=HIDDEN["ambient"],
+        infrared=infrared,
+        pattern=replace(BASE.pattern, seed=77),
+        misalignment=Misalignment(),
+        matcher=StereoBlockMatcher(num_disparities=128),  # its depth is not looked at
+        filters=(),
+    )
+
+
+def pictures(sensor, depth_m, name, renderer, frames=8, half_px=220):
+    """Frames of a wall that faces the camera, and one with the projector off."""
+    half = half_px * depth_m / sensor.focal_px
+    wall = square(depth_m, 2 * half)
+    box = box_of(square(depth_m, half))
+    off = replace(sensor, projector_strength=1e-9)
+    # Frames of a still scene: the renderer's own sampling noise is the same in all of them.
+    still, taken = StillRenderer(renderer, seed=round(100 * depth_m)), []
+    for i, one in enumerate([sensor] * frames + [off]):
+        if one is sensor:
+            still.rewind()
+        rng = np.random.default_rng([i, round(100 * depth_m)])
+        taken.append(one.scan((wall,), box, POSE, still if one is sensor else renderer, rng))
+    *left, dark = (frame.images["left"] for frame in taken)
+    return Pictures(name, left, (), [dark], taken[0].depth_m)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return MitsubaRenderer(samples=16)
+
+
+@pytest.fixture(scope="module")
+def scenes(renderer):
+    bright, dim = camera(fixed_gain=35.0), camera(fixed_gain=15.0)
+    return [
+        pictures(bright, 0.9, "near", renderer),
+        pictures(bright, 1.5, "far", renderer),
+        pictures(dim, 1.1, "dim", renderer),
+    ]
+
+
+def test_light_lens_and_noise_are_found_within_five_percent(scenes):
+    base = replace(BASE, infrared=replace(BASE.infrared, speckle_contrast=0.01))
+    found = fit_pictures(scenes, base)
+    for key in ("ambient", "infrared.psf_px", "infrared.read_noise_e"):
+        assert key not in found.unknown
+        assert found.values[key] == pytest.approx(HIDDEN[key], rel=0.05), key
+        assert found.errors[key] < 0.1
+    assert found.values["infrared.electrons_at_white"] == pytest.approx(2500, rel=0.05)
+    assert found.misfit < 2
+    assert "infrared.speckle_contrast" in found.unknown  # there is none
+    assert found.distance_m == pytest.approx(1.1, abs=0.02)
+
+
+def test_one_frame_does_not_tell_noise(scenes):
+    single = [replace(scene, left=scene.left[:1]) for scene in scenes[:1]]
+    found = fit_pictures(single, BASE)
+    for key in ("infrared.read_noise_e", "infrared.electrons_at_white"):
+        assert "two or more frames" in found.unknown[key]
+        assert found.values[key] == getattr(BASE.infrared, key.split(".")[1])
+
+
+def test_statistics_of_shifted_noise():
+    """Texture of the shape of a box: neighbours share what overlaps; noise is not shared."""
+    rng = np.random.default_rng(0)
+    noise = cv2.blur(rng.standard_normal((500, 500)), (1, 3)) * np.sqrt(3)
+    grey = torch.from_numpy(100 * (1 + 0.1 * noise))
+    white = torch.from_numpy(rng.standard_normal((500, 500)) * 5)
+    plain, noisy = statistics(grey), statistics(grey + white)
+    # Over rows and columns: none along a row; along a column 2/3 and 1/3.
+    expected = 0.01 * np.array([1 / 3, 1 / 6, 0, 0, 0, 0])
+    np.testing.assert_allclose(plain.shared, expected, atol=3e-4)
+    np.testing.assert_allclose(noisy.shared, expected, atol=3e-4)
+    np.testing.assert_allclose(noisy.variance - plain.variance, 0.0025, rtol=0.15)
+    assert abs(float(plain.skewness)) < 1e-4
+
+
+def save(folder, scenes):
+    folder.mkdir()
+    for scene in scenes:
+        for kind, images in (("left", scene.left), ("right", scene.right)):
+            for i, image in enumerate(images):
+                cv2.imwrite(str(folder / f"{scene.name}_{kind}_{i}.png"), image)
+        if scene.depth_m is not None:
+            np.save(folder / f"{scene.name}_depth.npy", scene.depth_m)
+
+
+def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
+    save(tmp_path / "pictures", scenes)
+    out = tmp_path / "sensor" / "mine.yaml"
+    out.parent.mkdir()
+    words = ["fit", f"images={tmp_path / 'pictures'}", f"out={out}"]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "3 scenes, 1.10 m away" in said
+    assert "infrared.psf_px" in said
+    assert "dots over ambient" in said
+    written = yaml.safe_load(out.read_text())
+    assert written["defaults"][0] == "realsense_d415"
+    assert written["ambient"] == pytest.approx(HIDDEN["ambient"], rel=0.07)
+    assert written["infrared"]["psf_px"] == pytest.approx(HIDDEN["infrared.psf_px"], rel=0.07)
+    text = out.read_text()
+    assert text.splitlines()[1].startswith("# qs3 fit images=")
+    found = build(composed(None, f"hydra.searchpath=[file://{tmp_path}]", "+sensor=mine").sensor)
+    assert isinstance(found, SpeckleStereo)
+    assert found.ambient == pytest.approx(written["ambient"])
+    assert found.pattern.columns == BASE.pattern.columns
+
+
+def test_focal_length_times_baseline_by_disparity_and_depth(renderer):
+    """Both pictures over the whole row, as devices give them."""
+    sensor = SpeckleStereo(
+        width_px=320, height_px=200, focal_px=300.0, baseline_m=0.061, step_px=1, ambient=0.5,
+        min_depth_m=0.5, infrared=InfraredCamera(psf_px=0.8),
+        pattern=Speckle(columns=300, rows=240, dot_px=1), matcher=BASE.matcher,
+    )  # fmt: skip
+    wall = square(1.0, 1.5)
+    box = np.array([[0.99, -0.9, -0.4], [1.01, 0.9, 0.4]])
+    frame = sensor.scan((wall,), box, POSE, renderer, np.random.default_rng(0))
+    left, right = (frame.images[side] for side in ("left", "right"))
+    assert left.shape == right.shape
+    off_by_a_fifth = replace(sensor, baseline_m=0.05)
+    scene = Pictures("wall", [left], [right], (), frame.clean_m)
+    found = fit_pictures([scene], off_by_a_fifth)
+    assert found.focal_baseline == pytest.approx(300 * 0.061, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("images", "error", "message"),
+    [
+        ([np.full((60, 80), 90.0)], DataError, "too small"),
+        ([np.full((200, 200), 1.0)], DataError, "black"),
+        ([np.random.default_rng(0).normal(90, 5, (200, 200))], DataError, "no dots"),
+        ([np.full((200, 200), 90.0), np.full((200, 210), 90.0)], DataError, "different sizes"),
+    ],
+)
+def test_pictures_that_show_nothing_are_refused(images, error, message):
+    with pytest.raises(error, match=message):
+        fit_pictures([Pictures("a", images)], BASE, distance_m=1.0)
+
+
+def test_without_a_distance_there_is_none(scenes):
+    with pytest.raises(ConfigError, match="distance=METRES"):
+        fit_pictures([replace(scenes[0], depth_m=None)], BASE)
+
+
+def test_folders_and_files_are_explained(tmp_path, capsys):
+    with pytest.raises(MissingDataError, match="no such folder"):
+        read_pictures(tmp_path / "none")
+    (tmp_path / "photo.png").write_bytes(b"x")
+    with pytest.raises(MissingDataError, match="SCENE_left"):
+        read_pictures(tmp_path)
+    (tmp_path / "a_left.png").write_bytes(b"x")
+    with pytest.raises(DataError, match=r"a_left\.png"):
+        read_pictures(tmp_path)
+    assert main(["fit", f"images={tmp_path}", "base=kinect_v1", "out=x.yaml"]) == 1
+    assert "no active stereo camera" in capsys.readouterr().err
+    assert main(["fit", "base=realsense_d415", "out=x.yaml", "focal=3", "a.npy"]) == 1
+    assert "belong to images=" in capsys.readouterr().err
