@@ -129,7 +129,7 @@ def fit_images(
 
 FIT = Command(
     "qs3 fit",
-    "a preset for your own depth camera, from a few frames of a wall, or from infrared pictures",
+    "a preset for your own depth camera, from frames of a wall or infrared pictures",
     _fit,
     (
         Option("out", text("FILE"), "the preset, conf/sensor/NAME.yaml", required=True),
