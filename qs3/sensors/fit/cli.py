@@ -108,9 +108,9 @@ def fit_images(
     from qs3.config.compose import choices, composed
     from qs3.config.hydra import build
     from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-    from qs3.sensors.gradients.image_fit import fit_pictures
-    from qs3.sensors.gradients.pictures import read_pictures
-    from qs3.sensors.gradients.preset import report, save
+    from qs3.sensors.fit.infrared import fit_pictures
+    from qs3.sensors.fit.pictures import read_pictures
+    from qs3.sensors.fit.stereo_preset import report, save
 
     name = base or "realsense_d415"
     known = [choice for choice in choices("sensor") if choice != "none"]

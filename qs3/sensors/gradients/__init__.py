@@ -1,1 +1,1 @@
-"""A differentiable twin of the speckle-stereo sensor, and what it is used for."""
+"""The speckle-stereo sensor in torch, with gradients."""

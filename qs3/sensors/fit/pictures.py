@@ -9,7 +9,7 @@ import numpy as np
 
 from qs3.errors import DataError, MissingDataError
 from qs3.sensors.fit.frames import read_frame
-from qs3.sensors.gradients.image_fit import Pictures
+from qs3.sensors.fit.infrared import Pictures
 from qs3.utils.pictures import png_bytes, read_png
 
 NAMES = "SCENE_left.png, SCENE_right.png, SCENE_off.png, SCENE_depth.png or .npy"

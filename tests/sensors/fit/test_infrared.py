@@ -13,9 +13,9 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.gradients.image_fit import Pictures, fit_pictures
-from qs3.sensors.gradients.pictures import read_pictures
-from qs3.sensors.gradients.statistics import statistics
+from qs3.sensors.fit.infrared import Pictures, fit_pictures
+from qs3.sensors.fit.infrared_statistics import statistics
+from qs3.sensors.fit.pictures import read_pictures
 from qs3.sensors.matching import StereoBlockMatcher
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.misalignment import Misalignment

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.gradients.image_fit import InfraredFit
+from qs3.sensors.fit.infrared import InfraredFit
 from qs3.utils.files import write_text
 
 _WORDS = {

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.gradients.statistics import BRIGHTNESSES, SMOOTH_PX, inner, smooth, statistics
+from qs3.sensors.fit.infrared_statistics import BRIGHTNESSES, SMOOTH_PX, inner, smooth, statistics
 from qs3.sensors.gradients.twin import Twin, blurred, settings_of
 from qs3.sensors.gradients.views import Pair, View
 from qs3.sensors.optics.infrared import InfraredCamera
