@@ -119,6 +119,14 @@ def test_majority_rates_of_tiers_stand_below(tmp_path):
     )
 
 
+def test_factors_are_told_apart_by_their_names(empty):
+    """`qs3 report judge` calls runs by their experiment's name; the source's path is not hashed."""
+    cells = empty["real_factors"].cells
+    names = [[word for word in c.overrides if word.startswith("experiment_name=")] for c in cells]
+    assert len({*map(tuple, names)}) == len(cells)
+    assert [c.row for c, name in zip(cells, names, strict=True) if not name] == ["R"]
+
+
 def test_problems_reach_the_reader(tmp_path):
     cell = build_table("quickstart", tmp_path).cells[0]
     run_cell(tmp_path, cell, seeds=(0, 1))
