@@ -206,8 +206,8 @@ class _Figure:
         return Path(path)
 
 
-def drawn(positions: np.ndarray, most: int) -> list[int]:
+def drawn(positions: np.ndarray, most: int, seed: int = 0) -> list[int]:
     """At most so many of some positions [n], at random, always the same ones, in order."""
     if len(positions) <= most:
         return [int(i) for i in positions]
-    return sorted(np.random.default_rng(0).choice(positions, most, replace=False).tolist())
+    return sorted(np.random.default_rng(seed).choice(positions, most, replace=False).tolist())

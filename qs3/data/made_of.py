@@ -25,7 +25,7 @@ class MadeOf:
             were not made here.
         views: of each object; 0 if nothing looks, or nobody knows.
         without: classes of the domain that have no object, such as "lamp, plant".
-        benchmark: "kinectsim10 v2", or that it is like it, for domains with versions.
+        benchmark: "kinectsim10 v2", a part of it, or that it is like it, for domains with versions.
         meshes: digits that all datasets made of these very meshes share; "" if nobody knows.
         recipe: digits that datasets made of the same objects by the same settings and code share,
             on any machine; "" if nobody knows.

@@ -216,6 +216,7 @@ class Evaluation:
             tuple(self._meshes.get(id_) or id_ for id_ in ids),
             np.full(len(ids), -1) if labels is None else labels,
             predict(net, self.test.points, self.batch_size, device),
+            tuple(self._tiers.tolist()) if (self._tiers != "").any() else (),
         )
 
     def scores(self, net: nn.Module, device: Any = "cpu") -> Scores:

@@ -287,18 +287,26 @@ def stored_config(cfg: DictConfig) -> dict[str, Any]:
 
 
 def benchmark(cfg: DictConfig, recipe: dict[str, Any]) -> str:
-    """Whether this is the benchmark that a domain's version names, or something like it.
+    """Whether this is the benchmark that a domain's version names, a split of it, or like it.
 
     Returns:
-        "kinectsim10 v2", or "like kinectsim10 v2, but not it" where settings or objects
-        differ; empty for domains without a version.
+        "kinectsim10 v2"; "kinectsim10 v2, train" for its train part alone, whose objects are the
+        same; "like kinectsim10 v2, but not it" where settings or objects differ; empty for
+        domains without a version.
     """
     stated = cfg.get("benchmark")
     if stated is None:
         return ""
     name = f"{cfg.domain.name} v{stated.version}"
-    same = plan_hash(recipe) == stated.plan_sha256
-    return name if same else f"like {name}, but not it (other settings or objects)"
+    if plan_hash(recipe) == stated.plan_sha256:
+        return name
+    if cfg.splits and cfg.meshes is None:  # other meshes than the catalogue's are not it anyway
+        whole = mesh_items(OmegaConf.merge(cfg, {"splits": None}))  # type: ignore[arg-type]
+        part = [_name_and_content(item) for item in whole if item.split in cfg.splits]
+        full = {**recipe, "objects": [_name_and_content(item) for item in whole]}
+        if recipe["objects"] == part and plan_hash(full) == stated.plan_sha256:
+            return f"{name}, {' and '.join(cfg.splits)}"
+    return f"like {name}, but not it (other settings or objects)"
 
 
 def stated_hash(cfg: DictConfig, recipe: dict[str, Any]) -> str:

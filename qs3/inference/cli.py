@@ -74,7 +74,8 @@ PREDICT = Command(
     about="""
 Without ckpt= a classifier of the ten classes that comes with qs3 is taken, and what it is worth on
 real objects is said: dgcnn-speckle, for clouds in any unit; dgcnn-rooms, which knows sizes and
-heights, where floor= or camera_height= is given; pointnet-speckle is another net for any unit.
+heights and is right more often, where floor= or camera_height= is given, or where the objects of an
+archive say by their lowest points where the floor is; pointnet-speckle is another net for any unit.
 
 CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of points,
 any unit, any place. A net that knows sizes takes them as metres; one that knows heights wants

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from qs3.data.importers.object_archive import read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.inference import pretrained
 from qs3.inference.depth_list import Shown, direction, find_shown, numbers
+from qs3.inference.floor import Floor, floor_under
 from qs3.inference.inputs import (
+    archive_part,
     archive_units,
     cloud_units,
     depth_units,
@@ -43,6 +47,9 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     source = _depth_images(settings) if settings.depth else _clouds(settings)
     ckpt = settings.ckpt or pretrained.usual(source.floor_known)
     predictor = load(ckpt, device=settings.device)
+    found = _floor(source, settings, predictor)
+    if found:
+        settings = replace(settings, floor=found.z)
     second = _second(settings, ckpt, predictor)
     classes = predictor.classes
     inputs = source.find(predictor)
@@ -57,9 +64,10 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         inputs = inputs._replace(units=[inputs.units[i] for i in sorted(drawn)])
     if _camera_is_missing(predictor, settings):
         key = "camera_height=METRES" if settings.depth else "floor=-METRES"
+        why = f" ({source.floor.words})" if source.floor else ""
         raise ConfigError(
             "the classifier knows heights above the floor, and its target's clouds say nothing "
-            f"about a camera: give its height, {key}"
+            f"about a camera: give its height, {key}{why}"
         )
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
@@ -72,9 +80,11 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     seconds = time.monotonic() - began
     records = [record(row, classes) for row in rows]
     trained_on, worth = _trained_on(ckpt), predictor.result.worth
-    lines = told(rows, records, inputs, predictor, settings, seconds)
-    if not settings.ckpt:
-        lines.append(chosen(ckpt, source))
+    heights = any(one.needs_floor for one in (predictor, second) if one)
+    taken = found.words if found and heights else ""
+    lines = [] if settings.ckpt else [chosen(ckpt, source)]
+    lines += [taken] * bool(taken)
+    lines += told(rows, records, inputs, predictor, settings, seconds)
     if second:
         lines.append(agreement(rows, classes))
     lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
@@ -86,9 +96,18 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     lines.append(_save(out, text))
     if settings.page:
         title = f"{Path(settings.input or settings.depth).name}, as {ckpt} sees it"
-        html = page(title, rows, gallery, classes, trained_on, worth)
+        html = page(title, rows, gallery, classes, trained_on, worth, taken)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _floor(source: Source, settings: Settings, predictor: Predictor) -> Floor | None:
+    """What the clouds say of the floor; None if nobody need ask them, or they cannot tell.
+
+    A net of one's own that was adapted to a camera's clouds knows that camera's height.
+    """
+    known = bool(settings.ckpt) and predictor.camera_height is not None
+    return None if known or source.floor is None or source.floor.z is None else source.floor
 
 
 def _trained_on(ckpt: str) -> str:
@@ -137,20 +156,31 @@ def saved(out: str | Path, replaces: bool) -> str:
 def _clouds(settings: Settings) -> Source:
     """Clouds of files or of an archive; what is not there is told before the net is read."""
     files, root, others = find_files(settings.input)
-    archive = len(files) == 1 and files[0].is_file() and is_archive(files[0])
-    if archive and settings.up not in ("", "z"):
-        raise ConfigError(f"up={settings.up}: in an archive of objects z points up")
-    if settings.part and not archive:
+    if len(files) == 1 and files[0].is_file() and is_archive(files[0]):
+        return _archive(files[0], settings)
+    if settings.part:
         raise ConfigError(f"part={settings.part}: {settings.input} is not an archive of objects")
 
     def find(predictor: Predictor) -> Inputs:
-        if archive:
-            units, part = archive_units(files[0], settings.part, predictor.classes)
-            return Inputs(units, 0, "objects", part)
         units = cloud_units(files, root, settings.up or "z", predictor.classes)
         return Inputs(units, others, "files")
 
     return Source(find, settings.floor is not None, "floor=Z, if they are in metres,")
+
+
+def _archive(path: Path, settings: Settings) -> Source:
+    """Objects of an archive: in metres, the camera at the origin."""
+    if settings.up not in ("", "z"):
+        raise ConfigError(f"up={settings.up}: in an archive of objects z points up")
+    archive = read_archive(path)
+    chosen, part = archive_part(archive, settings.part)
+
+    def find(predictor: Predictor) -> Inputs:
+        return Inputs(archive_units(archive, chosen, predictor.classes), 0, "objects", part)
+
+    given = settings.floor is not None
+    floor = None if given else floor_under(archive.cloud(i, True) for i in chosen)
+    return Source(find, given, "floor=-METRES, minus the camera's height,", floor)
 
 
 def _depth_images(settings: Settings) -> Source:

@@ -22,7 +22,7 @@ from qs3.clouds.finite import measured
 from qs3.data.frames.cutting import Piece, faults
 from qs3.data.frames.given import check_intrinsics, read_depth, read_intrinsics, read_mask
 from qs3.data.frames.pointed import RULES, Caution, Pointed, point_out
-from qs3.data.importers.object_archive import ADAPT, JUDGE, Archive, read_archive
+from qs3.data.importers.object_archive import ADAPT, JUDGE, Archive
 from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.inference.depth_list import Shown
 from qs3.inference.table import Row
@@ -130,17 +130,15 @@ def is_archive(path: Path) -> bool:
         return False  # said when it is read as clouds
 
 
-def archive_units(path: Path, part: str, classes: Sequence[str]) -> tuple[list[Unit], str]:
-    """One an object of the archive, and which part of it was taken, in words; no stray points.
+def archive_part(archive: Archive, part: str) -> tuple[list[int], str]:
+    """Positions of the objects of a part of an archive, and in words which part was taken.
 
     Without a part: `adapt` where there is one, else all but `judge`, which is looked at once.
     `part=all` takes everything.
 
     Raises:
-        DataError: it is damaged.
         ConfigError: it has no such part.
     """
-    archive = read_archive(path)
     parts = archive.parts
     part = part or (ADAPT if ADAPT in parts else "")
     if part and (part != ALL or ALL in parts):
@@ -149,11 +147,16 @@ def archive_units(path: Path, part: str, classes: Sequence[str]) -> tuple[list[U
         chosen, taken = np.flatnonzero(archive.dev != JUDGE).tolist(), f"all but part {JUDGE}"
     else:
         chosen, taken = list(range(len(archive))), "all objects"
-    if parts:
-        counts = ", ".join(f"{name} {count}" for name, count in parts.items())
-        taken += f" of {path.name} (its parts: {counts}; part=NAME or part={ALL} takes others)"
-    units: list[Unit] = [functools.partial(_object, archive, i, classes) for i in chosen]
-    return units, taken if parts else ""
+    if not parts:
+        return chosen, ""
+    counts = ", ".join(f"{name} {count}" for name, count in parts.items())
+    others = f"its parts: {counts}; part=NAME or part={ALL} takes others"
+    return chosen, f"{taken} of {archive.path.name} ({others})"
+
+
+def archive_units(archive: Archive, chosen: Sequence[int], classes: Sequence[str]) -> list[Unit]:
+    """One an object of the archive, of those in `chosen`; no stray points."""
+    return [functools.partial(_object, archive, i, classes) for i in chosen]
 
 
 def depth_units(shown: Sequence[Shown], gravity: str, classes: Sequence[str]) -> list[Unit]:

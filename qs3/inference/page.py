@@ -99,6 +99,7 @@ def page(
     classes: Sequence[str],
     trained_on: str = "",
     worth: str = "",
+    floor: str = "",
 ) -> str:
     """The page as HTML.
 
@@ -109,10 +110,13 @@ def page(
         classes: names in the order of the probabilities.
         trained_on: what the net's data are made of; "" if nobody knows.
         worth: what it was found to be worth on real objects; likewise.
+        floor: how it is known where that is, if the objects were asked.
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
     parts = _head(found, rows, failed, classes)
+    if floor:
+        parts.append(f'<p class="note">{escape(floor[:1].upper() + floor[1:])}</p>')
     if trained_on:
         parts.append(f'<p class="soft">The net\'s data: {escape(trained_on)}</p>')
     if worth:

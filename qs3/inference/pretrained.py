@@ -37,5 +37,5 @@ def other_than(name: str) -> str:
 
 
 def usual(floor_known: bool) -> str:
-    """Which one is used where nobody names one."""
+    """Which one is used where nobody names one; `floor_known`: said, or seen in the clouds."""
     return HEIGHTS if floor_known else ANY_SIZE

@@ -10,9 +10,8 @@ from typing import NamedTuple
 from qs3.config.checks import check_choice, check_float
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError
-from qs3.inference.inputs import (
-    Unit,
-)
+from qs3.inference.floor import Floor
+from qs3.inference.inputs import Unit
 from qs3.inference.predictor import Predictor
 
 _SHOWN = 10  # failures in the text for the terminal
@@ -95,10 +94,17 @@ class Inputs(NamedTuple):
 class Source(NamedTuple):
     """Where clouds come from.
 
-    `find` gives them for a net; `floor_known`: whether they are in metres, and the height of the
-    floor or of the camera is known; `tells` is the option that would say it.
+    `find` gives them for a net; `given`: whether they are in metres, and the height of the floor or
+    of the camera was said; `tells` is the option that says it; `floor`: what the clouds themselves
+    say, if they were asked.
     """
 
     find: Callable[[Predictor], Inputs]
-    floor_known: bool
+    given: bool
     tells: str
+    floor: Floor | None = None
+
+    @property
+    def floor_known(self) -> bool:
+        """Whether somebody said where the floor is, or the clouds do."""
+        return self.given or (self.floor is not None and self.floor.z is not None)

@@ -8,6 +8,7 @@ from typing import Any
 
 from qs3.data.frames.pointed import LEVEL, PLANES
 from qs3.inference.predictor import Predictor
+from qs3.inference.pretrained import HEIGHTS
 from qs3.inference.scores import Count, disputed, right, scores
 from qs3.inference.settings import Inputs, Settings, Source
 from qs3.inference.table import Row
@@ -116,10 +117,11 @@ def agreement(rows: Sequence[Row], classes: Sequence[str]) -> str:
 
 
 def chosen(name: str, source: Source) -> str:
-    """Which classifier was taken because none was named, and what would take another one."""
+    """Which classifier was taken because none was named, and what would take a better one."""
     if source.floor_known:
         return f"classifier: {name}, which comes with qs3 and knows sizes and heights (ckpt=)"
+    why = f"; {source.floor.words}" if source.floor else ""
     return (
-        f"classifier: {name}, which comes with qs3 (ckpt=); {source.tells} takes one that knows "
-        "sizes and heights, too"
+        f"classifier: {name}, which comes with qs3 (ckpt=); {source.tells} takes {HEIGHTS}, which "
+        f"knows sizes and heights and is right more often{why}"
     )

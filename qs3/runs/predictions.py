@@ -1,7 +1,9 @@
 """`predictions.csv`: a run's predictions for the target's evaluated clouds, one row each.
 
-Columns: id; mesh (hash of the object's mesh: scans of one mesh are not independent samples; the id
-where no mesh is known); label (empty if nobody knows it); predicted; and a probability per class.
+Columns: id; mesh (hash of the object's mesh: scans of one mesh are not independent samples; of
+objects of frames their room, or their block of frames; the id where neither is known); label (empty
+if nobody knows it); predicted; tier ("clean" or "hard", where the dataset has tiers: else there is
+no such column); and a probability per class.
 """
 
 from __future__ import annotations
@@ -9,11 +11,11 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from qs3.errors import DataError
 from qs3.utils.files import write_text
@@ -23,6 +25,7 @@ from qs3.utils.text_table import csv_text
 FILE = "predictions.csv"
 OF_FILES = "predictions_of_files.csv"
 _FIRST = ("id", "mesh", "label", "predicted")
+_TIER = "tier"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +38,7 @@ class Predictions:
         meshes: cluster of each cloud.
         labels: [n] true classes; -1 where unknown.
         probabilities: [n, C] in [0, 1].
+        tiers: how much of its object each cloud shows; empty where nobody knows.
     """
 
     classes: tuple[str, ...]
@@ -42,6 +46,19 @@ class Predictions:
     meshes: tuple[str, ...]
     labels: Int[np.ndarray, " n"]
     probabilities: Float[np.ndarray, "n c"]
+    tiers: tuple[str, ...] = ()
+
+    def of(self, chosen: Bool[np.ndarray, " n"]) -> Predictions:
+        """Those of some clouds."""
+        where = np.flatnonzero(chosen)
+        return replace(
+            self,
+            ids=tuple(self.ids[i] for i in where),
+            meshes=tuple(self.meshes[i] for i in where),
+            labels=self.labels[where],
+            probabilities=self.probabilities[where],
+            tiers=tuple(self.tiers[i] for i in where) if self.tiers else (),
+        )
 
     @property
     def predicted(self) -> Int[np.ndarray, " n"]:
@@ -52,11 +69,13 @@ class Predictions:
 def write_predictions(path: Path, predictions: Predictions) -> None:
     """Write the table, atomically; probabilities with all their digits."""
     p = predictions
-    lines: list[list[str]] = [[*_FIRST, *(f"p_{name}" for name in p.classes)]]
-    rows = zip(p.ids, p.meshes, p.labels, p.predicted, p.probabilities, strict=True)
-    for id_, mesh, label, predicted, row in rows:
+    first = (*_FIRST, *([_TIER] if p.tiers else []))
+    lines: list[list[str]] = [[*first, *(f"p_{name}" for name in p.classes)]]
+    tiers = [[tier] for tier in p.tiers] or [[]] * len(p.ids)
+    rows = zip(p.ids, p.meshes, p.labels, p.predicted, tiers, p.probabilities, strict=True)
+    for id_, mesh, label, predicted, tier, row in rows:
         name = "" if label < 0 else p.classes[label]
-        lines.append([id_, mesh, name, p.classes[predicted], *map(repr, row.tolist())])
+        lines.append([id_, mesh, name, p.classes[predicted], *tier, *map(repr, row.tolist())])
     write_text(path, csv_text(lines))
 
 
@@ -87,7 +106,8 @@ def read_predictions(path: Path) -> Predictions:
     try:
         text = read_whole(path, TABLE_PEAK).decode()
         header, *rows = list(csv.reader(io.StringIO(text, newline="")))
-        classes = tuple(name.removeprefix("p_") for name in header[len(_FIRST) :])
+        first = len(_FIRST) + (header[len(_FIRST) :][:1] == [_TIER])
+        classes = tuple(name.removeprefix("p_") for name in header[first:])
         if tuple(header[: len(_FIRST)]) != _FIRST or not classes or not rows:
             raise ValueError("it has other columns, or no rows")
         return Predictions(
@@ -95,7 +115,8 @@ def read_predictions(path: Path) -> Predictions:
             tuple(row[0] for row in rows),
             tuple(row[1] for row in rows),
             np.array([classes.index(row[2]) if row[2] else -1 for row in rows]),
-            np.array([[float(cell) for cell in row[len(_FIRST) :]] for row in rows]),
+            np.array([[float(cell) for cell in row[first:]] for row in rows]),
+            tuple(row[len(_FIRST)] for row in rows) if first > len(_FIRST) else (),
         )
     except (OSError, ValueError, IndexError, csv.Error) as error:
         raise DataError(f"{path} cannot be read ({error}); repeat the run with force=true") from (

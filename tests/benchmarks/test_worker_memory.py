@@ -1,4 +1,4 @@
-"""What a worker process needs in memory over 200 objects, at the paper's settings.
+"""What a worker process needs in memory over 200 objects: by Mitsuba with the paper's five views.
 
 python -m pytest tests/benchmarks/test_worker_memory.py -m slow -s
 python -m tests.benchmarks.test_worker_memory mitsuba 4 5 200    (samples, views, objects)

@@ -184,14 +184,17 @@ def _objects(folder: Path) -> list[bytes]:
 
 def _read_objects(path: Path) -> None:
     from qs3.data.importers.object_archive import _contents, read_archive
-    from qs3.inference.inputs import archive_units
+    from qs3.inference.floor import floor_under
+    from qs3.inference.inputs import archive_part, archive_units
 
     _contents(path)
     archive = read_archive(path)
     for i in range(min(len(archive), 3)):
         archive.cloud(i, inliers_only=True)
-    for unit in archive_units(path, "all", TWO)[0][:3]:
+    chosen = archive_part(archive, "all")[0][:3]
+    for unit in archive_units(archive, chosen, TWO):
         list(unit())
+    floor_under([archive.cloud(i, inliers_only=True) for i in chosen] * 10)
 
 
 def _stores(folder: Path) -> list[bytes]:

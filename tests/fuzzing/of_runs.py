@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 from pathlib import Path
@@ -23,7 +24,8 @@ def _runs(folder: Path) -> list[bytes]:
     from tests.runs.test_predictions import predictions
 
     write_metrics(folder / "run", metrics())
-    write_predictions(folder / "run" / "predictions.csv", predictions([2, 0]))
+    said = dataclasses.replace(predictions([2, 0]), tiers=("clean", "hard"))
+    write_predictions(folder / "run" / "predictions.csv", said)
     rounds = path_of(folder / "run", 1)
     write_pseudo_labels(rounds, ["a", "b"], [0, 1], [0.5, 0.25], [True, False], TWO)
     (folder / "run" / "started.json").write_text('{"data": {"source": "a"}, "config": "b"}')

@@ -84,6 +84,18 @@ def test_the_benchmark_knows_itself():
         assert plan(other).startswith("like kinectsim10 v2, but not it")
 
 
+def test_a_part_of_the_benchmark_is_called_so():
+    """Its objects are those of the whole, byte for byte: each has a seed of its own."""
+    assert plan("splits=[train]") == "kinectsim10 v2, train"
+    assert plan("splits=[test]", "workers=1") == "kinectsim10 v2, test"
+    assert plan("splits=[train]", domain="roomscan10") == "roomscan10 v4, train"
+    for other in ("fraction=0.5", "views=3", "classes=[chair,table]"):
+        assert plan("splits=[train]", other).startswith("like kinectsim10 v2, but not it")
+    cfg = config("domain=kinectsim10", "splits=[train]")
+    fewer = mesh_items(cfg)[1:]  # such as what the config does not say
+    assert benchmark(cfg, describe(cfg, fewer, {})).startswith("like kinectsim10 v2, but not it")
+
+
 def test_so_does_the_one_in_scannet10s_sizes():
     assert plan(domain="kinectsim10_full") == "kinectsim10_full v1"
     assert plan("limit=3", domain="kinectsim10_full").startswith("like kinectsim10_full v1, but")

@@ -118,5 +118,54 @@ def test_without_a_name_what_is_known_of_the_clouds_decides(own, capsys):
     depth = np.full((120, 160), 2.0)
     np.save(own / "depth.npy", depth)
     words = ("depth=depth.npy", "box=40,30,120,90", "intrinsics=150,150,79.5,59.5", "up=0,-1,0")
-    assert "dgcnn-speckle, which comes with qs3 (ckpt=); camera_height=" in said(capsys, *words)
+    text = said(capsys, *words)
+    assert text.startswith(
+        "classifier: dgcnn-speckle, which comes with qs3 (ckpt=); camera_height="
+    )
     assert "classifier: dgcnn-rooms" in said(capsys, *words, "camera_height=1.2")
+
+
+def archive(path, end, count=40):
+    """Boxes whose lowest points lie at `end`, for an archive of objects."""
+    rng = np.random.default_rng(0)
+    tenths = rng.integers(-2500, 2500, (count * 200, 3)).astype(np.int16)
+    names = np.array(["chair"] * count)
+    np.savez(
+        path,
+        xyz_tenth_mm=tenths,
+        centre_m=np.tile([0.0, 2.0, end + 0.25], (count, 1)),
+        start=np.arange(count + 1) * 200,
+        cls=names,
+        tier=np.array(["clean"] * count),
+        img=np.arange(count),
+    )
+
+
+def test_an_archive_says_itself_where_its_floor_is(own, high_net, capsys):
+    archive("objects.npz", end=-1.4)
+    text = said(capsys, "input=objects.npz", "page=true", "out=said.csv").splitlines()
+    assert text[0].startswith("classifier: dgcnn-rooms, which comes with qs3 and knows sizes")
+    assert text[1].startswith("the floor is taken to lie at z = -1.4, by the lowest points of 40 ")
+    assert "The floor is taken to lie at z = -1.4" in (own / "said.html").read_text()
+    found = (own / "said.csv").read_text()
+    few = said(capsys, "input=objects.npz", "sample=5")  # all of them are asked
+    assert "z = -1.4, by the lowest points of 40 " in few
+    given = said(capsys, "input=objects.npz", "floor=-1.4", "out=given.csv")
+    assert "is taken to lie" not in given
+    assert (own / "given.csv").read_text() == found
+
+    # a net of one's own knows its camera's height, and one that came from scans of z = 0 does not
+    knows = said(capsys, "input=objects.npz", f"ckpt={high_net}")
+    assert "the camera counts as 1.25 m above the floor" in knows
+    write_result(own / "zero.pt", replace(qs3.load(high_net).result, floor_m=0.0))
+    assert "is taken to lie at z = -1.4" in said(capsys, "input=objects.npz", "ckpt=zero.pt")
+    both = said(capsys, "input=objects.npz", "ckpt=dgcnn-speckle", "second=zero.pt")
+    assert "is taken to lie at z = -1.4" in both
+    assert "is taken to lie" not in said(capsys, "input=objects.npz", "ckpt=dgcnn-speckle")
+
+    archive("objects.npz", end=-0.5)  # on tables
+    text = said(capsys, "input=objects.npz")
+    assert text.startswith("classifier: dgcnn-speckle, which comes with qs3 (ckpt=); floor=-METRES")
+    assert "a camera 0.5 m above the floor is not what" in text.splitlines()[0]
+    assert main(["predict", "input=objects.npz", "ckpt=zero.pt"]) == 1
+    assert "give its height, floor=-METRES (the lowest of 40 objects" in capsys.readouterr().err

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,12 +25,36 @@ def test_read_as_written(tmp_path, labels):
     np.testing.assert_array_equal(after.predicted, [1, 0])
 
 
+def test_tiers_are_a_column_where_there_are_some(tmp_path):
+    plain, path = predictions([2, 0]), tmp_path / "p.csv"
+    write_predictions(path, plain)
+    assert "tier" not in path.read_text()
+    assert read_predictions(path).tiers == ()
+    write_predictions(path, replace(plain, tiers=("clean", "hard")))
+    after = read_predictions(path)
+    assert (after.classes, after.tiers) == (plain.classes, ("clean", "hard"))
+    np.testing.assert_array_equal(after.probabilities, plain.probabilities)
+    hard = after.of(np.array([False, True]))
+    assert (hard.ids, hard.meshes, hard.tiers) == (plain.ids[1:], plain.meshes[1:], ("hard",))
+    np.testing.assert_array_equal(hard.labels, [0])
+    np.testing.assert_array_equal(hard.probabilities, plain.probabilities[1:])
+
+
 HEADER = "id,mesh,label,predicted,p_a\n"
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "id,mesh\n", HEADER, HEADER + "1,2,q,a,1\n", HEADER + "1\n", HEADER + "x" * 200_000],
+    [
+        "",
+        "id,mesh\n",
+        HEADER,
+        HEADER + "1,2,q,a,1\n",
+        HEADER + "1\n",
+        HEADER + "x" * 200_000,
+        HEADER.replace("p_a", "tier,p_a") + "1,2,a,a\n",
+        HEADER.replace("p_a", "tier") + "1,2,,a,b\n",
+    ],
 )
 def test_damage_is_an_error_that_names_the_file(tmp_path, text):
     path = tmp_path / "p.csv"

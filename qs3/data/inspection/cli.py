@@ -18,11 +18,16 @@ _KEYS = "of the domain's config, e.g. variant=points_clean path=PATH published.f
 
 
 def _inspect(
-    domain: str, data_dir: str | None, out: str | None, more: Sequence[str], **given: Any
+    domain: str,
+    data_dir: str | None,
+    out: str | None,
+    sheets: int,
+    more: Sequence[str],
+    **given: Any,
 ) -> None:
     from qs3.data.inspection.command import Bounds, inspect_command
 
-    print(inspect_command(domain, _overrides(data_dir, more), Bounds(**given), out))
+    print(inspect_command(domain, _overrides(data_dir, more), Bounds(**given), out, sheets))
 
 
 def _compare(
@@ -63,6 +68,7 @@ INSPECT = Command(
             required=True,
         ),
         *_COMMON,
+        Option("sheets", whole(0), "clouds of each class on its sheet; 0: no sheets", 48),
         Option("out", text("FOLDER"), "out/inspection/NAME by default"),
     ),
     (
@@ -72,8 +78,9 @@ INSPECT = Command(
     ),
     about="""
 What it is made of, counts by class and split, sizes, which way is up by the shape, spacing,
-density, coverage, copies, leaks from train to test, odd objects; a contact sheet, and a page where
-clouds can be turned. Published files are imported first.
+density, coverage, copies, leaks from train to test, odd objects; a contact sheet of all classes and
+one of each (sheets/CLASS.png, with tiers), and a page where clouds can be turned. Published files
+are imported first.
 """,
     bare="domain",
     others={"": _KEYS},

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from qs3.data.contact_sheets import class_sheet, scan_picture
+from qs3.data.inspection.class_sheets import OBJECTS, class_sheets
 from qs3.data.inspection.measure import COMPARE_STEPS, Bounds, compare, inspect
 from qs3.data.inspection.open_dataset import Opened, open_named
 from qs3.data.inspection.text import of_domain, of_pair
@@ -15,13 +16,21 @@ from qs3.utils.files import make_folder, write_json, write_text
 from qs3.utils.progress import progress_bar
 
 OUT = Path("out/inspection")
+SHEETS = "sheets"
 _TURNABLE = 50  # clouds on the page where they can be turned
 
 
 def inspect_command(
-    domain: str, overrides: Mapping[str, str], bounds: Bounds, out: str | None = None
+    domain: str,
+    overrides: Mapping[str, str],
+    bounds: Bounds,
+    out: str | None = None,
+    sheets: int = OBJECTS,
 ) -> str:
-    """Inspect one domain (see `open_named`), save what was found; the text for the terminal."""
+    """Inspect one domain (see `open_named`), save what was found; the text for the terminal.
+
+    `sheets` is how many clouds of each class its sheet has; 0: there are no sheets.
+    """
     opened = open_named(domain, overrides)
     steps = min(bounds.sample, len(opened.data))
     with progress_bar(f"inspecting {opened.name}", total=steps) as advance:
@@ -35,9 +44,11 @@ def inspect_command(
     class_sheet(opened.data, folder / "clouds.png", split=split, heading=heading)
     part = part_of(opened, chosen(opened.data, _TURNABLE), residuals=False)
     write_text(folder / "clouds.html", page(opened.label, [part]))
-    return (
-        f"{text}\n\nsaved inspection.json, inspection.txt, clouds.png and clouds.html in {folder}"
-    )
+    saved = ["inspection.json", "inspection.txt", "clouds.png", "clouds.html"]
+    if sheets:
+        shown = class_sheets(opened, folder / SHEETS, split=split, most=sheets, seed=bounds.seed)
+        saved.append(f"{SHEETS}/{shown[0].name}" + f" and {len(shown) - 1} more" * (len(shown) > 1))
+    return f"{text}\n\nsaved {', '.join(saved)} in {folder}"
 
 
 def compare_command(

@@ -251,7 +251,7 @@ def _cloud(one: Shown, most: float) -> dict[str, Any]:
         "size": [float(f"{side:.6g}") for side in size],
         "radius": float(np.linalg.norm(xyz - low - size / 2, axis=1).max()) or 1.0,
         "step": step,
-        "turn": _turn(low, size),
+        "turn": turn_deg(low, size),
         "xyz": _base64(np.rint((xyz - low) / step).astype("<u2")),
     }
     if one.view is not None:
@@ -263,8 +263,8 @@ def _cloud(one: Shown, most: float) -> dict[str, Any]:
     return found
 
 
-def _turn(low: np.ndarray, size: np.ndarray) -> float:
-    """Degrees to turn a cloud by: what lies beside the origin is first seen from there.
+def turn_deg(low: np.ndarray, size: np.ndarray) -> float:
+    """Degrees to turn the viewer by: what lies beside the origin is first seen from there.
 
     That is where a scan has its camera; what lies around the origin is seen as in all pictures.
     """

@@ -91,4 +91,9 @@ def _about(run: RunFiles, said: Predictions, count: int) -> str:
     order = "in doubt first"
     if labelled.any():
         order = f"{wrong} are wrong, the most confident first"
-    return f"{run.title}, target {run.target}: {count} of {len(said.ids)} clouds; {order}"
+    text = f"{run.title}, target {run.target}: {count} of {len(said.ids)} clouds; {order}"
+    m = run.metrics
+    if m is None:
+        return text
+    trained = f"{m.source} ({m.made_of.source})" if m.source != m.target else "it"
+    return f"{text}; the target is made of: {m.made_of.target}; trained on {trained}"

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from qs3.data.importers.object_archive import TIERS
 from qs3.errors import ConfigError, DataError
 from qs3.report.clustered import LEVEL
 from qs3.report.tables.aggregate import data_lines, same_data
@@ -13,10 +18,14 @@ from qs3.report.tables.cells import Cell, Table
 from qs3.report.tables.formats import SIMULATED, marks
 from qs3.report.tables.made_of import data_marks, results_of
 from qs3.report.tables.paired import Difference, compare_on_average
-from qs3.runs.predictions import FILE, read_predictions
+from qs3.runs.predictions import FILE, Predictions, read_predictions
 from qs3.utils import text_table
 
-_MORE_MESHES = "more meshes"
+MESHES, BLOCKS, ROOMS = "meshes", "blocks of frames", "rooms"
+_BLOCK = re.compile(r"(?:\w+_)?block\d+")  # as importers of frames call them
+ALL = "all"
+Pair = tuple[Difference, Difference]
+"""The differences in accuracy and in balanced accuracy."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +37,25 @@ class Compared:
         differences: accuracy, balanced accuracy; None if `why` says what is missing.
         why: "" or the reason.
         objects_known: whether it is known which clouds show the same object.
+        tiers: the differences of the clouds of each tier, where the target has tiers.
+        tiers_unknown: the target has tiers, but no predictions say which cloud is of which.
+        clusters: what clouds of one cluster share: one of `MESHES`, `BLOCKS`, `ROOMS`.
+        made_of: what the row's source, the base's source and the target are made of.
     """
 
     name: str
-    differences: tuple[Difference, Difference] | None
+    differences: Pair | None
     why: str = ""
     objects_known: bool = True
+    tiers: Mapping[str, Pair] = field(default_factory=dict)
+    tiers_unknown: bool = False
+    clusters: str = MESHES
+    made_of: tuple[str, str, str] = ("", "", "")
+
+    @property
+    def subsets(self) -> dict[str, Pair]:
+        """The differences of all clouds, then of each tier; empty if there are none."""
+        return {} if self.differences is None else {ALL: self.differences, **self.tiers}
 
 
 def against(table: Table, base: str) -> list[Compared]:
@@ -42,7 +64,8 @@ def against(table: Table, base: str) -> list[Compared]:
     Raises:
         ConfigError: there is no such row.
     """
-    return [_compared(name, [(cell, own)]) for name, cell, own in _beside(table, base)]
+    tiers = _Tiers(table)
+    return [_compared(name, [(cell, own)], tiers) for name, cell, own in _beside(table, base)]
 
 
 def minus_each(table: Table, row: str) -> list[Compared]:
@@ -51,8 +74,9 @@ def minus_each(table: Table, row: str) -> list[Compared]:
     Raises:
         ConfigError: there is no such row.
     """
+    tiers = _Tiers(table)
     return [
-        _compared(name, [(own, cell)])
+        _compared(name, [(own, cell)], tiers)
         for name, cell, own in _beside(table, row)
         if cell.group and own.group
     ]
@@ -85,9 +109,10 @@ def effects(table: Table) -> list[Compared]:
         name: [cells[i] for cells in table.rows.values()] for i, name in enumerate(table.columns)
     }
     by_row = {name: list(cells) for name, cells in table.rows.items()}
+    tiers = _Tiers(table)
     return [
-        *_main_effects(columns, list(table.rows)),
-        *_main_effects(by_row, list(table.columns)),
+        *_main_effects(columns, list(table.rows), tiers),
+        *_main_effects(by_row, list(table.columns), tiers),
     ]
 
 
@@ -99,7 +124,7 @@ def _same(one: Cell, two: Cell) -> bool:
 
 
 def _main_effects(
-    lines: Mapping[str, Sequence[Cell | None]], others: Sequence[str]
+    lines: Mapping[str, Sequence[Cell | None]], others: Sequence[str], tiers: _Tiers
 ) -> list[Compared]:
     """Each line of cells minus the first one, over the others that both have."""
     (base, base_cells), *rest = lines.items()
@@ -112,11 +137,39 @@ def _main_effects(
         }
         if both:
             title = f"{name} minus {base}, over {', '.join(both)}"
-            found.append(_compared(title, list(both.values())))
+            found.append(_compared(title, list(both.values()), tiers))
     return found
 
 
-def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
+class _Tiers:
+    """Of which tier each cloud is, by the predictions that say it, whichever run of a table's.
+
+    Runs on one target saw the same clouds, and older ones did not save the tiers.
+    """
+
+    def __init__(self, table: Table) -> None:
+        self._runs = [run for c in table.cells if c.group for run in c.group.finished]
+        self._known: dict[str, dict[str, str]] = {}
+
+    def __call__(self, target: str, ids: Sequence[str]) -> list[str]:
+        """Of each cloud of the target with this content hash; "" where nobody knows."""
+        if target not in self._known:
+            self._known[target] = self._of(target)
+        return [self._known[target].get(id_, "") for id_ in ids]
+
+    def _of(self, target: str) -> dict[str, str]:
+        for run in self._runs:
+            metrics = run.metrics
+            if metrics is None or not metrics.evaluation.tiers or metrics.data.target != target:
+                continue
+            with contextlib.suppress(DataError):
+                said = read_predictions(run.folder / FILE)
+                if said.tiers:
+                    return dict(zip(said.ids, said.tiers, strict=True))
+        return {}
+
+
+def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) -> Compared:
     """The mean difference of pairs of cells, or why there is none."""
     cells = [cell for pair in pairs for cell in pair]
     if any(cell.take != "final" for cell in cells):
@@ -138,10 +191,56 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]]) -> Compared:
     try:
         said = [[read_predictions(runs[seed].folder / FILE) for seed in seeds] for runs in finished]
         both = list(zip(said[::2], said[1::2], strict=True))
-        plain, balanced = (compare_on_average(both, balanced=b) for b in (False, True))
+        found = _pair_of(both)
     except DataError as error:
         return Compared(name, None, str(error))
-    return Compared(name, (plain, balanced), objects_known=said[0][0].meshes != said[0][0].ids)
+    first, target = said[0][0], results[0].data.target if results[0] else ""
+    known = tiers(target, first.ids)
+    has_tiers = any(result and result.evaluation.tiers for result in results)
+    return Compared(
+        name,
+        found,
+        objects_known=first.meshes != first.ids,
+        tiers=_by_tier(both, known),
+        tiers_unknown=has_tiers and not any(known),
+        clusters=_clusters(first.meshes, has_tiers),
+        made_of=_made_of(cells),
+    )
+
+
+def _pair_of(both: Sequence[tuple[Sequence[Predictions], Sequence[Predictions]]]) -> Pair:
+    plain, balanced = (compare_on_average(both, balanced=b) for b in (False, True))
+    return plain, balanced
+
+
+def _by_tier(
+    both: Sequence[tuple[Sequence[Predictions], Sequence[Predictions]]], tiers: Sequence[str]
+) -> dict[str, Pair]:
+    """The differences of the clouds of each tier of at least two clusters."""
+    found = {}
+    for tier in TIERS:
+        of = np.array([one == tier for one in tiers])
+        some = [tuple([p.of(of) for p in row] for row in pair) for pair in both]
+        if of.any() and len(set(some[0][0][0].meshes)) > 1:
+            found[tier] = _pair_of(some)  # type: ignore[arg-type]
+    return found
+
+
+def _clusters(names: Sequence[str], of_frames: bool) -> str:
+    """What clouds of one cluster share."""
+    if all(_BLOCK.fullmatch(name) for name in names):
+        return BLOCKS
+    return ROOMS if of_frames else MESHES
+
+
+def _made_of(cells: Sequence[Cell]) -> tuple[str, str, str]:
+    """Of the rows', the bases' and all targets' data, each thing once."""
+
+    def said(some: Sequence[Cell], role: str) -> str:
+        runs = [result for cell in some if cell.group for result in cell.group.results]
+        return "; ".join(dict.fromkeys(str(getattr(run.made_of, role)) for run in runs))
+
+    return said(cells[::2], "source"), said(cells[1::2], "source"), said(cells, "target")
 
 
 def text(
@@ -154,34 +253,42 @@ def text(
         markdown: instead of columns for the terminal.
         table: that they are of: its title and what must not be overlooked come first.
     """
-    lines = [[f"minus {base}" if base else "difference", "accuracy", "balanced accuracy", "seeds",
-              "to tell apart"]]  # fmt: skip
+    several = any(one.tiers for one in found)
+    lines = [[f"minus {base}" if base else "difference", *(["clouds"] if several else []),
+              "accuracy", "balanced accuracy", "seeds", "to tell apart"]]  # fmt: skip
     reasons: dict[str, list[str]] = {}
-    judged = {one.name: one.differences[0] for one in found if one.differences}
+    judged = [(one, pair[0]) for one in found for pair in one.subsets.values()]
     for one in found:
         if one.differences is None:
             reasons.setdefault(one.why, []).append(one.name)
-            continue
-        accuracy, balanced = one.differences
-        lines.append(
-            [one.name, _shown(accuracy), _shown(balanced), str(accuracy.seeds), _needed(accuracy)]
-        )
-    meshes = ", ".join(map(str, sorted({one.meshes for one in judged.values()})))
+        for subset, (accuracy, balanced) in one.subsets.items():
+            lines.append(
+                [one.name, *([subset] if several else []), _shown(accuracy), _shown(balanced),
+                 str(accuracy.seeds), _needed(one, accuracy)]
+            )  # fmt: skip
+    clusters = " or ".join(dict.fromkeys(one.clusters for one, _ in judged)) or MESHES
+    counts = sorted({one.differences[0].meshes for one in found if one.differences})
+    of = f" ({', '.join(map(str, counts))} {clusters})" if counts else ""
     notes = [
-        f"differences in percentage points with {LEVEL:.0%} intervals over seeds and test meshes"
-        + (f" ({meshes} meshes)" if meshes else "")
-        + "; * marks those whose interval does not reach 0, each line by itself: of twenty rows "
-        "that are no better than the other one gets a star"
+        f"differences in percentage points with {LEVEL:.0%} intervals over seeds and test "
+        f"{clusters}{of}; * marks those whose interval does not reach 0, each line by itself: of "
+        "twenty rows that are no better than the other one gets a star"
     ]
     if any(not one.objects_known for one in found):
         notes.append(
             "which clouds show the same object is not known, so each counts as one of its own: "
             "where several do, the intervals are too narrow"
         )
-    notes += [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
-    if any(_needed(one) == _MORE_MESHES for one in judged.values()):
+    if any(one.tiers_unknown for one in found):
         notes.append(
-            f"{_MORE_MESHES}: no number of seeds would tell them apart, the test split has too few"
+            f"{' and '.join(TIERS)} clouds are not told apart: these predictions were saved "
+            "without tiers"
+        )
+    notes += [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
+    if lacking := dict.fromkeys(one.clusters for one, d in judged if _hopeless(d)):
+        more = " or ".join(f"more {name}" for name in lacking)
+        notes.append(
+            f"{more}: no number of seeds would tell them apart, the test split has too few"
         )
     head = []
     if table:
@@ -195,21 +302,26 @@ def text(
 
 
 def csv_text(found: Sequence[Compared], table: Table) -> str:
-    """A line a difference and metric, in percentage points."""
+    """A line a difference, metric and tier, in percentage points."""
     rows: list[list[Any]] = [
-        ["name", "metric", "difference", "low", "high", "seeds", "meshes", "seeds_needed",
-         "simulated", "why"]
+        ["name", "clouds", "metric", "difference", "low", "high", "seeds", "clusters",
+         "clusters_are", "seeds_needed", "simulated", "source_made_of", "other_source_made_of",
+         "target_made_of", "why"]
     ]  # fmt: skip
     simulated = str(any(cell.simulated for cell in table.cells)).lower()
+    metrics = ("accuracy", "balanced accuracy")
     for one in found:
-        for i, metric in enumerate(("accuracy", "balanced accuracy")):
-            if one.differences is None:
-                rows.append([one.name, metric, *[""] * 6, simulated, one.why])
-                continue
-            d = one.differences[i]
-            points = [f"{100 * value:.4f}" for value in (d.mean, d.low, d.high)]
-            needed = "" if d.seeds_needed is None else d.seeds_needed
-            rows.append([one.name, metric, *points, d.seeds, d.meshes, needed, simulated, ""])
+        if one.differences is None:
+            rows += [
+                [one.name, ALL, name, *[""] * 7, simulated, *one.made_of, one.why]
+                for name in metrics
+            ]
+        for subset, pair in one.subsets.items():
+            for metric, d in zip(metrics, pair, strict=True):
+                points = [f"{100 * value:.4f}" for value in (d.mean, d.low, d.high)]
+                needed = "" if d.seeds_needed is None else d.seeds_needed
+                known = [d.seeds, d.meshes, one.clusters, needed, simulated, *one.made_of, ""]
+                rows.append([one.name, subset, metric, *points, *known])
     return text_table.csv_text(rows)
 
 
@@ -218,7 +330,12 @@ def _shown(d: Difference) -> str:
     return f"{100 * d.mean:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}]{star}"
 
 
-def _needed(d: Difference) -> str:
+def _hopeless(d: Difference) -> bool:
+    """Whether no number of seeds would tell the two apart."""
+    return not d.clear and d.seeds_needed is None
+
+
+def _needed(one: Compared, d: Difference) -> str:
     if d.clear:
         return "-"
-    return _MORE_MESHES if d.seeds_needed is None else f"{d.seeds_needed} seeds"
+    return f"more {one.clusters}" if _hopeless(d) else f"{d.seeds_needed} seeds"

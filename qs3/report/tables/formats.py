@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from qs3.data.importers.object_archive import TIERS
 from qs3.report.tables.aggregate import FEW_SEEDS, Group, data_lines, task
 from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Metric, Table
 from qs3.report.tables.made_of import OTHER_DATA, data_marks, is_other, results_of
@@ -189,10 +190,7 @@ def remarks(table: Table) -> list[str]:
     for target, simulated_ in targets.items():
         of = [g for g in found if g.first and g.first.target == target]
         simulated = "simulated target" if simulated_ else "target"
-        rates = sorted({f"{100 * s.mean:.1f} %" for g in of if (s := g.stat("majority_rate"))})
-        lines.append(
-            f"majority rate of the {simulated} {target}: {' or '.join(rates) or 'unknown'}"
-        )
+        lines.append(f"majority rate of the {simulated} {target}: {_majority(of)}")
     for role in ("teacher", "student"):
         rules = {rule for cell in table.cells if (rule := _rule(cell, role))}
         if rules:
@@ -221,6 +219,17 @@ def remarks(table: Table) -> list[str]:
     for reason in dict.fromkeys(c.missing for c in missing):
         lines.append(f"not available yet: {reason}")
     return list(dict.fromkeys(lines))
+
+
+def _majority(groups: Sequence[Group]) -> str:
+    """Such as "32.0 %"; with that of each tier, where there are tiers."""
+
+    def rates(score: str) -> str:
+        stats = [g.stat(score) for g in groups]
+        return " or ".join(sorted({f"{100 * stat.mean:.1f} %" for stat in stats if stat}))
+
+    tiers = [f"{tier} {rate}" for tier in TIERS if (rate := rates(f"majority_rate_{tier}"))]
+    return ", ".join([rates("majority_rate") or "unknown", *tiers])
 
 
 def to_run(table: Table) -> list[str]:

@@ -1,12 +1,12 @@
-r"""Are two rows of a table different? Paired over test clouds and seeds, scans of a mesh together.
+r"""Are two rows of a table different? Paired over test clouds and seeds, with clouds in clusters.
 
 Both rows are judged on the same clouds with the same seeds, so their difference is a mean over
 pairs: d = Σ_{s,i} w_i (a_{s,i} - b_{s,i}) / S, where a and b are 1 if the row's run of seed s is
 right about cloud i, and w_i is 1/n for accuracy, 1/(C n_class) for balanced accuracy.
 
 Two things make d vary: other seeds, and other test meshes (scans of one mesh are not independent
-samples). Their variances are those of errors clustered two ways (`qs3.report.clustered`). With
-three seeds intervals are wide, as they should be.
+samples, nor are the objects of a room or of a block of frames). Their variances are those of errors
+clustered two ways (`qs3.report.clustered`). With three seeds intervals are wide, as they should be.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ class Difference:
     Attributes:
         mean: in [-1, 1].
         low, high: its interval at `clustered.LEVEL`.
-        seeds, meshes: numbers of each.
+        seeds, meshes: numbers of each; `meshes` are what clouds of one cluster share, see
+            `qs3.runs.predictions`.
         seeds_needed: so many would make 0 fall outside the interval, if the difference stays as it
-            is; None if no number of seeds would, because there are too few test meshes.
+            is; None if no number of seeds would, because there are too few clusters.
     """
 
     mean: float

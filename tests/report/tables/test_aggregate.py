@@ -9,9 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.report.tables.aggregate import Stat, group, load_run, load_runs, summarise
+from qs3.report.tables.aggregate import (
+    Stat,
+    data_lines,
+    group,
+    load_run,
+    load_runs,
+    same_data,
+    summarise,
+)
 from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
-from tests.report.made_runs import CATALOGUE, scores, write_run
+from tests.report.made_runs import CATALOGUE, metrics, scores, write_run
 
 
 def test_mean_and_sem_by_hand():
@@ -170,3 +178,14 @@ def test_load_run_of_another_name(tmp_path):
     assert "no result" in summarise([tmp_path / "exp" / "seed0-ab"])
     run = load_run(tmp_path / "elsewhere")
     assert (run.seed, run.status) == (None, "unfinished")
+
+
+def test_an_older_word_for_the_same_data_is_not_a_second_line():
+    old = replace(CATALOGUE, benchmark="like roomscan10 v4, but not it (other settings or objects)")
+    new = replace(CATALOGUE, benchmark="roomscan10 v4, train", recipe="1" * 12)
+    runs = [metrics(made_of=DataMadeOf(source=made, target=CATALOGUE)) for made in (old, new, old)]
+    target = f"data: kinectsim10: {CATALOGUE}"
+    assert data_lines(runs) == [f"data: specklenet10: {new}", target]
+    other = replace(runs[0], data=DataHashes(source="e" * 64, target="b" * 64))
+    assert data_lines([*runs, other])[-1] == f"data: specklenet10: {old}"  # other bytes
+    assert same_data(runs, "source")

@@ -19,10 +19,10 @@ from qs3.report.tables.cells import Table
 from qs3.report.tables.comparison import against, csv_text, effects, text
 from qs3.report.tables.running import Job, chosen, launch, missing
 from qs3.report.tables.table import build_table
-from qs3.runs.metrics import DataHashes, DataMadeOf
+from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
 from tests.commands import main
-from tests.report.made_runs import CATALOGUE, change
+from tests.report.made_runs import CATALOGUE, change, scores
 from tests.report.tables.test_tables import run_cell
 from tests.training.toy import overrides, write_toy
 
@@ -143,7 +143,8 @@ def test_compare_by_hand(tmp_path):
     assert len(rows) == 2 * len(found)
     (row,) = (r for r in rows if (r["name"], r["metric"]) == ("DANN", "accuracy"))
     assert float(row["difference"]) == pytest.approx(20)
-    assert (row["seeds"], row["meshes"], row["simulated"]) == ("3", "20", "true")
+    assert (row["seeds"], row["clusters"], row["simulated"]) == ("3", "20", "true")
+    assert (row["clouds"], row["clusters_are"]) == ("all", "meshes")
     with pytest.raises(ConfigError, match="no row 'x'"):
         against(table, "x")
 
@@ -191,6 +192,48 @@ def test_objects_that_are_known_are_counted(tmp_path):
     (one,) = (one for one in against(table, "source only") if one.differences)
     assert one.differences[0].meshes == 4
     assert "each counts as one of its own" not in text([one])
+
+
+def test_each_tier_is_compared_by_itself(tmp_path):
+    """Ten clean and ten hard clouds in four blocks of frames; one run alone saved the tiers."""
+    place = "target test"
+    table = fill(tmp_path, "cad10", {("source only", place): 5, ("DANN", place): 13})
+    tiers = {"clean": scores(0.5), "hard": scores(0.5)}
+    known = Evaluated(split="test", labels=True, rotations=0, norms="trained", tiers=tiers)
+    folders = [run.folder for c in table.cells if c.group for run in c.group.finished]
+    for i, folder in enumerate(folders):
+        change(folder, evaluation=known)
+        said = read_predictions(folder / FILE)
+        said = replace(said, meshes=tuple(f"block{i // 5:04d}" for i in range(20)))
+        last = i == len(folders) - 1
+        write_predictions(
+            folder / FILE, replace(said, tiers=("clean",) * 10 + ("hard",) * 10) if last else said
+        )
+    found = against(build_table("cad10", tmp_path), "source only")
+    (one,) = (one for one in found if one.differences)
+    means = {name: pair[0].mean for name, pair in one.subsets.items()}
+    assert means == pytest.approx({"all": 0.4, "clean": 0.5, "hard": 0.3})
+    assert {name: pair[0].meshes for name, pair in one.subsets.items()} == {
+        "all": 4, "clean": 2, "hard": 2
+    }  # fmt: skip
+    shown = text(found, "source only", table=table)
+    assert "over seeds and test blocks of frames (4 blocks of frames)" in shown
+    assert "meshes" not in shown.partition("data: ")[0]
+    assert [line.split()[:2] for line in shown.splitlines() if line.startswith("DANN")] == [
+        ["DANN", "all"], ["DANN", "clean"], ["DANN", "hard"],
+    ]  # fmt: skip
+    rows = list(csv.DictReader(io.StringIO(csv_text(found, table))))
+    hard = next(row for row in rows if (row["name"], row["clouds"]) == ("DANN", "hard"))
+    assert float(hard["difference"]) == pytest.approx(30)
+    assert (hard["clusters"], hard["clusters_are"]) == ("2", "blocks of frames")
+    assert hard["source_made_of"] == hard["other_source_made_of"] == "published files"
+    assert hard["target_made_of"] == str(CATALOGUE)
+
+    plain = replace(read_predictions(folders[-1] / FILE), tiers=())
+    write_predictions(folders[-1] / FILE, plain)
+    found = against(build_table("cad10", tmp_path), "source only")
+    assert [list(one.subsets) for one in found if one.differences] == [["all"]]
+    assert "clean and hard clouds are not told apart" in text(found, "source only")
 
 
 def test_effects_by_hand(tmp_path):

@@ -16,7 +16,7 @@ from qs3.errors import ConfigError
 from qs3.report.tables.cells import Published
 from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
 from qs3.report.tables.table import build_table
-from qs3.runs.metrics import DataHashes, EpochScores, Warmup
+from qs3.runs.metrics import DataHashes, EpochScores, Evaluated, Warmup
 from tests.commands import main
 from tests.composing import compose
 from tests.report.made_runs import scores, write_run
@@ -106,6 +106,25 @@ def test_paper_beside_ours(tmp_path, empty):
     assert float(ours["mean"]) == pytest.approx(51)
     assert (ours["paper_mean"], ours["paper_sem"], ours["seeds"]) == ("72.4", "0.8", "0 1 2")
     assert ours["command"].startswith("python train.py experiment=qs3_s2d")
+
+
+def test_majority_rates_of_tiers_stand_below(tmp_path):
+    tiers = {"clean": scores(majority_rate=0.25), "hard": scores(majority_rate=0.625)}
+    known = Evaluated(split="test", labels=True, rotations=0, norms="trained", tiers=tiers)
+    run_cell(tmp_path, build_table("quickstart", tmp_path).cells[0], evaluation=known)
+    text = markdown(build_table("quickstart", tmp_path))
+    assert (
+        "majority rate of the simulated target kinectsim10: 45.0 %, clean 25.0 %, hard 62.5 %\n"
+        in text
+    )
+
+
+def test_factors_are_told_apart_by_their_names(empty):
+    """`qs3 report judge` calls runs by their experiment's name; the source's path is not hashed."""
+    cells = empty["real_factors"].cells
+    names = [[word for word in c.overrides if word.startswith("experiment_name=")] for c in cells]
+    assert len({*map(tuple, names)}) == len(cells)
+    assert [c.row for c, name in zip(cells, names, strict=True) if not name] == ["R"]
 
 
 def test_problems_reach_the_reader(tmp_path):

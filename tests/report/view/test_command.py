@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from qs3.data.store import open_pointset
+from qs3.runs.metrics import read_metrics
 from tests.commands import main
 from tests.data.viewer.reading import data_of, places
 from tests.fixtures.frame_files import write_archive
@@ -172,6 +173,8 @@ def test_a_run_s_most_confident_errors_come_first(view, run):
     assert status == 0
     assert f"{len(wrong)} are wrong, the most confident first" in said
     assert "kinectsim10 (simulated)" in said
+    made = read_metrics(run).made_of
+    assert f"the target is made of: {made.target}; trained on specklenet10 ({made.source})" in said
     right = [row for row in rows[::-1] if row["label"] == row["predicted"]]
     assert names(data) == [row["id"] for row in (*wrong, *right)]
     for found, row in zip(data["clouds"], (*wrong, *right), strict=True):
