@@ -29,12 +29,12 @@ D435_REACH_M = 3.25
 """To here Kotsonis' D435 measured. Beyond, on a plain wall in a lit room, its dots are too dim for
 the texture that Intel's sub-pixel RMS asks for."""
 
-FILL_TILTED: dict[float, tuple[float, float]] = {80.0: (0.3, 0.99), 85.0: (0.0, 0.7)}
+FILL_TILTED: dict[float, tuple[float, float]] = {80.0: (0.3, 1.0), 85.0: (0.0, 0.7)}
 """Fill of planes that are nearly edge-on (in degrees), where D400s lose pixels. By geometry: at 80
 degrees and 2 m the disparity changes by 2 px and more across a D415's window (`ramp_px`), at 85
 degrees by 5, where one or two are the most that a single shift fits; at the same time a dot's light
 falls with the cosine, to a sixth and to a tenth. No published count of their pixels was found, so
-the ranges are wide: less than all at 80 degrees, a minority or little more at 85."""
+the ranges are wide: at 80 degrees all or a third, at 85 a minority or little more."""
 
 REAL_ROOM_EMPTY = 0.11
 """Share of pixels without depth in frames of real rooms by Kinects; what windows, screens and the

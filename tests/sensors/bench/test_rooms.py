@@ -67,7 +67,7 @@ def test_rooms_are_for_devices_that_look_at_them():
     assert "RoomCondition" not in {type(c).__name__ for c in runner.Plan.quick().conditions(SMALL)}
 
 
-def crafted(name, empty=0.08, fill=0.9):
+def crafted(name, empty=0.08, fill=0.9, edge_on=0.0):
     subject, config = runner.load(name)
     result = runner.SensorResult(subject, config)
 
@@ -80,7 +80,10 @@ def crafted(name, empty=0.08, fill=0.9):
 
     result.planes = [planar(z, 0.0, True, 0.003 * z * z, 1.0) for z in (0.5, 1.0, 2.0, 3.0)]
     for across in (True, False):
-        result.planes += [planar(2.0, 80.0, across, 0.02, fill), planar(2.0, 85.0, across, 0.1, 0)]
+        result.planes += [
+            planar(2.0, 80.0, across, 0.02, fill),
+            planar(2.0, 85.0, across, 0.1, edge_on),
+        ]
     result.rooms = [
         {
             "condition": {"materials": materials, "frames": 1}, "empty": empty, "mixed": 0.2,
@@ -97,7 +100,9 @@ def crafted(name, empty=0.08, fill=0.9):
         ("kinect_v1", {"empty": 0.08}, "of a room without depth", True),
         ("kinect_v1", {"empty": 0.005}, "of a room without depth", False),
         ("realsense_d415", {"fill": 0.9}, "fill at 80 degrees", True),
-        ("realsense_d415", {"fill": 0.999}, "fill at 80 degrees", False),
+        ("realsense_d415", {"fill": 0.1}, "fill at 80 degrees", False),
+        ("realsense_d415", {"edge_on": 0.2}, "fill at 85 degrees", True),
+        ("realsense_d435", {"edge_on": 0.988}, "fill at 85 degrees", False),
         ("realsense_d435", {}, "Kotsonis", False),  # 3 mm at 1 m, a real one 2.1
     ],
 )
