@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterable
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -50,31 +51,90 @@ def made_of(
 
 
 @functools.cache
-def _sensor_files() -> dict[str, Any]:
-    """What each file of conf/sensor says, in one composition."""
-    names = choices("sensor")
-    files = composed(None, *(f"+sensor@{name}={name}" for name in names))
-    return {name: OmegaConf.to_container(files[name]) for name in names}
+def _files(group: str) -> dict[str, Any]:
+    """What each file of conf/`group` sets there, in one composition."""
+    if group == "sensor":
+        names = choices("sensor")
+        files = composed(None, *(f"+sensor@{name}={name}" for name in names))
+        found = {name: _plain(files[name]) for name in names}
+        released = composed("generate", "domain=specklenet10", "released=yes")
+        return found | {"speckle_stereo as released": _plain(released.sensor)}
+    # These files are global: one composition each, and those that set nothing are left out.
+    each = {name: composed(None, f"+{group}={name}").get(group) for name in choices(group)}
+    return {name: _plain(found) for name, found in each.items() if found}
 
 
 def _sensor(cfg: DictConfig) -> str:
-    """The sensor's preset (its class where a value was changed), and materials and light."""
+    """The sensor's preset, materials and light, each with the settings that were changed."""
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
-    words = [_preset(cfg)]
+    words = [_named("sensor", cfg.sensor)]
     if kinds := cfg.get("materials"):
-        clear = any(kind.get("transmission") for kind in kinds.kinds.values())
-        words.append("mixed and clear materials" if clear else "mixed materials")
+        words.append(_named("materials", kinds, _MATERIALS))
     if light := cfg.get("light"):
-        words += ["light above"] * ("height_m" in light)
-        words += ["light between surfaces"] * bool(light.get("bounces"))
+        bounces = bool(light.get("bounces"))
+        words.append(_named("light", light, _LIGHTS, ("bounces",)))
+        words += ["light between surfaces"] * (bounces and "height_m" in light)
     return ", ".join(words)
 
 
-def _preset(cfg: DictConfig) -> str:
-    plain = OmegaConf.to_container(cfg.sensor)
-    for name, settings in _sensor_files().items():
-        if settings == plain:
-            return name
-    return f"{cfg.sensor._target_.rsplit('.', 1)[-1]} with changed settings"
+_MATERIALS = {
+    "mixed": "mixed materials",
+    "clear": "mixed and clear materials",
+    "principled": "principled materials",
+}
+_LIGHTS = {"area": "light above", "bounced": "light between surfaces"}
+_MOST = 3  # settings are named
+_LENGTH = 40  # of a value that is named
+
+
+def _named(
+    group: str,
+    settings: DictConfig,
+    words: Mapping[str, str] | None = None,
+    besides: Collection[str] = (),
+) -> str:
+    """The file of a group that settings are most like, and what they have else.
+
+    Args:
+        group: its folder in conf.
+        settings: to be named.
+        words: for each file, what it is called; None: its name.
+        besides: keys that are said elsewhere.
+    """
+    plain = _plain(settings)
+    found: list[tuple[int, str, list[str]]] = []
+    for name, file in _files(group).items():
+        if file.get("_target_") == plain["_target_"]:
+            changed = [word for key, word in _differences(plain, file) if key not in besides]
+            found.append((len(changed), name, changed))
+    if not found:  # of one's own
+        return str(plain["_target_"].rsplit(".", 1)[-1])
+    count, name, changed = min(found)
+    said = (words or {}).get(name, name)
+    if not count:
+        return said
+    more = f" and {count - _MOST} more" if count > _MOST else ""
+    return f"{said} with {' '.join(changed[:_MOST])}{more}"
+
+
+def _differences(
+    given: Mapping[str, Any], file: Mapping[str, Any], above: str = ""
+) -> Iterator[tuple[str, str]]:
+    """Each key that has another value than in a file, with dots, and "key=value" or "no key"."""
+    for key in (*given, *(key for key in file if key not in given)):
+        value, place = given.get(key), above + key
+        other = file.get(key)
+        if isinstance(value, dict) and isinstance(other, dict):
+            yield from _differences(value, other, f"{place}.")
+        elif key not in given:
+            yield place, f"no {place}"
+        elif key not in file or value != other:
+            said = json.dumps(value).replace('"', "")
+            yield place, f"{place}={said if len(said) <= _LENGTH else said[:_LENGTH] + '...'}"
+
+
+def _plain(settings: DictConfig) -> dict[str, Any]:
+    plain: Any = OmegaConf.to_container(settings, resolve=True)
+    return dict(plain)

@@ -53,7 +53,15 @@ def test_it_names_meshes_sensor_views_and_missing_classes(finished, meshes, tmp_
         (["domain=kinectsim10"], "embedded catalogue, kinect_like, 4 views"),
         (
             ["domain=specklenet10", "sensor.baseline_m=0.2"],
-            "embedded catalogue, SpeckleStereo with changed settings, 5 views",
+            "embedded catalogue, speckle_stereo with baseline_m=0.2, 5 views",
+        ),
+        (
+            ["domain=specklenet10", "sensor=realsense_d415", "sensor.ambient=20"],
+            "embedded catalogue, realsense_d415 with ambient=20, 5 views",
+        ),
+        (
+            ["domain=specklenet10", "released=yes"],
+            "embedded catalogue, speckle_stereo as released, 5 views",
         ),
         (["domain=modelnet10"], "embedded catalogue, surface samples"),
         (["domain=modelnet10_dropout"], "embedded catalogue, surface samples with holes"),
@@ -61,6 +69,38 @@ def test_it_names_meshes_sensor_views_and_missing_classes(finished, meshes, tmp_
 )
 def test_the_sensor_has_the_name_of_its_file(words, said):
     assert str(made_of(composed(*words), CLASSES, ["a"], "")) == said
+
+
+PAPER = ["domain=specklenet10", "materials=principled", "light=area"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (PAPER, "principled materials, light above"),
+        ([*PAPER, "light.strength=1"], "principled materials, light above with strength=1"),
+        ([*PAPER, "light.bounces=1"], "principled materials, light above, light between surfaces"),
+        (["light=bounced", "light.ambient=0.3"], "light between surfaces with ambient=0.3"),
+        (["materials=mixed"], "mixed materials"),
+        (["materials=clear"], "mixed and clear materials"),
+        (
+            ["materials=mixed", "materials.kinds.metal.weight=0.5", "~materials.kinds.paint"],
+            "mixed materials with kinds.metal.weight=0.5 no kinds.paint",
+        ),
+    ],
+)
+def test_materials_and_light_have_the_names_of_their_files_and_what_was_changed(words, said):
+    domain = [] if words[0].startswith("domain") else ["domain=specklenet10"]
+    made = made_of(composed(*domain, *words), CLASSES, ["a"], "")
+    assert made.sensor == f"speckle_stereo, {said}"
+
+
+def test_many_changes_are_counted_and_a_class_of_ones_own_is_named():
+    many = [f"sensor.{key}" for key in ("width_px=900", "ambient=1", "max_depth_m=4", "step_px=1")]
+    made = made_of(composed("domain=specklenet10", *many), CLASSES, ["a"], "")
+    assert made.sensor == "speckle_stereo with width_px=900 step_px=1 max_depth_m=4 and 1 more"
+    own = composed("domain=specklenet10", "sensor._target_=my.lab.Camera")
+    assert made_of(own, CLASSES, ["a"], "").sensor == "Camera"
 
 
 def test_all_of_modelnet40_serves_as_it_is(tmp_path, caplog):

@@ -15,6 +15,7 @@ import numpy as np
 from qs3.sensors.bench import laws, metrics
 from qs3.sensors.bench.runner import SensorResult
 
+_KINECTS = ("kinect_v1", "structure_sensor")
 NGUYEN_DEPTHS_M = (1.0, 1.5, 2.0, 3.0, 4.0)
 
 
@@ -52,8 +53,9 @@ def judge(result: SensorResult) -> list[Verdict]:
     name = result.subject.name
     out: list[_Band] = []
     if result.subject.focal_baseline is not None:
-        p, _ = exponent(result)
-        out.append(("sigma_Z grows as Z^p, p in 1.8 to 2.2", f"p = {p:.2f}", 1.8, 2.2, p))
+        p, _ = exponent(result, _reach_m(name))
+        band = "sigma_Z grows as Z^p, p in 1.8 to 2.2" + _up_to(name)
+        out.append((band, f"p = {p:.2f}", 1.8, 2.2, p))
         out += _bias(result) + _levels(result)
     if name.startswith("kinect_v1"):
         out += _nguyen(result)
@@ -61,7 +63,13 @@ def judge(result: SensorResult) -> list[Verdict]:
         out += _real_d415(result)
     elif "d4" in name:
         out += _d400(result)
+    if "d435" in name:
+        out += _kotsonis(result)
+    if "d4" in name:
+        out += _grazing(result)
     out += _own_law(result) + _fill(result) + _edge(result)
+    if name.startswith(_KINECTS):
+        out += _rooms(result)
     return [Verdict(name, *band) for band in out]
 
 
@@ -83,9 +91,19 @@ def _own_law(result: SensorResult) -> list[_Band]:
     return [(band, text, 0.9, 1.1, ratio)]
 
 
-def exponent(result: SensorResult) -> tuple[float, float]:
-    """Exponent and factor of sigma_Z = a Z^p over the distances."""
-    facing = [m for m in result.facing() if m["sigma_m"]]
+def _reach_m(name: str) -> float:
+    """How far the laws of a sensor's noise are asked for."""
+    return laws.D435_REACH_M if "d435" in name else np.inf
+
+
+def _up_to(name: str) -> str:
+    reach = _reach_m(name)
+    return f" up to {reach:g} m" if np.isfinite(reach) else ""
+
+
+def exponent(result: SensorResult, reach_m: float = np.inf) -> tuple[float, float]:
+    """Exponent and factor of sigma_Z = a Z^p over the distances up to `reach_m`."""
+    facing = [m for m in result.facing() if m["sigma_m"] and m["condition"]["depth_m"] <= reach_m]
     depth = np.array([m["condition"]["depth_m"] for m in facing])
     return metrics.power_law(depth, np.array([m["sigma_m"] for m in facing]))
 
@@ -96,7 +114,7 @@ def _bias(result: SensorResult) -> list[_Band]:
     What a device's calibration leaves is a bias too: of such a sensor the data sheet's is asked.
     """
     facing = [m for m in result.facing() if m["bias_px"] is not None]
-    if getattr(getattr(result.subject.sensor, "misalignment", None), "columns_px", 0):
+    if _is_misaligned(result.subject.sensor):
         return _accuracy(facing)
     worst = max(facing, key=lambda m: abs(m["bias_px"]), default=None)
     if worst is None:
@@ -125,15 +143,24 @@ def _accuracy(facing: list[dict[str, Any]]) -> list[_Band]:
 
 
 def _levels(result: SensorResult) -> list[_Band]:
-    """As many distinct depths as the quantiser has steps; coarse ones only, where all occur."""
+    """As many distinct depths as the quantiser has steps.
+
+    What a calibration leaves moves the first and the last plane: up to a level a distance may
+    be missing then.
+    """
     subject = result.subject
     if not subject.steps_per_px:
         return []
     found = sum(m.get("levels", 0) for m in result.facing())
     wanted = sum(m.get("levels_expected", 0) for m in result.facing())
+    low = wanted - len(result.facing()) * _is_misaligned(subject.sensor)
     band = f"distinct depth levels as 1/{subject.steps_per_px} px predicts"
     text = f"{found} of {wanted} over {len(result.facing())} distances"
-    return [(band, text, wanted, wanted, found)]
+    return [(band, text, low, wanted, found)]
+
+
+def _is_misaligned(sensor: Any) -> bool:
+    return bool(getattr(getattr(sensor, "misalignment", None), "columns_px", 0))
 
 
 def _nguyen(result: SensorResult) -> list[_Band]:
@@ -152,14 +179,47 @@ def _nguyen(result: SensorResult) -> list[_Band]:
 
 def _d400(result: SensorResult) -> list[_Band]:
     low, high = laws.D400_BAND_PX
-    values = [m["subpixel_rms_px"] for m in result.facing()]
+    name = result.subject.name
+    near = [m for m in result.facing() if m["condition"]["depth_m"] <= _reach_m(name)]
+    values = [m["subpixel_rms_px"] for m in near]
     good = [v for v in values if v is not None]
     text = f"{min(good):.3f} to {max(good):.3f} px" if good else "nothing measured"
-    band = f"sub-pixel RMS in {low:g} to {high:g} px at every distance"
+    band = f"sub-pixel RMS in {low:g} to {high:g} px at every distance{_up_to(name)}"
     # The value farthest from the middle of the band decides.
     middle = (low + high) / 2
     worst = max(good, key=lambda v: abs(v - middle)) if len(good) == len(values) else None
     return [(band, text, low, high, worst)]
+
+
+def _kotsonis(result: SensorResult) -> list[_Band]:
+    """Noise of a real D435: within 30 %, where it is farthest from that."""
+    worst: tuple[float, float, float] | None = None
+    for m in result.facing():
+        depth = m["condition"]["depth_m"]
+        if depth in laws.D435_KOTSONIS_M and m["sigma_m"]:
+            found = (m["sigma_m"] / float(laws.kotsonis_d435_m(depth)), depth, m["sigma_m"])
+            if worst is None or abs(np.log(found[0])) > abs(np.log(worst[0])):
+                worst = found
+    first, last = laws.D435_KOTSONIS_M[0], laws.D435_KOTSONIS_M[-1]
+    band = f"sigma_Z from {first:g} to {last:g} m within 30 % of a real D435's (Kotsonis)"
+    if worst is None:
+        return [(band, "nothing measured", 0, 0, None)]
+    ratio, depth, sigma = worst
+    text = f"{1e3 * sigma:.2f} mm at {depth:g} m, {ratio - 1:+.0%}, the worst"
+    return [(band, text, 0.7, 1.3, ratio)]
+
+
+def _grazing(result: SensorResult) -> list[_Band]:
+    """Fill of planes that are nearly edge-on, the mean of both ways to recede."""
+    out: list[_Band] = []
+    for tilt, (low, high) in laws.FILL_TILTED.items():
+        both = result.tilted(True) + result.tilted(False)
+        found = [m["fill"] for m in both if m["condition"]["tilt_deg"] == tilt]
+        if found:  # a quick bench leaves them out
+            value = float(np.mean(found))
+            band = f"fill at {tilt:g} degrees in {low:.0%} to {high:.0%}"
+            out.append((band, f"{value:.1%}", low, high, value))
+    return out
 
 
 _D415_WORDS = {
@@ -223,6 +283,16 @@ def _edge(result: SensorResult) -> list[_Band]:
         worst_px = max(abs(right), abs(wall if wall is not None else np.inf))
         out.append((band, text, 0.0, half + 1, worst_px))
     return out
+
+
+def _rooms(result: SensorResult) -> list[_Band]:
+    """Rooms with mixed materials: pixels lost within a factor of two of a real Kinect's."""
+    found = [m for m in result.rooms if m["condition"]["materials"] == "mixed"]
+    if not found:  # a quick bench leaves them out
+        return []
+    empty, real = found[0]["empty"], laws.REAL_ROOM_EMPTY
+    band = f"pixels of a room without depth within a factor of 2 of {real:.0%}"
+    return [(band, f"{empty:.1%}", real / 2, 2 * real, empty)]
 
 
 def drop(result: SensorResult, across: bool, below: float = 0.95) -> float | None:

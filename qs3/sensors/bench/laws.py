@@ -21,6 +21,29 @@ D400_BAND_PX = (0.03, 0.10)
 D400_ACCURACY = (0.02, 2.0)
 """Z accuracy of the D400 data sheet: within 2 % up to 2 m."""
 
+D435_KOTSONIS_M = (0.5, 0.7, 1.0, 1.5, 2.0, 3.0)
+"""Where Kotsonis' noise of a real D435 (0.2 to 3.25 m) is asked of a D435 preset. Below 0.5 m it is
+that of the whole steps of his depth images, not of the disparity."""
+
+D435_REACH_M = 3.25
+"""To here Kotsonis' D435 measured. Beyond, on a plain wall in a lit room, its dots are too dim for
+the texture that Intel's sub-pixel RMS asks for."""
+
+FILL_TILTED: dict[float, tuple[float, float]] = {80.0: (0.3, 1.0), 85.0: (0.0, 0.7)}
+"""Fill of planes that are nearly edge-on (in degrees), where D400s lose pixels. By geometry: at 80
+degrees and 2 m the disparity changes by 2 px and more across a D415's window (`ramp_px`), at 85
+degrees by 5, where one or two are the most that a single shift fits; at the same time a dot's light
+falls with the cosine, to a sixth and to a tenth. No published count of their pixels was found, so
+the ranges are wide: at 80 degrees all or a third, at 85 a minority or little more."""
+
+REAL_ROOM_EMPTY = 0.11
+"""Share of pixels without depth in frames of real rooms by Kinects; what windows, screens and the
+move to the colour camera take is part of it."""
+
+REAL_MIXED = 0.11
+"""Share of the steps over 10 cm in frames of real rooms with a mixed pixel. In the eight clouds of
+a table that the bench reads it is three of 2,142: edges there are near, and clearer."""
+
 D415_AT_M = 1.0
 """Where a D415 preset is held against the device's figures: its pictures show a table."""
 

@@ -44,7 +44,7 @@ def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         holes: share of pixels without depth within the outline of what has depth.
         run_median_px, run_90_px: median and 90 % quantile of the holes' lengths.
         left_share: see `shadow_side`.
-        mixed: see `mixed_share`.
+        mixed: see `mixed_share`. mixed_steps, steps: its counts.
     """
     flat = depth_m[np.isfinite(depth_m)].astype(np.float64)
     values = np.unique(np.rint(flat[flat > 0.8] * 1000)) / 1000
@@ -53,6 +53,7 @@ def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
     inside = outline(depth_m)
     gaps = inside & ~np.isfinite(depth_m)
     runs = metrics.runs(gaps)
+    mixed, steps = depth_steps(depth_m)
     return {
         "levels": len(values),
         "step_focal_baseline": fb,
@@ -64,7 +65,9 @@ def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         "run_median_px": metrics.median(runs),
         "run_90_px": float(np.quantile(runs, 0.9)) if runs.size else float("nan"),
         "left_share": shadow_side(depth_m, gaps),
-        "mixed": mixed_share(depth_m),
+        "mixed": mixed / steps if steps else float("nan"),
+        "mixed_steps": mixed,
+        "steps": steps,
     }, runs
 
 
@@ -137,7 +140,13 @@ def shadow_side(depth_m: np.ndarray, gaps: np.ndarray) -> float:
 
 
 def mixed_share(depth_m: np.ndarray, step_m: float = 0.1, apart_m: float = 0.02) -> float:
-    """Share of the steps in depth, along rows and columns, with a pixel that lies between.
+    """Share of the steps in depth with a pixel that lies between; see `depth_steps`."""
+    mixed, steps = depth_steps(depth_m, step_m, apart_m)
+    return mixed / steps if steps else float("nan")
+
+
+def depth_steps(depth_m: np.ndarray, step_m: float = 0.1, apart_m: float = 0.02) -> tuple[int, int]:
+    """Steps in depth, along rows and columns: those with a pixel that lies between, and all.
 
     A step is two neighbours that differ by more than `step_m`, or two pixels that do with one
     between them that is farther than `apart_m` from both: a mixed or flying pixel.
@@ -154,7 +163,7 @@ def mixed_share(depth_m: np.ndarray, step_m: float = 0.1, apart_m: float = 0.02)
         sharp[:, 1:] &= ~between
         mixed += int(between.sum())
         steps += int(sharp.sum()) + int(between.sum())
-    return mixed / steps if steps else float("nan")
+    return mixed, steps
 
 
 def table_noise(depth_m: np.ndarray, block: int = 24) -> tuple[float, float]:

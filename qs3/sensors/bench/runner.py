@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from qs3.config.compose import choices, composed
 from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
-from qs3.sensors.bench import edges, infrared_images, planar
+from qs3.sensors.bench import edges, infrared_images, planar, rooms
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.files import write_json
@@ -27,7 +27,12 @@ DEFAULT_SENSORS = (
 """On the page. Not on it: copies of others, and those that repeat a defect on purpose."""
 
 
-Condition = planar.PlanarCondition | edges.EdgeCondition | infrared_images.InfraredCondition
+Condition = (
+    planar.PlanarCondition
+    | edges.EdgeCondition
+    | infrared_images.InfraredCondition
+    | rooms.RoomCondition
+)
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,7 @@ class Plan:
         repeats: frames for the noise over time.
         half_px: half the region, in samples.
         edge_frames: frames of the edge bench.
+        room_frames: frames of rooms for each of their materials; 0 leaves them out.
     """
 
     tilts_deg: tuple[float, ...] = (15, 30, 45, 60, 65, 70, 75, 80, 85)
@@ -49,14 +55,17 @@ class Plan:
     repeats: int = 12
     half_px: int = 24
     edge_frames: int = 8
+    room_frames: int = 2
 
     @staticmethod
     def quick() -> Plan:
         """Less of everything: seconds a sensor."""
-        return Plan(tilts_deg=(45, 75), phases=8, repeats=6, half_px=16, edge_frames=3)
+        return Plan(
+            tilts_deg=(45, 75), phases=8, repeats=6, half_px=16, edge_frames=3, room_frames=0
+        )
 
     def conditions(self, subject: Subject) -> list[Condition]:
-        """All of one sensor: the distances, the tilts both ways, the edge, infrared images."""
+        """All of one sensor: distances, tilts both ways, the edge, infrared images, rooms."""
         depths = subject.depths_m()
         common: dict[str, Any] = {"phases": self.phases, "half_px": self.half_px}
         out: list[Condition] = [
@@ -70,6 +79,8 @@ class Plan:
         out.append(edges.default_condition(subject, self.edge_frames))
         if infrared_images.applies(subject):
             out.append(infrared_images.InfraredCondition())
+        if self.room_frames and rooms.applies(subject):
+            out += [rooms.RoomCondition(each, self.room_frames) for each in rooms.MATERIALS]
         return out
 
 
@@ -83,6 +94,7 @@ class SensorResult:
         planes: results of `planar.measure`, in the order of the plan.
         edge: result of `edges.measure`.
         infrared: result of `infrared_images.measure`; None of a sensor without such images.
+        rooms: results of `rooms.measure`, by materials.
     """
 
     subject: Subject
@@ -90,6 +102,7 @@ class SensorResult:
     planes: list[dict[str, Any]] = field(default_factory=list)
     edge: dict[str, Any] = field(default_factory=dict)
     infrared: dict[str, Any] | None = None
+    rooms: list[dict[str, Any]] = field(default_factory=list)
 
     def facing(self) -> list[dict[str, Any]]:
         """Conditions without tilt, by depth."""
@@ -150,6 +163,8 @@ def run(
             result.edge = found
         elif isinstance(condition, infrared_images.InfraredCondition):
             result.infrared = found
+        elif isinstance(condition, rooms.RoomCondition):
+            result.rooms.append(found)
         else:
             result.planes.append(found)
         advance()
@@ -161,6 +176,8 @@ def _measured(subject: Subject, condition: Condition, renderer: Renderer) -> dic
         return edges.measure(subject, condition, renderer)
     if isinstance(condition, infrared_images.InfraredCondition):
         return infrared_images.measure(subject, condition, renderer)
+    if isinstance(condition, rooms.RoomCondition):
+        return rooms.measure(subject, condition, renderer)
     return planar.measure(subject, condition, renderer)
 
 

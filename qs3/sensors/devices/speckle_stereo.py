@@ -117,7 +117,9 @@ class SpeckleStereo(TriangulatingSensor):
         images = shot.renderer.render(scene, cameras, seed=seed, geometry=[True, False])
         windows = (shot.window, window)
         canvas = self._canvas(*windows)
-        gain = self.infrared.gain(images[0].radiance, images[0].label > 0)
+        whole = isinstance(self.infrared, InfraredCamera) and self.infrared.metering == "image"
+        metered = np.isfinite(images[0].depth_m) if whole else images[0].label > 0
+        gain = self.infrared.gain(images[0].radiance, metered)
         radiance = self._seen(images, windows, canvas)
         if isinstance(self.infrared, InfraredCamera) and self.infrared.needs_ambient:
             # The same seed: the same places in each pixel.

@@ -109,6 +109,7 @@ def fit_images(
     from qs3.config.hydra import build
     from qs3.sensors.devices.speckle_stereo import SpeckleStereo
     from qs3.sensors.fit.infrared import fit_pictures
+    from qs3.sensors.fit.pair_fill import pair_fills, words_of
     from qs3.sensors.fit.pictures import read_pictures
     from qs3.sensors.fit.stereo_preset import report, save
 
@@ -123,6 +124,8 @@ def fit_images(
     found = fit_pictures(scenes, sensor, distance_m)
     for said in report(found, sensor, len(scenes)):
         print(said)
+    for pair in pair_fills(scenes, sensor):
+        print(words_of(pair, name))
     save(out, found, name, sensor, line)
     print(f"wrote {out}")
 
@@ -166,7 +169,8 @@ images=FOLDER holds rectified pictures of an active stereo camera: SCENE_left.pn
 are any SCENE_right.png, SCENE_off.png (projector off, the same exposure) and SCENE_depth.png (the
 left camera's). Several frames of a still scene, SCENE_left_0.png and so on, tell noise from
 texture. Found, with their errors: ambient light, blur, exposure, noise and speckle, and f B. What
-the pictures do not tell is said, and left as it is in base=.
+the pictures do not tell is said, and left as it is in base=. Of each pair it is said how much of it
+the matcher of base= fills, and why the rest is lost.
 """,
     words="FRAMES",
     line=True,

@@ -129,6 +129,9 @@ class Twin:
             radiance = radiance * _gamma_like(radiance, contrast, noise)
         image = blurred(radiance, settings["infrared.psf_px"])
         per_grey = settings["infrared.electrons_at_white"] / 255
+        camera = self.pair.sensor.infrared
+        if isinstance(camera, InfraredCamera) and camera.max_exposure is not None:
+            per_grey = per_grey / (settings["gain"] / camera.max_exposure).clamp_min(1)
         electrons = image * settings["gain"] * per_grey
         if noise is None:
             return (electrons / per_grey).clamp(0, 255)

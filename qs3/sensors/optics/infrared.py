@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from qs3.config.checks import check_bool, check_ranges
+from qs3.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -15,13 +17,14 @@ class InfraredCamera:
     """A linear 8-bit sensor with automatic exposure.
 
     Noise is drawn here and not left to Monte Carlo luck of the renderer, so that it is the
-    same whatever the number of samples a pixel.
+    same whatever the number of samples a pixel. Exposure comes first, and an amplifier does the
+    rest: as many grey values of fewer electrons, so that noise grows with it.
 
     Attributes:
-        white_quantile: the exposure puts this quantile of the object's radiance ...
+        white_quantile: the exposure puts this quantile of the metered radiance ...
         white_level: ... at this grey value (0..255); brighter pixels saturate.
-        electrons_at_white: electrons collected at grey value 255; shot noise has a variance
-            equal to the number of electrons.
+        electrons_at_white: electrons collected at grey value 255, before any amplifier; shot
+            noise has a variance equal to the number of electrons.
         read_noise_e: standard deviation of the read-out noise in electrons.
         speckle_contrast: of the laser's own speckle, standard deviation over mean: radiance is
             multiplied by a Gamma variable with mean 1 and shape 1 / contrast ** 2 (Landau,
@@ -32,6 +35,12 @@ class InfraredCamera:
         speckle_grain_px: side of the square grains that share a value; 1 is a pixel.
         ambient_speckles: false: light that is not the projector's, and so no laser's, has no
             speckle; takes one more render a frame.
+        metering: what the exposure goes by: "object", what bodies with a label show, or "image",
+            all surfaces in the part of the view that is rendered. Cameras that are matched
+            against a stored image go by all surfaces.
+        max_exposure: grey values per unit of radiance at the longest exposure; null: as long as
+            it takes.
+        max_gain: by how much the amplifier makes up for what `max_exposure` lacks, at most.
     """
 
     white_quantile: float = 0.98
@@ -43,6 +52,9 @@ class InfraredCamera:
     fixed_gain: float | None = None
     speckle_grain_px: int = 1
     ambient_speckles: bool = True
+    metering: Literal["object", "image"] = "object"
+    max_exposure: float | None = None
+    max_gain: float = 1.0
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -55,8 +67,12 @@ class InfraredCamera:
             speckle_grain_px=">= 1",
             psf_px="[0, 10]",
             fixed_gain="> 0",
+            max_exposure="> 0",
+            max_gain=">= 1",
         )
         check_bool("ambient_speckles", self.ambient_speckles)
+        if self.metering not in ("object", "image"):
+            raise ConfigError(f"metering must be object or image, got {self.metering!r}")
 
     @property
     def needs_ambient(self) -> bool:
@@ -69,7 +85,14 @@ class InfraredCamera:
             return self.fixed_gain
         values = radiance[region]
         white = float(np.quantile(values, self.white_quantile)) if values.size else 0.0
-        return self.white_level / white if white > 0 else 0.0
+        wanted = self.white_level / white if white > 0 else 0.0
+        if self.max_exposure is None:
+            return wanted
+        return min(wanted, self.max_exposure * self.max_gain)
+
+    def amplified(self, gain: float) -> float:
+        """By how much the amplifier raises what the longest exposure gives; 1: not at all."""
+        return 1.0 if self.max_exposure is None else max(1.0, gain / self.max_exposure)
 
     def expose(
         self,
@@ -83,7 +106,7 @@ class InfraredCamera:
         `gain` is shared by the cameras of one rig. `ambient` [h, w] is the part of the radiance
         that has no speckle; None: nothing.
         """
-        per_grey = self.electrons_at_white / 255.0
+        per_grey = self.electrons_at_white / 255.0 / self.amplified(gain)
         if self.speckle_contrast:  # before the lens: grains are as small as its blur or smaller
             grains = self._grains(radiance.shape, rng)
             if ambient is None:

@@ -19,7 +19,7 @@ from tests.commands import main
 CLOUDS = Path(__file__).parents[4] / "shared" / "data" / "kinect_v1"
 KINECT = Subject("kinect_like", ReferenceSpeckle())
 STEREO = Subject("speckle_stereo", SpeckleStereo())
-PLAN = runner.Plan(tilts_deg=(60,), phases=4, repeats=3, half_px=8, edge_frames=1)
+PLAN = runner.Plan((60,), phases=4, repeats=3, half_px=8, edge_frames=1, room_frames=0)
 
 
 @pytest.mark.parametrize("subject", [KINECT, STEREO], ids=lambda s: s.name)
@@ -167,6 +167,9 @@ def test_simulated_tables_have_the_steps_and_the_noise_of_real_ones(renderer, tm
     assert ours["table_subpixel_px"] == pytest.approx(real["table_subpixel_px"], rel=0.35)
     assert real["left_share"] > 0.5
     assert ours["left_share"] > 0.5
+    for group in (found.real, found.simulated):
+        share = sum(one["mixed_steps"] for one in group) / sum(one["steps"] for one in group)
+        assert share < 0.03  # of the steps by a real one, three of 2,142
     assert Path(tmp_path / "real.png").is_file()
 
 

@@ -83,16 +83,16 @@ def test_without_its_light_and_smoothing_a_d415_is_not_the_real_one(renderer):
     assert result.infrared["dots_over_ambient"] > 100
 
 
-def test_a_d415_loses_planes_that_are_nearly_edge_on(renderer):
+@pytest.mark.parametrize("name", ["realsense_d415", "realsense_d435"])
+def test_a_d400_loses_planes_that_are_nearly_edge_on(name, renderer):
     """As devices do, by the contrast that is left; the plane at 60 degrees is whole."""
-    subject, _ = runner.load("realsense_d415")
+    subject, _ = runner.load(name)
     fill = [
         planar.measure(subject, planar.PlanarCondition(2.0, tilt, phases=4), renderer)["fill"]
         for tilt in (60.0, 80.0, 85.0)
     ]
     assert fill[0] > 0.99
-    assert fill[1] < 0.97
-    assert fill[2] < 0.5
+    assert fill[2] < 0.7 < fill[1] < 1
 
 
 def test_a_sensor_that_is_too_noisy_fails_its_bands(renderer):

@@ -1,5 +1,6 @@
 """A preset from infrared pictures: what a simulated camera hides is found again."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -133,7 +134,8 @@ def save(folder, scenes):
 
 
 def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
-    save(tmp_path / "pictures", scenes)
+    shifted = np.roll(scenes[0].left[0], -61, axis=1)  # f B / Z
+    save(tmp_path / "pictures", [replace(scenes[0], right=[shifted]), *scenes[1:]])
     out = tmp_path / "sensor" / "mine.yaml"
     out.parent.mkdir()
     words = ["fit", f"images={tmp_path / 'pictures'}", f"out={out}"]
@@ -142,6 +144,7 @@ def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
     assert "3 scenes, 1.10 m away" in said
     assert "infrared.psf_px" in said
     assert "dots over ambient" in said
+    assert re.search(r"near: realsense_d415 fills 9\d\.\d%", said)
     written = yaml.safe_load(out.read_text())
     assert written["defaults"][0] == "realsense_d415"
     assert written["ambient"] == pytest.approx(HIDDEN["ambient"], rel=0.07)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from qs3.errors import ConfigError
 from qs3.sensors.optics.infrared import InfraredCamera
 
 
@@ -92,3 +93,50 @@ def test_ambient_light_without_speckle_keeps_its_evenness():
     assert camera.expose(total, 1.0, np.random.default_rng(0)).std() == pytest.approx(30, rel=0.03)
     none = camera.expose(total, 1.0, np.random.default_rng(0), 0 * ambient)
     np.testing.assert_array_equal(none, camera.expose(total, 1.0, np.random.default_rng(0)))
+
+
+LIMITED = InfraredCamera(
+    white_level=100.0,
+    electrons_at_white=2000.0,
+    read_noise_e=25.0,
+    max_exposure=100.0,
+    max_gain=4.0,
+)
+
+
+@pytest.mark.parametrize(
+    ("radiance", "gain", "amplified", "grey"),
+    [
+        (2.0, 50.0, 1.0, 100.0),  # bright: the exposure alone
+        (0.5, 200.0, 2.0, 100.0),  # dim: the longest exposure, amplified
+        (0.2, 400.0, 4.0, 80.0),  # dark: all there is, and less than white
+    ],
+)
+def test_exposure_comes_first_and_then_an_amplifier_which_amplifies_noise(
+    radiance, gain, amplified, grey
+):
+    flat = np.full((500, 500), radiance, np.float32)
+    found = LIMITED.gain(flat, np.ones_like(flat, dtype=bool))
+    assert found == pytest.approx(gain)
+    assert LIMITED.amplified(found) == pytest.approx(amplified)
+    seen = LIMITED.expose(flat, found, np.random.default_rng(0)).astype(float)
+    assert seen.mean() == pytest.approx(grey, abs=0.5)
+    per_grey = 2000.0 / 255.0 / amplified  # fewer electrons give a grey value
+    expected = (grey * per_grey + 25.0**2) / per_grey**2 + 1 / 12
+    assert seen.var() == pytest.approx(expected, rel=0.02)
+
+
+def test_limits_that_are_not_reached_change_no_byte():
+    radiance = np.random.default_rng(1).random((40, 40)).astype(np.float32)
+    plain, limited = InfraredCamera(), InfraredCamera(max_exposure=1000.0, max_gain=8.0)
+    everywhere = np.ones_like(radiance, dtype=bool)
+    assert plain.gain(radiance, everywhere) == limited.gain(radiance, everywhere)
+    pictures = [one.expose(radiance, 200.0, np.random.default_rng(2)) for one in (plain, limited)]
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_settings_of_the_exposure_are_checked():
+    with pytest.raises(ConfigError, match="metering must be object or image"):
+        InfraredCamera(metering="centre")
+    with pytest.raises(ConfigError, match="max_gain"):
+        InfraredCamera(max_gain=0.5)
