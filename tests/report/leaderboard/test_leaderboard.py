@@ -153,6 +153,7 @@ def test_one_s_own_method_beside_the_others(toy, capsys):
     for job in jobs:
         metrics = train(compose("train", list(job.overrides)))
         assert metrics.times.memory_gb > 0.05
+        assert metrics.times.core_seconds > 0
     assert main(words(toy, "seeds=0,1", "method.weight=0.5")) == 0
     shown = capsys.readouterr().out
     assert shown.startswith("turned: 0 runs to do\n## Small: turned\n")
@@ -160,7 +161,7 @@ def test_one_s_own_method_beside_the_others(toy, capsys):
     head, _, ours = (line for line in rows[1:6] if line)
     assert head == [
         "method", "S → K (simulated), accuracy %", "PointDA-10, published accuracy %",
-        "time a run", "memory",
+        "core time a run", "memory",
     ]  # fmt: skip
     assert ours[0] == "turned"
     assert re.fullmatch(r"\d+\.\d ± \d+\.\d \(n=2\)", ours[1])
@@ -205,9 +206,14 @@ def test_what_is_shown(tmp_path):
         return build_table(str(tmp_path / "small.yaml"), tmp_path)
 
     real, simulated, _ = built().rows["source only"]
-    times = Times(seconds=480.0, memory_gb=1.1, gpu_memory_gb=2.25)
+    times = Times(seconds=700.0, core_seconds=480.0, memory_gb=1.1, gpu_memory_gb=2.25)
     run_cell(tmp_path, real, (0, 1, 2), times=times, target="nyuv2", simulated=False, accuracy=0.4)
-    run_cell(tmp_path, simulated, range(5), times=Times(seconds=600.0, memory_gb=0.82))
+    run_cell(
+        tmp_path,
+        simulated,
+        range(5),
+        times=Times(seconds=900.0, core_seconds=600.0, memory_gb=0.82),
+    )
     table = built()
     assert grid(table)[1:] == [
         [
