@@ -74,7 +74,7 @@ def test_rows_say_nothing_beyond_the_rules():
         named = {word.partition("=")[0] for word in words[1:]}
         assert named <= {
             *("method", "selftraining", "selftraining.share", "evaluation.norms", "model"),
-            "selftraining.selector.graph",
+            *("selftraining.selector.graph", "selftraining.selector.growth"),
             *("protocol.epochs", "protocol.steps"),
         }, row
         assert ("selftraining" in named) == (rounds <= set(words)), row
