@@ -39,6 +39,7 @@ PLAIN = (
 )
 SETTINGS = ("method=source_only", f"protocol.epochs={WARMUP}", "protocol.optimizer.lr=0.05", *PLAIN)
 FEATURED = "model._target_=tests.training.nets.featured"
+LOW = "method.theta=0.3"  # of its selector
 STEPS = "selftraining.selector.steps=3"  # of the graph's net
 
 
@@ -162,7 +163,7 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         (("method=cpcm", "selftraining=spst", "evaluation.norms=tent"), 2),
         (("method=mlsp", "selftraining=spst", FEATURED), 2),
         # its selector sees all of the target in both; the pool is of epoch 1
-        (("method=pcfea_qbst", "method.every=1.0", "method.theta=0.3", FEATURED), 3),
+        (("method=pcfea_qbst", "method.every=1.0", LOW, "selftraining=spst", FEATURED), 3),
         (("selftraining=sd", "selftraining.theta=0", STEPS, FEATURED), WARMUP + EPOCHS + 1),
     ],
     ids=lambda value: "" if isinstance(value, int) else " ".join(value[:2]) or "qbst",
