@@ -14,6 +14,7 @@ from lightning.pytorch.plugins.io import CheckpointIO
 from qs3.runs.checkpoints import LAST, load, save
 from qs3.runs.metrics import Times
 from qs3.utils.memory import forget_peak, peak_bytes
+from qs3.utils.processor_time import Moment, processor_seconds
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -59,12 +60,13 @@ class Clock(Callback):
     the run would have taken alone, up to the speed of the machine.
 
     Args:
-        began: `time.time()` at this start, before the data were loaded.
+        began: this start, before the data were loaded.
     """
 
-    def __init__(self, began: float) -> None:
+    def __init__(self, began: Moment) -> None:
         self.began = began
         self.before = 0.0
+        self.cores_before: float | None = 0.0  # None: a start did not count them
         self.peaks = {"memory": 0, "gpu": 0}
         forget_peak()
         if torch.cuda.is_available():
@@ -72,21 +74,37 @@ class Clock(Callback):
 
     def seconds(self) -> float:
         """Wall time so far."""
-        return self.before + time.time() - self.began
+        return self.before + time.time() - self.began.wall
+
+    def core_seconds(self) -> float | None:
+        """Processor time so far; None if it is not known of an earlier start."""
+        if self.cores_before is None:
+            return None
+        return self.cores_before + max(0.0, processor_seconds() - self.began.cores)
 
     def taken(self) -> Times:
         """What the run has taken so far."""
         gb = {name: round(peak / 1e9, 3) or None for name, peak in self._now().items()}
-        seconds = round(self.seconds(), 1)
-        return Times(seconds=seconds, memory_gb=gb["memory"], gpu_memory_gb=gb["gpu"])
+        cores = self.core_seconds()
+        return Times(
+            seconds=round(self.seconds(), 1),
+            core_seconds=None if cores is None else round(cores, 1),
+            memory_gb=gb["memory"],
+            gpu_memory_gb=gb["gpu"],
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Seconds and bytes so far."""
-        return {"seconds": self.seconds(), "peaks": self._now()}
+        return {
+            "seconds": self.seconds(),
+            "core_seconds": self.core_seconds(),
+            "peaks": self._now(),
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take over what earlier starts took."""
         self.before = float(state_dict["seconds"])
+        self.cores_before = state_dict.get("core_seconds")  # of older versions: none
         self.peaks |= state_dict["peaks"]
 
     def _now(self) -> dict[str, int]:

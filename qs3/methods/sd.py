@@ -103,13 +103,18 @@ class Sd(Method):
         assert self.teacher is not None, "prepare() comes first"
         self.teacher.eval()  # the trainer puts all modules into training mode, now and then
         self.steps += 1
-        part = (1 / self.steps).clamp_min(1 - self.momentum)
-        ours, theirs = self.teacher.state_dict(), net.state_dict()
-        for name, mean in ours.items():
-            if mean.is_floating_point():
-                mean.lerp_(theirs[name], part.to(mean))
-            else:
-                mean.copy_(theirs[name])  # counts of batch norm
+        move_towards(self.teacher, net, (1 / self.steps).clamp_min(1 - self.momentum))
+
+
+@torch.no_grad()
+def move_towards(mean: nn.Module, net: nn.Module, part: Tensor) -> None:
+    """A running mean of weights and statistics takes `part` in [0, 1] of the net's."""
+    theirs = net.state_dict()
+    for name, value in mean.state_dict().items():
+        if value.is_floating_point():
+            value.lerp_(theirs[name], part.to(value))
+        else:
+            value.copy_(theirs[name])  # counts of batch norm
 
 
 def spoilt(

@@ -204,7 +204,9 @@ _TABLE = (
     Option("log_dir", text("FOLDER"), "paths.log_dir of the runs (default logs)"),
     Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
     Option("target", text("NAME"), "another target domain for all of the table"),
-    Option("overrides", text('"A=B ..."'), "that the runs had beyond the table's", ""),
+    Option(
+        "overrides", text('"A=B ..."'), "further ones of the runs; COLUMN:A=B: of a column's", ""
+    ),
     Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: taken up, not run"),
 )
 _OUT = Option("out", text("FOLDER"), "where the files go (default LOG_DIR/tables)")

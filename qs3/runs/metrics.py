@@ -229,11 +229,14 @@ class Times:
 
     Attributes:
         seconds: wall time.
+        core_seconds: user and system time of the process, its threads and its children; None: not
+            known, as of runs before it was counted.
         memory_gb: the most that a start's process had in memory; None: not known.
         gpu_memory_gb: the most that torch had taken on the GPU; None without one.
     """
 
     seconds: float
+    core_seconds: float | None = None
     memory_gb: float | None = None
     gpu_memory_gb: float | None = None
 

@@ -8,6 +8,7 @@ of the warm-up that stands among the selectors, as one of them may choose its po
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,6 +22,7 @@ from qs3.config.checks import check_choice, check_float
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, class_loss, weight
+from qs3.methods.sd import move_towards
 from qs3.models.norms import use_domain
 from qs3.selftraining.selectors import Selector, TeacherPredictions, most_confident
 
@@ -46,18 +48,26 @@ class Pcfea(Method):
     Args:
         strength: 0.25; 0 leaves the styling out.
         align_weight: w; 1; 0 leaves the alignment out.
-        shift: a is "growing", λ, as in the class that the released logs name, or "full", 1, as in
-            the released one.
+        shift: a is "growing", λ, as in the class that the released logs name, "full", 1, as in the
+            released one, or "none", 0, as in a third one of its file.
         plain: e_0 / E, rounded up to whole epochs: 0.1.
         every: epochs between two pools, of E: 0.05.
         selector: which clouds of the target are in the pool: None for the growing share, or a
             selector of `selftraining`, such as QBST.
         theta: of that selector.
+        pool: "share", as above, or "threshold", the released code's default: of the source what the
+            net names rightly with a probability above t, of the target what it names with one above
+            1 - t; t is `every` in the first pool and grows by `every` with each.
+        rank: what makes a source cloud probable: "label", the probability of its label, or "most",
+            as in the released code, that of the class which the net names, right or wrong.
+        momentum: m; pools are made by a running mean of the net, which takes 1 - m of its weights
+            and statistics a step: 0.99 in the released code. 0: by the net itself.
     """
 
     uses_target: ClassVar[bool] = True
     mean: Tensor
     source_mean: Tensor
+    part: Tensor
     covariance: Tensor
 
     def __init__(
@@ -69,11 +79,17 @@ class Pcfea(Method):
         every: float = 0.05,
         selector: Selector | None = None,
         theta: float = 0.8,
+        pool: str = "share",
+        rank: str = "label",
+        momentum: float = 0.0,
     ) -> None:
         super().__init__()
         self.strength = weight("strength", strength)
         self.align_weight = weight("align_weight", align_weight)
-        self.shift = check_choice("method.shift", shift, ("growing", "full"))
+        self.shift = check_choice("method.shift", shift, ("growing", "full", "none"))
+        self.pool = check_choice("method.pool", pool, ("share", "threshold"))
+        self.rank = check_choice("method.rank", rank, ("label", "most"))
+        self.momentum = check_float("method.momentum", momentum, "[0, 1)")
         self.plain = check_float("method.plain", plain, "[0, 1]")
         self.every = check_float("method.every", every, "(0, 1]")
         self.theta = check_float("method.theta", theta, "[0, 1)")
@@ -81,6 +97,7 @@ class Pcfea(Method):
             raise ConfigError("method.selector must be null or a selector, as in selftraining=qbst")
         self.selector = selector
         self.styled = False  # whether there is a pool
+        self.teacher: Any = None  # the running mean, if there is one
 
     def prepare(self, net: Any) -> None:
         """Room for the figures of a pool, which a checkpoint holds."""
@@ -94,18 +111,23 @@ class Pcfea(Method):
         self.register_buffer("mean", torch.zeros(classes, width))
         self.register_buffer("source_mean", torch.zeros(classes, width))
         self.register_buffer("covariance", torch.zeros(classes, width, width))
+        if self.momentum:
+            self.teacher = copy.deepcopy(net).requires_grad_(False)
+            self.register_buffer("part", torch.tensor(1 - self.momentum))
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Terms "ce", and once there is a pool "align_source" and "align_target"; each >= 0."""
+        if self.teacher is not None:
+            move_towards(self.teacher, net, self.part)
         source = batch["source"]
         f, z = penultimate(net, source["points"])
         labels = source["y_source"]
         if not self.styled:
             return {"ce": class_loss(z, labels, self.smoothing)}
         grown = self.strength * batch["progress"]
-        a = grown if self.shift == "growing" or not self.strength else 1.0
+        a = {"growing": grown, "full": 1.0 if self.strength else 0.0, "none": 0.0}[self.shift]
         with torch.autocast(z.device.type, enabled=False):
             added = style(
                 net.head[-1].weight, self.covariance, self.mean - self.source_mean, grown, a
@@ -128,17 +150,22 @@ class Pcfea(Method):
         self.styled = epoch >= first
         if not self.styled or (epoch - first) % max(1, round(self.every * epochs)):
             return
-        progress = (epoch - first) / (epochs - first)
         size, classes = data.eval_batch_size, len(self.mean)
-        labels = data.labelled.labels.numpy()
-        f, p = _features(net, data.labelled.clouds.all(), size, "source", self.mean.device)
-        of_source = most_confident(p[np.arange(len(p)), labels], labels, 1 - progress)
-        g, q = _features(net, data.target.points, size, "target", self.mean.device)
+        labels, asked = data.labelled.labels.numpy(), self.teacher or net
+        f, p = _features(asked, data.labelled.clouds.all(), size, "source", self.mean.device)
+        g, q = _features(asked, data.target.points, size, "target", self.mean.device)
         said = TeacherPredictions.of(q, data.target.ids)
         named = said.predicted
-        if self.selector is None:
-            of_target = most_confident(said.confidence, named, progress)
+        if self.pool == "threshold":
+            t = (epoch - first) / epochs + self.every
+            of_source = (p.argmax(axis=1) == labels) & (p.max(axis=1) > t)
+            of_target = said.confidence > 1 - t
         else:
+            progress = (epoch - first) / (epochs - first)
+            own = p[np.arange(len(p)), labels] if self.rank == "label" else p.max(axis=1)
+            of_source = most_confident(own, labels, 1 - progress)
+            of_target = most_confident(said.confidence, named, progress)
+        if self.selector is not None:
             chosen = self.selector.select(said, self.theta)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels
         source_mean, _ = moments(f, torch.from_numpy(labels), classes)

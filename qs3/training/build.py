@@ -21,6 +21,7 @@ from qs3.training.given import Given
 from qs3.training.load import Loaded
 from qs3.training.run import Run
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
+from qs3.utils.processor_time import Moment
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +38,12 @@ class Built:
 
 
 def build_training(
-    run: Run, method: Method, loaded: Loaded, given: Given | None, began: float
+    run: Run, method: Method, loaded: Loaded, given: Given | None, began: Moment
 ) -> Built:
     """Everything that `Trainer.fit` needs but the data.
 
     `loaded`: for class names, and the hash of what the warm-up depends on; `given`: the classifier
-    to begin with; `began`: `time.time()` when the run started.
+    to begin with; `began`: when the run started.
     """
     cfg, folder, phases = run.cfg, run.folder, run.phases
     classifier = _classifier(run, method, given)

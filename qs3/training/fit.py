@@ -29,6 +29,7 @@ from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
 from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.cli import TERMINATED
+from qs3.utils.processor_time import Moment, processor_seconds
 from qs3.utils.threads import cores, number_of
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ def fit(run: Run) -> RunMetrics:
         What `metrics.json` is to hold: the same whenever the run is repeated on this machine,
         interrupted or not, except its times.
     """
-    began = time.time()
+    began = Moment(time.time(), processor_seconds())
     quieten()
     keep_freed_memory()
     # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.

@@ -13,6 +13,7 @@ from qs3.engine.checkpointing import AtomicCheckpointIO, Clock
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from qs3.utils.files import sha256_file
+from qs3.utils.processor_time import Moment
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.watching import interrupt
 
@@ -24,6 +25,7 @@ def wind_forward(checkpoint):
     """As if the run had taken `LONG` until then."""
     content = load(checkpoint)
     content["callbacks"]["Clock"]["seconds"] += LONG
+    content["callbacks"]["Clock"]["core_seconds"] += LONG
     torch.save(content, checkpoint)
 
 
@@ -31,24 +33,31 @@ def test_earlier_starts_count(toy):  # noqa: F811
     cfg = toy("selftraining=none")
     interrupt(cfg, "on_train_epoch_start", 3)
     wind_forward(hashing.run_folder(cfg) / "last.ckpt")
-    assert LONG < train(cfg).times.seconds < 2 * LONG
+    times = train(cfg).times
+    assert LONG < times.seconds < 2 * LONG
+    assert LONG < times.core_seconds < 2 * LONG
 
 
 def test_a_shared_warmup_counts(toy, tmp_path):  # noqa: F811
-    assert 0 < train(toy("selftraining=none")).times.seconds < LONG
+    times = train(toy("selftraining=none")).times
+    assert 0 < times.seconds < LONG
+    assert 0 < times.core_seconds < LONG
     (shared,) = (tmp_path / "logs" / "warmups").rglob("*.ckpt")
     wind_forward(shared)
     mark = shared.with_name("started.json")  # as if it had been written so
     content = json.loads(mark.read_text())
     content["files"]["last.ckpt"] = sha256_file(shared)
     mark.write_text(json.dumps(content))
-    assert LONG < train(toy()).times.seconds < 2 * LONG
+    times = train(toy()).times
+    assert LONG < times.seconds < 2 * LONG
+    assert LONG < times.core_seconds < 2 * LONG
 
 
 @pytest.fixture
 def meters(monkeypatch):
     """The clock's time, and what process and GPU have had at most, as a test sets them."""
-    found = {"time": 100.0, "memory": None, "gpu": None}
+    found = {"time": 100.0, "cores": 20.0, "memory": None, "gpu": None}
+    monkeypatch.setattr(checkpointing, "processor_seconds", lambda: found["cores"])
     monkeypatch.setattr(checkpointing.time, "time", lambda: found["time"])
     monkeypatch.setattr(checkpointing, "peak_bytes", lambda: found["memory"])
     monkeypatch.setattr(checkpointing, "forget_peak", lambda: None)
@@ -59,25 +68,47 @@ def meters(monkeypatch):
 
 
 def test_a_clock_says_seconds_and_gigabytes(meters):
-    clock = Clock(began=90.0)
-    assert clock.state_dict() == {"seconds": 10.0, "peaks": {"memory": 0, "gpu": 0}}
+    clock = Clock(Moment(wall=90.0, cores=18.0))
+    assert clock.state_dict() == {
+        **{"seconds": 10.0, "core_seconds": 2.0},
+        "peaks": {"memory": 0, "gpu": 0},
+    }
     taken = clock.taken()
     assert (taken.seconds, taken.memory_gb, taken.gpu_memory_gb) == (10.0, None, None)
-    meters |= {"time": 102.34, "memory": 1_500_500_000_000 // 1000, "gpu": 2_250_000}
+    meters |= {
+        "time": 102.34,
+        "cores": 43.21,
+        "memory": 1_500_500_000_000 // 1000,
+        "gpu": 2_250_000,
+    }
     taken = clock.taken()
     assert (taken.seconds, taken.memory_gb, taken.gpu_memory_gb) == (12.3, 1.5, 0.002)
+    assert taken.core_seconds == 25.2
     meters |= {"memory": 1234 * 10**9 + 1_500_600}  # where a billion and one would be another
     assert clock.taken().memory_gb == 1234.002
 
 
 def test_a_clock_goes_on_with_the_greater_peak_and_both_times(meters):
     meters |= {"memory": 2 * GB, "gpu": GB}
-    clock = Clock(began=100.0)
-    clock.load_state_dict({"seconds": 50, "peaks": {"memory": 3 * GB, "gpu": GB // 2}})
-    meters["time"] = 101.0
-    assert clock.state_dict() == {"seconds": 51.0, "peaks": {"memory": 3 * GB, "gpu": GB}}
+    clock = Clock(Moment(wall=100.0, cores=20.0))
+    peaks = {"memory": 3 * GB, "gpu": GB // 2}
+    clock.load_state_dict({"seconds": 50, "core_seconds": 70.0, "peaks": peaks})
+    meters |= {"time": 101.0, "cores": 22.0}
+    assert clock.state_dict() == {
+        **{"seconds": 51.0, "core_seconds": 72.0},
+        "peaks": {"memory": 3 * GB, "gpu": GB},
+    }
     meters |= {"memory": None, "gpu": None}
     assert clock.state_dict()["peaks"] == {"memory": 3 * GB, "gpu": GB // 2}
+
+
+def test_what_an_older_start_did_not_count_is_not_known(meters):
+    """Not the time since then alone, which would look like a short run."""
+    clock = Clock(Moment(wall=100.0, cores=20.0))
+    clock.load_state_dict({"seconds": 50.0, "peaks": {"memory": 0, "gpu": 0}})
+    meters["cores"] = 22.0
+    assert clock.taken().core_seconds is None
+    assert clock.state_dict()["core_seconds"] is None
 
 
 def test_a_checkpoint_goes_where_it_is_asked_for(tmp_path):

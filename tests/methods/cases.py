@@ -42,9 +42,9 @@ class Case:
     pseudo: str = ""
 
 
-def _styled() -> Pcfea:
+def _styled(**settings: Any) -> Pcfea:
     """As it is once there is a pool."""
-    method = Pcfea()
+    method = Pcfea(**settings)
     method.styled = True
     return method
 
@@ -69,6 +69,7 @@ CASES = {
     "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),
+    "pcfea_averaged": Case(lambda: _styled(momentum=0.99), 2),
     "student": Case(Student, 1, source=False, pseudo="hard"),
     "student_pcm": Case(lambda: Student(pcm=True), 1, source=False, pseudo="hard"),
     "student_source": Case(lambda: Student(weight_step=0.005), 2, pseudo="hard"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,9 +18,14 @@ from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from qs3.datamodules.augment import Augment
+from qs3.evaluation.metrics import adapt_norms
+from qs3.evaluation.tent import minimise_entropy
 from qs3.methods.base import Method
 from qs3.methods.source_only import SourceOnly
 from qs3.models.dgcnn import dgcnn
+from qs3.selftraining.pcfea import Pcfea
+from qs3.selftraining.sd import GraphRefined
+from qs3.selftraining.selectors import Qbst, TeacherPredictions
 from tests.device import Watch
 from tests.methods.cases import CASES, Case, batch_of, total
 from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
@@ -70,8 +76,12 @@ def test_operations_do_not_grow_with_the_batch(name: str) -> None:
     assert _watched(name, b=4).counts == _watched(name, b=8).counts
 
 
-# Kernels that a step of DGCNN may take above those of its forward passes.
-ABOVE = {"pcm": 60, "dann": 60, "defrec_pcm": 200, "gast": 250, "student_source_pcm": 100}
+# Kernels that a step of DGCNN may take above those of its forward passes, 196 each. SD's has two
+# passes of its teacher among them, MLSP's the normals.
+ABOVE = {
+    **{"pcm": 60, "dann": 60, "defrec_pcm": 200, "gast": 250, "student_source_pcm": 100},
+    **{"cpcm": 200, "mlsp": 400, "sd": 400, "pcfea_styled": 130},
+}
 
 
 @pytest.mark.parametrize(
@@ -110,6 +120,60 @@ def test_as_many_passes_as_stated(name: str) -> None:
     setattr(backbone, real, counted)
     total(method, net, batch, torch.Generator().manual_seed(0))
     assert calls == CASES[name].passes
+
+
+def _passes(net: nn.Module) -> list[int]:
+    """Sizes of the batches that pass through the net's backbone from now on."""
+    sizes: list[int] = []
+    net.backbone.register_forward_pre_hook(lambda _, args: sizes.append(len(args[0])))
+    return sizes
+
+
+def test_a_pool_takes_one_pass_of_each_cloud() -> None:
+    """In batches for evaluation, and of no more clouds than there are."""
+    clouds = torch.rand(2, 50, 16, 3)
+    data = SimpleNamespace(
+        labelled=SimpleNamespace(
+            clouds=SimpleNamespace(all=lambda: clouds[0]), labels=torch.arange(50) % CLASSES
+        ),
+        target=SimpleNamespace(points=clouds[1], ids=[f"{i:02d}" for i in range(50)]),
+        eval_batch_size=20,
+    )
+    for settings in ({}, {"pool": "threshold"}, {"selector": Qbst()}):
+        net, method = tiny_net(), Pcfea(**settings)
+        method.prepare(net)
+        sizes = _passes(net)
+        method.start_epoch(net, data, 1, 20)  # no pool yet
+        assert sizes == []
+        method.start_epoch(net, data, 2, 20)
+        assert sizes == [20, 20, 10] * 2
+
+
+def test_tent_takes_two_passes_and_adabn_one() -> None:
+    """A batch more for the net's momentum would be a third of the time."""
+    for adapt, times in ((adapt_norms, 1), (minimise_entropy, 2)):
+        net = tiny_net()
+        sizes = _passes(net)
+        adapt(net, torch.rand(48, 16, 3), 16, 0)
+        assert sizes == [16] * 3 * times
+
+
+def test_a_graph_s_step_does_not_grow_with_the_features() -> None:
+    """Its net sees 128 components of them, and each edge once: no pass through the big net."""
+    generator = torch.Generator().manual_seed(0)
+    counts = []
+    for width in (200, 800):
+        features = torch.randn(60, width, generator=generator).numpy()
+        p = torch.rand(60, 4, generator=generator).softmax(1).numpy()
+        said = TeacherPredictions.of(p, [f"{i:02d}" for i in range(60)], features)
+        found = []
+        for steps in (2, 6):
+            with torch.profiler.profile() as inside:
+                GraphRefined(correlation=-0.5, steps=steps).select(said, 0.0, 1)
+            found.append(sum(event.count for event in inside.key_averages()))
+        counts.append((found[1] - found[0]) // 4)
+    assert counts[0] == counts[1]
+    assert counts[0] < 800  # operations of a step, forward, backward and Adam's
 
 
 @pytest.mark.parametrize(

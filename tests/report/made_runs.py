@@ -67,7 +67,7 @@ def metrics(seed=0, accuracy=0.5, **changes):
             never_predicted=[],
         ),
         "data": DataHashes(source="a" * 64, target="b" * 64),
-        "times": Times(seconds=60.0, memory_gb=0.5, gpu_memory_gb=2.0),
+        "times": Times(seconds=60.0, core_seconds=90.0, memory_gb=0.5, gpu_memory_gb=2.0),
         "versions": {"qs3": "0.1.0"},
     }
     content |= changes

@@ -9,8 +9,11 @@ from qs3.config import hashing
 from qs3.data.store import open_pointset
 from qs3.datamodules.splits import load_clouds
 from qs3.evaluation.metrics import adapt_norms
+from qs3.methods.source_only import SourceOnly
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
+from tests.methods import shapes
+from tests.methods.test_learning import POINTS, aside
 from tests.training.toy import TinyNet
 
 
@@ -62,3 +65,25 @@ def test_order_of_clouds_is_mixed_and_batches_are_even():
     flat = [value for batch in seen for value in batch]
     assert sorted(flat) == list(range(65))
     assert flat != sorted(flat)
+
+
+def test_adabn_finds_a_target_that_lies_elsewhere():
+    """All clouds moved by 1 along x: 100 % against 33, 64 and 71 (three seeds).
+
+    Of the shifts tried, all gain: strays 6 to 8 points, noise 3 to 9; of a stretch, clouds of six
+    tenths of the size and a move by 0.3, at most 5, as little is lost to them.
+    """
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.arange(256) % shapes.CLASSES
+    source, net = shapes.boxes(labels, POINTS, generator), shapes.tiny_net()
+    shapes.train(SourceOnly(), net, (source, labels), source, steps=150, seed=0, batch_size=16)
+    of_target, held_out = (
+        torch.randint(shapes.CLASSES, (256,), generator=generator) for _ in range(2)
+    )
+    target, test = (
+        aside(shapes.boxes(y, POINTS, generator), generator) for y in (of_target, held_out)
+    )
+    plain = shapes.accuracy(net, test, held_out)
+    adapt_norms(net, target, 16, seed=0)
+    assert shapes.accuracy(net, test, held_out) > 0.95
+    assert plain < 0.8

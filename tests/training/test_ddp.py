@@ -19,13 +19,15 @@ from qs3.config.hydra import build
 from qs3.data.store import open_pointset
 from qs3.datamodules.splits import load_clouds
 from qs3.evaluation.metrics import predict
+from qs3.evaluation.tent import minimise_entropy
 from qs3.runs.checkpoints import load
 from qs3.runs.pseudo_labels import write_pseudo_labels
 from qs3.selftraining.selectors import Qbst, TeacherPredictions
 from qs3.training.command import train
+from qs3.utils.seeding import derive
 from tests.commands import command
 from tests.training.conftest import result_of
-from tests.training.toy import CLASSES, overrides, toy_config, write_domain
+from tests.training.toy import CLASSES, TinyNet, overrides, toy_config, write_domain
 from tests.training.watching import interrupt, seen_by
 
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
@@ -37,6 +39,8 @@ PLAIN = (
 )
 SETTINGS = ("method=source_only", f"protocol.epochs={WARMUP}", "protocol.optimizer.lr=0.05", *PLAIN)
 FEATURED = "model._target_=tests.training.nets.featured"
+LOW = "method.theta=0.3"  # of its selector
+STEPS = "selftraining.selector.steps=3"  # of the graph's net
 
 
 @dataclass(frozen=True)
@@ -156,7 +160,13 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         (("method=sd", "selftraining=spst", FEATURED), 2),
         (("method=pcfea", "method.every=1.0", "selftraining=spst", FEATURED), 3),
         (("method=dann", "selftraining=crst_lrent", "selftraining.theta=0", FEATURED), 2),
+        (("method=cpcm", "selftraining=spst", "evaluation.norms=tent"), 2),
+        (("method=mlsp", "selftraining=spst", FEATURED), 2),
+        # its selector sees all of the target in both; the pool is of epoch 1
+        (("method=pcfea_qbst", "method.every=1.0", LOW, "selftraining=spst", FEATURED), 3),
+        (("selftraining=sd", "selftraining.theta=0", STEPS, FEATURED), WARMUP + EPOCHS + 1),
     ],
+    ids=lambda value: "" if isinstance(value, int) else " ".join(value[:2]) or "qbst",
 )
 def test_a_killed_run_goes_on(tmp_path: Path, settings: tuple[str, ...], epoch: int) -> None:
     """Both processes killed; continued, they end as if they had not been, to the bit."""
@@ -181,5 +191,16 @@ def test_a_killed_run_goes_on(tmp_path: Path, settings: tuple[str, ...], epoch: 
     again = run("killed")
     assert again.returncode == 0, again.stderr
     assert result_of(folder("killed")) == result_of(folder("whole"))
-    ours, theirs = (load(folder(name) / "student.pt") for name in ("killed", "whole"))
-    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    for file in ("student.pt", "result.pt"):  # of the latter the norms may be of the target
+        ours, theirs = (load(folder(name) / file) for name in ("killed", "whole"))
+        ours, theirs = (found.get("weights", found) for found in (ours, theirs))
+        assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    if "evaluation.norms=tent" in settings:
+        net, trained = TinyNet(3), load(folder("whole") / "student.pt")
+        net.load_state_dict(trained)
+        data = open_pointset(tmp_path / "data/kinectsim10")
+        target = load_clouds(data, "train", 32, scale="unit_ball")
+        minimise_entropy(net, target.points, 16, derive(0, "tent"))
+        assert not torch.equal(theirs["norm.weight"], trained["norm.weight"])
+        for name, value in net.state_dict().items():  # what one process makes of the weights
+            torch.testing.assert_close(theirs[name], value)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from qs3.report.tables.cells import Table
 
 ALONE = "experiment=leaderboard"
-WITH_ROUNDS = "protocol.epochs=10 protocol.steps=1000"
+WITH_ROUNDS = "protocol.epochs=10 protocol.steps=180"
 """What rows with rounds have beside `ALONE`: as many steps in all as the others."""
 
 
@@ -157,7 +157,10 @@ LEADERBOARD = Command(
         ),
         Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
         Option(
-            "overrides", text('"A=B ..."'), "that all of the table's runs had beyond its own", ""
+            "overrides",
+            text('"A=B ..."'),
+            "further ones of the runs; COLUMN:A=B: of a column's",
+            "",
         ),
         Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: taken up"),
         Option("out", text("FOLDER"), "where the page goes (default LOG_DIR/tables)"),

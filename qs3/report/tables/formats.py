@@ -33,7 +33,7 @@ def _plain_grid(table: Table) -> list[list[str]]:
             continue
         beside = "paper" if _ACCURACY in table.metrics else f"paper, {METRICS[_ACCURACY]}"
         header += _heads(table, i, many) + ([beside] if _has_paper(table, i) else [])
-    header += ["time a run", "memory"] if table.costs else []
+    header += ["core time a run", "memory"] if table.costs else []
     lines = [header if many else [*header, "seeds"]]
     for name, cells in table.rows.items():
         line = [name]
@@ -47,7 +47,7 @@ def _plain_grid(table: Table) -> list[list[str]]:
                 line.append(paper.text() if paper else "")
         if table.costs:
             groups = table.groups(name)
-            line += [_time(groups), _memory(groups)]
+            line += [_span(_core_seconds(groups)), _memory(groups)]
         if not many:
             finished = cells[0].group.seeds if cells[0] and cells[0].group else []
             line.append(", ".join(map(str, finished)) or "-")
@@ -113,7 +113,7 @@ def _rule(cell: Cell, role: str) -> str:
 def details(table: Table) -> list[list[str]]:
     """What stands behind each of our numbers, a line a cell, header first."""
     header = ["method", "task", "target", "mean ± SEM %", "n", "seeds", "teacher selected by",
-              "student selected by", "time a run", "memory", "runs"]  # fmt: skip
+              "student selected by", "time a run", "core time", "memory", "runs"]  # fmt: skip
     lines = [header]
     for cell in table.cells:
         if cell.group is None or not cell.group.finished:
@@ -129,7 +129,8 @@ def details(table: Table) -> list[list[str]]:
                 ", ".join(map(str, cell.group.seeds)),
                 _rule(cell, "teacher"),
                 _rule(cell, "student"),
-                _time([cell.group]),
+                _span(seconds(cell.group)),
+                _span(_core_seconds([cell.group])),
                 _memory([cell.group]),
                 f"{cell.group.experiment}/seed*-{cell.group.hash}",
             ]
@@ -142,9 +143,14 @@ def seconds(group: Group) -> list[float]:
     return [result.times.seconds for result in group.results]
 
 
-def _time(groups: Sequence[Group]) -> str:
-    """Such as "3.5 min" or "3.5 to 4.1 min"; "" without runs."""
-    found = [value for group in groups for value in seconds(group)]
+def _core_seconds(groups: Sequence[Group]) -> list[float]:
+    """Processor time of the finished runs of which it is known."""
+    times = [result.times for group in groups for result in group.results]
+    return [t.core_seconds for t in times if t.core_seconds is not None]
+
+
+def _span(found: Sequence[float]) -> str:
+    """Seconds such as "3.5 min" or "3.5 to 4.1 min"; "" of none."""
     most = max(found, default=0.0)
     unit, name = next(
         (u, n) for u, n in ((3600, "h"), (60, "min"), (1, "s")) if most >= u or u == 1
@@ -206,8 +212,9 @@ def remarks(table: Table) -> list[str]:
         if any(seconds(g) for g in found):
             lines.append(
                 "time: wall time of each run, the least and the most; all of its starts together, "
-                "also the warm-up that was taken from another run; memory: the most that its "
-                "process had"
+                "also the warm-up that was taken from another run; core time: likewise the time of "
+                "all cores that worked for it, which others on a busy machine change little; "
+                "memory: the most that its process had"
             )
     for source in dict.fromkeys(c.paper.source for c in table.cells if c.paper and c.paper.source):
         rows = dict.fromkeys(c.row for c in table.cells if c.paper and c.paper.source == source)
@@ -280,8 +287,8 @@ def csv_text(table: Table) -> str:
     rows: list[list[Any]] = [
         ["row", "column", "metric", "mean", "sem", "n", "seeds", "paper_mean", "paper_sem",
          "paper_selected", "paper_source", "task", "target", "simulated", "source_made_of",
-         "target_made_of", "teacher_selected", "student_selected", "seconds", "memory_gb",
-         "gpu_memory_gb", "problems", "hash", "command"]
+         "target_made_of", "teacher_selected", "student_selected", "seconds", "core_seconds",
+         "memory_gb", "gpu_memory_gb", "problems", "hash", "command"]
     ]  # fmt: skip
     for cell in table.cells:
         known = cell.group.first if cell.group else None
@@ -299,9 +306,9 @@ def csv_text(table: Table) -> str:
             values += [_rule(cell, "teacher"), _rule(cell, "student")]
             values.append(" ".join(f"{value:g}" for value in times))
             taken = [result.times for result in cell.group.results] if cell.group else []
-            for name in ("memory_gb", "gpu_memory_gb"):
-                peaks = [getattr(one, name) for one in taken]
-                values.append(" ".join("" if peak is None else f"{peak:g}" for peak in peaks))
+            for name in ("core_seconds", "memory_gb", "gpu_memory_gb"):
+                found = [getattr(one, name) for one in taken]
+                values.append(" ".join("" if one is None else f"{one:g}" for one in found))
             values.append("; ".join(cell.group.problems) if cell.group else "")
             rows.append([*values, cell.group.hash if cell.group else "", cell.command])
     return text_table.csv_text(rows)

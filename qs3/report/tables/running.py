@@ -10,7 +10,7 @@ import json
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from qs3.config.location import python_command, typed
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
 from qs3.report.tables.cells import Table
+from qs3.report.tables.overrides import chosen
 
 LAUNCHERS: Mapping[str, str | None] = {
     "basic": None,
@@ -83,19 +84,6 @@ def missing(
                 where = f"{cell.row}, {cell.column}" if len(table.columns) > 1 else cell.row
                 jobs.setdefault(overrides, Job(f"{where}, seed {seed}", overrides))
     return list(jobs.values())
-
-
-def chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
-    """Names that are meant by the words: the one that is the word, else all that contain it."""
-    typed = {name: name.lower().replace("→", "->") for name in names}
-    if not words:
-        return set(typed)
-    found: set[str] = set()
-    for word in words:
-        word = word.lower().replace("→", "->")
-        exact = {name for name, text in typed.items() if text == word}
-        found |= exact or {name for name, text in typed.items() if word in text}
-    return found
 
 
 def launch(

@@ -13,9 +13,9 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from qs3.config.compose import composing, first_line
@@ -25,11 +25,19 @@ from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import Group, group, load_runs
 from qs3.report.tables.cells import SEEDS, Cell, Metric, Published, Table
 from qs3.report.tables.keeping import with_kept
-from qs3.report.tables.running import chosen
+from qs3.report.tables.overrides import ALONE, by_column, chosen
 from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.yamls import load_yaml
 
 _SUPERVISED = "qs3.methods.supervised.Supervised"
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
+class _Column:
+    """A column with fewer seeds than its rows have."""
+
+    run: str
+    seeds: Annotated[int, Field(ge=1)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
@@ -38,7 +46,7 @@ class _Spec:
 
     title: str
     metrics: list[Metric]
-    columns: list[str] | dict[str, str | None]
+    columns: list[str] | dict[str, str | _Column | None]
     rows: list[dict[str, Any]]
     layout: Literal["", "benchmark"] = ""
     notes: list[str] = field(default_factory=list)
@@ -65,7 +73,8 @@ def build_table(
     Args:
         name: of a file in conf/table, or the path of one's own, NAME.yaml.
         log_dir: `paths.log_dir` of the runs.
-        extra: overrides of train.py for every cell, as the runs had them.
+        extra: overrides of train.py for every cell, as the runs had them, or for the cells of
+            some columns (`qs3.report.tables.overrides`).
         target: another target domain for all cells, e.g. "kinectsim10"; the paper's numbers,
             measured on another target, are then left out.
         kept: folder of results of runs that need not be there any more (`keeping.keep`).
@@ -96,12 +105,14 @@ def build_table(
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
     if str(log_dir) != "logs":
         more.append(override("paths.log_dir", log_dir))
+    own = by_column(more, tuple(spec.columns))
     try:
         cells = [
             replace(cell, column=_column(column, target))
             for row in spec.rows
             for i, column in enumerate(spec.columns)
-            if column in shown and (cell := _cell(spec, row, i, column, more, published=not target))
+            if column in shown
+            and (cell := _cell(spec, row, i, column, own[column], published=not target))
         ]
         names = [row["name"] for row in spec.rows]
         averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
@@ -110,7 +121,8 @@ def build_table(
     if twice := [one for one in names if names.count(one) > 1]:
         raise ConfigError(f"{path}: two rows are called {twice[0]!r}; give one another name")
     groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
-    filled = {(c.row, c.column): c for c in _fill(cells, groups, target)}
+    hint = f"; {ALONE}" if extra and len(shown) > 1 else ""
+    filled = {(c.row, c.column): c for c in _fill(cells, groups, target, hint)}
     named = tuple(_column(column, target) for column in shown)
     filled_rows = {
         row["name"]: tuple(filled.get((row["name"], column)) for column in named)
@@ -139,7 +151,8 @@ def _read(path: Path) -> _Spec:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
+        # The deepest: of a column that may be text or more, each kind has its error.
+        first = max(error.errors(), key=lambda one: len(one["loc"]))
         text = "; put quotes around it" * (first["type"] == "string_type")
         place = ".".join(map(str, first["loc"])) or "the file"
         raise ConfigError(f"{path}: {place}: {first['msg']}{text}") from error
@@ -153,7 +166,10 @@ def _column(name: str, target: str | None) -> str:
 
 def _task(spec: _Spec, column: str) -> str | None:
     """Overrides of a column; None where it is not for runs of ours, "" where rows have them all."""
-    return spec.columns[column] if isinstance(spec.columns, dict) else ""
+    if not isinstance(spec.columns, dict):
+        return ""
+    found = spec.columns[column]
+    return found.run if isinstance(found, _Column) else found
 
 
 def _cell(
@@ -195,6 +211,8 @@ def _cell(
     overrides = () if line is None else (*shlex.split(line), *more)
     take = own.get("take", row.get("take", "final"))
     seeds = tuple(range(row["seeds"])) if "seeds" in row else SEEDS
+    if isinstance(spec.columns, dict) and isinstance(of_all := spec.columns[column], _Column):
+        seeds = seeds[: of_all.seeds]
     first = bool(own.get("first", row.get("first", False)))
     return Cell(row["name"], column, overrides, paper, take, seeds=seeds, first=first)
 
@@ -209,9 +227,15 @@ def check_domain(key: str, name: str) -> None:
 
 
 def _fill(
-    cells: Sequence[Cell], groups: Mapping[tuple[str, str], Group], target: str | None = None
+    cells: Sequence[Cell],
+    groups: Mapping[tuple[str, str], Group],
+    target: str | None,
+    hint: str,
 ) -> list[Cell]:
-    """The cells with their runs, or with the reason why they cannot be run."""
+    """The cells with their runs, or with the reason why they cannot be run.
+
+    `hint` ends the message about an override that a cell's config does not take.
+    """
     from hydra.errors import (
         ConfigCompositionException,
         MissingConfigException,
@@ -234,7 +258,7 @@ def _fill(
             continue
         except (ConfigCompositionException, OverrideParseException) as error:
             raise ConfigError(
-                f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}"
+                f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}{hint}"
             ) from error
         found = groups.get((run.experiment, run.hash))
         filled.append(replace(cell, group=found, target=run.target, simulated=run.simulated))

@@ -17,7 +17,8 @@ import pytest
 from qs3.errors import ConfigError
 from qs3.report.tables.cells import Table
 from qs3.report.tables.comparison import against, csv_text, effects, text
-from qs3.report.tables.running import Job, chosen, launch, missing
+from qs3.report.tables.overrides import chosen
+from qs3.report.tables.running import Job, launch, missing
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions

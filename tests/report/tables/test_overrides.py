@@ -1,0 +1,82 @@
+"""Overrides that are for some columns of a table alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from qs3.errors import ConfigError
+from qs3.report.tables.overrides import by_column, chosen
+from qs3.report.tables.running import missing
+from qs3.report.tables.table import build_table
+from tests.commands import main
+
+COLUMNS = ("R → A", "R → A0", "S → K")
+TABLE = """
+title: Several targets
+metrics: [accuracy]
+columns:
+  R → A: domain@data.source=roomscan10 domain@data.target=objects
+  R → A0:
+    run: domain@data.source=roomscan10 domain@data.target=objects data.target.published.fold=0
+    seeds: 1
+  S → K: domain@data.source=specklenet10 domain@data.target=kinectsim10
+rows:
+  - {name: source only, run: experiment=leaderboard, seeds: 5}
+"""
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("a.b=1", [("a.b=1",)] * 3),
+        ("R->A:a.b=1", [("a.b=1",), (), ()]),
+        ("r -> a:a.b=1", [("a.b=1",), (), ()]),
+        ("R → A,S->K:+a=1", [("+a=1",), (), ("+a=1",)]),
+        ("A:a=1", [("a=1",), ("a=1",), ()]),  # of no column: all with it in their name
+        ("K:~a.b", [(), (), ("~a.b",)]),
+        ("a.b={c: 1}", [("a.b={c: 1}",)] * 3),
+        ("paths.data_dir=C:x", [("paths.data_dir=C:x",)] * 3),
+    ],
+)
+def test_whose_they_are(word, expected):
+    assert list(by_column([word], COLUMNS).values()) == expected
+    own = by_column(["x=0", word, "x=1"], COLUMNS)
+    assert [own[c] for c in COLUMNS] == [("x=0", *e, "x=1") for e in expected]
+
+
+def test_a_column_that_is_not_there_is_named():
+    with pytest.raises(ConfigError, match=r"M->D:a=1: no column has 'M->D' in its name; columns"):
+        by_column(["M->D:a=1"], COLUMNS)
+
+
+def test_spaces_and_arrows_do_not_count():
+    assert chosen(COLUMNS, ["r->a"]) == {"R → A"}
+    assert chosen(COLUMNS, ["s -> k", "R→A0"]) == {"S → K", "R → A0"}
+
+
+def test_a_key_that_one_column_s_target_lacks(tmp_path, capsys):
+    """The archive's path, which the simulated target knows nothing of."""
+    path = tmp_path / "several.yaml"
+    path.write_text(TABLE)
+    own = "data.target.published.file=/x/a.npz"
+    with pytest.raises(ConfigError, match=r"'S → K': .*; for some columns alone: overrides="):
+        build_table(str(path), tmp_path, [own])
+    table = build_table(str(path), tmp_path, [f"R->A,R->A0:{own}", "data.points=64"])
+    (real, fold, simulated) = table.rows["source only"]
+    assert own in real.overrides
+    assert own in fold.overrides
+    assert own not in simulated.overrides
+    assert all("data.points=64" in cell.overrides for cell in (real, fold, simulated))
+    seeds = [[job.name[-1] for job in missing(table, columns=[c])] for c in table.columns]
+    assert seeds == [list("01234"), ["0"], list("01234")]
+    words = [f"table={path}", f"log_dir={tmp_path}", "overrides=M->D:a=1"]
+    assert main(["report", *words]) == 1
+    assert "M->D:a=1: no column has 'M->D' in its name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seeds", ["0", "1.5", "[0]"])
+def test_a_column_s_seeds_are_a_number(tmp_path, seeds):
+    path = tmp_path / "x.yaml"
+    path.write_text(TABLE.replace("seeds: 1", f"seeds: {seeds}"))
+    with pytest.raises(ConfigError, match=r"x\.yaml: columns.*seeds"):
+        build_table(str(path))
