@@ -10,17 +10,15 @@ simulated targets: docs/how-to/predict.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import minimize_scalar
-from torch import nn
 
 from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.splits import Labelled, Unlabelled
-from qs3.evaluation.metrics import predict, predict_rotated
 from qs3.evaluation.ood import limits, ood_reasons_of_all, relax_min_points
 from qs3.evaluation.validators import entropies
 from qs3.runs.metrics import AccuracyEstimates, Estimates
@@ -154,19 +152,33 @@ def estimates(
     }
 
 
+@dataclass(frozen=True, eq=False)
+class Said:
+    """Class probabilities by one net.
+
+    Attributes:
+        validation: of labelled clouds that no warm-up was trained on.
+        target: of the clouds that are judged.
+    """
+
+    validation: Float[np.ndarray, "v c"]
+    target: Float[np.ndarray, "n c"]
+
+    @property
+    def finite(self) -> bool:
+        """False of a net that has diverged."""
+        return bool(np.isfinite(self.validation).all() and np.isfinite(self.target).all())
+
+
 def estimate_accuracy(
-    net: nn.Module,
-    target: Unlabelled,
-    validation: Labelled,
-    source: Clouds,
+    said: Said,
+    labels: Int[np.ndarray, " v"],
+    unlike_source: float,
     *,
     owner: str,
     classes: Sequence[str],
-    batch_size: int,
-    device: Any = "cpu",
-    teacher: nn.Module | None = None,
-    unadapted: tuple[nn.Module, nn.Module | None] | None = None,
-    upright: bool = True,
+    teacher: Said | None = None,
+    turned: Callable[[float], Float[np.ndarray, "n c"]] | None = None,
 ) -> AccuracyEstimates:
     """What `metrics.json` has under `quality`; `qs3.evaluation.estimates_text` says it as text.
 
@@ -174,46 +186,35 @@ def estimate_accuracy(
     is not finite because the net has diverged.
 
     Args:
-        net: the reported one.
-        target: the clouds that are judged.
-        validation: labelled clouds that no warm-up was trained on.
-        source: all labelled clouds.
-        owner: of their labels, "source" or "target_train".
+        said: by the reported net.
+        labels: of the validation clouds.
+        unlike_source: `ood_fraction` of the clouds that are judged.
+        owner: of the labels, "source" or "target_train".
         classes: names in label order.
-        teacher: the net before self-training; None if there was none.
-        unadapted: net and teacher with the norms that they were trained with, for the labelled
-            clouds of the source, where `net` and `teacher` have the target's (AdaBN).
-        upright: z points up in the target's clouds.
+        teacher: by the net before self-training; None if there was none.
+        turned: by the reported net of the judged clouds after a rotation about z by an angle in
+            radians; None if z does not point up in them.
     """
-    points, labels = target.points, validation.labels.numpy()
-    domain = "source" if owner == "source" else "target"
-    as_trained, taught = unadapted if unadapted and owner == "source" else (net, teacher)
-    known = predict(as_trained, validation.clouds.all(), batch_size, device, domain=domain)
-    judged = predict(net, points, batch_size, device)
-    counts = np.bincount(judged.argmax(axis=1), minlength=len(classes))
+    counts = np.bincount(said.target.argmax(axis=1), minlength=len(classes))
     about: dict[str, Any] = {
-        "clouds": len(judged),
+        "clouds": len(said.target),
         "validated_on": f"{owner}_val",
         "validation_clouds": len(labels),
-        "validation_accuracy": agreement(known, np.eye(len(classes))[labels]),
-        "unlike_source": ood_fraction(target.clouds, source),
+        "validation_accuracy": agreement(said.validation, np.eye(len(classes))[labels]),
+        "unlike_source": unlike_source,
         "never_predicted": [name for name, n in zip(classes, counts, strict=True) if not n],
     }
-    if not (np.isfinite(known).all() and np.isfinite(judged).all()):
+    if not said.finite:
         return AccuracyEstimates(**about)
-    about |= estimates(known, labels, judged)
-    if upright:
+    about |= estimates(said.validation, labels, said.target)
+    if turned is not None:
         turns = [2 * math.pi * i / (TURNS + 1) for i in range(1, TURNS + 1)]
-        rotated = [predict_rotated(net, points, turn, batch_size, device) for turn in turns]
-        about["rotation_agreement"] = rotation_agreement(judged, rotated)
+        about["rotation_agreement"] = rotation_agreement(said.target, [*map(turned, turns)])
     if teacher is not None:
-        assert taught is not None
-        theirs = predict(teacher, points, batch_size, device)
-        about["teacher_agrees"] = agreement(judged, theirs)
-        known = predict(taught, validation.clouds.all(), batch_size, device, domain=domain)
-        if np.isfinite(known).all() and np.isfinite(theirs).all():
-            accuracy = agreement(known, np.eye(len(classes))[labels])
-            found = estimates(known, labels, theirs)
+        about["teacher_agrees"] = agreement(said.target, teacher.target)
+        if teacher.finite:
+            accuracy = agreement(teacher.validation, np.eye(len(classes))[labels])
+            found = estimates(teacher.validation, labels, teacher.target)
             about["teacher"] = Estimates(validation_accuracy=accuracy, **found)
     return AccuracyEstimates(**about)
 

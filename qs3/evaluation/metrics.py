@@ -127,16 +127,11 @@ def predict_rotated(
     return predict(net, rotate_z(points, angle), batch_size, device)
 
 
-def predict_rotation_averaged(
-    net: nn.Module,
-    points: Float[Tensor, "n p 3"],
-    rotations: int,
-    batch_size: int,
-    device: Any = "cpu",
+def rotation_average(
+    of_turn: Callable[[float], Float[np.ndarray, "n c"]], rotations: int
 ) -> Float[np.ndarray, "n c"]:
     """Mean of the probabilities over `rotations` turns about the up axis: by 0, 2π/n, 4π/n, ..."""
-    turns = (2 * math.pi * i / rotations for i in range(rotations))
-    total: Any = sum(predict_rotated(net, points, turn, batch_size, device) for turn in turns)
+    total: Any = sum(of_turn(2 * math.pi * i / rotations) for i in range(rotations))
     return total / rotations
 
 
@@ -179,7 +174,6 @@ class Evaluation:
         labels: theirs [n]; None if nobody knows them.
         train_labels: of its training clouds by id, which only judge pseudo-labels; None likewise.
         classes: names in label order.
-        batch_size: of the predictions.
         rotations: over how many rotations `rotation_averaged` averages; 0 leaves it out.
         meshes: of the test clouds by id; None or missing where not known.
         tiers: likewise.
@@ -191,12 +185,11 @@ class Evaluation:
         labels: Int[Tensor, " n"] | None,
         train_labels: Mapping[str, int] | None,
         classes: Sequence[str],
-        batch_size: int,
         rotations: int = 0,
         meshes: Mapping[str, str] | None = None,
         tiers: Mapping[str, str] | None = None,
     ) -> None:
-        self.test, self.classes, self.batch_size = test, tuple(classes), batch_size
+        self.test, self.classes = test, tuple(classes)
         self.y_target_eval = None if labels is None else labels.numpy()
         self.rotations = rotations
         self._train, self._meshes = train_labels, meshes or {}
@@ -207,21 +200,17 @@ class Evaluation:
         """Whether anybody knows the classes of the evaluated clouds."""
         return self.y_target_eval is not None
 
-    def predictions(self, net: nn.Module, device: Any = "cpu") -> Predictions:
-        """What `net` predicts for each cloud, as it is and in one fixed sample."""
+    def predictions_of(self, probabilities: Float[np.ndarray, "n c"]) -> Predictions:
+        """These probabilities, with what is known of each cloud."""
         labels, ids = self.y_target_eval, self.test.ids
         return Predictions(
             self.classes,
             ids,
             tuple(self._meshes.get(id_) or id_ for id_ in ids),
             np.full(len(ids), -1) if labels is None else labels,
-            predict(net, self.test.points, self.batch_size, device),
+            probabilities,
             tuple(self._tiers.tolist()) if (self._tiers != "").any() else (),
         )
-
-    def scores(self, net: nn.Module, device: Any = "cpu") -> Scores:
-        """What `net` is worth on the target's test clouds."""
-        return self.scores_of(predict(net, self.test.points, self.batch_size, device))
 
     def scores_of(self, probabilities: Float[np.ndarray, "n c"]) -> Scores:
         """What these predictions of the test clouds are worth."""
@@ -237,15 +226,17 @@ class Evaluation:
             for tier, chosen in of.items()
         } or None
 
-    def rotation_averaged(self, net: nn.Module, device: Any = "cpu") -> Scores | None:
-        """The same for probabilities averaged over turns; None if that was not asked for."""
+    def rotation_averaged(
+        self, of_turn: Callable[[float], Float[np.ndarray, "n c"]]
+    ) -> Scores | None:
+        """The same for probabilities averaged over turns; None if that was not asked for.
+
+        Args:
+            of_turn: the test clouds' after a rotation about the up axis, by an angle in radians.
+        """
         if not self.rotations:
             return None
-        return self.scores_of(
-            predict_rotation_averaged(
-                net, self.test.points, self.rotations, self.batch_size, device
-            )
-        )
+        return self.scores_of(rotation_average(of_turn, self.rotations))
 
     def pseudo_labels(self, path: Path) -> PseudoLabelScores | None:
         """How right a round's pseudo-labels were: a diagnostic, computed when training is over.

@@ -1,4 +1,4 @@
-"""EdgeConv along its edges, and maxima of linear layers backwards, compiled for the CPU.
+"""EdgeConv along its edges, nearest neighbours, and maxima of linear layers backwards, compiled.
 
 By torch's operations the gathered rows are written and read again, k times the size of the result;
 here it is one loop. Without numba, and off the CPU, callers go by torch's operations, with the same
@@ -14,6 +14,7 @@ from functools import cache
 from importlib.util import find_spec
 from itertools import pairwise
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -98,6 +99,48 @@ def linear_max_backward(
 @linear_max_backward.register_fake
 def _(x: Tensor, weight: Tensor, grad: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
     return x.new_empty(x.shape), weight.new_empty(weight.shape)
+
+
+@torch.library.custom_op("qs3::smallest_sums", mutates_args=("values",))
+def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
+    """Columns of the k smallest values of each row after `more` was added to them, smallest first.
+
+    As `qs3.geometry.neighbours` finds them by numpy, to the same columns where values are equal.
+
+    Args:
+        values: [r, n] contiguous; the sums afterwards.
+        more: [c, n], of the first r / c rows, the next ones, ...
+        k: at most `n`.
+
+    Returns:
+        int64 [r, k].
+    """
+    (r, n), groups = values.shape, groups_for(k)
+    minima = values.new_empty(r, groups)
+    _shared("add_and_minima", r, values.numel(), values, more, minima)
+    bound = torch.from_numpy(np.sort(minima.numpy(), axis=1)[:, k - 1].copy())
+    count = torch.empty(r, dtype=torch.int64)
+    for places in (2 * k + 8, n):  # where many values are equal more of them may be in
+        few = values.new_empty(r, places + groups)
+        column = torch.empty(few.shape, dtype=torch.int32)
+        _shared("collect_below", r, values.numel(), values, minima, bound, few, column, count)
+        width = max(int(count.max()), k)
+        if width <= places:
+            break
+    order = torch.from_numpy(np.argsort(few.numpy()[:, :width], axis=1))
+    out = torch.empty(r, k, dtype=torch.int64)
+    _shared("take_in_order", r, values.numel(), column, order, out)
+    return out
+
+
+@smallest_sums.register_fake
+def _(values: Tensor, more: Tensor, k: int) -> Tensor:
+    return values.new_empty(len(values), k, dtype=torch.int64)
+
+
+def groups_for(k: int) -> int:
+    """To how many groups columns are dealt, so that hardly more than k values have to be sorted."""
+    return 64 * -(-k // 32)
 
 
 def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:

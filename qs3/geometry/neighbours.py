@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from qs3.geometry import compiled
 from qs3.geometry.farthest_points import farthest_points, farthest_points_by_scan
 from qs3.geometry.matmul import matmul_t
 from qs3.geometry.sampling import farthest_point_sampling_np
@@ -55,6 +56,7 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
     on_cpu = takes_numpy(x)
     block = _CPU_BLOCK if on_cpu else _BLOCK
     smallest = _smallest_on_cpu if on_cpu else _smallest
+    added = on_cpu and n >= 3 * compiled.groups_for(k) and compiled.usable(x)
     rows = max(1, min(n, block // n))
     clouds = max(1, block // (n * rows))
     out = torch.empty(b, n, k, dtype=torch.int64, device=x.device)
@@ -63,10 +65,14 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
         for j in range(0, n, rows):
             part = out[c, j : j + rows]
             if clouds == 1:
-                distance = matmul_t(x[i, j : j + rows], scaled[i])[None].add_(squares[c])
+                product = matmul_t(x[i, j : j + rows], scaled[i])[None]
             else:
-                distance = (x[c, j : j + rows] @ scaled[c].transpose(1, 2)).add_(squares[c])
-            part.copy_(smallest(distance.view(-1, n), k).view(part.shape))
+                product = x[c, j : j + rows] @ scaled[c].transpose(1, 2)
+            if added:
+                found = compiled.smallest_sums(product.view(-1, n), squares[c, 0], k)
+            else:
+                found = smallest(product.add_(squares[c]).view(-1, n), k)
+            part.copy_(found.view(part.shape))
     return out
 
 
@@ -78,12 +84,14 @@ def _smallest(values: Tensor, k: int) -> Tensor:
 def _smallest_on_cpu(values: Tensor, k: int) -> Tensor:
     """As `_smallest`, several times faster: only the few values that can be in are sorted.
 
+    `qs3.geometry.compiled.smallest_sums` is the same, compiled.
+
     Columns are dealt to groups; the k-th smallest of the groups' minima is no less than the
     k-th smallest of the row, so everything above it is out. That leaves hardly more than k.
     numpy's sort and argsort are vectorised (AVX-512), its partition and torch's topk are not.
     """
     r, n = values.shape
-    groups = 64 * -(-k // 32)
+    groups = compiled.groups_for(k)
     if n < 3 * groups:
         return _smallest(values, k)
     array = values.numpy()

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
+import numpy as np
 
 _SETTINGS: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": "numpy"}
 
@@ -40,6 +41,76 @@ def neighbour_max(x: Any, index: Any, best: Any, where: Any, begin: int, end: in
                 above = value > most[c] or value != value
                 most[c] = value if above else most[c]
                 at[c] = row if above else at[c]
+
+
+@_compiled
+def add_and_minima(values: Any, more: Any, minima: Any, begin: int, end: int) -> None:
+    """values[i] += more[i // r], r rows a cloud; and the least of each group of columns.
+
+    Columns are dealt to the groups in turn; those that do not fill a turn have none. The least of a
+    group with a NaN is NaN.
+    """
+    groups, turns = minima.shape[1], values.shape[1] // minima.shape[1]
+    rows = values.shape[0] // more.shape[0]
+    for i in range(begin, end):
+        least, other = minima[i], more[i // rows]
+        for g in range(groups):
+            least[g] = np.inf
+        for turn in range(turns):
+            row, added = values[i, turn * groups :], other[turn * groups :]
+            for g in range(groups):
+                value = row[g] + added[g]
+                row[g] = value
+                least[g] = value if value < least[g] or value != value else least[g]
+        for j in range(turns * groups, values.shape[1]):
+            values[i, j] += other[j]
+
+
+@_compiled
+def collect_below(
+    values: Any, minima: Any, bound: Any, few: Any, column: Any, count: Any, begin: int, end: int
+) -> None:
+    """Values up to a row's bound and their columns, in order; the places behind them get inf.
+
+    `few` and `column` have as many places as may be in, and a turn more to be written to. A count
+    that is greater says that they were too few.
+    """
+    groups, turns = minima.shape[1], values.shape[1] // minima.shape[1]
+    places = few.shape[1] - groups
+    chosen = np.empty(groups, np.int64)
+    for i in range(begin, end):
+        row, most, kept, where = values[i], bound[i], few[i], column[i]
+        number = 0
+        for g in range(groups):
+            chosen[number] = g
+            number += not minima[i, g] > most
+        found = 0
+        for turn in range(turns):
+            for g in range(number):
+                j = turn * groups + chosen[g]
+                kept[found] = row[j]
+                where[found] = j
+                found += row[j] <= most
+            if found > places:
+                break
+        if found <= places:
+            for j in range(turns * groups, len(row)):
+                if row[j] <= most:
+                    kept[found] = row[j]
+                    where[found] = j
+                    found += 1
+        count[i] = found
+        for j in range(found, places):
+            kept[j] = np.inf
+            where[j] = 0
+
+
+@_compiled
+def take_in_order(column: Any, order: Any, out: Any, begin: int, end: int) -> None:
+    """out[i, j] = column[i, order[i, j]]."""
+    for i in range(begin, end):
+        for j in range(out.shape[1]):
+            out[i, j] = column[i, order[i, j]]
 
 
 @_compiled

@@ -8,9 +8,10 @@ another weight; here it is compared whenever a file is read.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, BinaryIO
 
 import torch
@@ -59,6 +60,15 @@ def check(path: str | os.PathLike[str], advice: str) -> None:
 def copy_weights(net: nn.Module) -> dict[str, torch.Tensor]:
     """The net's parameters and buffers, copied to the CPU."""
     return {name: value.detach().cpu().clone() for name, value in net.state_dict().items()}
+
+
+def weights_sha256(weights: Mapping[str, torch.Tensor]) -> str:
+    """A hash of names, types, shapes and values: equal for equal weights, to the bit."""
+    digest = hashlib.sha256()
+    for name, value in weights.items():
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
+        digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 @contextlib.contextmanager

@@ -204,7 +204,8 @@ def _check_settings(cfg: DictConfig) -> None:
         if value is not None and (key, value) != ("trainer.threads", "auto"):
             check_int(key, value, 1)
     check_bool("data.make_source", cfg.data.make_source)
-    check_bool("report.pictures", cfg.report.pictures)
+    if cfg.report.pictures != "auto":
+        check_bool("report.pictures", cfg.report.pictures)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
         raise ConfigError(f"ckpt_path must be last or a path, got {cfg.ckpt_path!r}")
     if cfg.ckpt_path is not None and cfg.force:

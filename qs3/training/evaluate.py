@@ -6,18 +6,21 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
 from torch import nn
 
 from qs3.datamodules.splits import Labelled, Unlabelled
-from qs3.evaluation.accuracy_estimates import estimate_accuracy
-from qs3.evaluation.metrics import adapt_norms, predict
+from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy, ood_fraction
+from qs3.evaluation.metrics import adapt_norms, predict, predict_rotated
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.tent import minimise_entropy
 from qs3.evaluation.validators import LABEL_FREE
-from qs3.runs.checkpoints import load
+from qs3.runs.checkpoints import load, weights_sha256
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
@@ -58,64 +61,95 @@ class Outcome:
 
 
 class SavedNets:
-    """Nets with the weights in a run's files.
+    """Nets with the weights in a run's files, and what they predict.
+
+    Equal weights are one net, and each net predicts the same clouds once: without rounds, for one,
+    the reported weights are those of the warm-up, and its last ones the student's.
 
     Args:
         run: whose they are.
-        loaded: the target's training clouds, for norms that adapt to them.
+        loaded: clouds, and the target's for norms that adapt to them.
         built: how a net is made, and where it runs.
     """
 
     def __init__(self, run: Run, loaded: Loaded, built: Built) -> None:
-        self.run, self.target = run, loaded.data.target
+        self.run, self.data, self.test = run, loaded.data, loaded.evaluation.test
         self.classifier, self.device = built.classifier, built.classifier.device
+        self._weights: dict[Path, str] = {}
+        self._nets: dict[tuple[str, str], nn.Module] = {}
+        self._predicted: dict[tuple[str, str, float], np.ndarray] = {}
 
     def __call__(self, file: Path) -> nn.Module:
         """As it is evaluated: with norms of the target if `evaluation.norms` says so."""
-        net, cfg = self.as_trained(file), self.run.cfg
-        if cfg.evaluation.norms != "trained":
-            adapt = adapt_norms if cfg.evaluation.norms == "adabn" else minimise_entropy
-            seed = derive(self.run.seed, cfg.evaluation.norms)
-            adapt(net, self.target.points, cfg.protocol.batch_size, seed, self.device)
-        return net
+        return self._net(file, self.run.cfg.evaluation.norms)
 
-    def as_trained(self, file: Path) -> nn.Module:
-        """With the norms that it was trained with."""
-        net = self.classifier.fresh_net(phase=0).to(self.device)
-        net.load_state_dict(load(file, self.device))
-        return net
+    def of_test(self, file: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
+        """Probabilities of the evaluated clouds, rotated about the up axis by `turn` in radians."""
+        key = self._weights_in(file), "test", turn
+        if key not in self._predicted:
+            more = self(file), self.test.points
+            how: Any = self.run.cfg.data.eval_batch_size, self.device
+            found = predict_rotated(*more, turn, *how) if turn else predict(*more, *how)
+            self._predicted[key] = found
+        return self._predicted[key]
+
+    def of_validation(self, file: Path) -> Float[np.ndarray, "v c"]:
+        """Probabilities of the labelled validation clouds, with the norms for their domain."""
+        key = self._weights_in(file), "validation", 0.0
+        if key not in self._predicted:
+            of_source, clouds = self.data.owner == "source", self.data.validation.clouds
+            net = self._net(file, "trained" if of_source else self.run.cfg.evaluation.norms)
+            self._predicted[key] = predict(
+                net,
+                clouds.all(),
+                self.run.cfg.data.eval_batch_size,
+                self.device,
+                domain="source" if of_source else "target",
+            )
+        return self._predicted[key]
+
+    def _net(self, file: Path, norms: str) -> nn.Module:
+        key = self._weights_in(file), norms
+        if key not in self._nets:
+            net = self.classifier.fresh_net(phase=0).to(self.device)
+            net.load_state_dict(load(file, self.device))
+            if norms != "trained":
+                adapt = adapt_norms if norms == "adabn" else minimise_entropy
+                size, seed = self.run.cfg.protocol.batch_size, derive(self.run.seed, norms)
+                adapt(net, self.data.target.points, size, seed, self.device)
+            self._nets[key] = net
+        return self._nets[key]
+
+    def _weights_in(self, file: Path) -> str:
+        """A hash of the weights: files of equal ones need not be equal."""
+        if file not in self._weights:
+            self._weights[file] = weights_sha256(load(file))
+        return self._weights[file]
 
 
 def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     """Score the warm-up's and the student's weights; of the reported ones say more."""
     nets, evaluation = SavedNets(run, loaded, built), loaded.evaluation
-    device = nets.device
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
     choice = None if built.student.rule == LAST else built.student.choice()
     reported = "student" if run.scheme.rounds else "selected"
     file = choice.file if choice else files[reported]
-    net = nets(file)
-    predictions = evaluation.predictions(net, device)
-    final = evaluation.scores_of(predictions.probabilities)
-    scores = {
-        name: final if path == file else evaluation.scores(nets(path), device)
-        for name, path in files.items()
-    }
-    rotated = evaluation.rotation_averaged(net, device)
-    before = rotated if file == files["selected"] else None
-    if before is None:
-        before = evaluation.rotation_averaged(nets(files["selected"]), device)
+    net, device = nets(file), nets.device
+    predictions = evaluation.predictions_of(nets.of_test(file))
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
     return Outcome(
         net=net,
         predictions=predictions,
         choice=choice,
-        final=final,
-        scores=scores,
-        rotated=(rotated, before),
+        final=evaluation.scores_of(predictions.probabilities),
+        scores={name: evaluation.scores_of(nets.of_test(path)) for name, path in files.items()},
+        rotated=(
+            evaluation.rotation_averaged(partial(nets.of_test, file)),
+            evaluation.rotation_averaged(partial(nets.of_test, files["selected"])),
+        ),
         validators=without_labels(net, data.target, choice, batch_size, device),
-        quality=_quality(run, loaded, nets, file, net),
+        quality=_quality(run, loaded, nets, file),
         training=(
             training_accuracy(net, data.labelled, data.owner, batch_size, device)
             if run.cfg.data.clouds_a_class is not None
@@ -124,26 +158,19 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     )
 
 
-def _quality(
-    run: Run, loaded: Loaded, nets: SavedNets, file: Path, net: nn.Module
-) -> AccuracyEstimates:
-    taught = run.folder / WARMUP_SELECTED if run.scheme.rounds else None
-    unadapted = None
-    if run.cfg.evaluation.norms != "trained":
-        unadapted = nets.as_trained(file), nets.as_trained(taught) if taught else None
+def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> AccuracyEstimates:
+    def said(weights: Path) -> Said:
+        return Said(validation=nets.of_validation(weights), target=nets.of_test(weights))
+
     data = loaded.data
-    more: dict[str, Any] = {"batch_size": data.eval_batch_size, "device": nets.device}
     return estimate_accuracy(
-        net,
-        loaded.evaluation.test,
-        data.validation,
-        data.all_labelled,
+        said(file),
+        data.validation.labels.numpy(),
+        ood_fraction(loaded.evaluation.test.clouds, data.all_labelled),
         owner=data.owner,
         classes=loaded.evaluation.classes,
-        teacher=nets(taught) if taught else None,
-        unadapted=unadapted,
-        upright=run.target.gravity == "z",
-        **more,
+        teacher=said(run.folder / WARMUP_SELECTED) if run.scheme.rounds else None,
+        turned=partial(nets.of_test, file) if run.target.gravity == "z" else None,
     )
 
 

@@ -86,7 +86,6 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         labels_of(target, split) if split == "test" else None,
         _labels_by_id(target, "train"),
         target.classes,
-        cfg.data.eval_batch_size,
         cfg.evaluation.rotations,
         _objects_by_id(target, run.target),
         _tiers_by_id(target, run.target),

@@ -14,7 +14,8 @@ from qs3.evaluation.calibration import calibration_error, reliability
 from qs3.evaluation.metrics import (
     Evaluation,
     predict,
-    predict_rotation_averaged,
+    predict_rotated,
+    rotation_average,
     scores,
 )
 from qs3.runs.metrics import Scores
@@ -101,21 +102,24 @@ class Net(nn.Module):
         return 3 * points[:, 0, :2]
 
 
+def turned(points: torch.Tensor, batch_size: int = 4):
+    """What `Net` says of the clouds after a turn."""
+    return lambda turn: predict_rotated(Net(), points, turn, batch_size)
+
+
 def test_mean_over_turns():
     points = torch.nn.functional.normalize(torch.rand(6, 4, 3), dim=2)
     net = Net()
-    assert np.array_equal(predict_rotation_averaged(net, points, 1, 4), predict(net, points, 4))
+    assert np.array_equal(rotation_average(turned(points), 1), predict(net, points, 4))
     by_hand = [
         predict(net, rotate_z(points, torch.full((6,), angle)), 4)
         for angle in (0.0, torch.pi / 2, torch.pi, 3 * torch.pi / 2)
     ]
-    assert np.allclose(
-        predict_rotation_averaged(net, points, 4, 4), np.mean(by_hand, axis=0), atol=1e-6
-    )
-    turned = rotate_z(points, torch.full((6,), 2 * torch.pi / 12))
-    twelve = predict_rotation_averaged(net, points, 12, 4)
-    assert np.allclose(twelve, predict_rotation_averaged(net, turned, 12, 4), atol=1e-6)
-    assert not np.allclose(predict(net, points, 4), predict(net, turned, 4), atol=1e-2)
+    assert np.allclose(rotation_average(turned(points), 4), np.mean(by_hand, axis=0), atol=1e-6)
+    first = rotate_z(points, torch.full((6,), 2 * torch.pi / 12))
+    twelve = rotation_average(turned(points), 12)
+    assert np.allclose(twelve, rotation_average(turned(first), 12), atol=1e-6)
+    assert not np.allclose(predict(net, points, 4), predict(net, first, 4), atol=1e-2)
 
 
 @pytest.mark.parametrize("labelled", [True, False])
@@ -124,7 +128,7 @@ def test_each_tier_is_scored_by_itself(labelled, tiers):
     clouds = Clouds.of(np.zeros((4, 6, 3), np.float32))
     labels = torch.tensor([0, 1, 0, 1]) if labelled else None
     evaluation = Evaluation(
-        Unlabelled(clouds, tuple("abcd")), labels, None, ("x", "y"), 2, tiers=tiers
+        Unlabelled(clouds, tuple("abcd")), labels, None, ("x", "y"), tiers=tiers
     )
     p = np.array([[0.9, 0.1], [0.8, 0.2], [0.4, 0.6], [0.3, 0.7]], np.float32)
     of_each = evaluation.predictions(Net()).tiers
@@ -144,16 +148,14 @@ def test_each_tier_is_scored_by_itself(labelled, tiers):
 def test_turned_scores_stand_beside_the_plain_ones(rotations, labelled):
     clouds = Clouds.of(np.random.default_rng(0).normal(size=(5, 6, 3)).astype(np.float32))
     labels = torch.tensor([0, 1, 0, 1, 1]) if labelled else None
-    evaluation = Evaluation(
-        Unlabelled(clouds, tuple("abcde")), labels, None, ("x", "y"), 2, rotations
-    )
-    net = Net()
-    plain, turned = evaluation.scores(net), evaluation.rotation_averaged(net)
-    assert (turned is None) == (rotations == 0)
+    evaluation = Evaluation(Unlabelled(clouds, tuple("abcde")), labels, None, ("x", "y"), rotations)
+    first, of_turn = predict(Net(), clouds.all(), 2), turned(clouds.all(), 2)
+    plain, mean = evaluation.scores_of(first), evaluation.rotation_averaged(of_turn)
+    assert (mean is None) == (rotations == 0)
     assert (plain.accuracy is None) == (not labelled)
-    predicted = predict(net, clouds.all(), 5).argmax(axis=1)
+    predicted = first.argmax(axis=1)
     assert list(plain.predicted.values()) == np.bincount(predicted, minlength=2).tolist()
-    if turned is not None:
-        assert (turned.n, turned.accuracy is None) == (plain.n, plain.accuracy is None)
-        predicted = predict_rotation_averaged(net, clouds.all(), rotations, 5).argmax(axis=1)
-        assert list(turned.predicted.values()) == np.bincount(predicted, minlength=2).tolist()
+    if mean is not None:
+        assert (mean.n, mean.accuracy is None) == (plain.n, plain.accuracy is None)
+        predicted = rotation_average(of_turn, rotations).argmax(axis=1)
+        assert list(mean.predicted.values()) == np.bincount(predicted, minlength=2).tolist()

@@ -117,6 +117,19 @@ def test_without_numba_torch_gives_the_same(monkeypatch):
     assert not asked
 
 
+@pytest.mark.parametrize(("rows", "k", "among"), [(1, 1, 1), (50, 4, 50), (40, 20, 3)])
+def test_rows_are_added_to_those_that_they_name(rows, k, among):
+    """By a loop; with rows that nobody names, and some that one row names several times."""
+    index = edges(among, rows, k)
+    x = torch.randn(rows, 5, dtype=torch.float64)
+    expected = torch.zeros_like(x)
+    for i in range(rows):
+        for j in index[i].tolist():
+            expected[j] += x[i]
+    for way in (edgeconv._added_to_neighbours, compiled.add_to_neighbours):
+        torch.testing.assert_close(way(x, index), expected)
+
+
 def test_torchs_compiler_knows_them():
     x, index = torch.randn(9, 4), edges(9, 9, 3)
     best, where = compiled.neighbour_max(x, index)
@@ -126,6 +139,8 @@ def test_torchs_compiler_knows_them():
     torch.library.opcheck(compiled.add_to_neighbours, (x, index), test_utils=checks)
     of_layer = torch.randn(2, 9, 4), torch.randn(3, 4), torch.randn(2, 3), edges(9, 2, 3)
     torch.library.opcheck(compiled.linear_max_backward, of_layer, test_utils=checks)
+    sums = torch.randn(6, 200), torch.randn(2, 200), 20
+    torch.library.opcheck(compiled.smallest_sums, sums, test_utils=checks)
 
 
 FORKED = """

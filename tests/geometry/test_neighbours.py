@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.geometry import neighbours
+from qs3.geometry import compiled, neighbours
 from qs3.geometry.neighbours import farthest_point_sampling, gather, knn
 from tests.device import as_on_device
 from tests.geometry.test_sampling import assert_farthest
@@ -35,6 +35,50 @@ def test_knn_equals_brute_force(n: int, c: int, k: int, dtype: torch.dtype) -> N
     index = knn(x, k)
     _assert_nearest(x.double(), index, atol=1e-4 if dtype == torch.float32 else 1e-9)
     assert torch.equal(index[:, :, 0], torch.arange(n).expand(2, n))  # itself
+
+
+def _points(kind: str, shape: tuple[int, int, int], dtype: torch.dtype) -> torch.Tensor:
+    x = torch.randn(shape, generator=torch.Generator().manual_seed(0)).to(dtype)
+    if kind == "grid":  # most distances are equal to others
+        return (2 * x).round()
+    if kind == "copies":
+        return x[:, torch.arange(shape[1]) % 40]
+    if kind == "one place":
+        return torch.zeros_like(x)
+    if kind == "nan":
+        x[0, 5, 0], x[1, 7] = torch.nan, torch.inf
+    return x
+
+
+@pytest.mark.parametrize("kind", ["random", "grid", "copies", "one place", "nan"])
+@pytest.mark.parametrize(("n", "c", "k"), [(192, 3, 20), (333, 5, 20), (500, 3, 33), (260, 8, 1)])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_compiled_and_numpys_nearest_are_the_same(
+    n: int, c: int, k: int, kind: str, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the last index, also where distances are equal: trainings must not depend on numba."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    for dtype in (torch.float32, torch.float64):
+        x = _points(kind, (2, n, c), dtype)
+        found = knn(x, k)
+        with monkeypatch.context() as without:
+            without.setattr(compiled, "_has_numba", lambda: False)
+            assert torch.equal(knn(x, k), found)
+        if kind in ("random", "grid"):
+            _assert_nearest(x.double(), found, atol=1e-4)
+
+
+@pytest.mark.parametrize("equal", [0, 1, 60, 200])
+def test_smallest_sums_of_rows_that_are_mostly_equal(equal: int) -> None:
+    """By a stable sort: of `equal` columns that share the least value any may come first."""
+    torch.manual_seed(0)
+    values, more = torch.rand(6, 203), torch.rand(3, 203)
+    values[:, 3 : 3 + equal] = -9 - more.repeat_interleave(2, 0)[:, 3 : 3 + equal]
+    sums = values + more.repeat_interleave(2, 0)
+    found = compiled.smallest_sums(values, more, 20)
+    assert torch.equal(values, sums)
+    assert torch.equal(sums.gather(1, found), sums.sort(1)[0][:, :20])
+    assert (found.sort(1)[0].diff(dim=1) > 0).all()
 
 
 def test_knn_is_exact_in_float64() -> None:

@@ -102,6 +102,21 @@ def test_kernels_beside_the_passes(name: str) -> None:
     assert kernels[name] <= CASES[name].passes * kernels["source_only"] + ABOVE[name]
 
 
+# Kernels of a step of DGCNN that no change may exceed, whatever its forward passes cost.
+AT_MOST = {"source_only": 250, "pcm": 250 + 60, "gast": 2000}
+
+
+@pytest.mark.parametrize("name", AT_MOST)
+def test_kernels_of_a_step(name: str) -> None:
+    method, net = CASES[name].make(), dgcnn(CLASSES)
+    method.prepare(net)
+    net, method = net.to("meta"), method.to("meta")
+    batch = batch_of(CASES[name], method, 16, 1024, CLASSES, "meta")
+    with Watch() as watch:
+        total(method, net, batch, torch.Generator().manual_seed(0)).backward()
+    assert 100 < watch.kernels.total() <= AT_MOST[name]
+
+
 @parametrize
 def test_as_many_passes_as_stated(name: str) -> None:
     """The benchmark compares with them; a pass is a call of the backbone."""

@@ -18,7 +18,7 @@ from qs3.models.norms import KINDS, use_domain
 from tests.device import Watch, as_on_device
 from tests.models.test_all_nets import NETS, build, clouds
 
-# Kernels of a step. The authors' DGCNN has 167.
+# Kernels of a step. The authors' DGCNN has 167. tests/methods/test_steps.py has those of methods.
 BARS = {
     "dgcnn": 250,
     "pointdan": 350,

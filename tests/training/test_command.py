@@ -103,13 +103,17 @@ def test_ddp_is_refused_in_a_multirun(tmp_path):
 
 def test_multirun_then_one_seed(tmp_path, toy_data):  # noqa: F811
     arguments = overrides(tmp_path, f"paths.data_dir={toy_data}", "selftraining=none")
-    sweep = command(tmp_path, *arguments, "seed=0,1", "-m")
+    sweep = command(tmp_path, *arguments, "report.pictures=auto", "seed=0,1", "-m")
     assert sweep.returncode == 0, sweep.stderr
     assert re.search(r"quickstart .* ± .* 2", sweep.stdout)
     assert "simulated" in sweep.stdout
     zero, one = sorted((tmp_path / "logs" / "quickstart").iterdir())
     assert (zero / ".hydra" / "config.yaml").is_file()
     assert not (zero / "wandb").exists()
+    page = zero / "pictures" / "index.html"  # of the first run alone
+    assert f"\npictures: {page}; of another run: qs3 report page run=PATH" in sweep.stdout
+    assert page.is_file()
+    assert not (one / "pictures").exists()
 
     imported, again = imports_of(tmp_path, *arguments, "seed=1")
     assert not imported & HEAVY

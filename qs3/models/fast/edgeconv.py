@@ -103,10 +103,18 @@ class _Moments(torch.autograd.Function):
         upstream = (x @ d_xax).flatten(0, 1)
         if compiled.usable(x):
             return dx.add_(compiled.add_to_neighbours(upstream, index).view_as(dx)), None
-        rows = dx.flatten(0, 1)  # a view
-        for j in range(index.shape[1]):
-            rows.index_add_(0, index[:, j], upstream)
-        return dx, None
+        return dx.add_(_added_to_neighbours(upstream, index).view_as(dx)), None
+
+
+def _added_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
+    """A'x: each row of x [q, c] added to the rows that index [q, k] names, [q, c].
+
+    By lists of who names each row: `embedding_bag` sums them without laying their rows out, where
+    `index_add_` takes one pass over x and the sums for each of the k columns.
+    """
+    row, order = index.flatten().int().sort(stable=True)
+    first = torch.searchsorted(row, torch.arange(len(x), dtype=row.dtype, device=x.device))
+    return F.embedding_bag(order // index.shape[1], x, first, mode="sum")
 
 
 def neighbour_max(x: Float[Tensor, "p c"], index: Int[Tensor, "q k"]) -> Float[Tensor, "q c"]:

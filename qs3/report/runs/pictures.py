@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from qs3.config.hydra import in_multirun
 from qs3.data.viewer.page import page as turnable_page
 from qs3.errors import Qs3Error
 from qs3.report.figures.canvas import NothingToDrawError
@@ -153,14 +154,15 @@ class AfterTraining:
     A picture that cannot be made is a warning: the result is saved already.
 
     Attributes:
-        pictures: False draws nothing.
+        pictures: False draws nothing, "auto" nothing in a sweep: they would take as long as many a
+            run, and the sweep draws its first run's (`of_sweep`).
     """
 
-    pictures: bool = True
+    pictures: bool | Literal["auto"] = "auto"
 
     def __call__(self, folder: Path, config: Mapping[str, Any] | None = None) -> None:
         """Draw those of the run in `folder`, by its composed config or the one that lies there."""
-        if not self.pictures:
+        if not self.pictures or (self.pictures == "auto" and in_multirun()):
             return
         try:
             drawn = draw(folder, embed=False, config=config)
@@ -174,6 +176,28 @@ class AfterTraining:
                 error,
                 folder,
             )
+
+
+def of_sweep(folders: Sequence[Path]) -> str:
+    """Draw the first finished run's pictures, unless it has some; what is said of it.
+
+    Args:
+        folders: of the runs that left their pictures to the sweep, in order.
+
+    Returns:
+        A line with the page, and how to draw another run's; "" if no run is finished, or where a
+        warning has said that its pictures failed.
+    """
+    first = next((folder for folder in folders if read_metrics(folder) is not None), None)
+    if first is None:
+        return ""
+    path = first / FOLDER / PAGE
+    if not path.is_file():
+        AfterTraining(pictures=True)(first)
+    if not path.is_file():
+        return ""
+    more = "; of another run: qs3 report page run=PATH" if len(folders) > 1 else ""
+    return f"pictures: {path}{more}\n"
 
 
 def _log_to_wandb(drawn: Drawn, metrics: RunMetrics | None) -> None:

@@ -142,6 +142,8 @@ class Table:
         averages: published averages by row, in percent, where they differ in the last digit from
             the mean of the published numbers.
         costs: whether time and memory stand beside the numbers.
+        factors: level of each factor, by row, of rows that cross several, such as two selectors by
+            two schemes.
     """
 
     name: str
@@ -153,6 +155,7 @@ class Table:
     benchmark: bool = False
     averages: Mapping[str, float] = field(default_factory=dict)
     costs: bool = False
+    factors: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def cells(self) -> list[Cell]:

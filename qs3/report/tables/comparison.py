@@ -103,8 +103,12 @@ def _beside(table: Table, base: str) -> list[tuple[str, Cell, Cell]]:
 def effects(table: Table) -> list[Compared]:
     """Main effects: each column minus the first over the rows that have both, then rows likewise.
 
-    Rows whose two cells are one run (a teacher that no column changes) are left out.
+    Rows whose two cells are one run (a teacher that no column changes) are left out. Of a table
+    whose rows cross factors: each level minus the factor's first, over rows with equal levels of
+    the others.
     """
+    if table.factors:
+        return _effects_of_factors(table)
     columns = {
         name: [cells[i] for cells in table.rows.values()] for i, name in enumerate(table.columns)
     }
@@ -114,6 +118,33 @@ def effects(table: Table) -> list[Compared]:
         *_main_effects(columns, list(table.rows), tiers),
         *_main_effects(by_row, list(table.columns), tiers),
     ]
+
+
+def _effects_of_factors(table: Table) -> list[Compared]:
+    """Levels come in the order of the rows, and cells of all columns are pairs of their own."""
+    found, levels_of = [], table.factors
+    for factor in next(iter(levels_of.values())):
+        base, *rest = dict.fromkeys(levels[factor] for levels in levels_of.values())
+        first = {_others(x, factor): row for row, x in levels_of.items() if x[factor] == base}
+        for level in rest:
+            both: dict[str, tuple[Cell, Cell]] = {}
+            for row, levels in levels_of.items():
+                if levels[factor] != level or (other := _others(levels, factor)) not in first:
+                    continue
+                beside = zip(table.columns, table.rows[row], table.rows[first[other]], strict=True)
+                for column, one, two in beside:
+                    if one and two and one.runnable and two.runnable:
+                        where = (*other, column) if len(table.columns) > 1 else other
+                        both[", ".join(where)] = one, two
+            if both:
+                title = f"{factor}: {level} minus {base}, over {'; '.join(both)}"
+                found.append(_compared(title, list(both.values())))
+    return found
+
+
+def _others(levels: Mapping[str, str], factor: str) -> tuple[str, ...]:
+    """The levels of the other factors."""
+    return tuple(level for name, level in levels.items() if name != factor)
 
 
 def _same(one: Cell, two: Cell) -> bool:

@@ -115,6 +115,7 @@ def build_table(
             and (cell := _cell(spec, row, i, column, own[column], published=not target))
         ]
         names = [row["name"] for row in spec.rows]
+        factors = _factors(spec.rows)
         averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
     except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
@@ -135,7 +136,7 @@ def build_table(
     metrics = tuple(spec.metrics)
     return Table(
         name, title, tuple(notes), metrics, named, filled_rows, bool(spec.layout), averages,
-        spec.costs,
+        spec.costs, factors,
     )  # fmt: skip
 
 
@@ -156,6 +157,23 @@ def _read(path: Path) -> _Spec:
         text = "; put quotes around it" * (first["type"] == "string_type")
         place = ".".join(map(str, first["loc"])) or "the file"
         raise ConfigError(f"{path}: {place}: {first['msg']}{text}") from error
+
+
+def _factors(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, str]]:
+    """What rows have under `factors`, e.g. {selector: QBST, scheme: scratch}, by their names."""
+    found = {row["name"]: dict(row["factors"]) for row in rows if "factors" in row}
+    known: dict[tuple[str, ...], str] = {}
+    for name, levels in found.items():
+        if not all(isinstance(word, str) for pair in levels.items() for word in pair):
+            raise ConfigError(f"table row {name!r}: factors: and their levels must be words")
+        if levels.keys() != (first := next(iter(found.values()))).keys():
+            raise ConfigError(
+                f"table row {name!r}: its factors are {', '.join(levels)}, those of the first row "
+                f"that has some {', '.join(first)}"
+            )
+        if (twin := known.setdefault(tuple(levels[key] for key in first), name)) != name:
+            raise ConfigError(f"table row {name!r} has the factors of row {twin!r}")
+    return found
 
 
 def _column(name: str, target: str | None) -> str:

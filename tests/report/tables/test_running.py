@@ -262,6 +262,73 @@ def test_effects_by_hand(tmp_path):
     assert "+10.0 [" in text([one])
 
 
+CROSSED = """
+title: Two by two
+metrics: [accuracy]
+columns: [K]
+rows:
+  - {name: before, run: experiment=cad10}
+  - name: a
+    factors: {selector: QBST, scheme: fresh}
+    run: experiment=cad10 selftraining=qbst selftraining.theta=0.1
+  - name: b
+    factors: {selector: QBST, scheme: goes on}
+    run: experiment=cad10 selftraining=qbst selftraining.theta=0.2
+  - name: c
+    factors: {selector: SPST, scheme: fresh}
+    run: experiment=cad10 selftraining=qbst selftraining.theta=0.3
+  - name: d
+    factors: {scheme: goes on, selector: SPST}
+    run: experiment=cad10 selftraining=qbst selftraining.theta=0.4
+"""
+
+
+def test_effects_of_rows_that_cross_two_factors(tmp_path):
+    """Of twenty clouds 8 and 14, and 9 and 12 are right."""
+    path = tmp_path / "crossed.yaml"
+    path.write_text(CROSSED)
+    right = {("before", "K"): 3, ("a", "K"): 8, ("b", "K"): 14, ("c", "K"): 9, ("d", "K"): 12}
+    found = {one.name: one for one in effects(fill(tmp_path / "runs", str(path), right))}
+    assert list(found) == [
+        "selector: SPST minus QBST, over fresh; goes on",
+        "scheme: goes on minus fresh, over QBST; SPST",
+    ]
+    selector, scheme = (one.differences[0].mean for one in found.values())
+    assert selector == pytest.approx((9 - 8 + 12 - 14) / 2 / 20)
+    assert scheme == pytest.approx((14 - 8 + 12 - 9) / 2 / 20)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("SPST, scheme: fresh", "QBST, scheme: fresh", "row 'c' has the factors of row 'a'"),
+        ("scheme: goes on, selector: SPST", "scheme: goes on", "row 'd': its factors are scheme,"),
+        ("scheme: goes on, selector: SPST", "scheme: 1, selector: SPST", "row 'd': .*be words"),
+        ("{scheme: goes on, selector: SPST}", "SPST", "missing or wrong entry"),
+    ],
+)
+def test_factors_that_cross_nothing(tmp_path, old, new, message):
+    path = tmp_path / "crossed.yaml"
+    path.write_text(CROSSED.replace(old, new))
+    with pytest.raises(ConfigError, match=message):
+        build_table(str(path), tmp_path)
+
+
+def test_the_last_rows_of_headline_are_two_selectors_by_two_schemes(tmp_path):
+    table = build_table("headline", tmp_path)
+    levels = [tuple(one.values()) for one in table.factors.values()]
+    assert len(set(levels)) == 4
+    assert [len({level[i] for level in levels}) for i in (0, 1)] == [2, 2]
+    assert list(table.factors) == list(table.rows)[-4:]
+    for row, (selector, scheme) in zip(table.factors, levels, strict=True):
+        words = table.rows[row][0].overrides
+        assert f"selftraining={selector.lower()}" in words
+        # QBST is fresh by itself, SPST goes on by itself
+        stated = any(word.startswith("selftraining.init=") for word in words)
+        assert stated == ((selector == "QBST") == scheme.startswith("the teacher"))
+    assert len(effects(table)) == 2
+
+
 @pytest.mark.slow
 def test_a_table_of_real_trainings(tmp_path):
     """Two rows, two seeds, two at a time; a second call has nothing to do; rows are compared."""
