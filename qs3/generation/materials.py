@@ -63,7 +63,7 @@ class MixedMaterials:
 
     def __post_init__(self) -> None:
         check_int("materials.max_materials", self.max_materials, 1)
-        kinds = {name: _kind(name, fields) for name, fields in self.kinds.items()}
+        kinds = {name: checked_kind(name, fields) for name, fields in self.kinds.items()}
         object.__setattr__(self, "kinds", kinds)
         if not sum(kind.weight for kind in kinds.values()) > 0:
             raise ConfigError("materials.kinds: no kind has a weight above 0")
@@ -124,7 +124,7 @@ def _faces_of(mesh: Mesh, wanted: np.ndarray) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
 
 
-def _kind(name: str, fields: Any) -> Kind:
+def checked_kind(name: str, fields: Any) -> Kind:
     """A kind of material; ConfigError names the key that is wrong."""
     place = f"materials.kinds.{name}"
     if isinstance(fields, Kind):
@@ -140,8 +140,10 @@ def _kind(name: str, fields: Any) -> Kind:
         ranges["transmission"] = "[0, 0.95]"
     for key, allowed in ranges.items():
         ends = getattr(kind, key)
-        if not isinstance(ends, Sequence) or len(ends) != 2 or not ends[0] <= ends[1]:
-            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r}")
+        if not isinstance(ends, list | tuple) or len(ends) != 2:
+            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r:.80}")
         for end in ends:
             check_float(f"{place}.{key}", end, allowed)
+        if ends[0] > ends[1]:
+            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r}")
     return kind

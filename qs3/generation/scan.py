@@ -10,6 +10,7 @@ import numpy as np
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
+from qs3.generation.materials_file import with_materials
 from qs3.generation.plan import check, check_recipe
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud
@@ -77,8 +78,9 @@ def composed_recipe(overrides: Sequence[str]) -> DictConfig:
     """
     from qs3.config.compose import composed
 
+    words = with_materials(overrides)
     try:
-        return composed("generate", *overrides)
+        return composed("generate", *words)
     except ConfigError as error:
         missing = str(getattr(error.__cause__, "missing_cfg_file", ""))
         if not missing.startswith("synthesis/"):

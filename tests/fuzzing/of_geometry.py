@@ -171,6 +171,20 @@ def _lists(folder: Path) -> list[bytes]:
     return [json.dumps([row, other]).encode(), listed.encode(), table.encode()]
 
 
+def _materials(folder: Path) -> list[bytes]:
+    ours = (Path(__file__).parents[2] / "conf" / "materials" / "mixed.yaml").read_bytes()
+    kind = "{weight: 1, albedo: &a [0.1, 0.2], roughness: *a, metal: true, transmission: null}"
+    return [ours, f"materials:\n  max_materials: 1\n  kinds:\n    a: {kind}\n".encode()]
+
+
+def _read_materials(path: Path) -> None:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    from qs3.generation.materials_file import with_materials
+
+    OverridesParser.create().parse_overrides(with_materials([f"materials={path}"]))
+
+
 def _read_list(path: Path) -> None:
     from qs3.inference.depth_list import Shown, find_shown
 
@@ -204,4 +218,6 @@ READERS: tuple[Reader, ...] = (
     Reader("intrinsics", _intrinsics, _read_intrinsics, "a.json"),
     Reader("list of pictures", _lists, _read_list, "a.yaml", None,
            ("inference/depth_list.py", "utils/yamls.py")),
+    Reader("materials .yaml", _materials, _read_materials, "a.yaml", None,
+           ("generation/materials_file.py",)),
 )  # fmt: skip
