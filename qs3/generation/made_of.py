@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.compose import choices, composed
 from qs3.data.made_of import MadeOf
-from qs3.generation.plan import known_classes, mesh_root
+from qs3.generation.plan import known_classes, mesh_root, own_materials
 
 
 def made_of(
@@ -65,7 +65,8 @@ def _sensor(cfg: DictConfig) -> str:
     words = [_preset(cfg)]
     if kinds := cfg.get("materials"):
         clear = any(kind.get("transmission") for kind in kinds.kinds.values())
-        words.append("mixed and clear materials" if clear else "mixed materials")
+        mixed = "mixed and clear materials" if clear else "mixed materials"
+        words.append("the files' materials" if own_materials(cfg) else mixed)
     if light := cfg.get("light"):
         words += ["light above"] * ("height_m" in light)
         words += ["light between surfaces"] * bool(light.get("bounces"))

@@ -120,7 +120,7 @@ def _scan(scanner: Scanner, name: str, solid: Any, cfg: DictConfig) -> Scan:
         else:
             mesh = Mesh.from_trimesh(solid, keep_colliders=cfg.colliders == "keep")
         if cfg.up == "y":
-            mesh = Mesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces, mesh.colliders)
+            mesh = mesh.at(mesh.vertices @ Y_UP_TO_Z_UP.T)
         cloud = scanner.cloud(mesh, name, keep)
     except DataError as error:
         raise type(error)(f"{name}: {error}") from error

@@ -16,9 +16,14 @@ from tests.fuzzing.mutate import GLB, PACKED, PNG
 
 def _mesh(name: str, *more: str) -> Reader:
     def seeds(folder: Path) -> list[bytes]:
+        from tests.meshes import coloured
         from tests.meshes.written import PRIMITIVES, dae, export, gltf, mixed_ply
 
         made = {
+            "coloured.glb": coloured.glb,
+            "coloured.obj": lambda: coloured.obj().encode(),
+            "faces.ply": coloured.ply,
+            "vertices.ply": lambda: coloured.ply("vertex", "float"),
             "mixed.ply": lambda: mixed_ply(">"),
             "a.gltf": lambda: json.dumps(gltf()[0]).encode(),
             **{f"{key}.dae": (lambda key=key: dae(PRIMITIVES[key]).encode()) for key in PRIMITIVES},
@@ -28,13 +33,28 @@ def _mesh(name: str, *more: str) -> Reader:
     def read(path: Path) -> None:
         from qs3.meshes.io import load_mesh
 
-        load_mesh(path)
+        load_mesh(path, materials=True)
 
     suffix = name.rpartition(".")[2]
     shapes = {"3mf": PACKED, "glb": GLB}
     module = {"gltf": "gltf", "glb": "gltf", "dae": "collada", "3mf": "threemf"}.get(suffix, suffix)
     covers = ("meshes/io.py", f"meshes/formats/{module}.py", "meshes/formats/by_trimesh.py")
     return Reader(f"mesh .{suffix}", seeds, read, f"a.{suffix}", shapes.get(suffix), covers)
+
+
+def _mtls(folder: Path) -> list[bytes]:
+    from tests.meshes.coloured import MTL
+
+    return [MTL.encode(), b"newmtl dark\nKd spectral a 1\nKs xyz 1\nNs 1e9\nTr .5\nPr 0.1\n"]
+
+
+def _read_mtl(path: Path) -> None:
+    from qs3.meshes.io import load_mesh
+    from tests.meshes.coloured import obj
+
+    mesh = path.with_suffix(".obj")
+    mesh.write_text(obj(library=path.name))
+    load_mesh(mesh, materials=True)
 
 
 def _cloud(suffix: str, module: str, shape: Any = None) -> Reader:
@@ -197,13 +217,14 @@ def _read_list(path: Path) -> None:
 
 READERS: tuple[Reader, ...] = (
     _mesh("a.off"),
-    _mesh("a.obj"),
-    _mesh("a.ply", "ascii.ply", "mixed.ply"),
+    _mesh("a.obj", "coloured.obj"),
+    _mesh("a.ply", "ascii.ply", "mixed.ply", "faces.ply", "vertices.ply"),
     _mesh("a.stl", "ascii.stl"),
     _mesh("a.gltf"),
-    _mesh("a.glb"),
+    _mesh("a.glb", "coloured.glb"),
     _mesh("triangles.dae", "polylist.dae", "polygons.dae"),
     _mesh("a.3mf"),
+    Reader("materials .mtl", _mtls, _read_mtl, "a.mtl", None, ("meshes/formats/mtl.py",)),
     _cloud(".xyz", "text"),
     _cloud(".npy", "arrays"),
     _cloud(".npz", "arrays", PACKED),
