@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
+from qs3.generation.materials import MixedMaterials
 from qs3.generation.materials_file import with_materials
 from qs3.generation.plan import check, check_recipe
 from qs3.generation.provenance import Keep
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     Solid = Mesh | trimesh.Trimesh | trimesh.Scene
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +126,9 @@ def _scan(scanner: Scanner, name: str, solid: Any, cfg: DictConfig) -> Scan:
         if cfg.up == "y":
             mesh = mesh.at(mesh.vertices @ Y_UP_TO_Z_UP.T)
         cloud = scanner.cloud(mesh, name, keep)
+        materials: MixedMaterials | None = getattr(scanner.recipe, "materials", None)
+        if materials is not None and (note := materials.note(mesh)):
+            log.warning("%s: %s", name, note)
     except DataError as error:
         raise type(error)(f"{name}: {error}") from error
     return Scan(

@@ -6,6 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
+import qs3
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from qs3.generation.command import generate
@@ -21,7 +22,7 @@ from qs3.sensors.renderers.base import Body, Projector, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.gloss import times_pi
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.generation.generating import composed, config
+from tests.generation.generating import QUICK, composed, config
 from tests.meshes.coloured import MTL, glb, obj, ply
 from tests.meshes.written import SQUARE_OFF, save
 
@@ -229,6 +230,19 @@ def test_a_mesh_that_is_sent_takes_its_library_along(folder, tmp_path):
             assert there.finishes is None
         else:
             assert there.finishes.kinds == here[item.id].finishes.kinds
+
+
+def test_meshes_from_memory_keep_what_was_read_of_their_files(tmp_path, caplog):
+    words = ("domain=specklenet10", *QUICK, "views=1", "recipe.min_points=1", "materials=own")
+    mesh = load_mesh(save(tmp_path, "a.glb", glb()), materials=True)
+    told, plain = (
+        qs3.generate(solid, *words).frames[0].images["left"]
+        for solid in (mesh, Mesh(mesh.vertices, mesh.faces))
+    )
+    assert (told != plain).any()
+    assert [record.getMessage() for record in caplog.records if "drawn" in record.getMessage()] == [
+        "object: materials drawn: the file has none that are read"
+    ]
 
 
 def test_the_catalogue_has_no_materials_of_its_own():
