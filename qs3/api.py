@@ -86,8 +86,9 @@ def generate(*arguments: Any) -> Any:
     if not arguments or isinstance(arguments[0], str):
         from qs3.config.compose import composed
         from qs3.generation.command import generate as made
+        from qs3.generation.materials_file import with_materials
 
-        return made(composed("generate", *arguments))
+        return made(composed("generate", *with_materials(arguments)))
     from qs3.generation.scan import scan_meshes
 
     solids, *overrides = arguments

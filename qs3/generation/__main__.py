@@ -1,20 +1,34 @@
 """CAD meshes to point clouds: `qs3-generate domain=specklenet10 meshes=PATH`."""
 
+import sys
+
 import hydra
 from omegaconf import DictConfig
 
 from qs3.config.hydra import cli_errors
 from qs3.config.location import CONF
+from qs3.errors import Qs3Error
 from qs3.utils.cli import hydra_command
 
 
-@hydra_command
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="generate")
-def main(cfg: DictConfig) -> None:
-    """Make the dataset that the config describes, or continue it."""
+def _composed(cfg: DictConfig) -> None:
     from qs3.generation.command import generate
 
     cli_errors(generate, cfg)
+
+
+@hydra_command
+def main() -> None:
+    """Make the dataset that the command line describes, or continue it."""
+    if any(word.startswith("materials=") for word in sys.argv[1:]):
+        from qs3.generation.materials_file import with_materials
+
+        try:
+            sys.argv[1:] = with_materials(sys.argv[1:])
+        except Qs3Error as error:
+            sys.exit(f"{type(error).__name__}: {error}")
+    _composed()
 
 
 if __name__ == "__main__":

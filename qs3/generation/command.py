@@ -32,6 +32,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
 from qs3.generation.disk import check_folder, disk_errors_explained
 from qs3.generation.made_of import made_of
+from qs3.generation.materials import DRAWN
 from qs3.generation.object_parts import InParts, Parts
 from qs3.generation.plan import (
     benchmark,
@@ -49,7 +50,7 @@ from qs3.generation.provenance import PROVENANCE
 from qs3.generation.recipe_fingerprint import recipe_fingerprint
 from qs3.generation.travel import software
 from qs3.generation.up_axis import with_up_axis
-from qs3.generation.workers import Job, Outcome, renderer_provenance, scan_all
+from qs3.generation.workers import COLLIDERS, Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import write_text
 from qs3.utils.locks import owned
@@ -296,9 +297,16 @@ def _report(
     if len(failures) > _FAILURES_SHOWN:
         more = len(failures) - _FAILURES_SHOWN
         log.warning("and %d more: %s says why", more, folder / "manifest.csv")
-    if noted := sum(bool(outcome.note) for outcome in outcomes):
+    if noted := sum(COLLIDERS in outcome.note for outcome in outcomes):
         log.info(
             "%d files hold colliders, which were left out (manifest.csv); colliders=keep", noted
+        )
+    if drawn := sum(DRAWN in outcome.note for outcome in outcomes):
+        log.info(
+            "%d of %d files do not say of all their faces what they are made of: for the others "
+            "materials were drawn (manifest.csv)",
+            drawn,
+            len(outcomes),
         )
     if others := pointset.meta.get("folders_left_alone"):
         names, count = others["names"][:_FOLDERS_SHOWN], others["count"]

@@ -81,6 +81,7 @@ def _sensor(cfg: DictConfig) -> str:
 
 _MATERIALS = {
     "mixed": "mixed materials",
+    "own": "the files' materials",
     "clear": "mixed and clear materials",
     "principled": "principled materials",
 }

@@ -11,11 +11,20 @@ from jaxtyping import Int
 
 from qs3.config.checks import check_bool, check_float, check_int
 from qs3.errors import ConfigError
+from qs3.meshes.finishes import NONE, Finish
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.renderers.base import Body
 from qs3.sensors.renderers.gloss import Gloss
 
+Surface = tuple[float, Gloss]
+"""Albedo and gloss."""
+
 _SAME = 1e-5  # of the largest side: vertices nearer to each other are one
+INFRARED_ALBEDO = (0.03, 0.9)
+"""From carbon black to the brightest of conf/materials/mixed.yaml: what a guess may be."""
+DRAWN = "materials drawn"
+"""Begins the note of an object that has not all of its own."""
+
 _ALIKE = 1e-3  # of the largest side: parts whose sides differ by less are alike
 
 
@@ -36,7 +45,7 @@ class Kind:
     metal: bool = False
     transmission: tuple[float, float] | None = None
 
-    def draw(self, rng: np.random.Generator) -> tuple[float, Gloss]:
+    def draw(self, rng: np.random.Generator) -> Surface:
         """Albedo and gloss of one surface."""
         albedo, roughness, specular = (
             float(rng.uniform(*ends)) for ends in (self.albedo, self.roughness, self.specular)
@@ -63,7 +72,7 @@ class MixedMaterials:
 
     def __post_init__(self) -> None:
         check_int("materials.max_materials", self.max_materials, 1)
-        kinds = {name: _kind(name, fields) for name, fields in self.kinds.items()}
+        kinds = {name: checked_kind(name, fields) for name, fields in self.kinds.items()}
         object.__setattr__(self, "kinds", kinds)
         if not sum(kind.weight for kind in kinds.values()) > 0:
             raise ConfigError("materials.kinds: no kind has a weight above 0")
@@ -71,9 +80,7 @@ class MixedMaterials:
     def dress(self, bodies: Sequence[Body], rng: np.random.Generator) -> tuple[Body, ...]:
         """The same shapes with materials; the first body, the object, as one body a material."""
         thing, *rest = bodies
-        materials = [self._draw(rng) for _ in range(int(rng.integers(1, self.max_materials + 1)))]
-        parts = parts_of(thing.mesh)
-        chosen = rng.integers(0, len(materials), parts.max() + 1)[parts]
+        materials, chosen = self._surfaces(thing.mesh, rng)
         dressed = [
             Body(_faces_of(thing.mesh, chosen == i), albedo, thing.label, gloss)
             for i, (albedo, gloss) in enumerate(materials)
@@ -84,11 +91,64 @@ class MixedMaterials:
             dressed.append(Body(body.mesh, albedo, body.label, gloss))
         return tuple(dressed)
 
-    def _draw(self, rng: np.random.Generator) -> tuple[float, Gloss]:
+    def note(self, mesh: Mesh) -> str:
+        """What a manifest should say of an object's materials; nothing here."""
+        return ""
+
+    def _surfaces(
+        self, mesh: Mesh, rng: np.random.Generator
+    ) -> tuple[list[Surface], Int[np.ndarray, " f"]]:
+        """The object's surfaces, and the index of each face's."""
+        materials = [self._draw(rng) for _ in range(int(rng.integers(1, self.max_materials + 1)))]
+        parts = parts_of(mesh)
+        return materials, rng.integers(0, len(materials), parts.max() + 1)[parts]
+
+    def _draw(self, rng: np.random.Generator) -> Surface:
         kinds: list[Kind] = list(self.kinds.values())
         ends = np.cumsum([kind.weight for kind in kinds])
         place = rng.uniform(0, ends[-1])
         return kinds[int(np.searchsorted(ends, place, side="right"))].draw(rng)
+
+
+@dataclass(frozen=True)
+class OwnMaterials(MixedMaterials):
+    """What mesh files say their faces are made of; the rest is drawn as `MixedMaterials` draws it.
+
+    A face of which the file says nothing, or whose colour lies in a picture, has the material that
+    it would have without the file's; so has every other body.
+    """
+
+    def note(self, mesh: Mesh) -> str:
+        """How many faces have drawn materials; empty if none has."""
+        found, faces = mesh.finishes, len(mesh.faces)
+        if found is None:
+            return f"{DRAWN}: the file has none that are read"
+        if not found.missing:
+            return ""
+        pictures = f", {found.pictured} of them in pictures, which are not read"
+        return f"{DRAWN} for {found.missing} of {faces} faces" + pictures * bool(found.pictured)
+
+    def _surfaces(
+        self, mesh: Mesh, rng: np.random.Generator
+    ) -> tuple[list[Surface], Int[np.ndarray, " f"]]:
+        drawn, chosen = super()._surfaces(mesh, rng)
+        if mesh.finishes is None:
+            return drawn, chosen
+        own = [surface_of(finish) for finish in mesh.finishes.kinds]
+        of_face = mesh.finishes.of_face
+        return [*drawn, *own], np.where(of_face == NONE, chosen, len(drawn) + of_face)
+
+
+def surface_of(finish: Finish) -> Surface:
+    """The surface in the near infrared of what a file says of the visible one.
+
+    The colour's brightest channel, clipped to `INFRARED_ALBEDO`: a dye that is dark in one colour
+    and bright in another is an organic one, and these are clear in the infrared, where the surface
+    is at least as bright as anywhere; grey and black that come from carbon stay as they are.
+    """
+    albedo = float(np.clip(max(finish.colour), *INFRARED_ALBEDO))
+    roughness = float(np.clip(finish.roughness, 0.1, 1))
+    return albedo, Gloss(roughness, finish.specular, finish.metal, min(finish.clear, 0.95))
 
 
 def parts_of(mesh: Mesh) -> Int[np.ndarray, " f"]:
@@ -124,7 +184,7 @@ def _faces_of(mesh: Mesh, wanted: np.ndarray) -> Mesh:
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
 
 
-def _kind(name: str, fields: Any) -> Kind:
+def checked_kind(name: str, fields: Any) -> Kind:
     """A kind of material; ConfigError names the key that is wrong."""
     place = f"materials.kinds.{name}"
     if isinstance(fields, Kind):
@@ -140,8 +200,10 @@ def _kind(name: str, fields: Any) -> Kind:
         ranges["transmission"] = "[0, 0.95]"
     for key, allowed in ranges.items():
         ends = getattr(kind, key)
-        if not isinstance(ends, Sequence) or len(ends) != 2 or not ends[0] <= ends[1]:
-            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r}")
+        if not isinstance(ends, list | tuple) or len(ends) != 2:
+            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r:.80}")
         for end in ends:
             check_float(f"{place}.{key}", end, allowed)
+        if ends[0] > ends[1]:
+            raise ConfigError(f"{place}.{key} must be [lowest, highest], got {ends!r}")
     return kind

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -19,10 +20,12 @@ from qs3.classes import CLASSES, class_list
 from qs3.config.checks import check_bool, check_choice, check_float, check_int
 from qs3.config.hydra import build
 from qs3.data.dataset_folder import VIEWS
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, MeshError
+from qs3.generation.materials import OwnMaterials
 from qs3.generation.provenance import Keep
 from qs3.generation.released.poses import read_poses
 from qs3.meshes.folder import SPLITS, MeshFolder
+from qs3.meshes.formats.mtl import libraries
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import sha256_file
 from qs3.utils.version import VERSION
@@ -31,6 +34,7 @@ _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0, "shard_mb
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
 COLLIDERS = ("skip", "keep")
 UPS = ("auto", "z", "y")
+_OWN_MATERIALS = f"{OwnMaterials.__module__}.{OwnMaterials.__name__}"
 _SWITCHES = ("provenance", "keep_views", "force", "strict", "fill_up")
 # Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
 _OF_LOOKING = ("scene", "tracking", "crop")
@@ -130,6 +134,11 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
                 "up=y is for meshes of yours, and the embedded catalogue has z up: give a folder "
                 "with meshes=PATH, or leave it out"
             )
+        if own_materials(cfg):
+            raise ConfigError(
+                "materials=own is for meshes of yours, and the embedded catalogue's have none: "
+                "give a folder with meshes=PATH, or take materials=mixed"
+            )
         wanted = set(cfg.classes or known_classes(cfg))
         if missing := sorted(wanted - set(CLASSES)):
             raise ConfigError(
@@ -197,7 +206,13 @@ def mesh_folder(cfg: DictConfig) -> MeshFolder:
         keep_colliders=cfg.colliders == "keep",
         up="y" if cfg.up == "y" else "z",
         optional=CLASSES if cfg.fill_up else (),
+        materials=own_materials(cfg),
     )
+
+
+def own_materials(cfg: DictConfig) -> bool:
+    """Whether mesh files are asked what they are made of."""
+    return (cfg.get("materials") or {}).get("_target_") == _OWN_MATERIALS
 
 
 def mesh_root(cfg: DictConfig) -> Path:
@@ -228,7 +243,7 @@ def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -
     return {
         "kept": [key for key in ("provenance", "keep_views") if cfg[key]],
         "settings": settings(cfg),
-        "objects": [_name_and_content(item) for item in items],
+        "objects": [_name_and_content(item, own_materials(cfg)) for item in items],
         "versions": {
             **renderer,
             "qs3": VERSION,
@@ -328,9 +343,14 @@ def plan_hash(recipe: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(plan, sort_keys=True).encode()).hexdigest()
 
 
-def _name_and_content(item: MeshItem) -> str:
-    content = "" if item.path is None else f" {sha256_file(item.path)[:16]}"
-    return f"{item.id} {item.origin}{content}"
+def _name_and_content(item: MeshItem, with_materials: bool) -> str:
+    if item.path is None:
+        return f"{item.id} {item.origin}"
+    files = [item.path]
+    if with_materials:
+        with contextlib.suppress(MeshError):  # of one object, which will fail by it
+            files += libraries(item.path)
+    return f"{item.id} {item.origin} {' '.join(sha256_file(path)[:16] for path in files)}"
 
 
 def _scan_of(item: MeshItem, scan: int) -> MeshItem:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,8 @@ import numpy as np
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
+from qs3.generation.materials import MixedMaterials
+from qs3.generation.materials_file import with_materials
 from qs3.generation.plan import check, check_recipe
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     Solid = Mesh | trimesh.Trimesh | trimesh.Scene
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +82,9 @@ def composed_recipe(overrides: Sequence[str]) -> DictConfig:
     """
     from qs3.config.compose import composed
 
+    words = with_materials(overrides)
     try:
-        return composed("generate", *overrides)
+        return composed("generate", *words)
     except ConfigError as error:
         missing = str(getattr(error.__cause__, "missing_cfg_file", ""))
         if not missing.startswith("synthesis/"):
@@ -118,8 +124,11 @@ def _scan(scanner: Scanner, name: str, solid: Any, cfg: DictConfig) -> Scan:
         else:
             mesh = Mesh.from_trimesh(solid, keep_colliders=cfg.colliders == "keep")
         if cfg.up == "y":
-            mesh = Mesh(mesh.vertices @ Y_UP_TO_Z_UP.T, mesh.faces, mesh.colliders)
+            mesh = mesh.at(mesh.vertices @ Y_UP_TO_Z_UP.T)
         cloud = scanner.cloud(mesh, name, keep)
+        materials: MixedMaterials | None = getattr(scanner.recipe, "materials", None)
+        if materials is not None and (note := materials.note(mesh)):
+            log.warning("%s: %s", name, note)
     except DataError as error:
         raise type(error)(f"{name}: {error}") from error
     return Scan(

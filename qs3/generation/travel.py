@@ -13,6 +13,7 @@ from typing import Any
 
 from qs3.errors import ConfigError, MeshError, RenderError
 from qs3.generation.code_fingerprint import code_fingerprint
+from qs3.meshes.formats.mtl import libraries
 from qs3.meshes.io import load_mesh
 from qs3.meshes.source import MeshItem
 from qs3.utils.memory import check_memory
@@ -78,14 +79,18 @@ class _Sent:
         assert item.path is not None
         assert isinstance(item.load, partial)
         self.path, self.settings = item.path, item.load.keywords
-        self.content: bytes | None = None
+        self.content: dict[str, bytes] | None = None
         self.unreadable = ""
 
     def __getstate__(self) -> dict[str, Any]:
         """Read when it is sent, not before: there may be many."""
         try:
-            check_memory(self.path.stat().st_size, "", MeshError)
-            return {**self.__dict__, "content": self.path.read_bytes()}
+            beside = libraries(self.path) if self.settings.get("materials") else []
+            check_memory(sum(p.stat().st_size for p in [self.path, *beside]), "", MeshError)
+            root = self.path.parent.resolve()
+            content = {str(path.relative_to(root)): path.read_bytes() for path in beside}
+            content[self.path.name] = self.path.read_bytes()
+            return {**self.__dict__, "content": content}
         except (OSError, MeshError) as error:  # of one object, as if it were read where it is
             return {**self.__dict__, "unreadable": str(error)}
 
@@ -100,9 +105,11 @@ class _Sent:
         if self.content is None:
             return load_mesh(self.path, **self.settings)
         with tempfile.TemporaryDirectory(prefix="qs3-mesh-") as folder:
-            copy = Path(folder) / self.path.name
-            copy.write_bytes(self.content)
+            for name, content in self.content.items():
+                copy = Path(folder) / name
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                copy.write_bytes(content)
             try:
-                return load_mesh(copy, **self.settings)
+                return load_mesh(Path(folder) / self.path.name, **self.settings)
             except MeshError as error:
                 raise MeshError(str(error).replace(folder, str(self.path.parent))) from error

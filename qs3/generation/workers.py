@@ -17,16 +17,20 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from qs3.errors import Qs3Error, RenderError
+from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud, Recipe
 from qs3.generation.travel import check_software, sent, software
 from qs3.generation.view_files import DiskError, disk_errors_travel
+from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
 from qs3.utils.pool import Pool, Processes
 
 log = logging.getLogger(__name__)
 
+COLLIDERS = "colliders left out"
+"""Begins the note of an object that had some."""
 _DEATHS = 3  # objects in a row
 DIED = "the worker process died on this object each time (out of memory, or a crash)"
 
@@ -104,8 +108,7 @@ def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
         mesh = item.load()
         sha256 = mesh.sha256
         cloud = job.recipe.make(mesh, item.id, job.seed, renderer, job.keep)
-        note = f"colliders left out: {mesh.colliders}" if mesh.colliders else ""
-        return Outcome(item.id, sha256, replace(cloud, frames=()), "", note=note)
+        return Outcome(item.id, sha256, replace(cloud, frames=()), "", note=_note(job, mesh))
     except DiskError:
         raise
     except Qs3Error as error:
@@ -116,6 +119,14 @@ def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
         log.exception("%s: unexpected error", item.id)
         reason, lasting = f"unexpected {type(error).__name__}: {error}", False
     return Outcome(item.id, sha256, None, reason, lasting)
+
+
+def _note(job: Job, mesh: Mesh) -> str:
+    """What a manifest should say of an object that was made."""
+    notes = [f"{COLLIDERS}: {mesh.colliders}"] * bool(mesh.colliders)
+    materials: MixedMaterials | None = getattr(job.recipe, "materials", None)
+    notes += [materials.note(mesh)] if materials is not None else []
+    return "; ".join(filter(None, notes))
 
 
 def renderer_provenance(job: Job) -> dict[str, str]:

@@ -51,7 +51,7 @@ class MeshFolder:
             that a source and a target domain made from one folder share no shape.
         skip: stems of files to leave out, as if they were not there.
         known: the classes of the dataset, in label order.
-        keep_colliders, up: as `load_mesh`.
+        keep_colliders, up, materials: as `load_mesh`.
         optional: classes that need not be there: their objects come from elsewhere. One class at
             least must be.
     """
@@ -65,6 +65,7 @@ class MeshFolder:
     keep_colliders: bool = False
     up: str = "z"
     optional: tuple[str, ...] = ()
+    materials: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", Path(self.path))
@@ -220,7 +221,13 @@ class MeshFolder:
             id=f"{cls}/{split}/{stem}",
             cls=cls,
             split=split,
-            load=partial(load_mesh, file, keep_colliders=self.keep_colliders, up=self.up),
+            load=partial(
+                load_mesh,
+                file,
+                keep_colliders=self.keep_colliders,
+                up=self.up,
+                materials=self.materials,
+            ),
             origin=self._origin(file),
             path=file,
         )

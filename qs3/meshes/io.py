@@ -14,27 +14,29 @@ formats the caller says it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from qs3.config.checks import check_choice
 from qs3.errors import MeshError
-from qs3.meshes.formats import collada, gltf, obj, off, ply, stl, threemf
+from qs3.meshes.finishes import FoundFinishes
+from qs3.meshes.formats import collada, gltf, mtl, obj, off, ply, stl, threemf
 from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.mesh import Mesh
 from qs3.utils.memory import check_memory
 
-_READERS: dict[str, Callable[[bytes, Path, Colliders], Triangles]] = {
+_READERS: dict[str, Callable[[bytes, Path, Colliders, FoundFinishes | None], Triangles]] = {
     ".off": lambda data, *_: off.read(data),
-    ".obj": lambda data, *_: obj.read(data),
-    ".ply": lambda data, *_: ply.read(data),
+    ".obj": lambda data, folder, _, found: _read_obj(data, folder, found),
+    ".ply": lambda data, _, __, found: ply.read(data, found),
     ".stl": lambda data, *_: stl.read(data),
     ".glb": gltf.read_glb,
     ".gltf": gltf.read_gltf,
-    ".dae": lambda data, _, colliders: collada.read(data, colliders),
-    ".3mf": lambda data, _, colliders: threemf.read(data, colliders),
+    ".dae": lambda data, _, colliders, __: collada.read(data, colliders),
+    ".3mf": lambda data, _, colliders, __: threemf.read(data, colliders),
 }
 
 _PEAK = {".off": 4, ".stl": 7, ".obj": 10, ".ply": 10, ".dae": 10, ".glb": 12, ".gltf": 12}
@@ -51,7 +53,9 @@ AXES = ("z", "y")
 """Which axis may be up in the other files."""
 
 
-def load_mesh(path: str | Path, keep_colliders: bool = False, up: str = "z") -> Mesh:
+def load_mesh(
+    path: str | Path, keep_colliders: bool = False, up: str = "z", materials: bool = False
+) -> Mesh:
     """Read a mesh; polygons are cut into triangles, the parts of a scene are put together.
 
     Duplicate faces and faces of either orientation are accepted, and vertices are not merged.
@@ -62,6 +66,8 @@ def load_mesh(path: str | Path, keep_colliders: bool = False, up: str = "z") -> 
             `qs3.meshes.formats.colliders`); else they are left out, and counted in the mesh.
         up: one of `AXES`, which is up in a file that does not say (not of `DECLARE_UP`); "y" is
             turned to z up, (x, y, z) -> (x, -z, y).
+        materials: also read what glTF, OBJ (its .mtl files) and PLY (its colours) say of their
+            faces, as `Mesh.finishes`; the other formats say nothing that is read.
 
     Raises:
         MeshError: the file is missing, empty, truncated, too large or damaged, or holds no
@@ -69,12 +75,14 @@ def load_mesh(path: str | Path, keep_colliders: bool = False, up: str = "z") -> 
     """
     check_choice("up", up, AXES)
     path, colliders = Path(path), Colliders(skip=not keep_colliders)
+    found = FoundFinishes() if materials else None
     try:
         with np.errstate(all="ignore"):  # what is not finite is found and named below
-            vertices, faces = _read(path, colliders)
+            vertices, faces = _read(path, colliders, found)
             if up == "y" and path.suffix.lower() not in DECLARE_UP:
                 vertices = vertices @ Y_UP_TO_Z_UP.T
-            return _checked(vertices, faces, colliders)
+            mesh = _checked(vertices, faces, colliders)
+            return mesh if found is None else replace(mesh, finishes=found.of(len(mesh.faces)))
     except MeshError as error:
         raise MeshError(f"{path}: {error}. Export the mesh again or remove the file") from error
     except MemoryError as error:
@@ -86,7 +94,7 @@ def load_mesh(path: str | Path, keep_colliders: bool = False, up: str = "z") -> 
         ) from error
 
 
-def _read(path: Path, colliders: Colliders) -> Triangles:
+def _read(path: Path, colliders: Colliders, found: FoundFinishes | None) -> Triangles:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise MeshError(f"is not of a known format ({', '.join(SUFFIXES)})")
@@ -96,7 +104,13 @@ def _read(path: Path, colliders: Colliders) -> Triangles:
     if size == 0:
         raise MeshError("is empty")
     check_memory(_PEAK.get(path.suffix.lower(), 1) * size, "", MeshError)
-    return reader(path.read_bytes(), path.parent, colliders)
+    return reader(path.read_bytes(), path.parent, colliders, found)
+
+
+def _read_obj(data: bytes, folder: Path, found: FoundFinishes | None) -> Triangles:
+    if found is not None:
+        mtl.read_finishes(data, folder, found)
+    return obj.read(data)
 
 
 def _checked(vertices: np.ndarray, faces: np.ndarray, colliders: Colliders) -> Mesh:

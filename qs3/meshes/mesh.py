@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from qs3.errors import MeshError
+from qs3.meshes.finishes import Finishes
 from qs3.meshes.formats.colliders import Colliders
 
 if TYPE_CHECKING:
@@ -23,11 +24,13 @@ class Mesh:
         vertices: [V, 3] float64.
         faces: [F, 3] int32, indices into `vertices`; orientation is not relied upon.
         colliders: invisible nodes of its file or scene that were left out.
+        finishes: what its file says its faces are made of; None: nothing, or it was not asked.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     colliders: int = 0
+    finishes: Finishes | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -45,6 +48,8 @@ class Mesh:
             raise MeshError(
                 f"a face refers to vertex {int(faces.max())}, but there are {len(vertices)}"
             )
+        if self.finishes is not None and len(self.finishes.of_face) != len(faces):
+            raise MeshError(f"has materials of {len(self.finishes.of_face)} of {len(faces)} faces")
         vertices.flags.writeable = False
         faces.flags.writeable = False
         object.__setattr__(self, "vertices", vertices)
@@ -102,7 +107,11 @@ class Mesh:
 
     def transformed(self, matrix: np.ndarray) -> Mesh:
         """Apply a 4x4 homogeneous matrix to the vertices."""
-        return Mesh(self.vertices @ matrix[:3, :3].T + matrix[:3, 3], self.faces)
+        return self.at(self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
+
+    def at(self, vertices: np.ndarray) -> Mesh:
+        """The same faces and materials with other vertices [V, 3]."""
+        return replace(self, vertices=vertices)
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
@@ -112,4 +121,5 @@ def merge(meshes: list[Mesh]) -> Mesh:
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     vertices = np.concatenate([m.vertices for m in meshes])
     faces = np.concatenate([m.faces + o for m, o in zip(meshes, offsets, strict=True)])
-    return Mesh(vertices, faces)
+    finishes = Finishes.joined([(m.finishes, len(m.faces)) for m in meshes])
+    return Mesh(vertices, faces, finishes=finishes)

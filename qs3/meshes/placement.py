@@ -94,7 +94,7 @@ class OnFurniture(RealSize):
         if ends is None or not raised or placed.bounds[1, 2] > self.tallest_m:
             return placed
         low, high = ends
-        return Mesh(placed.vertices + np.array([0, 0, low + (high - low) * height]), placed.faces)
+        return placed.at(placed.vertices + np.array([0, 0, low + (high - low) * height]))
 
 
 def _yaw_rad(rng: np.random.Generator) -> float:
@@ -116,4 +116,4 @@ def _place(mesh: Mesh, scale: float, on_floor: bool, yaw_rad: float) -> Mesh:
         anchor[2] = low[2]
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    return Mesh((mesh.vertices - anchor) * scale @ turn.T, mesh.faces)
+    return mesh.at((mesh.vertices - anchor) * scale @ turn.T)

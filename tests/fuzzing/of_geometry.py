@@ -16,9 +16,14 @@ from tests.fuzzing.mutate import GLB, PACKED, PNG
 
 def _mesh(name: str, *more: str) -> Reader:
     def seeds(folder: Path) -> list[bytes]:
+        from tests.meshes import coloured
         from tests.meshes.written import PRIMITIVES, dae, export, gltf, mixed_ply
 
         made = {
+            "coloured.glb": coloured.glb,
+            "coloured.obj": lambda: coloured.obj().encode(),
+            "faces.ply": coloured.ply,
+            "vertices.ply": lambda: coloured.ply("vertex", "float"),
             "mixed.ply": lambda: mixed_ply(">"),
             "a.gltf": lambda: json.dumps(gltf()[0]).encode(),
             **{f"{key}.dae": (lambda key=key: dae(PRIMITIVES[key]).encode()) for key in PRIMITIVES},
@@ -28,13 +33,28 @@ def _mesh(name: str, *more: str) -> Reader:
     def read(path: Path) -> None:
         from qs3.meshes.io import load_mesh
 
-        load_mesh(path)
+        load_mesh(path, materials=True)
 
     suffix = name.rpartition(".")[2]
     shapes = {"3mf": PACKED, "glb": GLB}
     module = {"gltf": "gltf", "glb": "gltf", "dae": "collada", "3mf": "threemf"}.get(suffix, suffix)
     covers = ("meshes/io.py", f"meshes/formats/{module}.py", "meshes/formats/by_trimesh.py")
     return Reader(f"mesh .{suffix}", seeds, read, f"a.{suffix}", shapes.get(suffix), covers)
+
+
+def _mtls(folder: Path) -> list[bytes]:
+    from tests.meshes.coloured import MTL
+
+    return [MTL.encode(), b"newmtl dark\nKd spectral a 1\nKs xyz 1\nNs 1e9\nTr .5\nPr 0.1\n"]
+
+
+def _read_mtl(path: Path) -> None:
+    from qs3.meshes.io import load_mesh
+    from tests.meshes.coloured import obj
+
+    mesh = path.with_suffix(".obj")
+    mesh.write_text(obj(library=path.name))
+    load_mesh(mesh, materials=True)
 
 
 def _cloud(suffix: str, module: str, shape: Any = None) -> Reader:
@@ -171,6 +191,20 @@ def _lists(folder: Path) -> list[bytes]:
     return [json.dumps([row, other]).encode(), listed.encode(), table.encode()]
 
 
+def _materials(folder: Path) -> list[bytes]:
+    ours = (Path(__file__).parents[2] / "conf" / "materials" / "mixed.yaml").read_bytes()
+    kind = "{weight: 1, albedo: &a [0.1, 0.2], roughness: *a, metal: true, transmission: null}"
+    return [ours, f"materials:\n  max_materials: 1\n  kinds:\n    a: {kind}\n".encode()]
+
+
+def _read_materials(path: Path) -> None:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    from qs3.generation.materials_file import with_materials
+
+    OverridesParser.create().parse_overrides(with_materials([f"materials={path}"]))
+
+
 def _read_list(path: Path) -> None:
     from qs3.inference.depth_list import Shown, find_shown
 
@@ -183,13 +217,14 @@ def _read_list(path: Path) -> None:
 
 READERS: tuple[Reader, ...] = (
     _mesh("a.off"),
-    _mesh("a.obj"),
-    _mesh("a.ply", "ascii.ply", "mixed.ply"),
+    _mesh("a.obj", "coloured.obj"),
+    _mesh("a.ply", "ascii.ply", "mixed.ply", "faces.ply", "vertices.ply"),
     _mesh("a.stl", "ascii.stl"),
     _mesh("a.gltf"),
-    _mesh("a.glb"),
+    _mesh("a.glb", "coloured.glb"),
     _mesh("triangles.dae", "polylist.dae", "polygons.dae"),
     _mesh("a.3mf"),
+    Reader("materials .mtl", _mtls, _read_mtl, "a.mtl", None, ("meshes/formats/mtl.py",)),
     _cloud(".xyz", "text"),
     _cloud(".npy", "arrays"),
     _cloud(".npz", "arrays", PACKED),
@@ -204,4 +239,6 @@ READERS: tuple[Reader, ...] = (
     Reader("intrinsics", _intrinsics, _read_intrinsics, "a.json"),
     Reader("list of pictures", _lists, _read_list, "a.yaml", None,
            ("inference/depth_list.py", "utils/yamls.py")),
+    Reader("materials .yaml", _materials, _read_materials, "a.yaml", None,
+           ("generation/materials_file.py",)),
 )  # fmt: skip

@@ -57,7 +57,7 @@ class ReleasedPlacing:
                 f"({', '.join(f'{value:.3f}' for value in middle)}) m, not at the origin (another "
                 f"origin or axis up?); recipe.poses.max_error={self.max_error} is the limit"
             )
-        return Mesh(mesh.vertices * pose.scale @ turn.T + pose.location_m, mesh.faces)
+        return mesh.at(mesh.vertices * pose.scale @ turn.T + pose.location_m)
 
 
 @dataclass(frozen=True, eq=False)

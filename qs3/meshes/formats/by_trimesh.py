@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -34,12 +34,21 @@ def loaded(kind: str, data: bytes, **options: Any) -> dict[str, Any]:
             raise MeshError("is truncated or damaged: what it promises is not there") from error
 
 
-def assembled(found: Mapping[str, Any], colliders: Colliders | None = None) -> Triangles:
-    """The mesh of what `loaded` returned: all instances of its parts, put into the world."""
-    return joined(_parts(found, colliders or Colliders(skip=False)))
+def assembled(
+    found: Mapping[str, Any],
+    colliders: Colliders | None = None,
+    placed: Callable[[str, int], None] = lambda name, faces: None,
+) -> Triangles:
+    """The mesh of what `loaded` returned: all instances of its parts, put into the world.
+
+    `placed` is told the name and the number of faces of each instance, in their order.
+    """
+    return joined(_parts(found, colliders or Colliders(skip=False), placed))
 
 
-def _parts(found: Mapping[str, Any], colliders: Colliders) -> Iterator[Triangles]:
+def _parts(
+    found: Mapping[str, Any], colliders: Colliders, placed: Callable[[str, int], None]
+) -> Iterator[Triangles]:
     shapes = found["geometry"]
     world = {"world": np.eye(4)}
     for edge in found["graph"]:
@@ -51,6 +60,7 @@ def _parts(found: Mapping[str, Any], colliders: Colliders) -> Iterator[Triangles
         shape = shapes[name]
         if len(shape.get("faces", ())):
             part = used_part(np.asarray(shape["vertices"]), np.asarray(shape["faces"], np.int64))
+            placed(name, len(part[1]))
             yield transformed(part, matrix)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -20,9 +21,11 @@ from urllib.parse import unquote
 import numpy as np
 
 from qs3.errors import MeshError
+from qs3.meshes.finishes import FoundFinishes
 from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts
 from qs3.meshes.formats.by_trimesh import MAX_PARTS, assembled, loaded
 from qs3.meshes.formats.colliders import Colliders
+from qs3.meshes.formats.gltf_materials import finish_of
 
 MAX_BUFFER_BYTES = 1 << 30
 
@@ -35,7 +38,9 @@ _EXTENSIONS = (
 )
 
 
-def read_glb(data: bytes, folder: Path, colliders: Colliders) -> Triangles:
+def read_glb(
+    data: bytes, folder: Path, colliders: Colliders, found: FoundFinishes | None = None
+) -> Triangles:
     """Read GLB: a header, a JSON chunk and, in most files, a binary chunk."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise MeshError("is not a GLB file, or cut within its header")
@@ -50,15 +55,23 @@ def read_glb(data: bytes, folder: Path, colliders: Colliders) -> Triangles:
         binary_length, kind = struct.unpack_from("<I4s", data, end)
         if kind == b"BIN\0":
             binary = data[end + 8 : min(end + 8 + binary_length, length)]
-    return _triangles(data[20:end], binary, folder, colliders)
+    return _triangles(data[20:end], binary, folder, colliders, found)
 
 
-def read_gltf(data: bytes, folder: Path, colliders: Colliders) -> Triangles:
+def read_gltf(
+    data: bytes, folder: Path, colliders: Colliders, found: FoundFinishes | None = None
+) -> Triangles:
     """Read the JSON form; its buffers lie within it, or in files of the same folder."""
-    return _triangles(data, None, folder, colliders)
+    return _triangles(data, None, folder, colliders, found)
 
 
-def _triangles(text: bytes, binary: bytes | None, folder: Path, colliders: Colliders) -> Triangles:
+def _triangles(
+    text: bytes,
+    binary: bytes | None,
+    folder: Path,
+    colliders: Colliders,
+    finishes: FoundFinishes | None,
+) -> Triangles:
     tree = _parsed(text)
     nodes = _nodes(tree, colliders)
     surfaces = _Surfaces(tree)
@@ -82,8 +95,26 @@ def _triangles(text: bytes, binary: bytes | None, folder: Path, colliders: Colli
     for shape, largest in zip(found["geometry"].values(), surfaces.largest, strict=True):
         if largest:
             shape["vertices"] = np.maximum(shape["vertices"] / largest, -1.0)
-    vertices, faces = assembled(found)
+    if finishes is None:
+        vertices, faces = assembled(found)
+    else:
+        made_of = _finishes(tree, surfaces, found["geometry"], finishes)
+        vertices, faces = assembled(found, placed=made_of)
     return vertices @ Y_UP_TO_Z_UP.T, faces
+
+
+def _finishes(
+    tree: dict[str, Any], surfaces: _Surfaces, shapes: Iterable[str], found: FoundFinishes
+) -> Callable[[str, int], None]:
+    """What is to be told of each instance that is placed."""
+    of_shape = dict(zip(shapes, surfaces.materials, strict=True))
+    materials = tree.get("materials", [])
+
+    def placed(name: str, faces: int) -> None:
+        index = of_shape[name]
+        found.add(faces, *((None,) if index is None else finish_of(materials[index])))
+
+    return placed
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
@@ -149,6 +180,7 @@ class _Surfaces:
         meshes: in the order of their first use.
         accessors: the indices of those that the meshes use.
         largest: for each primitive what its integers are divided by, or None.
+        materials: for each primitive the index of its material in the file, or None.
     """
 
     def __init__(self, tree: dict[str, Any]) -> None:
@@ -157,6 +189,7 @@ class _Surfaces:
         self.places: dict[int, int] = {}
         self.accessors: set[int] = set()
         self.largest: list[int | None] = []
+        self.materials: list[int | None] = []
 
     def place(self, index: int) -> int:
         """Where in `meshes` the mesh with this index in the file is, or comes to be."""
@@ -176,6 +209,7 @@ class _Surfaces:
         accessor = self._accessor(position, "VEC3")
         normalised = accessor.get("normalized")
         self.largest.append(_LARGEST[accessor["componentType"]] if normalised else None)
+        self.materials.append(primitive.get("material"))
         made = {"mode": mode, "attributes": {"POSITION": position}}
         if "indices" in primitive:
             self._accessor(primitive["indices"], "SCALAR")

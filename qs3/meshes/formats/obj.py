@@ -1,4 +1,4 @@
-"""Wavefront OBJ: its vertices and polygons. Materials are not even opened.
+"""Wavefront OBJ: its vertices and polygons. Materials are read by `mtl`, where they are wanted.
 
 trimesh 5.2 is not used here: it takes indices relative to the end of the list so far ("f -3 -2
 -1") as relative to the end of the file, and orders faces by material.

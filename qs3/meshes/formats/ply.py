@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import MeshError
+from qs3.meshes.finishes import FoundFinishes
 from qs3.meshes.formats.arrays import Triangles, check_counts, fan, numbers, whole
+from qs3.meshes.formats.ply_colours import add_colours, colours_of
 from qs3.utils.memory import check_memory
 
 _TYPES = {
@@ -42,10 +44,16 @@ class _Element:
     properties: list[_Property]
 
 
-def read(data: bytes) -> Triangles:
-    """Read the elements "vertex" and "face"; all else is stepped over."""
+def read(data: bytes, found: FoundFinishes | None = None) -> Triangles:
+    """Read the elements "vertex" and "face"; all else is stepped over.
+
+    `found`: also of the faces' colours, or else the mean of their corners'.
+    """
     vertices = faces = None
+    colours: dict[str, np.ndarray | None] = {}
     for name, columns in _elements(data):
+        if found is not None and name in ("vertex", "face"):
+            colours[name] = colours_of(columns)
         if name == "vertex":
             vertices = _vertices(columns)
         elif name == "face":
@@ -55,6 +63,11 @@ def read(data: bytes) -> Triangles:
             sizes, corners = columns[key]
             faces = fan(sizes, whole(corners.astype(np.float64), "a vertex index"))
         if vertices is not None and faces is not None:
+            if found is not None:
+                per_face = colours.get("face")
+                if per_face is not None:
+                    per_face = np.repeat(per_face, np.maximum(sizes - 2, 0), axis=0)
+                add_colours(found, faces, per_face, colours.get("vertex"))
             return vertices, faces
     raise MeshError("has no faces: it is a point cloud, or not made of triangles")
 
