@@ -58,7 +58,7 @@ def _sensor_files() -> dict[str, Any]:
 
 
 def _sensor(cfg: DictConfig) -> str:
-    """The sensor's preset (its class where a value was changed), and materials and light."""
+    """The sensor's preset (its class where a value was changed), light, errors taken out."""
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
@@ -69,6 +69,8 @@ def _sensor(cfg: DictConfig) -> str:
     if light := cfg.get("light"):
         words += ["light above"] * ("height_m" in light)
         words += ["light between surfaces"] * bool(light.get("bounces"))
+    if errors := cfg.get("depth_errors"):
+        words += ["no holes"] * (not errors.holes) + ["no mixed pixels"] * (not errors.mixed_pixels)
     return ", ".join(words)
 
 
