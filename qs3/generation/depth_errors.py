@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -66,9 +65,7 @@ def _surface_near(
     """How far each depth is from the nearest of the true ones around it, m; NaN without a depth."""
     height, width = depth_m.shape
     near = np.where(np.isnan(depth_m), np.float32(np.nan), np.float32(np.inf))
-    around = cv2.copyMakeBorder(
-        true_m, steps, steps, steps, steps, cv2.BORDER_CONSTANT, value=float("inf")
-    )
+    around = np.pad(true_m, steps, constant_values=np.inf)
     for row in range(2 * steps + 1):
         for column in range(2 * steps + 1):
             other = around[row : row + height, column : column + width]
