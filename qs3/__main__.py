@@ -23,6 +23,7 @@ QS3 = Group(
         "leaderboard": "qs3.report.leaderboard.cli:LEADERBOARD",
         "bench": "qs3.sensors.bench.cli:BENCH",
         "fit": "qs3.sensors.fit.cli:FIT",
+        "tune": "qs3.tuning.cli:TUNE",
     },
     (
         "qs3 quickstart",

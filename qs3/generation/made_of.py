@@ -65,7 +65,7 @@ def _files(group: str) -> dict[str, Any]:
 
 
 def _sensor(cfg: DictConfig) -> str:
-    """The sensor's preset, materials and light, each with the settings that were changed."""
+    """The preset, materials and light, each with what was changed, and errors taken out."""
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
@@ -76,6 +76,8 @@ def _sensor(cfg: DictConfig) -> str:
         bounces = bool(light.get("bounces"))
         words.append(_named("light", light, _LIGHTS, ("bounces",)))
         words += ["light between surfaces"] * (bounces and "height_m" in light)
+    if errors := cfg.get("depth_errors"):
+        words += ["no holes"] * (not errors.holes) + ["no mixed pixels"] * (not errors.mixed_pixels)
     return ", ".join(words)
 
 

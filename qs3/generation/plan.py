@@ -39,6 +39,7 @@ _SWITCHES = ("provenance", "keep_views", "force", "strict", "fill_up")
 # Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
 _OF_LOOKING = ("scene", "tracking", "crop")
 _OF_LIGHT = ("materials", "light")
+_OF_DEPTH = (*_OF_LIGHT, "depth_errors")
 _ADDED = "catalogue-"  # before the names of objects that fill up the user's
 _OTHER_HALF = 1000
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
@@ -82,13 +83,19 @@ def check(cfg: DictConfig) -> None:
                 f"authors made them; leave it out for domain={cfg.domain.name}"
             )
 
-    for key in _OF_LIGHT:
+    for key in _OF_DEPTH:
         # Before the recipe is built: one that looks at nothing does not take them.
         if cfg.get(key) and not cfg.sensor:
             raise ConfigError(
                 f"domain {cfg.domain.name} looks at nothing, so {key}= says nothing to it: leave "
                 "it out"
             )
+    if cfg.get("depth_errors") and cfg.recipe._target_.endswith("RoomScan"):
+        raise ConfigError(
+            "depth_errors= changes which pictures of a room pass its rules, so that objects would "
+            "be seen from elsewhere: leave it out, or take a source without a room, such as "
+            "domain=specklenet10_kinect"
+        )
 
 
 def known_classes(cfg: DictConfig) -> tuple[str, ...]:

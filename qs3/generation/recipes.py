@@ -18,6 +18,7 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
+from qs3.generation.depth_errors import DepthErrors
 from qs3.generation.lights import Light
 from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep, preview_of, provenance_of
@@ -146,6 +147,7 @@ class Mesh2Point:
         poses: from a file, in place of `placing` and of `views` (whose count is kept).
         materials: of the bodies; None: as the scene has them, matt.
         light: beside the sensor's own; None: none.
+        depth_errors: which of them stay; None: all.
         box_of_corners: crop by the box of the turned corners of the mesh's own box, as the
             released code does, and not by the object's own axis-aligned box.
     """
@@ -164,6 +166,7 @@ class Mesh2Point:
     poses: PoseFile | None = None
     materials: MixedMaterials | None = None
     light: Light | None = None
+    depth_errors: DepthErrors | None = None
     box_of_corners: bool = False
     needs_renderer: bool = True
 
@@ -198,6 +201,8 @@ class Mesh2Point:
             frame = self.sensor.scan(bodies, box, pose, renderer, view_rng, explain, lighting)
             if frame is None:
                 continue
+            if self.depth_errors is not None:
+                frame = self.depth_errors.left_in(frame)
             frames.append(frame)
             if keep.views is not None:
                 save_view(keep.views, object_id, i, frame, pose, believed)

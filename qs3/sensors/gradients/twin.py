@@ -22,7 +22,9 @@ from qs3.sensors.gradients.views import Pair, View
 from qs3.sensors.optics.infrared import InfraredCamera
 
 _REACH = 4.0  # of the lens's Gaussian, in standard deviations
-_STEPS = 4  # of the disparity to a pixel
+STEPS = 4
+"""Of the disparity to a pixel, at which blocks are compared."""
+
 _NEAR = 4  # of these steps to each side of the best one
 
 Settings = Mapping[str, torch.Tensor]
@@ -116,30 +118,13 @@ class Twin:
                 no rounding either.
             whole: noisy images are rounded to grey values; gradients pass as if they were not.
         """
+        camera = self.pair.sensor.infrared
+        longest = camera.max_exposure if isinstance(camera, InfraredCamera) else None
         first, second = (
-            self._exposed(image, settings, noise, whole) for image in self.radiance(settings)
+            exposed(image, settings, noise, whole, max_exposure=longest)
+            for image in self.radiance(settings)
         )
         return first, second
-
-    def _exposed(
-        self, radiance: torch.Tensor, settings: Settings, noise: torch.Generator | None, whole: bool
-    ) -> torch.Tensor:
-        contrast = settings["infrared.speckle_contrast"]
-        if noise is not None and float(contrast.detach()) > 0:
-            radiance = radiance * _gamma_like(radiance, contrast, noise)
-        image = blurred(radiance, settings["infrared.psf_px"])
-        per_grey = settings["infrared.electrons_at_white"] / 255
-        camera = self.pair.sensor.infrared
-        if isinstance(camera, InfraredCamera) and camera.max_exposure is not None:
-            per_grey = per_grey / (settings["gain"] / camera.max_exposure).clamp_min(1)
-        electrons = image * settings["gain"] * per_grey
-        if noise is None:
-            return (electrons / per_grey).clamp(0, 255)
-        variance = electrons.clamp_min(0) + settings["infrared.read_noise_e"] ** 2
-        spread = torch.sqrt(variance + 1e-9)  # the root of 0 has no gradient
-        drawn = torch.randn(electrons.shape, generator=noise, dtype=electrons.dtype)
-        grey = ((electrons + spread * drawn) / per_grey).clamp(0, 255)
-        return grey + (grey.round() - grey).detach() if whole else grey
 
     def disparity(
         self,
@@ -163,11 +148,42 @@ class Twin:
         if rows:
             raise ConfigError("the two views have other rows: they are of another pair")
         cost = correlations(left, right, offset, lowest, highest, block_px)
-        return lowest + soft_argmax(cost, sharpness) / _STEPS
+        return lowest + soft_argmax(cost, sharpness) / STEPS
 
     def depth_m(self, disparity: torch.Tensor, settings: Settings) -> torch.Tensor:
         """Metres along the optical axis: f b / disparity, by the numbers in `settings`."""
         return settings["focal_px"] * settings["baseline_m"] / disparity
+
+
+def exposed(
+    radiance: torch.Tensor,
+    settings: Settings,
+    noise: torch.Generator | None,
+    whole: bool = True,
+    even: torch.Tensor | None = None,
+    max_exposure: float | None = None,
+) -> torch.Tensor:
+    """[h, w] grey values of `radiance` [h, w]; see `Twin.grey`.
+
+    `even` [h, w] is the part of the radiance that has no speckle; None: nothing. Gain above
+    `max_exposure` amplifies the noise, too; None: all of the gain is exposure.
+    """
+    contrast = settings["infrared.speckle_contrast"]
+    if noise is not None and float(contrast.detach()) > 0:
+        grains = _gamma_like(radiance, contrast, noise)
+        radiance = radiance * grains if even is None else even + (radiance - even) * grains
+    image = blurred(radiance, settings["infrared.psf_px"])
+    per_grey = settings["infrared.electrons_at_white"] / 255
+    if max_exposure is not None:
+        per_grey = per_grey / (settings["gain"] / max_exposure).clamp_min(1)
+    electrons = image * settings["gain"] * per_grey
+    if noise is None:
+        return (electrons / per_grey).clamp(0, 255)
+    variance = electrons.clamp_min(0) + settings["infrared.read_noise_e"] ** 2
+    spread = torch.sqrt(variance + 1e-9)  # the root of 0 has no gradient
+    drawn = torch.randn(electrons.shape, generator=noise, dtype=electrons.dtype)
+    grey = ((electrons + spread * drawn) / per_grey).clamp(0, 255)
+    return grey + (grey.round() - grey).detach() if whole else grey
 
 
 def _slide_at(
@@ -216,11 +232,13 @@ def correlations(
     lowest: int,
     highest: int,
     block_px: int,
+    grid: tuple[int, int, int] = (0, 0, 1),
 ) -> torch.Tensor:
-    """[D, h, w] normalised correlation of blocks, -1..1, in steps of 1 / `_STEPS` px.
+    """[D, h, w] normalised correlation of blocks, -1..1, in steps of 1 / `STEPS` px.
 
-    Column u of `left` is column u + offset - d of `right`; what is outside is dark, and between two
-    pixels is the cubic through four (Catmull and Rom).
+    Of the pixels of a grid: first row, first column, and step. Column u of `left` is column
+    u + offset - d of `right`; what is outside is dark, and between two pixels is the cubic through
+    four (Catmull and Rom).
     """
     width = left.shape[1]
     begin = offset - highest - 1  # a pixel more on both sides for the cubics
@@ -228,18 +246,19 @@ def correlations(
     after = max(0, begin + width + highest - lowest + 4 - right.shape[1])
     wide = F.pad(right, (before, after))[:, max(0, begin) :]
     half = block_px // 2
-    cubics = [_catmull_rom(step / _STEPS) for step in range(_STEPS)]
+    cubics = [_catmull_rom(step / STEPS) for step in range(STEPS)]
 
     def mean(image: torch.Tensor) -> torch.Tensor:
         padded = F.pad(image[None], (half, half, half, half), mode="reflect")
-        return F.avg_pool2d(padded, block_px, stride=1)[0]
+        row, column, step = grid
+        return F.avg_pool2d(padded[:, row:, column:], block_px, stride=step)[0]
 
     mean_left = mean(left)
     spread_left = mean(left * left) - mean_left**2
     found = []
-    for step in range((highest - lowest) * _STEPS + 1):
+    for quarter in range((highest - lowest) * STEPS + 1):
         # A larger disparity lies farther left: d = low + part is between low and low + 1.
-        low, part = lowest + step // _STEPS, step % _STEPS
+        low, part = lowest + quarter // STEPS, quarter % STEPS
         at = highest - low + 1
         around = [wide[:, at + 1 - i : at + 1 - i + width] for i in range(4)]
         other = around[1]
