@@ -62,6 +62,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         seed=run.seed,
         owner=method.labels,
         uses_target=method.uses_target,
+        wants=method.wants,
     )
     data.prepare_data()
     source, target = run.source.open(verify=False), run.target.open(verify=False)
