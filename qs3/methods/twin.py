@@ -9,7 +9,6 @@ Here the information is what a simulation knows and a scan does not show.
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -125,21 +124,23 @@ class Twin(MeanTeacher):
     def _of_the_twin(
         self, net: Any, source: dict[str, Tensor], features: Tensor, logits: Tensor
     ) -> dict[str, Tensor]:
-        """What the twins teach: their own classes, and the scans'."""
-        terms, own, twin = {}, None, source["twin"]
+        """What the twins teach: their own classes, and the scans'.
+
+        Teachers do not run in `no_grad`, in which a net looks at its input's values and a GPU would
+        wait: nothing of theirs asks for a gradient, and what is detached keeps none.
+        """
+        terms, twin = {}, source["twin"]
         if self.twin_weight or self.shared:
-            with nullcontext() if self.twin_weight else torch.no_grad():
-                own = net.features(twin).global_
-                classes = net.head(own)
+            own = net.features(twin).global_
+            classes = net.head(own)
         if self.twin_weight:
             ce = class_loss(classes, source["y_source"], self.smoothing)
             terms["twin"] = self.twin_weight * ce
         if not self._distils:
             return terms
-        if own is None or not self.shared:
-            with torch.no_grad():
-                own = self.teacher.features(twin).global_
-                classes = self.teacher.head(own)
+        if not self.shared:
+            own = self.teacher.features(twin).global_
+            classes = self.teacher.head(own)
         if self.logit_weight:
             distance = distillation(classes.detach(), logits, self.temperature)
             terms["logits"] = self.logit_weight * distance
@@ -152,8 +153,7 @@ class Twin(MeanTeacher):
         """Cross-entropy of cut target clouds with what the teacher says of them before the cut."""
         teacher = net if self.shared else self.teacher
         with use_domain(net, "target"), use_domain(teacher, "target"):
-            with torch.no_grad():
-                said = teacher(target["twin"])
+            said = teacher(target["twin"]).detach()
             student = net(target["points"])
         return F.cross_entropy(student, (said / self.target_temperature).softmax(dim=1))
 
