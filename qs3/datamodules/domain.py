@@ -13,6 +13,7 @@ With `twin="whole"` a training batch holds each cloud's whole object as "twin", 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from torch import Tensor
 
 from qs3.config.checks import check_choice
 from qs3.data.domain import Domain, compose_domain
+from qs3.data.meta import sha256_of
 from qs3.data.store import PointSet
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
@@ -76,6 +78,7 @@ class DomainData(LightningDataModule):
             `domain.views` says so. Validation and test clouds are those that are stored.
         classes: names in label order, after `setup`.
         sha256: of the dataset, after `setup`.
+        beside_sha256: of what is loaded beside it, after `prepare_data`; "" if nothing is.
 
     Raises:
         ConfigError: no such domain, rule, sampler or scale; labels are asked for and there are
@@ -128,7 +131,7 @@ class DomainData(LightningDataModule):
         self.validation: Labelled | None = None
         self.test: Labelled | Unlabelled | None = None
         self.classes: tuple[str, ...] = ()
-        self.sha256 = ""
+        self.sha256 = self.beside_sha256 = ""
         self._checked = False
         self._epochs = 0  # that have begun without a trainer
 
@@ -136,10 +139,13 @@ class DomainData(LightningDataModule):
         """Bring published files into the store if that has not been done; check it, once."""
         if not self._checked:
             self.domain.open()
+            beside: list[PointSet] = []
             if self.twin and (array := SOURCE_TWINS[self.twin]):
-                self.domain.open_array(array)
+                beside.append(self.domain.open_array(array))
             if self.domain.views == "random":
-                views_of(self.domain, verify=True)
+                beside += itertools.chain(*views_of(self.domain, verify=True))
+            if beside:
+                self.beside_sha256 = sha256_of(" ".join(one.sha256 for one in beside))
             self._checked = True
 
     def setup(self, stage: str | None = None) -> None:
