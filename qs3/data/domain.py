@@ -5,6 +5,7 @@ Light on purpose: `train.py` asks `Domain.check` before it imports anything heav
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 
 log = logging.getLogger(__name__)
 
-VARIANTS = ("points", "points_clean")
+VARIANTS = ("points", "points_clean", "points_whole")
 SCALES = ("unit_ball", "metres", "above_floor")
 """How clouds are as a net sees them: divided by their radius; of their size, about their centroid;
 or of their size, over the floor."""
@@ -45,7 +46,8 @@ class Domain:
         symbol: of the paper's tables, e.g. "S".
         title: as in a sentence, e.g. "SpeckleNet10".
         path: folder of the store.
-        variant: which array of the store: "points", or "points_clean" for the clean twin.
+        variant: which array of the store: "points", "points_clean" for the clean twin, or
+            "points_whole" for the whole surface (generated with twins=[whole]).
         twin_of: folder of a store that holds the same objects, and `variant` beside its clouds, if
             that store was generated; what `path` holds itself comes first.
         published: how to read the published files, if there are any: an `Importer`, or its
@@ -57,6 +59,8 @@ class Domain:
             clouds that were normalised) or nobody knows.
         floor_m: z of the floor in the store: 0 where objects stand on it, minus the camera's height
             where the camera is the origin; None: nobody knows.
+        views: what training sees of a source: "stored", its clouds; "random", each time others of
+            the views and twins that its store keeps (`qs3.datamodules.random_views`).
         classes: names in label order; "modelnet40"; None: the ten of the benchmark.
         expected_counts: clouds of each class, in label order, by split, as published.
         how_to_get: where the published files come from.
@@ -76,6 +80,7 @@ class Domain:
     gravity: str = "z"
     unit: str = "none"
     floor_m: float | None = None
+    views: str = "stored"
     how_to_get: str = ""
     make: str | None = None
     stand_in: str | None = None
@@ -94,6 +99,12 @@ class Domain:
                 "on z; let the importer turn them (its key `up`)"
             )
         check_choice(f"domain {self.name}: unit", self.unit, ("metres", "none"))
+        check_choice(f"domain {self.name}: views", self.views, ("stored", "random"))
+        if self.views == "random" and self.variant != "points":
+            raise ConfigError(
+                f"domain {self.name}: views=random draws from what was measured, and its variant "
+                f"is {self.variant}: leave views out"
+            )
         if self.floor_m is not None:
             check_float(f"domain {self.name}: floor_m", self.floor_m)
         object.__setattr__(self, "path", Path(self.path))
@@ -232,6 +243,30 @@ class Domain:
             text = "%s does not have the published numbers of clouds: %s"
             log.warning(text, self.label, ", ".join(problems))
         return replace(dataset, floor_m=self.floor_m)
+
+    def open_array(self, name: str, verify: bool = True) -> PointSet:
+        """The same clouds in another array of the store, such as "points_whole".
+
+        Raises:
+            DataError: the store lacks it; says how to get it.
+        """
+        if not self.has_array(name):
+            twin = "whole" if name == "points_whole" else "exact,views"
+            raise DataError(
+                f"{self.folder} has no {name}.npy: generate it again with it, python generate.py "
+                f"domain={self.name} force=true twins=[{twin}] (its clouds will be the same), or "
+                "set method.sees=scan, which takes the clouds themselves"
+            )
+        return replace(open_pointset(self.folder, name, verify=verify), floor_m=self.floor_m)
+
+    def has_array(self, name: str) -> bool:
+        """Whether the store has this array of clouds."""
+        return has_variant(self.folder, name)
+
+    def kept_views(self) -> list[str]:
+        """Names of the arrays of single views that the store keeps, in order; often none."""
+        names = (f"points_view{i}" for i in itertools.count())
+        return list(itertools.takewhile(self.has_array, names))
 
     def check_unpublished(self) -> None:
         """Raise DataError if published files are there: a dataset made here would pass for them."""

@@ -6,11 +6,12 @@ at all: only `qs3.evaluation.metrics` holds them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch import LightningDataModule
-from torch import Tensor
+from torch import Generator, Tensor
 
 from qs3.data.domain import Domain
 from qs3.data.ensure_source import check_or_make
@@ -20,6 +21,7 @@ from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled, Unlabelled
+from qs3.datamodules.twins import Wants, augmented
 from qs3.errors import ConfigError
 
 
@@ -37,6 +39,7 @@ class AdaptationData(LightningDataModule):
         owner: whose labels are trained on: "source", or "target_train" for the upper bound
             (`method=supervised`), which alone asks for them.
         uses_target: whether warm-up batches hold unlabelled target clouds as well.
+        wants: what they hold beside clouds and labels (see `qs3.datamodules.twins`).
         sampler: "shuffled" trains on each labelled cloud once an epoch; "balanced" on as many
             clouds of each class (see `batches.balanced`). For the source alone: how often the
             target's classes occur is not known.
@@ -63,6 +66,7 @@ class AdaptationData(LightningDataModule):
         seed: int,
         owner: str = "source",
         uses_target: bool = False,
+        wants: Wants | None = None,
         points: int = 1024,
         scale: str = "unit_ball",
         fps_starts: int = 4,
@@ -81,6 +85,12 @@ class AdaptationData(LightningDataModule):
                 "takes its true labels, which one released code does and which makes its figures "
                 "incomparable; set data.sampler=shuffled"
             )
+        if target.views == "random":
+            raise ConfigError(
+                "data.target.views=random: a target's clouds are what was measured; it is for "
+                "sources, data.source.views=random"
+            )
+        self.wants = wants or Wants()
         shared: dict[str, Any] = {
             "points": points,
             "scale": scale,
@@ -96,6 +106,7 @@ class AdaptationData(LightningDataModule):
             sampler=sampler,
             clouds_a_class=clouds_a_class,
             asks="data.source" if owner == "source" else "method=supervised",
+            twin=self.wants.twin,
             **shared,
         )
         self.target_domain = DomainData(target, labels=False, **shared)
@@ -152,11 +163,15 @@ class AdaptationData(LightningDataModule):
         """The batches of the current epoch (the trainer asks anew each epoch)."""
         epoch = self.trainer.current_epoch if self.trainer else 0
         warmup = self.phases.phase(epoch) == 0
-        tables = {} if not warmup and not self.scheme.use_source else {"source": self._labelled()}
+        tables = {}
+        if warmup or self.scheme.use_source:
+            tables = {"source": self._labelled(self.wants if warmup else Wants())}
         if not warmup:
             tables = {"target": self._pseudo_labelled(), **tables}
         elif self.uses_target:
-            tables["target"] = Table(self.target.clouds, {})
+            clouds = self.target.clouds
+            beside = {"twin": clouds} if self.wants.target_twin else {}
+            tables["target"] = Table(clouds, {}, beside=beside)
         steps = self.phases.steps(epoch)
         start, _ = self.phases.span(self.phases.phase(epoch))
         return Batches(
@@ -183,13 +198,16 @@ class AdaptationData(LightningDataModule):
         """Augment training batches, each domain with its own randomness."""
         if self.trainer is None or not self.trainer.training:
             return batch
-        result = dict(batch)
+        rank, result = self.trainer.global_rank, dict(batch)
         for name, part in batch.items():
             if isinstance(part, dict):
-                points, rank = part["points"], self.trainer.global_rank
-                generator = generator_of(batch, name, self.seed, rank, points.device)
-                points = self.augment(points, generator, self.scale)
-                result[name] = {**part, "points": points}
+                device = part["points"].device
+
+                def generator(use: str, name: str = name, device: Any = device) -> Generator:
+                    return generator_of(batch, f"{name} {use}".strip(), self.seed, rank, device)
+
+                together = name != "target"
+                result[name] = augmented(self.augment, part, generator, self.scale, together)
         return result
 
     def state_dict(self) -> dict[str, Any]:
@@ -208,10 +226,16 @@ class AdaptationData(LightningDataModule):
     def _pinned(self) -> bool:
         return self.trainer is not None and self.trainer.strategy.root_device.type == "cuda"
 
-    def _labelled(self) -> Table:
+    def _labelled(self, wants: Wants) -> Table:
         y = f"y_{self.owner}"
         balance = y if self.labelled_domain.sampler == "balanced" else None
-        return Table(self.labelled.clouds, {y: self.labelled.labels}, balance)
+        table = self.labelled_domain.training_table({y: self.labelled.labels}, balance)
+        beside = dict(table.beside)
+        if wants.again:
+            beside["again"] = table.sources["points"]
+        if wants.twin:
+            beside["twin"] = self.labelled_domain.twins_of(self.labelled.clouds)
+        return replace(table, beside=beside)
 
     def _pseudo_labelled(self) -> Table:
         assert self.pseudo is not None, "a round has begun without pseudo-labels"

@@ -62,29 +62,77 @@ class Augment:
             generator: on the device of `points`.
             scale: see `qs3.datamodules.clouds`; they are so again after a cut.
         """
+        return self.with_moves(points, generator, scale)[0]
+
+    def with_moves(
+        self,
+        points: Float[Tensor, "b n 3"],
+        generator: torch.Generator,
+        scale: str,
+        moves: Moves | None = None,
+    ) -> tuple[Float[Tensor, "b n 3"], Moves]:
+        """The same, and how clouds were moved; or moved as given, as others of the same objects.
+
+        Cut, holes and jitter are these clouds' own in any case.
+        """
+        if self.crop < 1.0:
+            points = crop(points, self.crop, generator, scale)
+        if self.drop_regions:
+            points = drop_regions(points, self.drop_regions, generator)
+        if moves is None:
+            moves = self._drawn_moves(points, generator, scale)
+        points = moves(points)
+        if self.jitter_sigma > 0.0:
+            noise = torch.randn(points.shape, generator=generator, device=points.device)
+            noise = (self.jitter_sigma * noise).clamp(-self.jitter_clip, self.jitter_clip)
+            points = points + noise.to(points.dtype)
+        return points, moves
+
+    def _drawn_moves(self, points: Tensor, generator: torch.Generator, scale: str) -> Moves:
         b, like = len(points), {"device": points.device, "dtype": points.dtype}
 
         def uniform(*shape: int) -> Tensor:
             return torch.rand(*shape, generator=generator, **like)  # type: ignore[call-overload]
 
-        if self.crop < 1.0:
-            points = crop(points, self.crop, generator, scale)
-        if self.drop_regions:
-            points = drop_regions(points, self.drop_regions, generator)
+        angle = factor = shift = None
         if self.rotate_z:
-            points = rotate_z(points, 2 * math.pi * uniform(b))
+            angle = 2 * math.pi * uniform(b)
         if self.scale > 1.0:
             low, high = 1 / self.scale, self.scale
-            points = points * (low + (high - low) * uniform(b, 1, 3))
+            factor = low + (high - low) * uniform(b, 1, 3)
         if self.shift > 0.0:
-            points = points + self.shift * (2 * uniform(b, 1, 3) - 1)
+            shift = self.shift * (2 * uniform(b, 1, 3) - 1)
+        lift = None
         if self.lift > 0.0 and scale == "above_floor":
             up = torch.arange(3, device=points.device).eq(2).to(points.dtype) * self.lift
-            points = points + up * (2 * uniform(b, 1, 1) - 1)
-        if self.jitter_sigma > 0.0:
-            noise = torch.randn(points.shape, generator=generator, device=points.device)
-            noise = (self.jitter_sigma * noise).clamp(-self.jitter_clip, self.jitter_clip)
-            points = points + noise.to(points.dtype)
+            lift = up * (2 * uniform(b, 1, 1) - 1)
+        return Moves(angle, factor, shift, lift)
+
+
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """How each of B clouds is moved as a whole, in this order; None: not at all.
+
+    Attributes:
+        angle: [B] about z, in radians.
+        factor: [B, 1, 3] of each axis.
+        shift, lift: [B, 1, 3] that are added.
+    """
+
+    angle: Tensor | None
+    factor: Tensor | None
+    shift: Tensor | None
+    lift: Tensor | None
+
+    def __call__(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
+        """The clouds, moved."""
+        if self.angle is not None:
+            points = rotate_z(points, self.angle)
+        if self.factor is not None:
+            points = points * self.factor
+        for way in (self.shift, self.lift):
+            if way is not None:
+                points = points + way
         return points
 
 

@@ -7,7 +7,7 @@ on the device. So there is nothing that the number of workers could change.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.random_views import RandomViews
 from qs3.utils.seeding import derive
 
 
@@ -26,19 +27,31 @@ class Table:
         clouds: n clouds.
         labels: by owner ("y_source", "y_pseudo", "y_target_train"): [n] int64; often none at all.
         balance: the owner whose classes are drawn equally often; None draws each cloud once.
+        beside: further clouds of the same objects, by their key in a batch (see
+            `qs3.datamodules.twins`); under "points" what comes in place of `clouds`.
     """
 
     clouds: Clouds
     labels: Mapping[str, Tensor]
     balance: str | None = None
+    beside: Mapping[str, Clouds | RandomViews] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.clouds)
 
-    def rows(self, index: Tensor, start: Tensor | None = None) -> dict[str, Tensor]:
-        """The clouds (key "points") and labels at `index`, each cloud in its sample `start`."""
+    def rows(self, index: Tensor, draws: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
+        """The clouds (key "points") and labels at `index`, and what is beside them.
+
+        `draws`: by key what was drawn for these rows (`draw` of the clouds).
+        """
         labels = {key: y[index] for key, y in self.labels.items()}
-        return {"points": self.clouds.take(index, start), **labels}
+        found = {key: some.take(index, draws.get(key)) for key, some in self.sources.items()}
+        return {**found, **labels}
+
+    @property
+    def sources(self) -> dict[str, Any]:
+        """Where the clouds of each key come from, "points" first."""
+        return {"points": self.clouds, **self.beside}
 
     def order(self, generator: torch.Generator) -> Int[Tensor, " n"]:
         """As many positions as clouds: all of them, shuffled; or `balanced`."""
@@ -128,19 +141,24 @@ class Batches:
         for i in range(len(self)):
             batch: dict[str, Any] = {"index": i, "epoch": self.epoch}
             for name, table in self.tables.items():
-                rows = table.rows(*(part[i] for part in parts[name]))
+                index, draws = parts[name]
+                rows = table.rows(index[i], {key: some[i] for key, some in draws.items()})
                 batch[name] = {k: x.pin_memory() for k, x in rows.items()} if self.pinned else rows
             yield batch
 
-    def _parts(self, name: str, table: Table) -> list[tuple[Tensor, ...]]:
-        """Positions [size] of each batch, and while training its samples [size]."""
+    def _parts(
+        self, name: str, table: Table
+    ) -> tuple[tuple[Tensor, ...], dict[str, tuple[Tensor, ...]]]:
+        """Positions [size] of each batch, and while training by key what is drawn for them."""
         index = self._order(name, table)
-        parts = [index.split(self.sizes)]
-        if self.shuffle and table.clouds.starts > 1:
-            generator = self._generator("sample", name, self.epoch)
-            start = torch.randint(table.clouds.starts, (len(table),), generator=generator)
-            parts.append(start[index].split(self.sizes))
-        return parts
+        draws = {}
+        if self.shuffle:
+            for key, clouds in table.sources.items():
+                use = (name,) if key == "points" else (name, key)
+                drawn = clouds.draw(len(table), self._generator("sample", *use, self.epoch))
+                if drawn is not None:
+                    draws[key] = drawn[index].split(self.sizes)
+        return index.split(self.sizes), draws
 
     def _order(self, name: str, table: Table) -> Tensor:
         """This process's positions of the epoch: its share of one order after another."""

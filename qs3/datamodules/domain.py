@@ -8,21 +8,30 @@ or, from conf/datamodule, `hydra.utils.instantiate(cfg.datamodule)` with `+datam
 A batch is `{"points": [B, N, 3] float32, "labels": [B] int64}`: clouds in the unit ball (or in
 metres, if `scale` says so), z up, sampled by farthest points. Without labels the key "labels" is
 not there; without a trainer, that takes them away, the step's "index" and "epoch" are there too.
+With `twin="whole"` a training batch holds each cloud's whole object as "twin", turned alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+import torch
 from lightning.pytorch import LightningDataModule
+from torch import Tensor
 
 from qs3.config.checks import check_choice
 from qs3.data.domain import Domain, compose_domain
+from qs3.data.meta import sha256_of
 from qs3.data.store import PointSet
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.random_views import RandomViews, views_of
 from qs3.datamodules.splits import (
     Labelled,
     Unlabelled,
@@ -31,6 +40,7 @@ from qs3.datamodules.splits import (
     load_clouds,
     subsample_splits,
 )
+from qs3.datamodules.twins import SOURCE_TWINS, augmented
 from qs3.datamodules.validation_split import RULES
 from qs3.errors import ConfigError, DataError
 
@@ -58,12 +68,17 @@ class DomainData(LightningDataModule):
         clouds_a_class: only the first so many training clouds of each class.
         data_dir: where the dataset of a named domain lies.
         asks: who needs the labels, for the message where there are none; None: the domain.
+        twin: one of `twins.SOURCE_TWINS`: load the twins of the training clouds, too.
 
     Attributes:
         train, validation, test: clouds of each part, after `setup`.
         whole: clouds of the training split before it was divided, without their labels.
+        twins: of the clouds of `whole`, after `setup`; None if they were not asked for.
+        random_views: what is drawn from in place of `whole`, after `setup`; None unless
+            `domain.views` says so. Validation and test clouds are those that are stored.
         classes: names in label order, after `setup`.
         sha256: of the dataset, after `setup`.
+        beside_sha256: of what is loaded beside it, after `prepare_data`; "" if nothing is.
 
     Raises:
         ConfigError: no such domain, rule, sampler or scale; labels are asked for and there are
@@ -92,6 +107,7 @@ class DomainData(LightningDataModule):
         clouds_a_class: int | None = None,
         data_dir: str | Path = "data",
         asks: str | None = None,
+        twin: str | None = None,
     ) -> None:
         super().__init__()
         if isinstance(domain, str):
@@ -104,15 +120,18 @@ class DomainData(LightningDataModule):
         self.val = check_choice("data.val", val, sorted(RULES))
         self.sampler = check_choice("data.sampler", sampler, SAMPLERS)
         self.clouds_a_split, self.clouds_a_class = clouds_a_split, clouds_a_class
+        self.twin = twin if twin is None else check_choice("twin", twin, sorted(SOURCE_TWINS))
         self.asks = asks or f"domain {domain.name}"
         # Indices that are cached are those of whole splits.
         self.cache_dir = Path(cache_dir) if cache_dir and clouds_a_split is None else None
         self.whole: Unlabelled | None = None
         self.train: Labelled | Unlabelled | None = None
+        self.twins: Clouds | None = None
+        self.random_views: RandomViews | None = None
         self.validation: Labelled | None = None
         self.test: Labelled | Unlabelled | None = None
         self.classes: tuple[str, ...] = ()
-        self.sha256 = ""
+        self.sha256 = self.beside_sha256 = ""
         self._checked = False
         self._epochs = 0  # that have begun without a trainer
 
@@ -120,6 +139,13 @@ class DomainData(LightningDataModule):
         """Bring published files into the store if that has not been done; check it, once."""
         if not self._checked:
             self.domain.open()
+            beside: list[PointSet] = []
+            if self.twin and (array := SOURCE_TWINS[self.twin]):
+                beside.append(self.domain.open_array(array))
+            if self.domain.views == "random":
+                beside += itertools.chain(*views_of(self.domain, verify=True))
+            if beside:
+                self.beside_sha256 = sha256_of(" ".join(one.sha256 for one in beside))
             self._checked = True
 
     def setup(self, stage: str | None = None) -> None:
@@ -129,8 +155,7 @@ class DomainData(LightningDataModule):
         """
         dataset = self.domain.open(verify=False)
         self.classes, self.sha256 = tuple(dataset.classes), dataset.sha256
-        if self.clouds_a_split is not None:
-            dataset = subsample_splits(dataset, self.clouds_a_split)
+        dataset = self._fewer(dataset)
         if stage in (None, "fit", "validate") and self.train is None:
             self._setup_training(dataset)
         if stage in (None, "test", "predict") and self.test is None and "test" in dataset.counts():
@@ -160,12 +185,45 @@ class DomainData(LightningDataModule):
         result = {key: value for key, value in batch.items() if key not in ("index", "epoch")}
         if self.augment is None or self.trainer is None or not self.trainer.training:
             return result
-        points, rank = batch["points"], self.trainer.global_rank
-        generator = generator_of(batch, "augment", self.seed, rank, points.device)
-        augmented = self.augment(points, generator, self.scale)
-        return {**result, "points": augmented}
+        rank, device = self.trainer.global_rank, batch["points"].device
+
+        def generator(use: str) -> torch.Generator:
+            return generator_of(batch, f"augment {use}".strip(), self.seed, rank, device)
+
+        return augmented(self.augment, result, generator, self.scale, together=True)
+
+    def training_table(self, labels: Mapping[str, Tensor], balance: str | None = None) -> Table:
+        """The training clouds, for `Batches`: random views in their place if the domain says so."""
+        assert self.train is not None, "setup() comes first"
+        clouds = self.train.clouds
+        drawn = self.random_views
+        return Table(clouds, labels, balance, {"points": drawn.at(clouds.rows)} if drawn else {})
+
+    def twins_of(self, clouds: Clouds) -> Clouds:
+        """The twins of some of the training clouds, row by row."""
+        if self.twins is None:  # "scan": each cloud is its own
+            return clouds
+        return self.twins.at(clouds.rows)
+
+    def _fewer(self, dataset: PointSet) -> PointSet:
+        few = self.clouds_a_split
+        return dataset if few is None else subsample_splits(dataset, few)
+
+    def _setup_beside(self) -> None:
+        """Twins and random views of the training split, as many and in the order of its clouds."""
+        if self.twin and (array := SOURCE_TWINS[self.twin]):
+            twins = self._fewer(self.domain.open_array(array, verify=False))
+            self.twins = self._clouds(twins, "train", self.fps_starts).clouds
+        if self.domain.views == "random":
+            measured, exact = (
+                [self._fewer(one).split("train").points for one in kept]
+                for kept in views_of(self.domain, verify=False)
+            )
+            rows, floor = np.arange(len(measured[0])), self.domain.floor_m or 0.0
+            self.random_views = RandomViews(measured, exact, self.points, rows, self.scale, floor)
 
     def _setup_training(self, dataset: PointSet) -> None:
+        self._setup_beside()
         train = self._load(dataset, "train", starts=self.fps_starts)
         if isinstance(train, Unlabelled):
             self.whole = self.train = train
@@ -177,7 +235,7 @@ class DomainData(LightningDataModule):
         self.train, self.validation = train.at(chosen), train.at(held_out)
 
     def _load(self, dataset: PointSet, split: str, starts: int) -> Labelled | Unlabelled:
-        found = load_clouds(dataset, split, self.points, starts, self.cache_dir, scale=self.scale)
+        found = self._clouds(dataset, split, starts)
         if not self.has_labels:
             return found
         labels = labels_of(dataset, split)
@@ -187,6 +245,9 @@ class DomainData(LightningDataModule):
                 "them, or choose another dataset or method"
             )
         return Labelled(found.clouds, found.ids, labels)
+
+    def _clouds(self, dataset: PointSet, split: str, starts: int) -> Unlabelled:
+        return load_clouds(dataset, split, self.points, starts, self.cache_dir, scale=self.scale)
 
     def _loader(
         self, part: Labelled | Unlabelled | None, batch_size: int, shuffle: bool = False
@@ -201,9 +262,16 @@ class DomainData(LightningDataModule):
         trainer = self.trainer
         rank, world = (trainer.global_rank, trainer.world_size) if trainer else (0, 1)
 
+        table = Table(part.clouds, labels, balance)
+        if shuffle:
+            table = self.training_table(labels, balance)
+            if self.twin:
+                beside = {**table.beside, "twin": self.twins_of(part.clouds)}
+                table = replace(table, beside=beside)
+
         def batches(epoch: int) -> Batches:
             return Batches(
-                {Loader.KEY: Table(part.clouds, labels, balance)},
+                {Loader.KEY: table},
                 batch_size,
                 seed=self.seed,
                 epoch=epoch,

@@ -19,11 +19,12 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from qs3.classes import CLASSES, class_list
 from qs3.config.checks import check_bool, check_choice, check_float, check_int
 from qs3.config.hydra import build
-from qs3.data.dataset_folder import VIEWS
+from qs3.data.dataset_folder import VIEWS as VIEWS_FOLDER
 from qs3.errors import ConfigError, MeshError
 from qs3.generation.materials import OwnMaterials
 from qs3.generation.provenance import Keep
 from qs3.generation.released.poses import read_poses
+from qs3.generation.twins import TWINS, VIEWS
 from qs3.meshes.folder import SPLITS, MeshFolder
 from qs3.meshes.formats.mtl import libraries
 from qs3.meshes.source import MeshItem
@@ -64,6 +65,8 @@ def check(cfg: DictConfig) -> None:
             raise ConfigError(f"splits is a list: splits=[train], got {cfg.splits}")
         if unknown := sorted(set(map(str, cfg.splits)) - set(SPLITS)):
             raise ConfigError(f"splits: {unknown} are not among {', '.join(SPLITS)}")
+    if not isinstance(cfg.twins, ListConfig) or not {*cfg.twins} <= {*TWINS}:
+        raise ConfigError(f"twins is a list of {', '.join(TWINS)}: twins=[whole], got {cfg.twins}")
     for key in _SWITCHES:
         check_bool(key, cfg[key])
     check_choice("colliders", cfg.colliders, COLLIDERS)
@@ -109,7 +112,7 @@ def check_recipe(recipe: Any, cfg: DictConfig) -> None:
     And if something is asked for that a domain without views cannot give.
     """
     if not recipe.needs_renderer:
-        for key in (*_OF_LOOKING, "provenance", "keep_views"):
+        for key in (*_OF_LOOKING, "provenance", "keep_views", "twins"):
             if cfg.get(key):
                 raise ConfigError(
                     f"domain {cfg.domain.name} looks at nothing, so {key}= says nothing to it: "
@@ -122,6 +125,11 @@ def check_recipe(recipe: Any, cfg: DictConfig) -> None:
             raise ConfigError(
                 f"domain {cfg.domain.name} looks at meshes: {key}=none does not do, choose another"
             )
+    if VIEWS in cfg.twins and getattr(recipe.views, "count", recipe.views) == 1:
+        raise ConfigError(
+            "twins=[views]: with one view it is the cloud itself; leave it out, or take a domain "
+            "of several such as specklenet10"
+        )
     for key in _OF_LIGHT:
         if cfg.get(key) and not recipe.sensor.sees_light:
             raise ConfigError(
@@ -237,7 +245,8 @@ def keep(cfg: DictConfig, items: Sequence[MeshItem], folder: Path) -> Keep:
         seen[item.cls] += 1
     return Keep(
         provenance=cfg.provenance,
-        views=folder / VIEWS if cfg.keep_views else None,
+        views=folder / VIEWS_FOLDER if cfg.keep_views else None,
+        twins=frozenset(cfg.twins),
         previews=frozenset(previews),
     )
 
@@ -248,7 +257,10 @@ def describe(cfg: DictConfig, items: list[MeshItem], renderer: dict[str, str]) -
     A folder of meshes is described by the content of its files, not by where it lies.
     """
     return {
-        "kept": [key for key in ("provenance", "keep_views") if cfg[key]],
+        "kept": [
+            *(key for key in ("provenance", "keep_views") if cfg[key]),
+            *(f"twins={name}" for name in TWINS if name in cfg.twins),
+        ],
         "settings": settings(cfg),
         "objects": [_name_and_content(item, own_materials(cfg)) for item in items],
         "versions": {

@@ -26,11 +26,13 @@ class Keep:
         provenance: add the array "provenance" to the cloud.
         views: folder for the images and depths of every view; None keeps none. The views are
             then scanned with `explain`, which costs renders.
+        twins: which further clouds are made, of `qs3.generation.twins.TWINS`.
         previews: ids of the objects whose first view is kept in small, for the contact sheet.
     """
 
     provenance: bool = False
     views: Path | None = None
+    twins: frozenset[str] = frozenset()
     previews: frozenset[str] = frozenset()
 
 

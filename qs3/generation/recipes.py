@@ -25,6 +25,7 @@ from qs3.generation.provenance import Keep, preview_of, provenance_of
 from qs3.generation.released.placement import PoseFile
 from qs3.generation.released.views import box_of_corners
 from qs3.generation.scenes import Alone, Surroundings
+from qs3.generation.twins import WHOLE, fused_twins, true_points, whole_surface
 from qs3.generation.view_files import save_view
 from qs3.geometry.sampling import farthest_point_sampling_np, surface_sample
 from qs3.meshes.mesh import Mesh
@@ -46,7 +47,8 @@ class Cloud:
 
     Attributes:
         arrays: [P, 3] float32 by name; "points", and "points_clean" where there is a twin;
-            where it was asked for also "provenance" [P, 5] of "points".
+            where it was asked for also "provenance" [P, 5] of "points", and its twins
+            (`qs3.generation.twins`).
         views: frames that gave points.
         valid_points: points before sampling.
         frames: the depth frames, for looking at (empty where there are none).
@@ -195,6 +197,7 @@ class Mesh2Point:
         believed_poses = self.drift.believed(true_poses, pose_rng)
 
         noisy, clean, frames, origins = [], [], [], []
+        seen_by = {}
         for i, (pose, believed) in enumerate(zip(true_poses, believed_poses, strict=True)):
             view_rng = object_rng(seed, object_id, 2 + i)
             explain = keep.views is not None
@@ -212,9 +215,12 @@ class Mesh2Point:
             # A box is known in the world; with drift the cloud and the box part company,
             # as they do when a scan is cropped by an annotation made on the fused model.
             inside = self.crop.inside(points, crop_box)
-            points = points[inside]
+            measured, points = points, points[inside]
             if len(points) >= self.min_view_points:
                 noisy.append(points)
+                if keep.twins:
+                    true = true_points(frame, depth, measured, pose)[inside]
+                    seen_by[i] = (points, true)
                 if keep.provenance:
                     origins.append(provenance_of(frame, depth, i)[inside])
             if self.clean:
@@ -229,6 +235,10 @@ class Mesh2Point:
             arrays["points_clean"] = true[true_order]
         if keep.provenance:
             arrays["provenance"] = np.concatenate(origins)[order]
+        if WHOLE in keep.twins:
+            arrays["points_whole"] = whole_surface(placed, object_id, seed, self.points)
+        if keep.twins:
+            arrays |= fused_twins(keep.twins, seen_by, self.views.count, order)
         preview = preview_of(frames[0]) if object_id in keep.previews else {}
         return Cloud(arrays, len(noisy), sum(map(len, noisy)), tuple(frames), preview)
 

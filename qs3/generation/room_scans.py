@@ -26,6 +26,7 @@ from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep, preview_of, provenance_of
 from qs3.generation.recipes import Cloud, MaskCrop, TooFewPointsError
 from qs3.generation.scenes import HAIR_M, Room, Surroundings, around_an_eye
+from qs3.generation.twins import WHOLE, fused_twins, true_points, whole_surface
 from qs3.generation.view_files import save_view
 from qs3.geometry.cameras import Intrinsics, look_at
 from qs3.geometry.sampling import farthest_point_sampling_np
@@ -205,7 +206,11 @@ class RoomScan:
                 own, _, _ = own_pixels(image, mask, rules, edge_px)
                 if self.rules.drop_outliers:
                     own[own] = inliers(image.points_m[own], self.rules)
-                return self._cloud(frame, own, pose, object_id, keep)
+                cloud = self._cloud(frame, own, pose, object_id, keep)
+                if WHOLE in keep.twins:
+                    whole = whole_surface(placed, object_id, seed, self.points)
+                    cloud = replace(cloud, arrays={**cloud.arrays, "points_whole": whole})
+                return cloud
             why = piece.why
         raise TooFewPointsError(
             f"none of {self.attempts} pictures (recipe.attempts) shows it well enough; "
@@ -251,6 +256,9 @@ class RoomScan:
             arrays["points_clean"] = true[farthest_point_sampling_np(true, self.points)]
         if keep.provenance:
             arrays["provenance"] = provenance_of(frame, depth, 0)[order]
+        if keep.twins:
+            one = {0: (points, true_points(frame, depth, points, pose))}
+            arrays |= fused_twins(keep.twins, one, 1, order)
         if keep.views is not None:
             save_view(keep.views, object_id, 0, frame, pose, pose)
         preview = preview_of(frame) if object_id in keep.previews else {}

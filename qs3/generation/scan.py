@@ -107,7 +107,7 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
         MeshError, DataError, RenderError: a mesh cannot be scanned; the message names it.
     """
     cfg = composed_recipe(overrides)
-    for key, nothing in (("meshes", None), ("keep_views", False)):
+    for key, nothing in (("meshes", None), ("keep_views", False), ("twins", [])):
         if cfg[key] != nothing:
             raise ConfigError(
                 f"{key}= is for files: a scan of meshes from memory has no use for it"

@@ -7,34 +7,31 @@ clouds, is `selftraining=sd`.
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
 from qs3.geometry.neighbours import gather
-from qs3.methods.base import Method, class_loss, feature_dims, weight
+from qs3.methods.base import class_loss, weight
+from qs3.methods.mean_teacher import MeanTeacher
 from qs3.models.norms import use_domain
 
 KEPT, LEAST, MOST = 0.7, 0.7, 1.5  # share of a cut cloud, and its size, of the released code
 
 
-class Sd(Method):
+class Sd(MeanTeacher):
     r"""L = CE(net(x_s'), y_s) + w e^{-5 (1 - p)^2} H(softmax(g(x) / T_t), softmax(f(x') / T_s)).
 
     f: the backbone's vector of a cloud [B, D]; g: the same of the teacher, a net whose weights and
     statistics are running means of the student's; x: the batch's clouds of both domains; x': as
     they are spoilt for the student (`spoilt`); H(q, p) = -sum_d q_d log p_d, mean over the clouds;
     p: progress of the warm-up. The D features serve as logits; T_t < T_s sharpens what the student
-    is to follow. The teacher is in eval mode, and no gradient reaches it.
-
-    After step t = 0, 1, ... the mean takes the part max(1 / (t + 1), 1 - m) of the student's
-    weights: a plain mean at first. It is taken before the next step, to the same effect.
+    is to follow.
 
     Args:
         consistency_weight: w; 1 in the released code's logs, 0 trains on the source alone.
@@ -48,7 +45,6 @@ class Sd(Method):
     """
 
     uses_target: ClassVar[bool] = True
-    steps: Tensor
 
     def __init__(
         self,
@@ -58,9 +54,8 @@ class Sd(Method):
         student_temperature: float = 0.5,
         cut: str = "source",
     ) -> None:
-        super().__init__()
+        super().__init__(momentum)
         self.consistency_weight = weight("consistency_weight", consistency_weight)
-        self.momentum = check_float("method.momentum", momentum, "[0, 1]")
         for key, value in (("teacher", teacher_temperature), ("student", student_temperature)):
             check_float(f"method.{key}_temperature", value, "> 0")
         self.teacher_temperature, self.student_temperature = (
@@ -68,13 +63,6 @@ class Sd(Method):
             student_temperature,
         )
         self.cut = check_choice("method.cut", cut, ("source", "both", "none"))
-        self.teacher: Any = None
-        self.register_buffer("steps", torch.zeros((), dtype=torch.float64))
-
-    def prepare(self, net: nn.Module) -> None:
-        """The teacher, which is the student before its first step."""
-        feature_dims(net)  # it has features at all
-        self.teacher = copy.deepcopy(net).requires_grad_(False)
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
@@ -96,25 +84,6 @@ class Sd(Method):
         consistency = F.cross_entropy(student / self.student_temperature, sharp)
         ramp = self.consistency_weight * math.exp(-5 * (1 - batch["progress"]) ** 2)
         return {"ce": ce, "consistency": ramp * consistency}
-
-    @torch.no_grad()
-    def follow(self, net: nn.Module) -> None:
-        """One step of the running means; the first takes the student as it is."""
-        assert self.teacher is not None, "prepare() comes first"
-        self.teacher.eval()  # the trainer puts all modules into training mode, now and then
-        self.steps += 1
-        move_towards(self.teacher, net, (1 / self.steps).clamp_min(1 - self.momentum))
-
-
-@torch.no_grad()
-def move_towards(mean: nn.Module, net: nn.Module, part: Tensor) -> None:
-    """A running mean of weights and statistics takes `part` in [0, 1] of the net's."""
-    theirs = net.state_dict()
-    for name, value in mean.state_dict().items():
-        if value.is_floating_point():
-            value.lerp_(theirs[name], part.to(value))
-        else:
-            value.copy_(theirs[name])  # counts of batch norm
 
 
 def spoilt(

@@ -22,7 +22,7 @@ from qs3.config.checks import check_choice, check_float
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, class_loss, weight
-from qs3.methods.sd import move_towards
+from qs3.methods.mean_teacher import move_towards
 from qs3.models.norms import use_domain
 from qs3.selftraining.selectors import Selector, TeacherPredictions, most_confident
 

@@ -62,13 +62,14 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         seed=run.seed,
         owner=method.labels,
         uses_target=method.uses_target,
+        wants=method.wants,
     )
     data.prepare_data()
     source, target = run.source.open(verify=False), run.target.open(verify=False)
     _check_classes(source, target, cfg.num_classes)
     if given:
         given.check_classes(target.classes)
-    started = note_start(run, source, target, given)
+    started = note_start(run, source, target, given, data.labelled_domain.beside_sha256)
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")

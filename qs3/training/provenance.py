@@ -27,11 +27,19 @@ log = logging.getLogger(__name__)
 
 
 def note_start(
-    run: Run, source: PointSet, target: PointSet, given: Given | None = None
+    run: Run,
+    source: PointSet,
+    target: PointSet,
+    given: Given | None = None,
+    beside_sha256: str = "",
 ) -> dict[str, Any]:
-    """Read `started.json` and compare it with today's data, or write it."""
+    """Read `started.json` and compare it with today's data, or write it.
+
+    `beside_sha256`: of twins and views that are trained on; "" where there are none.
+    """
     now: dict[str, Any] = {
         "data": {"source": source.sha256, "target": target.sha256},
+        **({"beside": beside_sha256} if beside_sha256 else {}),
         "versions": {
             "qs3": VERSION,
             "python": platform.python_version(),
@@ -63,6 +71,8 @@ def note_start(
     runs.check_config(run.folder, started.get("config_sha256"), now["config_sha256"])
     for role, dataset in (("source", source), ("target", target)):
         runs.check_data(run.folder, dataset.name, started["data"][role], dataset.sha256)
+    name = f"what lies beside {source.name}"
+    runs.check_data(run.folder, name, started.get("beside", ""), beside_sha256)
     warn_of_versions(started["versions"], now["versions"])
     return started
 

@@ -71,6 +71,8 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
     warn_of_versions(begun["versions"], started["versions"])
     for role in ("source", "target"):
         runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])
+    twins = (one.get("beside", "") for one in (begun, started))
+    runs.check_data(other, "the twins of data.source", *twins)
     check(path, "copy it again from where it comes from, or leave ckpt_path out to begin anew")
     log.info("going on from %s", path)
     bring(other, run.folder)

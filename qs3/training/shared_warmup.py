@@ -45,6 +45,8 @@ def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
     for key in _AFTERWARDS:
         OmegaConf.update(before, key, None)
     parts = [hashing.config_sha256(before), started["data"], started["versions"]]
+    if "beside" in started:
+        parts.append(started["beside"])
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

@@ -20,6 +20,7 @@ from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
 from qs3.methods.source_only import SourceOnly
 from qs3.methods.supervised import Supervised
+from qs3.methods.twin import Twin
 from qs3.selftraining.pcfea import Pcfea
 from qs3.selftraining.student_loss import Student
 
@@ -31,7 +32,7 @@ class Case:
     Attributes:
         make: the method.
         passes: how often a batch passes through the net (PointDAN's through its generator). SD's
-            two more are its teacher's, and have no way back.
+            and Twin's two more are their teacher's, and have no way back; nor has a shared one's.
         source: whether its batches have labelled source clouds.
         pseudo: pseudo-labels of its target clouds: "hard", "soft", or "" for none.
     """
@@ -67,6 +68,9 @@ CASES = {
     "mlsp": Case(lambda: Mlsp(min_points=2), 2),
     "sd": Case(Sd, 2),
     "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
+    "twin": Case(Twin, 4),
+    "twin_shared": Case(lambda: Twin(teacher="shared"), 5),
+    "twin_of_the_source": Case(lambda: Twin(view_weight=0.0, target_weight=0.0), 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),
     "pcfea_averaged": Case(lambda: _styled(momentum=0.99), 2),
@@ -84,14 +88,26 @@ def batch_of(
 ) -> dict[str, Any]:
     """b clouds of n points in the unit ball, of each domain that the case asks for."""
     generator = torch.Generator().manual_seed(0)
-    points = torch.randn(2, b, n, 3, generator=generator)
-    points = (points / points.norm(dim=3).amax(2)[:, :, None, None]).to(device)
+
+    def clouds(count: int) -> torch.Tensor:
+        points = torch.randn(count, b, n, 3, generator=generator)
+        return (points / points.norm(dim=3).amax(2)[:, :, None, None]).to(device)
+
+    points = clouds(2)
     labels = torch.arange(b, device=device) % classes
     batch: dict[str, Any] = {"index": 0, "epoch": 3, "progress": 0.5}
     if case.source:
         batch["source"] = {"points": points[0], f"y_{method.labels}": labels}
     if method.uses_target or case.pseudo:
         batch["target"] = {"points": points[1]}
+    wants = method.wants
+    for domain, key, wanted in (
+        ("source", "twin", wants.twin),
+        ("source", "again", wants.again),
+        ("target", "twin", wants.target_twin),
+    ):
+        if wanted:
+            batch[domain][key] = clouds(1)[0]
     if case.pseudo:
         soft = nn.functional.one_hot(labels, classes).float() * 0.7 + 0.3 / classes
         batch["target"]["y_pseudo"] = soft if case.pseudo == "soft" else labels

@@ -112,8 +112,12 @@ def train(
     seed: int,
     batch_size: int = 32,
     lr: float = 3e-3,
+    beside: tuple[dict[str, Tensor], dict[str, Tensor]] = ({}, {}),
 ) -> None:
-    """Adam on the method's loss, learning rate along half a cosine; all from `seed`."""
+    """Adam on the method's loss, learning rate along half a cosine; all from `seed`.
+
+    `beside`: of the source and of the target, further clouds by their key in a batch.
+    """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         method.prepare(net)
@@ -126,8 +130,15 @@ def train(
             own = torch.randint(len(source[0]), (batch_size,), generator=generator)
             other = torch.randint(len(target), (batch_size,), generator=generator)
             batch: dict[str, Any] = {
-                "source": {"points": source[0][own], "y_source": source[1][own]},
-                "target": {"points": target[other]},
+                "source": {
+                    "points": source[0][own],
+                    "y_source": source[1][own],
+                    **{key: clouds[own] for key, clouds in beside[0].items()},
+                },
+                "target": {
+                    "points": target[other],
+                    **{key: clouds[other] for key, clouds in beside[1].items()},
+                },
                 "progress": (step + 1) / steps,
             }
             loss = torch.stack(list(method.loss(net, batch, generator).values())).sum()

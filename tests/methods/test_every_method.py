@@ -24,7 +24,7 @@ from tests.methods.cases import Case, batch_of, total
 
 NAMES = [
     *("source_only", "pcm", "dann", "defrec_on_source", "defrec_pcm", "gast", "gast_pcm"),
-    *("pointdan", "cpcm", "mlsp", "sd", "pcfea_styled", "student_all"),
+    *("pointdan", "cpcm", "mlsp", "sd", "twin", "twin_shared", "pcfea_styled", "student_all"),
 ]
 CASES = {**cases.CASES, "student_all": Case(lambda: Student(True, 0.01, 0.1, 1), 2, pseudo="soft")}
 parametrize = pytest.mark.parametrize("name", NAMES)
@@ -75,6 +75,8 @@ def test_a_step_is_a_function_of_the_generator(name: str) -> None:
         "dann",
         "pointdan",
         "pcfea_styled",
+        "twin",
+        "twin_shared",
     ):  # these draw nothing of their own
         assert not torch.equal(values[0], values[2])
     torch.set_rng_state(state)
@@ -101,6 +103,13 @@ WEIGHTS = {
         "discrepancy_weight": {"discrepancy"},
         "node_weight": {"nodes"},
     },
+    "twin": {
+        "twin_weight": {"twin"},
+        "logit_weight": {"logits"},
+        "feature_weight": {"features"},
+        "view_weight": {"views"},
+        "target_weight": {"target"},
+    },
     "pcfea_styled": {"align_weight": {"align_source", "align_target"}},
 }
 
@@ -120,7 +129,7 @@ def test_a_weight_multiplies_its_terms_and_no_others(name: str) -> None:
 
 def test_who_sees_the_target() -> None:
     seen = {name for name, case in CASES.items() if case.make().uses_target}
-    without = {"source_only", "supervised", "pcm"}
+    without = {"source_only", "supervised", "pcm", "twin_of_the_source"}
     students = {name for name in CASES if name.startswith("student")}  # theirs are pseudo-labelled
     assert seen == set(CASES) - without - students
 

@@ -159,6 +159,8 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         # a teacher and a pool of the warm-up, in buffers; the pool is of epoch 1
         (("method=sd", "selftraining=spst", FEATURED), 2),
         (("method=pcfea", "method.every=1.0", "selftraining=spst", FEATURED), 3),
+        # twins, second draws and drawn sensors
+        (("method=twin", "selftraining=spst", "data.source.views=random", FEATURED), 2),
         (("method=dann", "selftraining=crst_lrent", "selftraining.theta=0", FEATURED), 2),
         (("method=cpcm", "selftraining=spst", "evaluation.norms=tent"), 2),
         (("method=mlsp", "selftraining=spst", FEATURED), 2),

@@ -45,20 +45,24 @@ class TinyNet(nn.Module):
 def write_domain(
     folder: Path, name: str, *, noise: float, train: int = 24, test: int = 8, points: int = 64
 ) -> None:
-    """A store of `train` and `test` clouds a class."""
+    """A store of `train` and `test` clouds a class; their twins lack the noise."""
     rng = np.random.default_rng(len(name))
-    clouds, rows = [], []
+    clouds, exact, rows = [], [], []
     for split, count in (("train", train), ("test", test)):
         for cls in CLASSES:
             for i in range(count):
                 cloud = rng.normal(size=(points, 3)) * _SHAPES[cls]
+                exact.append(cloud)
                 clouds.append(cloud + noise * rng.normal(size=(points, 3)))
                 rows.append(ManifestRow(id=f"{cls}/{split}/{i:03d}", cls=cls, split=split))
     write_pointset(
         folder / name,
         name=name,
         classes=CLASSES,
-        arrays={"points": np.array(clouds, dtype=np.float32)},
+        arrays={
+            "points": np.array(clouds, dtype=np.float32),
+            **{f"points_{twin}": np.array(exact, dtype=np.float32) for twin in ("exact", "whole")},
+        },
         rows=rows,
         meta=MADE_OF.get(name, MadeOf()).meta,
     )

@@ -1,0 +1,179 @@
+"""Twins: a student of one noisy, hidden, cut view follows a teacher who sees the whole object.
+
+Ours. Learning with information that only the teacher has is of Vapnik, Vashist, "A new learning
+paradigm: Learning using privileged information", Neural Networks 22 (2009), as distillation of
+Lopez-Paz, Bottou, Schölkopf, Vapnik, "Unifying distillation and privileged information", ICLR 2016.
+Here the information is what a simulation knows and a scan does not show.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from qs3.config.checks import check_choice, check_float
+from qs3.datamodules.twins import SOURCE_TWINS, Wants
+from qs3.methods.base import class_loss, weight
+from qs3.methods.mean_teacher import MeanTeacher
+from qs3.models.norms import use_domain
+
+TEACHERS = ("mean", "shared")
+
+
+class Twin(MeanTeacher):
+    r"""A student of cut views that says what a teacher of whole objects says.
+
+    L = CE(f(x), y) + a CE(f(w), y) + l T² KL(t(w) || f(x); T) + d (1 - cos(φ_t(w), φ_f(x)))
+    + v JS(f(x), f(x')) + u e^{-5 (1 - p)²} H(t(z); T_t, f(z')).
+
+    x: a source cloud as the student sees it, noisy, hidden and cut; w: its twin (`sees`), turned
+    alike; x': x drawn again, by another cut and, with `data.source.views=random`, another sensor
+    and number of views; z, z': a target cloud as it was measured, and cut. f: class probabilities
+    of the student, φ_f its vector of a cloud before the head; t, φ_t those of the teacher, which no
+    gradient reaches. KL(·; T): of softmaxes at temperature T; JS: their Jensen-Shannon divergence;
+    H(·; T_t, ·): cross-entropy with the teacher's softmax at T_t, which sharpens it; all are means
+    over the clouds, in nats. p: progress of the warm-up.
+
+    The normalised squared distance |û - v̂|² is 2 (1 - cos), so it is no further choice.
+
+    A weight of 0 leaves its term out, with its passes, and the clouds that nothing else needs are
+    not loaded.
+
+    Args:
+        twin_weight: a: the student learns twins, too, which is how its means come to know them.
+        logit_weight: l.
+        feature_weight: d.
+        view_weight: v.
+        target_weight: u.
+        sees: what the teacher sees of a source cloud: "whole", the object's whole surface; "clean",
+            what was seen, without error; "scan", the cloud itself, not cut. The first needs a store
+            made with twins=[whole].
+        teacher: "mean", running means of the student in eval mode; "shared", the student itself.
+        momentum: m of the means, see `MeanTeacher`.
+        temperature: T > 0.
+        target_temperature: T_t > 0.
+    """
+
+    def __init__(
+        self,
+        twin_weight: float = 1.0,
+        logit_weight: float = 1.0,
+        feature_weight: float = 1.0,
+        view_weight: float = 1.0,
+        target_weight: float = 1.0,
+        sees: str = "whole",
+        teacher: str = "mean",
+        momentum: float = 0.99,
+        temperature: float = 2.0,
+        target_temperature: float = 0.5,
+    ) -> None:
+        super().__init__(momentum)
+        self.twin_weight = weight("twin_weight", twin_weight)
+        self.logit_weight = weight("logit_weight", logit_weight)
+        self.feature_weight = weight("feature_weight", feature_weight)
+        self.view_weight = weight("view_weight", view_weight)
+        self.target_weight = weight("target_weight", target_weight)
+        self.sees = check_choice("method.sees", sees, sorted(SOURCE_TWINS))
+        self.shared = check_choice("method.teacher", teacher, TEACHERS) == "shared"
+        self.temperature = check_float("method.temperature", temperature, "> 0")
+        self.target_temperature = check_float(
+            "method.target_temperature", target_temperature, "> 0"
+        )
+        self.uses_target = self.target_weight > 0  # type: ignore[misc]
+        self.wants = Wants(
+            twin=self.sees if self.twin_weight or self._distils else None,
+            again=self.view_weight > 0,
+            target_twin=self.uses_target,
+        )
+
+    @property
+    def _distils(self) -> bool:
+        return self.logit_weight > 0 or self.feature_weight > 0
+
+    def prepare(self, net: Any) -> None:
+        """A teacher of its own, unless it is shared or says nothing."""
+        super().prepare(net)
+        if self.shared or not (self._distils or self.uses_target):
+            self.teacher = None
+
+    def loss(
+        self, net: Any, batch: dict[str, Any], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Terms "ce", "twin", "logits", "features", "views" and "target", each >= 0."""
+        if self.teacher is not None:
+            self.follow(net)
+        source = batch["source"]
+        features = net.features(source["points"]).global_  # [B, D]
+        logits = net.head(features)
+        terms = {"ce": class_loss(logits, source["y_source"], self.smoothing)}
+        if self.wants.twin:
+            terms |= self._of_the_twin(net, source, features, logits)
+        if self.view_weight:
+            again = net(source["again"])
+            terms["views"] = self.view_weight * jensen_shannon(logits, again)
+        if self.target_weight:
+            ramp = self.target_weight * math.exp(-5 * (1 - batch["progress"]) ** 2)
+            terms["target"] = ramp * self._of_the_target(net, batch["target"])
+        return terms
+
+    def _of_the_twin(
+        self, net: Any, source: dict[str, Tensor], features: Tensor, logits: Tensor
+    ) -> dict[str, Tensor]:
+        """What the twins teach: their own classes, and the scans'.
+
+        Teachers do not run in `no_grad`, in which a net looks at its input's values and a GPU would
+        wait: nothing of theirs asks for a gradient, and what is detached keeps none.
+        """
+        terms, twin = {}, source["twin"]
+        if self.twin_weight or self.shared:
+            own = net.features(twin).global_
+            classes = net.head(own)
+        if self.twin_weight:
+            ce = class_loss(classes, source["y_source"], self.smoothing)
+            terms["twin"] = self.twin_weight * ce
+        if not self._distils:
+            return terms
+        if not self.shared:
+            own = self.teacher.features(twin).global_
+            classes = self.teacher.head(own)
+        if self.logit_weight:
+            distance = distillation(classes.detach(), logits, self.temperature)
+            terms["logits"] = self.logit_weight * distance
+        if self.feature_weight:
+            cosine = F.cosine_similarity(own.detach().float(), features.float(), dim=1)
+            terms["features"] = self.feature_weight * (1 - cosine).mean()
+        return terms
+
+    def _of_the_target(self, net: Any, target: dict[str, Tensor]) -> Float[Tensor, ""]:
+        """Cross-entropy of cut target clouds with what the teacher says of them before the cut."""
+        teacher = net if self.shared else self.teacher
+        with use_domain(net, "target"), use_domain(teacher, "target"):
+            said = teacher(target["twin"]).detach()
+            student = net(target["points"])
+        return F.cross_entropy(student, (said / self.target_temperature).softmax(dim=1))
+
+
+def distillation(
+    teacher: Float[Tensor, "b c"], student: Float[Tensor, "b c"], temperature: float
+) -> Float[Tensor, ""]:
+    """T² KL(softmax(teacher / T) || softmax(student / T)) in nats, mean over the clouds, >= 0.
+
+    Hinton, Vinyals, Dean, "Distilling the Knowledge in a Neural Network", 2015: with T² gradients
+    keep their size as T grows.
+    """
+    q = (teacher.float() / temperature).log_softmax(dim=1)
+    p = (student.float() / temperature).log_softmax(dim=1)
+    return temperature**2 * F.kl_div(p, q, log_target=True, reduction="batchmean")
+
+
+def jensen_shannon(first: Float[Tensor, "b c"], second: Float[Tensor, "b c"]) -> Float[Tensor, ""]:
+    """Of two softmaxes: mean divergence of both from their mean, in [0, ln 2] nats."""
+    p, q = first.float().log_softmax(dim=1), second.float().log_softmax(dim=1)
+    mean = torch.logaddexp(p, q) - math.log(2)
+    both = [F.kl_div(mean, one, log_target=True, reduction="batchmean") for one in (p, q)]
+    return (both[0] + both[1]) / 2

@@ -1,0 +1,50 @@
+"""A run with twins: it is begun with them, and neither continued nor shared with others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from qs3.config import hashing
+from qs3.data.store import open_pointset, read_manifest, write_pointset
+from qs3.errors import DataError
+from qs3.runs.folder import read_started
+from qs3.training.command import train
+from qs3.training.shared_warmup import warmup_sha256
+from tests.training.toy import MADE_OF, toy_config, write_toy
+from tests.training.watching import interrupt
+
+WORDS = (
+    *("method=twin", "method.target_weight=0", "selftraining=none", "protocol.epochs=2"),
+    "model._target_=tests.training.nets.featured",
+)
+
+
+def test_other_twins_are_another_run(tmp_path):
+    """The clouds are the same, so is the dataset's hash; what the teacher saw is not."""
+    write_toy(tmp_path / "data")
+    folder = tmp_path / "data/specklenet10"
+    cfg = toy_config(tmp_path, *WORDS)
+    interrupt(cfg, epoch=1)
+    started = read_started(hashing.run_folder(cfg))
+    before = open_pointset(folder)
+    arrays = {
+        name: np.array(open_pointset(folder, name).points) for name in ("points", "points_whole")
+    }
+    arrays["points_whole"] += 1
+    rows = read_manifest(folder, before.classes)
+    made = write_pointset(
+        folder, name=before.name, classes=before.classes, arrays=arrays, rows=rows,
+        meta=MADE_OF["specklenet10"].meta,
+    )  # fmt: skip
+    assert made.sha256 == before.sha256
+    with pytest.raises(DataError, match="another version of what lies beside specklenet10"):
+        train(cfg)
+    hashes = {warmup_sha256(cfg, {**started, "beside": x}) for x in ("a", "b")}
+    assert len({*hashes, warmup_sha256(cfg, {k: started[k] for k in ("data", "versions")})}) == 3
+
+
+def test_a_run_without_twins_notes_none(toy, tmp_path):
+    cfg = toy("method=source_only", "selftraining=none", "protocol.epochs=2")
+    interrupt(cfg, epoch=1)
+    assert "beside" not in read_started(hashing.run_folder(cfg))
