@@ -9,6 +9,7 @@ PIP_ARGS ?=
 PARALLEL ?= -n 2 --dist loadfile
 # Of `make bench`.
 DEVICE ?= cpu
+THREADS ?=
 # Of `make release`.
 VERSION ?=
 GO ?= false
@@ -56,8 +57,8 @@ test: install ## all tests that are not slow, on 2 cores
 test-all: install ## the slow tests too, shapes in signatures checked, and the benchmarks once each
 	QS3_CHECK_SHAPES=1 $(RUN) -m pytest $(PARALLEL) -m ''
 
-bench: install ## speed, as ratios against named baselines; of nets and methods on DEVICE=cuda
-	QS3_BENCH_DEVICE=$(DEVICE) $(RUN) -m pytest tests/benchmarks --benchmark-enable -s
+bench: install ## speed, as ratios against named baselines; of nets and methods on DEVICE=cuda; THREADS=1
+	QS3_BENCH_DEVICE=$(DEVICE) QS3_BENCH_THREADS=$(THREADS) $(RUN) -m pytest tests/benchmarks --benchmark-enable -s
 
 mutants: install ## how many faults put into the core the tests notice; hours, goes on where it stopped
 	$(RUN) .ci/mutants.py .ci/mutants.toml docs/results/mutants.csv

@@ -6,12 +6,14 @@ import logging
 import warnings
 from typing import Any
 
+import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
+from qs3.utils.allocator import keep_freed_memory
 
 
 def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
@@ -47,6 +49,18 @@ def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
 def build_each(group: DictConfig | None) -> list[Any]:
     """The objects of a config group that has several, such as `callbacks`."""
     return [build(node) for node in (group or {}).values() if node is not None]
+
+
+def settle_process(threads: int) -> None:
+    """What a training sets for its whole process: memory is kept, no tensor is filled in vain.
+
+    Args:
+        threads: of torch.
+    """
+    keep_freed_memory()
+    # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    torch.set_num_threads(threads)
 
 
 def quieten() -> None:

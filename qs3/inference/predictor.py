@@ -39,6 +39,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
+from qs3.utils.allocator import keep_freed_memory
 
 BATCH = 32  # clouds: more are no faster on a CPU
 
@@ -294,6 +295,9 @@ def load(
 ) -> Predictor:
     """The classifier that a finished run reports; also as `qs3.load`.
 
+    On the CPU the process keeps the memory that predictions free from then on, as trainings do
+    (`qs3.utils.allocator`): it stays as large as it was at most, and predictions are faster.
+
     Args:
         run: its folder, or the file result.pt of it, which needs nothing else; or a folder of
             `qs3.inference.model_folder`; or a name of `qs3.inference.pretrained`.
@@ -308,6 +312,8 @@ def load(
     """
     result = read_result(run)
     place = device_of(device)
+    if place.type == "cpu":
+        keep_freed_memory()
     return Predictor(build_net(result, packages).to(place), result, place)
 
 

@@ -15,7 +15,7 @@ import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from qs3.config.hydra import build
-from qs3.engine.trainer import quieten
+from qs3.engine.trainer import quieten, settle_process
 from qs3.methods.base import Method
 from qs3.models.features import remember
 from qs3.runs.checkpoints import LAST, copy_weights, save
@@ -27,7 +27,6 @@ from qs3.training.load import Loaded, load_data
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
-from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.cli import TERMINATED
 from qs3.utils.processor_time import Moment, processor_seconds
 from qs3.utils.threads import cores, number_of
@@ -44,10 +43,7 @@ def fit(run: Run) -> RunMetrics:
     """
     began = Moment(time.time(), processor_seconds())
     quieten()
-    keep_freed_memory()
-    # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
-    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
-    torch.set_num_threads(number_of(run.cfg.trainer.threads))
+    settle_process(number_of(run.cfg.trainer.threads))
     method: Method = build(run.cfg.method)
     given = read_given(run.cfg)
     loaded = load_data(run, method, given)

@@ -1,4 +1,4 @@
-"""Where benchmarks of nets and methods run: `make bench DEVICE=cuda`. Nothing else changes."""
+"""Where benchmarks run: `make bench DEVICE=cuda`, for nets and methods, or `THREADS=1`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import os
 
 import torch
 
+from qs3.utils.threads import cores
+
+THREADS = int(os.environ.get("QS3_BENCH_THREADS") or len(cores()))  # as a training takes them
 DEVICE = torch.device(os.environ.get("QS3_BENCH_DEVICE") or "cpu")
 WHERE = (
-    f"{torch.get_num_threads()} threads"
+    f"{THREADS} threads"
     if DEVICE.type == "cpu"
     else torch.cuda.get_device_name(DEVICE)
     if DEVICE.type == "cuda"

@@ -48,6 +48,13 @@ def changed(run: Path, folder: Path, **values: Any) -> Path:
     return folder / "result.pt"
 
 
+def test_memory_that_predictions_free_is_kept(run, monkeypatch):
+    asked = []
+    monkeypatch.setattr("qs3.inference.predictor.keep_freed_memory", lambda: asked.append(1))
+    qs3.load(run)
+    assert asked == [1]
+
+
 def test_predictions_of_the_run_to_the_last_digit(run, predictor, test_clouds, tmp_path):
     expected = read_predictions(run / "predictions.csv")
     assert not (run / ".hydra").exists()  # called from Python: nothing but the run's own files
