@@ -69,8 +69,9 @@ BENCH = Command(
         "qs3 bench sensor=kinect_v1 sensor.infrared.read_noise_e=20",
     ),
     about="""
-Measures planes and an edge, and writes a page (index.md), its figures and all numbers (planes.csv).
-The exit status is 1 if a band does not hold. Every finished condition is kept in OUT/cache.
+Measures planes, an edge and whole frames of rooms, and writes a page (index.md), its figures and
+all numbers of the planes (planes.csv). The exit status is 1 if a band does not hold. Every finished
+condition is kept in OUT/cache.
 """,
     others={"sensor.": "settings of all of them"},
     line=True,

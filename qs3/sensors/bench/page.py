@@ -14,9 +14,9 @@ from qs3.utils import text_table
 _INTRO = """# What our depth sensors measure
 
 Each sensor of `conf/sensor` before targets whose geometry is known: planes at many distances and
-tilts, and a square before a wall. Nothing here is fitted to a curve: the images are rendered,
-exposed and matched as in a generated dataset, and the depths that come back are measured as
-librealsense's depth-quality tool does it.
+tilts, a square before a wall, and rooms. Nothing here is fitted to a curve: the images are
+rendered, exposed and matched as in a generated dataset, and the depths that come back are measured
+as librealsense's depth-quality tool does it.
 
     {command}
 

@@ -144,7 +144,9 @@ def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
     assert "3 scenes, 1.10 m away" in said
     assert "infrared.psf_px" in said
     assert "dots over ambient" in said
-    assert re.search(r"near: realsense_d415 fills 9\d\.\d%", said)
+    assert re.search(
+        r"near: realsense_d415 fills \d+\.\d%.*; the camera's own depth: 100\.0%", said
+    )
     written = yaml.safe_load(out.read_text())
     assert written["defaults"][0] == "realsense_d415"
     assert written["ambient"] == pytest.approx(HIDDEN["ambient"], rel=0.07)
