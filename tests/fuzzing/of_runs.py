@@ -157,7 +157,9 @@ def _read_judgement(path: Path) -> None:
 
 def _tables(folder: Path) -> list[bytes]:
     table = "title: mine\nmetrics: [accuracy]\ncolumns: [a]\nrows:\n- name: b\n  a:\n    paper: 1\n"
-    return [table.encode(), b"&a {title: x, metrics: [accuracy], columns: [*a], rows: []}"]
+    several = table.replace("[a]", "{a: {run: seed=1, seeds: 2}, c: null, d: seed=2}")
+    knot = "&a {title: x, metrics: [accuracy], columns: [*a], rows: []}"
+    return [text.encode() for text in (table, several, knot)]
 
 
 def _read_table(path: Path) -> None:
