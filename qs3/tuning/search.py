@@ -20,7 +20,8 @@ _FIRST, _SECOND = 0.9, 0.99
 LAST = 0.25
 """Share of the steps, at the end, whose numbers are averaged: single steps still shake."""
 
-_STEP = 0.25  # of differences, in logits: over what single pixels do by chance
+STEP = 0.6
+"""Of differences, in logits, at first: over what single pixels do by chance. At last a quarter."""
 
 
 class Seen(Protocol):
@@ -41,12 +42,13 @@ def by_differences(
     objects: Sequence[Seen],
     distance: Distance,
     points: int,
-    seed: int,
+    apart: float = STEP,
 ) -> tuple[float, np.ndarray]:
     """The distance of the objects' clouds, and its slope [K] by the free numbers.
 
     Central differences of the ordinary sensor, whose random numbers are the same on both sides:
-    1 + 2 K clouds of each object. Objects that it does not see on one side are left out.
+    1 + 2 K clouds of each object. Objects that it does not see on one side are left out. Both sides
+    are `apart` from the numbers, in logits.
 
     Raises:
         DataError: fewer than two objects give clouds.
@@ -54,7 +56,7 @@ def by_differences(
     at = np.array(numbers)
     steps = [
         np.zeros(len(at)),
-        *(sign * _STEP * one for one in np.eye(len(at)) for sign in (1, -1)),
+        *(sign * apart * one for one in np.eye(len(at)) for sign in (1, -1)),
     ]
     rows = []
     for one in objects:
@@ -64,7 +66,7 @@ def by_differences(
     _check_count(rows)
     with torch.no_grad():
         found = [float(distance.of(described)) for described in torch.stack(rows, dim=1)]
-    return found[0], (np.array(found[1::2]) - np.array(found[2::2])) / (2 * _STEP)
+    return found[0], (np.array(found[1::2]) - np.array(found[2::2])) / (2 * apart)
 
 
 def by_twin(
@@ -99,9 +101,6 @@ def by_twin(
             (ours * pull).sum().backward()
     slope = np.zeros(len(keys)) if at.grad is None else torch.nan_to_num(at.grad).numpy()
     return float(found.detach()), slope
-
-
-SLOPES = {"differences": by_differences, "twin": by_twin}
 
 
 def _values(numbers: np.ndarray, keys: Sequence[str]) -> dict[str, float]:
@@ -146,15 +145,18 @@ def search(
         k = state.steps
         rng = np.random.default_rng([seed, k])
         drawn = rng.permutation(len(objects))[:batch]
-        found, slope = SLOPES[slopes](
-            state.numbers, keys, [objects[i] for i in drawn], distance, points, seed
-        )
+        some = [objects[i] for i in drawn]
+        left = 0.5 * (1 + np.cos(np.pi * k / steps))  # 1 at first, 0 at last
+        if slopes == "twin":
+            found, slope = by_twin(state.numbers, keys, some, distance, points, seed)
+        else:
+            apart = STEP * (0.25 + 0.75 * left)
+            found, slope = by_differences(state.numbers, keys, some, distance, points, apart)
         mean = _FIRST * np.array(state.mean) + (1 - _FIRST) * slope
         square = _SECOND * np.array(state.square) + (1 - _SECOND) * slope**2
         straight = mean / (1 - _FIRST ** (k + 1))
         wide = np.sqrt(square / (1 - _SECOND ** (k + 1)))
-        cosine = 0.5 * (1 + np.cos(np.pi * k / steps))  # of the rate, which ends at a tenth
-        step = rate * (0.1 + 0.9 * cosine) * straight / (wide + 1e-12)
+        step = rate * (0.1 + 0.9 * left) * straight / (wide + 1e-12)
         state.path.append(list(state.numbers))
         state.numbers = [float(a - b) for a, b in zip(state.numbers, step, strict=True)]
         state.mean, state.square = [float(m) for m in mean], [float(s) for s in square]

@@ -134,6 +134,20 @@ def _read_model(path: Path) -> None:
     _read_result(folder)
 
 
+def _searches(folder: Path) -> list[bytes]:
+    from qs3.tuning.state import State
+
+    state = State("s", [0.5], [0.0], [0.0], [1.5, 1.25], [[0.0], [0.25]])
+    state.write(folder / "a.json")
+    return [(folder / "a.json").read_bytes()]
+
+
+def _read_search(path: Path) -> None:
+    from qs3.tuning.state import read_state
+
+    read_state(path, "s")
+
+
 def _judgements(folder: Path) -> list[bytes]:
     share = {"mean": 0.5, "sem": None, "low": 0.25, "high": None}
     figures = {
@@ -206,6 +220,7 @@ READERS: tuple[Reader, ...] = (
            ("inference/model_folder.py", "inference/tensor_file.py")),
     Reader("judgement .json", _judgements, _read_judgement, "a.json", None,
            ("inference/judgement.py",)),
+    Reader("search .json", _searches, _read_search, "a.json", None, ("tuning/state.py",)),
     Reader("table .yaml", _tables, _read_table, "a.yaml", None, ("report/tables/table.py",)),
     Reader("journal of a sweep", _journals, _read_journal, "a.txt", None, ("sweeps/summary.py",)),
     Reader("cache of samples", _caches, _read_cache, "a.npy", None, ("datamodules/fps_cache.py",)),

@@ -1,0 +1,137 @@
+"""qs3 tune with the real sensor, its twin and stores."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from qs3.config.compose import composed
+from qs3.config.hydra import build
+from qs3.errors import ConfigError
+from qs3.generation.command import generate
+from qs3.generation.plan import mesh_items
+from qs3.generation.scan import composed_recipe
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.tuning import parameters
+from qs3.tuning.features import Distance, roughness
+from qs3.tuning.scenes import _points, check_recipe, still_of
+from qs3.tuning.search import search, settled
+from qs3.tuning.state import State
+from tests.commands import main
+from tests.composing import compose
+
+TINY = (
+    "domain=specklenet10", "views=1", "sensor=speckle_stereo_small", "sensor/matcher=ncc",
+    "renderer=mitsuba", "renderer.samples=2", "renderer.threads=1", "sensor.width_px=240",
+    "sensor.height_px=240", "sensor.focal_px=333", "sensor.matcher.num_disparities=48",
+)  # fmt: skip
+
+
+def stills(count, *more):
+    cfg = composed_recipe([*TINY, "classes=[chair,sofa,bed]", "limit=4", *more])
+    recipe, renderer = check_recipe(build(cfg.recipe)), build(cfg.renderer)
+    items = [item for item in mesh_items(cfg) if item.split == "train"][::2][:count]
+    return [still_of(recipe, item.load(), item.id, cfg.seed, renderer) for item in items]
+
+
+def test_the_twin_s_cloud_without_noise_is_the_true_surface():
+    (one,) = stills(1)
+    calm = {
+        "infrared.electrons_at_white": 1e9, "infrared.read_noise_e": 0.0, "ambient": 0.05,
+        "infrared.psf_px": 0.4, "infrared.speckle_contrast": 0.0,
+    }  # fmt: skip
+    values = {key: torch.tensor(value, dtype=torch.float64) for key, value in calm.items()}
+    made = one.recipe.make(one.mesh, one.id, one.seed, one.renderer)
+    true = torch.from_numpy(made.arrays["points_clean"].astype(np.float64))
+    points = _points(one.views[0], one.recipe.sensor, values, torch.Generator())
+    assert len(points) > 500
+    apart = torch.cdist(points, true).min(dim=1).values
+    assert float(apart.median()) < 0.015  # m; a pixel is 12 mm wide there
+    ours = one.cloud(values, 400, 0)
+    again = one.cloud(values, 400, 0)
+    assert torch.equal(ours, again)  # the same noise at each call
+
+
+@pytest.mark.slow
+def test_hidden_numbers_of_the_real_sensor_are_found():
+    """The target is the source by a darker camera in brighter light, of other objects."""
+    every = stills(10, "sensor.ambient=1.0")
+    sources, others = every[:5], every[5:]
+    truth = {"infrared.electrons_at_white": 800.0, "ambient": 2.0}
+    distance = Distance(roughness, [one.measured(truth, 512) for one in every])
+    start = parameters.values_of(sources[0].recipe.sensor, tuple(truth))
+    zeros = [0.0, 0.0]
+    state = State("", parameters.free(start).tolist(), zeros, list(zeros))
+    search(state, tuple(truth), sources, distance, steps=16, batch=5, points=512, rate=0.5, seed=0)
+    found = parameters.as_floats(parameters.bounded(torch.tensor(settled(state)), tuple(truth)))
+    before, after = (
+        float(distance([one.measured(values, 512) for one in others])) for values in ({}, found)
+    )
+    assert after < 0.5 * before
+    assert found["infrared.electrons_at_white"] < 3000  # from 10,000 to 800
+    assert found["ambient"] > 1.0 or found["infrared.electrons_at_white"] < 800
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory):
+    place = tmp_path_factory.mktemp("target")
+    words = ["domain=modelnet10", "classes=[chair,sofa]", "limit=4", "workers=0", "splits=[train]"]
+    generate(compose("generate", [*words, f"paths.data_dir={place}"]))
+    return place / "modelnet10"
+
+
+def words(target, out, *more):
+    return [
+        "tune", f"target={target}", f"out={out}", "domain=specklenet10", "views=1",
+        "sensor=speckle_stereo_small", "renderer=mitsuba", "renderer.samples=1", "objects=4",
+        "held_out=4", "batch=2", "points=128", "classes=[chair,sofa]", "limit=4", "sample=6",
+        "parameters=ambient,infrared.psf_px", *more,
+    ]  # fmt: skip
+
+
+def test_the_command_writes_a_preset_that_composes_and_goes_on(target, tmp_path, capsys):
+    out = tmp_path / "sensor" / "tuned.yaml"
+    out.parent.mkdir()
+    assert main(words(target, out, "steps=2")) == 0
+    said = capsys.readouterr().out
+    assert "held out" in said
+    assert "infrared.psf_px" in said
+    preset = yaml.safe_load(out.read_text())
+    assert preset["defaults"] == ["speckle_stereo_small", "_self_"]
+    assert out.read_text().splitlines()[1].startswith("# qs3 tune target=")
+    found = build(composed(None, f"hydra.searchpath=[file://{tmp_path}]", "+sensor=tuned").sensor)
+    assert isinstance(found, SpeckleStereo)
+    assert found.ambient == pytest.approx(preset["ambient"])
+    assert found.infrared.electrons_at_white == 10_000
+    page = out.with_suffix(".md").read_text()
+    assert "| `ambient` | 0.003 to 5 | 0.15 |" in page
+    # The search is done: the same command only measures, and comes to the same.
+    before = out.read_text()
+    assert main(words(target, out, "steps=2")) == 0
+    assert out.read_text() == before
+    assert main(words(target, out, "steps=2", "rate=0.3")) == 1
+    assert "other settings" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["sensor.ambient=1"], "begins with a preset as it is"),
+        (["materials=mixed"], "leave materials= out"),
+        (["batch=5"], "batch= is of the objects="),
+        (["objects=400"], "are more than"),
+        (["features=dgcnn-rooms"], "sees sizes"),
+        (["parameters=baseline_m"], "cannot be tuned"),
+    ],
+)
+def test_what_cannot_be_tuned_is_said(more, message, target, tmp_path, capsys):
+    given = {word.partition("=")[0]: word for word in words(target, tmp_path / "a.yaml")[1:]}
+    given |= {word.partition("=")[0]: word for word in more}
+    assert main(["tune", *given.values()]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_sensors_without_a_twin_are_refused():
+    cfg = composed_recipe(["domain=specklenet10_kinect", "renderer=mitsuba"])
+    with pytest.raises(ConfigError, match="only active stereo sensors"):
+        check_recipe(build(cfg.recipe))
