@@ -336,8 +336,8 @@ def benchmark(cfg: DictConfig, recipe: dict[str, Any]) -> str:
         return name
     if cfg.splits and cfg.meshes is None:  # other meshes than the catalogue's are not it anyway
         whole = mesh_items(OmegaConf.merge(cfg, {"splits": None}))  # type: ignore[arg-type]
-        part = [_name_and_content(item) for item in whole if item.split in cfg.splits]
-        full = {**recipe, "objects": [_name_and_content(item) for item in whole]}
+        part = [_name_and_content(item, False) for item in whole if item.split in cfg.splits]
+        full = {**recipe, "objects": [_name_and_content(item, False) for item in whole]}
         if recipe["objects"] == part and plan_hash(full) == stated.plan_sha256:
             return f"{name}, {' and '.join(cfg.splits)}"
     return f"like {name}, but not it (other settings or objects)"

@@ -122,7 +122,7 @@ def effects(table: Table) -> list[Compared]:
 
 def _effects_of_factors(table: Table) -> list[Compared]:
     """Levels come in the order of the rows, and cells of all columns are pairs of their own."""
-    found, levels_of = [], table.factors
+    found, levels_of, tiers = [], table.factors, _Tiers(table)
     for factor in next(iter(levels_of.values())):
         base, *rest = dict.fromkeys(levels[factor] for levels in levels_of.values())
         first = {_others(x, factor): row for row, x in levels_of.items() if x[factor] == base}
@@ -138,7 +138,7 @@ def _effects_of_factors(table: Table) -> list[Compared]:
                         both[", ".join(where)] = one, two
             if both:
                 title = f"{factor}: {level} minus {base}, over {'; '.join(both)}"
-                found.append(_compared(title, list(both.values())))
+                found.append(_compared(title, list(both.values()), tiers))
     return found
 
 
