@@ -80,22 +80,34 @@ class GlossyScene(JitScene):
     def _shade(self, ray: Any, lamp: Any) -> Any:
         mi, dr = self._mi, self._dr
         hit, point = self._first(ray, lamp)
-        valid = hit.is_valid()
-        normal = dr.gather(mi.Normal3f, self._normal, hit.prim_index, valid)
-        to_eye = dr.normalize(-ray.d)
+        numbers = [*lamp.get("area", ()), *lamp.get("bounce", ())]
+
+        def none(face: Any, point: Any, way: Any, numbers: list[Any]) -> Any:
+            return mi.Float(0)
+
+        # A branch, not a mask: beside the object, which is much of a window, nothing is computed.
+        seen = hit.prim_index, point, mi.Vector3f(ray.d), numbers
+        return dr.if_stmt(seen, hit.is_valid(), self._reflected, none)
+
+    def _reflected(self, face: Any, point: Any, way: Any, numbers: list[Any]) -> Any:
+        """Radiance of a face at a point that is seen along `way`."""
+        mi, dr = self._mi, self._dr
+        valid = mi.Bool(True)
+        normal = dr.gather(mi.Normal3f, self._normal, face)
+        to_eye = dr.normalize(-way)
         facing = mi.Vector3f(normal * dr.sign(dr.dot(normal, to_eye)))
-        albedo = dr.gather(mi.Float, self._albedo, hit.prim_index, valid)
-        diffuse, facets = self._surface(hit.prim_index, valid, albedo, facing, to_eye)
-        total = dr.select(valid, albedo * self._ambient, 0)
+        albedo = dr.gather(mi.Float, self._albedo, face)
+        diffuse, facets = self._surface(face, valid, albedo, facing, to_eye)
+        total = albedo * self._ambient
         if self._projector is not None:
-            projected = self._projected(ray, point, normal, valid)
+            projected = self._projected(mi.Ray3f(point, way), point, normal, valid)
             shine = facets.times_pi(dr.normalize(self._slide_origin - point))
-            # Where nothing is hit, or the light is opposite to the eye, there is no half-way.
+            # Where the light is opposite to the eye there is no half-way.
             total += dr.select(projected > 0, (diffuse + shine) * projected, 0)
         if self._bounces and self._projector is not None:
-            total += diffuse * self._from_surfaces(point, facing, valid, lamp["bounce"])
+            total += diffuse * self._from_surfaces(point, facing, valid, numbers[-2:])
         if self._area is not None:
-            total += self._from_area(point, facing, valid, lamp["area"], diffuse, facets)
+            total += self._from_area(point, facing, valid, numbers[:4], diffuse, facets)
         return total
 
     def _first(self, ray: Any, lamp: Any) -> tuple[Any, Any]:
@@ -126,10 +138,12 @@ class GlossyScene(JitScene):
         body = dr.gather(mi.UInt32, self._body, face, valid)
         return dr.select(valid, dr.gather(mi.Float, self._transmission, body, valid), 0)
 
-    def _arriving(self, light: Any, source: Any, start: Any, active: Any) -> Any:
+    def _arriving(
+        self, light: Any, source: Any, start: Any, active: Any, coherent: bool = True
+    ) -> Any:
         """As in `JitScene`, and clear faces hold back a part."""
         if not self._clear:
-            return super()._arriving(light, source, start, active)
+            return super()._arriving(light, source, start, active, coherent)
         mi, dr = self._mi, self._dr
         way, passed = source - start, mi.Float(1)
         step = self._epsilon * dr.rsqrt(dr.squared_norm(way))
@@ -137,7 +151,7 @@ class GlossyScene(JitScene):
         for _ in range(_SHEETS + 1):
             ray = mi.Ray3f(start + done * way, way)
             ray.maxt = 1 - 1e-4 - done
-            hit = self._scene.ray_intersect_preliminary(ray, coherent=True, active=looking)
+            hit = self._scene.ray_intersect_preliminary(ray, coherent=coherent, active=looking)
             looking &= hit.is_valid()
             share = self._share(hit.prim_index, looking)
             passed = dr.select(looking, passed * share, passed)
@@ -220,7 +234,8 @@ class GlossyScene(JitScene):
         cosine = dr.dot(facing, way)
         lit = before & (cosine > 0) & (solid_angle > 0)
         shine = facets.times_pi(way) / (1 + solid_angle * facets.density(way))
-        total = self._arriving(cosine * solid_angle * (diffuse + shine), start + there, start, lit)
+        light = cosine * solid_angle * (diffuse + shine)
+        total = self._arriving(light, start + there, start, lit, coherent=False)
 
         way = facets.reflected(lamp[2], lamp[3])
         cosine = dr.dot(facing, way)
@@ -230,7 +245,7 @@ class GlossyScene(JitScene):
         met = before & (cosine > 0) & (along > 1e-6)
         met &= (u >= ends[0]) & (u <= ends[1]) & (v >= ends[2]) & (v <= ends[3])
         shine = facets.times_pi(way) * solid_angle / (1 + solid_angle * facets.density(way))
-        total += self._arriving(cosine * shine, start + there, start, met)
+        total += self._arriving(cosine * shine, start + there, start, met, coherent=False)
         return total * self._area_radiance / dr.pi
 
     def _on_square(self, ends: list[Any], z: Any, s: Any, t: Any) -> tuple[Any, Any, Any]:

@@ -130,11 +130,16 @@ class JitScene:
         light = self._strength * slide * dr.abs(cosine) / (z * z * z)
         return self._arriving(light, self._slide_origin, start, lit)
 
-    def _arriving(self, light: Any, source: Any, start: Any, active: Any) -> Any:
-        """What of the light from a point gets to another one: all if nothing lies between."""
+    def _arriving(
+        self, light: Any, source: Any, start: Any, active: Any, coherent: bool = True
+    ) -> Any:
+        """What of the light from a point gets to another one: all if nothing lies between.
+
+        `coherent`: neighbours' ways are alike; it changes the speed only.
+        """
         shadow_ray = self._mi.Ray3f(start, source - start)
         shadow_ray.maxt = 1 - 1e-4
-        active &= ~self._scene.ray_test(shadow_ray, coherent=True, active=active)
+        active &= ~self._scene.ray_test(shadow_ray, coherent=coherent, active=active)
         return self._dr.select(active, light, 0)
 
     def _pixels(self, camera: Camera) -> tuple[Any, Any, Callable[[Any, Any], Any]]:
