@@ -114,8 +114,9 @@ CASES = [
     (("selftraining=none",), True),
     (("selftraining.use_source=true",), True),
     *(((f"selection.student={rule}",), False) for rule in STUDENT_RULES),
+    (("method=twin", "selftraining=none", "model._target_=tests.training.nets.featured"), False),
 ]
-SLOW = ("last", "entropy", "infomax")  # rules; like the others
+SLOW = ("twin", "last", "entropy", "infomax")  # rules; like the others
 
 
 @pytest.mark.parametrize(
@@ -137,7 +138,9 @@ def test_no_target_label_within_reach(toy, tmp_path, watch, settings, class_in_i
     assert watch.found == names
     assert bool(names) == class_in_id
     rounds = "selftraining=none" not in settings
-    assert watch.keys == {"points", "y_source"} | ({"y_pseudo"} if rounds else set())
+    more = {"y_pseudo"} if rounds else set()
+    more |= {"twin", "again"} if "method=twin" in settings else set()
+    assert watch.keys == {"points", "y_source"} | more
 
 
 def test_the_upper_bound_does_hold_them(toy, tmp_path, watch):
