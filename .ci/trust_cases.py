@@ -1,0 +1,257 @@
+"""The cases on which `qs3.evaluation.trust` is calibrated: nets, targets, shifts and the truth.
+
+    python .ci/trust_cases.py cases data=data nets=out/trust objects=FILE.npz out=docs/results/trust/cases.csv
+    python .ci/trust_cases.py fit cases=docs/results/trust/cases.csv
+
+Nets are those of `.ci/trust_nets.py` and the classifiers that come with qs3. Targets are scans of
+test meshes, which no net has seen, as the stores `data/test_NAME` (docs/results/trust.md has the
+commands), the sample of room scans that comes with qs3, and an archive of real objects, of which
+only the part `adapt` is looked at. At most 200 clouds of each, at even steps. A case that the
+table has is not made again.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from trust_nets import MODELS, POINTS, SOURCES, labelled, parts
+
+from qs3.classes import CLASSES
+from qs3.data.importers.arrays import named_arrays
+from qs3.data.importers.object_archive import read_archive
+from qs3.data.store import open_pointset
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.fps_samples import sample
+from qs3.datamodules.splits import Labelled
+from qs3.evaluation.accuracy_estimates import estimates
+from qs3.evaluation.metrics import predict, predict_rotated
+from qs3.evaluation.ood import measure_one
+from qs3.evaluation.trust import COMPARED, SHIFTS, Known, Seen, shifts
+from qs3.inference.pretrained import FOLDER, SECOND
+from qs3.inference.predictor import load
+
+MOST, TURNED = 200, 100
+"""Clouds of a target, and how many of these are turned, too."""
+
+STORES = {
+    "M": "test_modelnet10",
+    "S": "test_specklenet10",
+    "S_1": "test_specklenet10_view",
+    "S_K": "test_specklenet10_kinect",
+    "S_tof": "test_specklenet10_tof",
+    "K": "kinectsim10",
+}
+ROOMS = {"R": "sample_kinect", "R_d435": "sample_d435", "R_tof": "sample_tof"}
+SEEN_BY = {
+    "dgcnn-speckle": {"M", "S_1", "S_K", *ROOMS},
+    "pointnet-speckle": {"M", "S_1", "S_K", *ROOMS},
+    "dgcnn-rooms": {*ROOMS},
+}
+"""What the classifiers that come with qs3 learnt from: their labelled clouds, and no targets."""
+
+FLOOR = {"real": -1.18, "rooms": 0.0}
+"""z of the floor, of targets in metres of which it is known."""
+
+FIRST = ("net", "source", "seed", "target", "left_out", "clouds", "held_out", "accuracy")
+CONFIDENCE = ("calibrated", "thresholded_confidence", "difference")
+COLUMNS = (*FIRST, *CONFIDENCE, *SHIFTS)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Clouds with their classes; `left_out` names what is never on both sides of a fit."""
+
+    name: str
+    left_out: str
+    clouds: list[np.ndarray]
+    labels: np.ndarray
+    floor: float | None = None
+
+    def few(self) -> Target:
+        """At most `MOST`, at even steps."""
+        take = np.unique(np.linspace(0, len(self.labels) - 1, min(MOST, len(self.labels))))
+        index = take.astype(int)
+        some = [self.clouds[i] for i in index]
+        return Target(self.name, self.left_out, some, self.labels[index], self.floor)
+
+
+@dataclass(frozen=True, eq=False)
+class Net:
+    """A net with what it knows, and how its clouds are made."""
+
+    name: str
+    source: str
+    seed: int
+    module: torch.nn.Module
+    points: int
+    scale: str
+    known: Known
+
+
+def targets(data: Path, objects: Path) -> Iterator[Target]:
+    """All of them that are there."""
+    for name, store in STORES.items():
+        if not (data / store / "meta.yaml").is_file():
+            print(f"{data / store} is not there: left out")
+            continue
+        found = open_pointset(data / store, verify=False)
+        yield Target(name, name, list(found.points), np.array(found.labels)).few()
+    arrays = named_arrays(FOLDER / "source_sample.npz")
+    labels = np.array([CLASSES.index(cls) for cls in arrays["cls"].tolist()])
+    for name, ending in ROOMS.items():
+        rows = [i for i, one in enumerate(arrays["name"].tolist()) if one.endswith(ending)]
+        clouds = [arrays["points"][i].astype(np.float32) for i in rows]
+        yield Target(name, name, clouds, labels[rows], FLOOR["rooms"]).few()
+    archive = read_archive(objects)
+    for tier in ("clean", "hard"):
+        rows = [i for i in archive.of_part("adapt") if archive.tier[i] == tier]
+        some = Target(f"real_{tier}", "real", rows, np.zeros(len(rows))).few().clouds
+        clouds = [archive.cloud(i, inliers_only=True) for i in some]
+        of = np.array([CLASSES.index(str(archive.cls[i])) for i in some])
+        yield Target(f"real_{tier}", "real", clouds, of, FLOOR["real"])
+
+
+def seen_by(net: Net, target: Target) -> Clouds:
+    """The target's clouds as the net sees them."""
+    stored = np.stack([of_size(cloud) for cloud in target.clouds])
+    order = sample(stored, net.points, 1) if net.points < stored.shape[1] else None
+    return Clouds.of(stored, order, net.scale, target.floor or 0.0)
+
+
+def of_size(cloud: np.ndarray, size: int = 2048) -> np.ndarray:
+    """Points repeated from the first one on, as a store has them."""
+    return np.ascontiguousarray(np.resize(cloud, (max(size, len(cloud)), 3)), dtype=np.float32)[
+        :size
+    ]
+
+
+def measures(clouds: Clouds, most: int = 200) -> np.ndarray:
+    """[m, 4] `COMPARED` of at most `most` of them, at even steps."""
+    chosen = np.unique(np.linspace(0, len(clouds) - 1, min(most, len(clouds)))).astype(int)
+    found = [measure_one(clouds, int(i)) for i in chosen]
+    return np.array([[each[name] for name in COMPARED] for each in found])
+
+
+def turned(net: torch.nn.Module, points: torch.Tensor, said: np.ndarray) -> float:
+    """The share of the first `TURNED` clouds that keep their class after a quarter turn."""
+    index = np.unique(np.linspace(0, len(points) - 1, min(TURNED, len(points)))).astype(int)
+    other = predict_rotated(net, points[index], np.pi / 2, 32)
+    return float((other.argmax(axis=1) == said[index].argmax(axis=1)).mean())
+
+
+def known_of(module: torch.nn.Module, held_out: Labelled, all_of_them: Clouds) -> Known:
+    """What the net knows of its labelled clouds."""
+    points = held_out.clouds.all()
+    said = predict(module, points, 32)
+    turns = turned(module, points, said)
+    return Known(said, held_out.labels.numpy(), measures(all_of_them), turns)
+
+
+def small_nets(data: Path, folder: Path) -> Iterator[Net]:
+    """Those that are trained by now."""
+    for path in sorted(folder.glob("*.pt"), key=lambda path: path.stat().st_mtime):
+        model, source, seed = path.stem.split("-")
+        module = MODELS[model](num_classes=10).eval()
+        module.load_state_dict(torch.load(path, weights_only=True))
+        clouds = labelled(data, source)
+        known = known_of(module, parts(clouds)[1], clouds.clouds)
+        yield Net(model, source, int(seed), module, POINTS, SOURCES[source][2], known)
+
+
+def shipped_nets(every: dict[str, Target]) -> Iterator[Net]:
+    """The classifiers that come with qs3; known are scans of test meshes by their sensors."""
+    for name, seen in SEEN_BY.items():
+        predictor = load(name)
+        result, parts_of = predictor.result, [every[one] for one in sorted(seen) if one in every]
+        clouds = [cloud for one in parts_of for cloud in one.clouds]
+        labels = np.concatenate([one.labels for one in parts_of])
+        one = Target(name, name, clouds, labels, 0.0)
+        net = Net(name, "shipped", 0, predictor.net, result.points, result.scale, None)  # type: ignore[arg-type]
+        both = Labelled(seen_by(net, one), tuple(map(str, labels)), torch.from_numpy(labels))
+        known = known_of(predictor.net, both, both.clouds)
+        yield Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
+
+
+def case(net: Net, target: Target, second: np.ndarray) -> dict[str, Any]:
+    """A row of the table."""
+    clouds = seen_by(net, target)
+    points = clouds.all()
+    said = predict(net.module, points, 32)
+    answers = said.argmax(axis=1)
+    seen = Seen(
+        said, measures(clouds), turned(net.module, points, said), float((answers == second).mean())
+    )
+    by_confidence = estimates(net.known.probabilities, net.known.labels, said)
+    values = (
+        *(net.name, net.source, net.seed, target.name, target.left_out, len(answers)),
+        *(net.known.accuracy, float((answers == target.labels).mean())),
+        *(by_confidence[key] for key in ("calibrated", "thresholded", "difference")),
+        *shifts(net.known, seen).values(),
+    )
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def make_cases(given: dict[str, str]) -> None:
+    """Make what the table lacks."""
+    torch.set_num_threads(1)
+    data, out = Path(given["data"]), Path(given["out"])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    every = {target.name: target for target in targets(data, Path(given["objects"]))}
+    asked: dict[tuple[str, str], np.ndarray] = {}
+    done = {(row["net"], row["source"], row["seed"], row["target"]) for row in read(out)}
+
+    def opinion(name: str, target: Target) -> np.ndarray:
+        if (name, target.name) not in asked:
+            other = load(name)
+            net = Net(name, "", 0, other.net, other.points, "unit_ball", None)  # type: ignore[arg-type]
+            said = predict(other.net, seen_by(net, target).all(), 32)
+            asked[name, target.name] = said.argmax(axis=1)
+        return asked[name, target.name]
+
+    def nets() -> Iterator[Net]:
+        yield from small_nets(data, Path(given["nets"]))
+        yield from shipped_nets(every)
+
+    for net in nets():
+        for target in every.values():
+            if target.name in SEEN_BY.get(net.name, set()):
+                continue
+            if net.scale == "above_floor" and target.floor is None:
+                continue
+            if (net.name, net.source, str(net.seed), target.name) in done:
+                continue
+            second = opinion(SECOND if net.name != SECOND else "dgcnn-speckle", target)
+            append(out, case(net, target, second))
+        print(f"{net.name} {net.source} {net.seed}", flush=True)
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """The rows of the table; none if it is not there."""
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def append(path: Path, row: dict[str, Any]) -> None:
+    """A row more; shares to four digits."""
+    begun = path.is_file()
+    shown = {k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()}
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        if not begun:
+            writer.writeheader()
+        writer.writerow(shown)
+
+
+if __name__ == "__main__":
+    words = dict(word.split("=", 1) for word in sys.argv[2:])
+    if sys.argv[1] == "cases":
+        make_cases(words)
