@@ -1,7 +1,7 @@
 """The cases on which `qs3.evaluation.trust` is calibrated: nets, targets, shifts and the truth.
 
-    python .ci/trust_cases.py cases data=data nets=out/trust objects=FILE.npz out=docs/results/trust/cases.csv
-    python .ci/trust_cases.py fit cases=docs/results/trust/cases.csv
+    python .ci/trust_cases.py cases data=data nets=out/trust objects=FILE.npz out=CASES.csv
+    python .ci/trust_cases.py fit cases=CASES.csv out=qs3/evaluation/trust_weights.json
 
 Nets are those of `.ci/trust_nets.py` and the classifiers that come with qs3. Targets are scans of
 test meshes, which no net has seen, as the stores `data/test_NAME` (docs/results/trust.md has the
@@ -30,12 +30,12 @@ from qs3.data.store import open_pointset
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
 from qs3.datamodules.splits import Labelled
-from qs3.evaluation.accuracy_estimates import estimates
+from qs3.evaluation.confidences import estimates
 from qs3.evaluation.metrics import predict, predict_rotated
 from qs3.evaluation.ood import measure_one
 from qs3.evaluation.trust import COMPARED, SHIFTS, Known, Seen, shifts
-from qs3.inference.pretrained import FOLDER, SECOND
 from qs3.inference.predictor import load
+from qs3.inference.pretrained import FOLDER, SECOND
 
 MOST, TURNED = 200, 100
 """Clouds of a target, and how many of these are turned, too."""
@@ -118,11 +118,17 @@ def targets(data: Path, objects: Path) -> Iterator[Target]:
         yield Target(f"real_{tier}", "real", clouds, of, FLOOR["real"])
 
 
-def seen_by(net: Net, target: Target) -> Clouds:
-    """The target's clouds as the net sees them."""
-    stored = np.stack([of_size(cloud) for cloud in target.clouds])
-    order = sample(stored, net.points, 1) if net.points < stored.shape[1] else None
-    return Clouds.of(stored, order, net.scale, target.floor or 0.0)
+def seen_as(target: Target, points: int, scale: str) -> tuple[Clouds, np.ndarray]:
+    """The target's clouds as a net sees them, and their `COMPARED`; kept for other nets."""
+    key = (target.name, points, scale)
+    if key not in _SEEN:
+        stored = np.stack([of_size(cloud) for cloud in target.clouds])
+        clouds = Clouds.of(stored, sample(stored, points, 1), scale, target.floor or 0.0)
+        _SEEN[key] = clouds, measures(clouds)
+    return _SEEN[key]
+
+
+_SEEN: dict[tuple[str, int, str], tuple[Clouds, np.ndarray]] = {}
 
 
 def of_size(cloud: np.ndarray, size: int = 2048) -> np.ndarray:
@@ -146,22 +152,25 @@ def turned(net: torch.nn.Module, points: torch.Tensor, said: np.ndarray) -> floa
     return float((other.argmax(axis=1) == said[index].argmax(axis=1)).mean())
 
 
-def known_of(module: torch.nn.Module, held_out: Labelled, all_of_them: Clouds) -> Known:
+def known_of(module: torch.nn.Module, held_out: Labelled, measured: np.ndarray) -> Known:
     """What the net knows of its labelled clouds."""
     points = held_out.clouds.all()
     said = predict(module, points, 32)
     turns = turned(module, points, said)
-    return Known(said, held_out.labels.numpy(), measures(all_of_them), turns)
+    return Known(said, held_out.labels.numpy(), measured, turns)
 
 
 def small_nets(data: Path, folder: Path) -> Iterator[Net]:
     """Those that are trained by now."""
+    of_source: dict[str, tuple[Labelled, np.ndarray]] = {}
     for path in sorted(folder.glob("*.pt"), key=lambda path: path.stat().st_mtime):
         model, source, seed = path.stem.split("-")
         module = MODELS[model](num_classes=10).eval()
         module.load_state_dict(torch.load(path, weights_only=True))
-        clouds = labelled(data, source)
-        known = known_of(module, parts(clouds)[1], clouds.clouds)
+        if source not in of_source:
+            clouds = labelled(data, source)
+            of_source[source] = parts(clouds)[1], measures(clouds.clouds)
+        known = known_of(module, *of_source[source])
         yield Net(model, source, int(seed), module, POINTS, SOURCES[source][2], known)
 
 
@@ -173,21 +182,19 @@ def shipped_nets(every: dict[str, Target]) -> Iterator[Net]:
         clouds = [cloud for one in parts_of for cloud in one.clouds]
         labels = np.concatenate([one.labels for one in parts_of])
         one = Target(name, name, clouds, labels, 0.0)
-        net = Net(name, "shipped", 0, predictor.net, result.points, result.scale, None)  # type: ignore[arg-type]
-        both = Labelled(seen_by(net, one), tuple(map(str, labels)), torch.from_numpy(labels))
-        known = known_of(predictor.net, both, both.clouds)
+        seen_clouds, _ = seen_as(one, result.points, result.scale)
+        held_out = Labelled(seen_clouds, tuple(map(str, labels)), torch.from_numpy(labels))
+        known = known_of(predictor.net, held_out, measures(seen_clouds, 400))
         yield Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
 
 
 def case(net: Net, target: Target, second: np.ndarray) -> dict[str, Any]:
     """A row of the table."""
-    clouds = seen_by(net, target)
+    clouds, measured = seen_as(target, net.points, net.scale)
     points = clouds.all()
     said = predict(net.module, points, 32)
     answers = said.argmax(axis=1)
-    seen = Seen(
-        said, measures(clouds), turned(net.module, points, said), float((answers == second).mean())
-    )
+    seen = Seen(said, measured, turned(net.module, points, said), float((answers == second).mean()))
     by_confidence = estimates(net.known.probabilities, net.known.labels, said)
     values = (
         *(net.name, net.source, net.seed, target.name, target.left_out, len(answers)),
@@ -210,8 +217,7 @@ def make_cases(given: dict[str, str]) -> None:
     def opinion(name: str, target: Target) -> np.ndarray:
         if (name, target.name) not in asked:
             other = load(name)
-            net = Net(name, "", 0, other.net, other.points, "unit_ball", None)  # type: ignore[arg-type]
-            said = predict(other.net, seen_by(net, target).all(), 32)
+            said = predict(other.net, seen_as(target, other.points, "unit_ball")[0].all(), 32)
             asked[name, target.name] = said.argmax(axis=1)
         return asked[name, target.name]
 

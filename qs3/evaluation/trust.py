@@ -24,7 +24,7 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from qs3.errors import DataError
-from qs3.evaluation.accuracy_estimates import (
+from qs3.evaluation.confidences import (
     average_confidence,
     scaled,
     temperature,
@@ -134,7 +134,7 @@ def logit(share: float) -> float:
 
 
 def centred_logs(probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-    """ln p about its mean of each row: a net's logits but for a constant a row, p >= 1e-12."""
+    """Ln p about its mean of each row: a net's logits but for a constant a row, p >= 1e-12."""
     logs = np.log(np.maximum(probabilities, 1e-12))
     return logs - logs.mean(axis=1, keepdims=True)
 
