@@ -32,8 +32,8 @@ from qs3.datamodules.fps_samples import sample
 from qs3.datamodules.splits import Labelled
 from qs3.evaluation.confidences import estimates
 from qs3.evaluation.metrics import predict, predict_rotated
-from qs3.evaluation.ood import measure_one
-from qs3.evaluation.trust import COMPARED, SHIFTS, Known, Seen, shifts
+from qs3.evaluation.trust import Known, Seen, compared, shifts
+from qs3.evaluation.trust_file import SHIFTS
 from qs3.inference.predictor import load
 from qs3.inference.pretrained import FOLDER, SECOND
 
@@ -124,7 +124,7 @@ def seen_as(target: Target, points: int, scale: str) -> tuple[Clouds, np.ndarray
     if key not in _SEEN:
         stored = np.stack([of_size(cloud) for cloud in target.clouds])
         clouds = Clouds.of(stored, sample(stored, points, 1), scale, target.floor or 0.0)
-        _SEEN[key] = clouds, measures(clouds)
+        _SEEN[key] = clouds, compared(clouds)
     return _SEEN[key]
 
 
@@ -136,13 +136,6 @@ def of_size(cloud: np.ndarray, size: int = 2048) -> np.ndarray:
     return np.ascontiguousarray(np.resize(cloud, (max(size, len(cloud)), 3)), dtype=np.float32)[
         :size
     ]
-
-
-def measures(clouds: Clouds, most: int = 200) -> np.ndarray:
-    """[m, 4] `COMPARED` of at most `most` of them, at even steps."""
-    chosen = np.unique(np.linspace(0, len(clouds) - 1, min(most, len(clouds)))).astype(int)
-    found = [measure_one(clouds, int(i)) for i in chosen]
-    return np.array([[each[name] for name in COMPARED] for each in found])
 
 
 def turned(net: torch.nn.Module, points: torch.Tensor, said: np.ndarray) -> float:
@@ -169,7 +162,7 @@ def small_nets(data: Path, folder: Path) -> Iterator[Net]:
         module.load_state_dict(torch.load(path, weights_only=True))
         if source not in of_source:
             clouds = labelled(data, source)
-            of_source[source] = parts(clouds)[1], measures(clouds.clouds)
+            of_source[source] = parts(clouds)[1], compared(clouds.clouds)
         known = known_of(module, *of_source[source])
         yield Net(model, source, int(seed), module, POINTS, SOURCES[source][2], known)
 
@@ -184,7 +177,7 @@ def shipped_nets(every: dict[str, Target]) -> Iterator[Net]:
         one = Target(name, name, clouds, labels, 0.0)
         seen_clouds, _ = seen_as(one, result.points, result.scale)
         held_out = Labelled(seen_clouds, tuple(map(str, labels)), torch.from_numpy(labels))
-        known = known_of(predictor.net, held_out, measures(seen_clouds, 400))
+        known = known_of(predictor.net, held_out, compared(seen_clouds))
         yield Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
 
 

@@ -1,10 +1,10 @@
 """What can be said about predictions whose labels nobody knows.
 
-Three estimates of their accuracy, made from confidences alone, and what else hints at trouble.
-All of them learn what a confidence means on labelled validation clouds of the source, and carry it
-over to the target. That carries over only in part: clouds of another domain, or of no known class,
-get high confidences too, so the estimates are too high as a rule. By how much was measured on
-simulated targets: docs/how-to/predict.md.
+Three estimates of their accuracy, made from confidences alone, what else hints at trouble, and a
+verdict of all. The three learn what a confidence means on labelled validation clouds of the source,
+and carry it over to the target. That carries over only in part: clouds of another domain, or of no
+known class, get high confidences too. `qs3.evaluation.trust` takes down for that:
+docs/results/trust.md.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.evaluation.confidences import agreement, estimates, rotation_agreement
 from qs3.evaluation.metrics import predict, predict_rotated
 from qs3.evaluation.ood import limits, ood_reasons_of_all, relax_min_points
+from qs3.evaluation.trust import Known, Seen, compared, judge
+from qs3.evaluation.trust_file import read_calibration
 from qs3.runs.metrics import AccuracyEstimates, Estimates
 
 TURNS = 3
@@ -42,8 +44,10 @@ def estimate_accuracy(
     teacher: nn.Module | None = None,
     unadapted: tuple[nn.Module, nn.Module | None] | None = None,
     upright: bool = True,
-) -> AccuracyEstimates:
-    """What `metrics.json` has under `quality`; `qs3.evaluation.estimates_text` says it as text.
+) -> tuple[AccuracyEstimates, Known | None]:
+    """What `metrics.json` has under `quality`, and what the net knows of its labelled clouds.
+
+    `qs3.evaluation.estimates_text` says it as text; the other is for the net's file.
 
     Looks at no label of the target. None where a figure does not exist (no teacher, no gravity), or
     is not finite because the net has diverged.
@@ -75,8 +79,11 @@ def estimate_accuracy(
         "never_predicted": [name for name, n in zip(classes, counts, strict=True) if not n],
     }
     if not (np.isfinite(known).all() and np.isfinite(judged).all()):
-        return AccuracyEstimates(**about)
+        return AccuracyEstimates(**about), None
     about |= estimates(known, labels, judged)
+    held_out = Known(known, labels, compared(source))
+    seen = Seen(judged, compared(target.clouds))
+    about["trust"] = judge(held_out, seen, read_calibration())
     if upright:
         turns = [2 * math.pi * i / (TURNS + 1) for i in range(1, TURNS + 1)]
         rotated = [predict_rotated(net, points, turn, batch_size, device) for turn in turns]
@@ -90,7 +97,7 @@ def estimate_accuracy(
             accuracy = agreement(known, np.eye(len(classes))[labels])
             found = estimates(known, labels, theirs)
             about["teacher"] = Estimates(validation_accuracy=accuracy, **found)
-    return AccuracyEstimates(**about)
+    return AccuracyEstimates(**about), held_out
 
 
 def ood_fraction(clouds: Clouds, source: Clouds) -> float:

@@ -7,7 +7,7 @@ labelled ones: the accuracy on held-out labelled clouds is taken down by each sh
 
 where every s_k is 0 if there is no shift. So no evidence ever raises an estimate, and clouds like
 the held-out ones get these one's accuracy. The weights are few, and were fitted over many pairs of
-source and target, simulated and real, whose accuracy is known: `qs3.evaluation.trust_weights`.
+source and target, simulated and real, whose accuracy is known: `qs3.evaluation.trust_file`.
 
 An estimate under `LEAST_TRUSTED` is a refusal: "do not trust this".
 """
@@ -23,6 +23,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
+from qs3.datamodules.clouds import Clouds
 from qs3.errors import DataError
 from qs3.evaluation.confidences import (
     average_confidence,
@@ -30,27 +31,21 @@ from qs3.evaluation.confidences import (
     temperature,
     thresholded_confidence,
 )
+from qs3.evaluation.ood import measure_one
+from qs3.evaluation.trust_file import Calibration
+from qs3.runs.metrics import Trust
 
 COMPARED = ("spacing", "middle", "thickness", "height")
 """Measures of `qs3.evaluation.ood` in which clouds are compared; `points` depends on the file."""
-
-SHIFTS: Mapping[str, str] = {
-    "unsure": "the net is less sure than on held-out labelled clouds",
-    "thresholded": "fewer answers are as sure as the right ones on held-out labelled clouds",
-    "answers": "its answers are unlike those to held-out labelled clouds",
-    "shapes": "the clouds are shaped unlike the labelled ones",
-    "outside": "clouds lie outside the range of the labelled ones",
-    "counts": "classes are predicted more or less often than on held-out labelled clouds",
-    "turns": "rotations about the up axis change more answers",
-    "second": "another classifier says otherwise",
-}
-"""What each shift means, in words."""
 
 LEAST_TRUSTED = 0.5
 """An expected accuracy under this is a refusal."""
 
 FEWEST = 30
 """Of fewer clouds nothing is said: the shares above are too rough."""
+
+MEASURED = 400
+"""Clouds of a domain whose shape is measured, at most."""
 
 _NEIGHBOUR, _TAIL, _EDGE = 5, 0.1, 0.02
 _RIDGE = 0.05  # of the weights, in units of each shift's own spread
@@ -105,9 +100,9 @@ class Seen:
 
 
 def shifts(known: Known, seen: Seen) -> dict[str, float]:
-    """How far the clouds are from the labelled ones, by `SHIFTS`; each >= 0, and 0 for none.
+    """How far the clouds are from the labelled ones, by name: each >= 0, and 0 for not at all.
 
-    Without `turns` or `second` these two are left out.
+    `trust_file.SHIFTS` says what they are. Without `turns` or `second` these two are left out.
     """
     t = temperature(known.probabilities, known.labels)
     source, target = scaled(known.probabilities, t), scaled(seen.probabilities, t)
@@ -236,3 +231,31 @@ def left_out_estimates(
             row = dict(zip(names, table[i].tolist(), strict=True))
             found[i] = expected(float(base[i]), row, weights)
     return found
+
+
+def judge(known: Known, seen: Seen, calibration: Calibration) -> Trust | None:
+    """What to make of a net's answers; None of fewer than `FEWEST` clouds.
+
+    Raises:
+        DataError: a shift that the calibration asks for cannot be told from what was given.
+    """
+    if len(seen.probabilities) < FEWEST:
+        return None
+    found = shifts(known, seen)
+    value = expected(known.accuracy, found, calibration.weights)
+    return Trust(
+        expected=value,
+        trusted=value >= LEAST_TRUSTED,
+        held_out=known.accuracy,
+        shifts=found,
+        lost={name: weight * found[name] for name, weight in calibration.weights.items()},
+        error=calibration.mean_error,
+        error_90=calibration.error_90,
+    )
+
+
+def compared(clouds: Clouds, most: int = MEASURED) -> Float[np.ndarray, "m 4"]:
+    """`COMPARED` of at most `most` clouds, at even steps; 3 ms each."""
+    chosen = np.unique(np.linspace(0, len(clouds) - 1, min(most, len(clouds)))).astype(int)
+    found = [measure_one(clouds, int(i)) for i in chosen]
+    return np.array([[each[name] for name in COMPARED] for each in found])

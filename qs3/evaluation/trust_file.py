@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,11 +13,22 @@ from typing import Annotated
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 from qs3.errors import DataError
-from qs3.evaluation.trust import SHIFTS
 from qs3.utils.files import write_text
 from qs3.utils.memory import JSON_PEAK, read_whole
 
 PATH = Path(__file__).with_name("trust_weights.json")
+
+SHIFTS: Mapping[str, str] = {
+    "unsure": "the net is less sure than on held-out labelled clouds",
+    "thresholded": "fewer answers are as sure as the right ones of held-out labelled clouds",
+    "answers": "its answers are unlike those to held-out labelled clouds",
+    "shapes": "the clouds are shaped unlike the labelled ones",
+    "outside": "clouds lie outside the range of the labelled ones",
+    "counts": "classes are named more or less often than on held-out labelled clouds",
+    "turns": "rotations about the up axis change more answers",
+    "second": "another classifier says otherwise",
+}
+"""By name what each shift of `qs3.evaluation.trust` means, in words."""
 
 _Share = Annotated[float, Field(ge=0, le=1)]
 _Weight = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]

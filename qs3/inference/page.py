@@ -99,6 +99,7 @@ def page(
     classes: Sequence[str],
     trained_on: str = "",
     worth: str = "",
+    verdict: str = "",
 ) -> str:
     """The page as HTML.
 
@@ -109,10 +110,14 @@ def page(
         classes: names in the order of the probabilities.
         trained_on: what the net's data are made of; "" if nobody knows.
         worth: what it was found to be worth on real objects; likewise.
+        verdict: how many are expected to be right, without a look at labels; likewise.
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
     parts = _head(found, rows, failed, classes)
+    if verdict:
+        without = "Without a look at labels: " if found else ""
+        parts.append(f'<p class="note">{without}{escape(verdict)}</p>')
     if trained_on:
         parts.append(f'<p class="soft">The net\'s data: {escape(trained_on)}</p>')
     if worth:

@@ -16,6 +16,7 @@ from qs3.evaluation.accuracy_estimates import estimate_accuracy
 from qs3.evaluation.metrics import adapt_norms, predict
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.tent import minimise_entropy
+from qs3.evaluation.trust import Known
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
@@ -43,6 +44,7 @@ class Outcome:
         rotated: scores of the reported net and of "selected", averaged over rotations.
         validators: its label-free scores.
         quality: estimates of its accuracy.
+        held_out: what it says of held-out labelled clouds; None of one that has diverged.
         training: its accuracy on training clouds, with `data.clouds_a_class` alone.
     """
 
@@ -54,6 +56,7 @@ class Outcome:
     rotated: tuple[Scores | None, Scores | None]
     validators: dict[str, float | None]
     quality: AccuracyEstimates
+    held_out: Known | None
     training: TrainingAccuracy | None
 
 
@@ -107,6 +110,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     if before is None:
         before = evaluation.rotation_averaged(nets(files["selected"]), device)
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
+    quality, held_out = _quality(run, loaded, nets, file, net)
     return Outcome(
         net=net,
         predictions=predictions,
@@ -115,7 +119,8 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         scores=scores,
         rotated=(rotated, before),
         validators=without_labels(net, data.target, choice, batch_size, device),
-        quality=_quality(run, loaded, nets, file, net),
+        quality=quality,
+        held_out=held_out,
         training=(
             training_accuracy(net, data.labelled, data.owner, batch_size, device)
             if run.cfg.data.clouds_a_class is not None
@@ -126,7 +131,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
 
 def _quality(
     run: Run, loaded: Loaded, nets: SavedNets, file: Path, net: nn.Module
-) -> AccuracyEstimates:
+) -> tuple[AccuracyEstimates, Known | None]:
     taught = run.folder / WARMUP_SELECTED if run.scheme.rounds else None
     unadapted = None
     if run.cfg.evaluation.norms != "trained":

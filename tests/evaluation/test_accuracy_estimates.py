@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from qs3.config import hashing
-from qs3.evaluation import accuracy_estimates as quality
+from qs3.evaluation import confidences as quality
 from qs3.evaluation.estimates_text import MEANINGS, in_words, table
 from qs3.report.runs.data import read_run
 from qs3.report.runs.page import page
