@@ -1,7 +1,7 @@
 """Small nets of many sources, from which `.ci/trust_cases.py` makes the cases of the calibration.
 
     python .ci/trust_nets.py data=data out=out/trust model=pointnet seeds=0,1
-    python .ci/trust_nets.py data=data out=out/trust model=dgcnn seeds=0
+    python .ci/trust_nets.py data=data out=out/trust model=dgcnn seeds=0 sources=M,R
 
 `data` holds modelnet10, specklenet10, specklenet10_view, specklenet10_kinect and roomscan10 as
 `python generate.py domain=NAME splits=[train]` makes them. A net sees 128 points, is trained in
@@ -89,7 +89,8 @@ def main(given: dict[str, Any]) -> None:
     data, out, model = Path(given["data"]), Path(given["out"]), given.get("model", "pointnet")
     out.mkdir(parents=True, exist_ok=True)
     for seed in map(int, given.get("seeds", "0").split(",")):
-        for name, (_, _, scale) in SOURCES.items():
+        for name in given.get("sources", ",".join(SOURCES)).split(","):
+            scale = SOURCES[name][2]
             path = out / f"{model}-{name}-{seed}.pt"
             if path.is_file():
                 continue
