@@ -6,7 +6,7 @@
 Nets are those of `.ci/trust_nets.py` and the classifiers that come with qs3. Targets are scans of
 test meshes, which no net has seen, as the stores `data/test_NAME` (docs/results/trust.md has the
 commands), the sample of room scans that comes with qs3, and an archive of real objects, of which
-only the part `adapt` is looked at. At most 200 clouds of each, at even steps. A case that the
+only the part `adapt` is looked at. At most 150 clouds of each, at even steps. A case that the
 table has is not made again.
 """
 
@@ -37,7 +37,7 @@ from qs3.evaluation.trust_file import SHIFTS
 from qs3.inference.predictor import load
 from qs3.inference.pretrained import FOLDER, SECOND
 
-MOST, TURNED = 200, 100
+MOST, TURNED = 150, 75
 """Clouds of a target, and how many of these are turned, too."""
 
 STORES = {
@@ -110,12 +110,18 @@ def targets(data: Path, objects: Path) -> Iterator[Target]:
         clouds = [arrays["points"][i].astype(np.float32) for i in rows]
         yield Target(name, name, clouds, labels[rows], FLOOR["rooms"]).few()
     archive = read_archive(objects)
+    adapt = np.array(archive.of_part("adapt"))
+    middle = np.median(archive.frame[adapt])
     for tier in ("clean", "hard"):
-        rows = [i for i in archive.of_part("adapt") if archive.tier[i] == tier]
-        some = Target(f"real_{tier}", "real", rows, np.zeros(len(rows))).few().clouds
-        clouds = [archive.cloud(i, inliers_only=True) for i in some]
-        of = np.array([CLASSES.index(str(archive.cls[i])) for i in some])
-        yield Target(f"real_{tier}", "real", clouds, of, FLOOR["real"])
+        for half, other_rooms in (("a", False), ("b", True)):
+            wanted = (archive.tier[adapt] == tier) & (
+                (archive.frame[adapt] > middle) == other_rooms
+            )
+            rows = adapt[wanted].tolist()
+            few = Target("", "", rows, np.zeros(len(rows))).few().clouds
+            clouds = [archive.cloud(i, inliers_only=True) for i in few]
+            of = np.array([CLASSES.index(str(archive.cls[i])) for i in few])
+            yield Target(f"real_{tier}_{half}", "real", clouds, of, FLOOR["real"])
 
 
 def seen_as(target: Target, points: int, scale: str) -> tuple[Clouds, np.ndarray]:
