@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import spearmanr
 from trust_nets import MODELS, POINTS, SOURCES, labelled, parts
 
 from qs3.classes import CLASSES
@@ -32,8 +33,16 @@ from qs3.datamodules.fps_samples import sample
 from qs3.datamodules.splits import Labelled
 from qs3.evaluation.confidences import estimates
 from qs3.evaluation.metrics import predict, predict_rotated
-from qs3.evaluation.trust import Known, Seen, compared, shifts
-from qs3.evaluation.trust_file import SHIFTS
+from qs3.evaluation.trust import (
+    LEAST_TRUSTED,
+    Known,
+    Seen,
+    compared,
+    fit_weights,
+    left_out_estimates,
+    shifts,
+)
+from qs3.evaluation.trust_file import SHIFTS, Calibration, write_calibration
 from qs3.inference.predictor import load
 from qs3.inference.pretrained import FOLDER, SECOND
 
@@ -60,6 +69,9 @@ FLOOR = {"real": -1.18, "rooms": 0.0}
 """z of the floor, of targets in metres of which it is known."""
 
 FIRST = ("net", "source", "seed", "target", "left_out", "clouds", "held_out", "accuracy")
+ALONE = ("unsure", "thresholded", "answers", "shapes", "outside", "counts")
+"""Shifts that take nothing but the clouds and the net's answers."""
+
 CONFIDENCE = ("calibrated", "thresholded_confidence", "difference")
 COLUMNS = (*FIRST, *CONFIDENCE, *SHIFTS)
 
@@ -187,7 +199,7 @@ def shipped_nets(every: dict[str, Target]) -> Iterator[Net]:
         yield Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
 
 
-def case(net: Net, target: Target, second: np.ndarray) -> dict[str, Any]:
+def case(net: Net, target: Target, second: np.ndarray | None) -> dict[str, Any]:
     """A row of the table."""
     clouds, measured = seen_as(target, net.points, net.scale)
     points = clouds.all()
@@ -199,9 +211,9 @@ def case(net: Net, target: Target, second: np.ndarray) -> dict[str, Any]:
         *(net.name, net.source, net.seed, target.name, target.left_out, len(answers)),
         *(net.known.accuracy, float((answers == target.labels).mean())),
         *(by_confidence[key] for key in ("calibrated", "thresholded", "difference")),
-        *shifts(net.known, seen).values(),
     )
-    return dict(zip(COLUMNS, values, strict=True))
+    found = dict(zip(COLUMNS[: len(values)], values, strict=True))
+    return {**dict.fromkeys(COLUMNS, ""), **found, **shifts(net.known, seen)}
 
 
 def make_cases(given: dict[str, str]) -> None:
@@ -210,6 +222,7 @@ def make_cases(given: dict[str, str]) -> None:
     data, out = Path(given["data"]), Path(given["out"])
     out.parent.mkdir(parents=True, exist_ok=True)
     every = {target.name: target for target in targets(data, Path(given["objects"]))}
+    asks = given.get("second", "true") == "true"
     asked: dict[tuple[str, str], np.ndarray] = {}
     done = {(row["net"], row["source"], row["seed"], row["target"]) for row in read(out)}
 
@@ -232,8 +245,8 @@ def make_cases(given: dict[str, str]) -> None:
                 continue
             if (net.name, net.source, str(net.seed), target.name) in done:
                 continue
-            second = opinion(SECOND if net.name != SECOND else "dgcnn-speckle", target)
-            append(out, case(net, target, second))
+            other = SECOND if net.name != SECOND else "dgcnn-speckle"
+            append(out, case(net, target, opinion(other, target) if asks else None))
         print(f"{net.name} {net.source} {net.seed}", flush=True)
 
 
@@ -256,7 +269,88 @@ def append(path: Path, row: dict[str, Any]) -> None:
         writer.writerow(shown)
 
 
+def make_fit(given: dict[str, str]) -> None:
+    """Fit the rules on the table, score them leave-one-target-out, and write the weights."""
+    rows = read(Path(given["cases"]))
+    rules = {
+        "alone": ALONE,
+        "turns": (*ALONE, "turns"),
+        "second": (*ALONE, "second"),
+        "both": (*ALONE, "turns", "second"),
+    }
+    targets_of = [row["left_out"] for row in rows]
+    base, truth = (column(rows, key) for key in ("held_out", "accuracy"))
+    lines = [["calibrated confidence (AC)", *score(column(rows, "calibrated"), truth, rows)]]
+    lines.append(["ATC", *score(column(rows, "thresholded_confidence"), truth, rows)])
+    lines.append(["DoC", *score(column(rows, "difference"), truth, rows)])
+    for rule, names in rules.items():
+        table = np.stack([column(rows, name) for name in names], axis=1)
+        found = left_out_estimates(names, table, base, truth, targets_of)
+        lines.append([f"rule {rule}", *score(found, truth, rows)])
+        weights = fit_weights(names, table, base, truth, targets_of)
+        print(rule, {name: round(value, 3) for name, value in weights.items()})
+        if rule == given.get("rule", "alone"):
+            kept, estimate = weights, found
+    print(text_of(lines))
+    off = np.abs(estimate - truth)
+    by = {}
+    for i, row in enumerate(rows):
+        by.setdefault(row["target"], []).append(i)
+    print(text_of([[name, *score(estimate[index], truth[index], [rows[i] for i in index])]
+                   for name, index in by.items()]))  # fmt: skip
+    if "out" in given:
+        found = Calibration(
+            weights={name: round(value, 4) for name, value in kept.items() if value > 0},
+            cases=len(rows),
+            targets=len(set(targets_of)),
+            mean_error=round(float(off.mean()), 4),
+            error_90=round(float(np.quantile(off, 0.9)), 4),
+            most_too_high=round(float((estimate - truth).max()), 4),
+        )
+        write_calibration(Path(given["out"]), found)
+    if "estimates" in given:
+        with Path(given["estimates"]).open("w", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["net", "source", "seed", "target", "clouds", "accuracy", "expected"])
+            for row, value in zip(rows, estimate, strict=True):
+                cells = [row[key] for key in ("net", "source", "seed", "target", "clouds")]
+                writer.writerow([*cells, row["accuracy"], f"{value:.4f}"])
+
+
+HEAD = ("", "cases", "mean error", "mean", "most too high", "refused", "right", "wrong", "rank")
+
+
+def score(found: np.ndarray, truth: np.ndarray, rows: list[dict[str, str]]) -> list[str]:
+    """The cells of `HEAD`: errors in points, of all cases / of those that are not refused."""
+    off, kept = 100 * (found - truth), found >= LEAST_TRUSTED
+    one = [f"{np.abs(x).mean():.1f}" if len(x) else "-" for x in (off, off[kept])]
+    high = [f"{x.max():+.1f}" if len(x) else "-" for x in (off, off[kept])]
+    rank = spearmanr(found, truth).statistic if len(found) > 2 and np.ptp(found) > 0 else np.nan
+    return [
+        str(len(rows)),
+        " / ".join(one),
+        f"{off.mean():+.1f}",
+        " / ".join(high),
+        str(int((~kept).sum())),
+        str(int((~kept & (truth < 0.5)).sum())),
+        str(int((~kept & (truth > 0.7)).sum())),
+        f"{rank:.2f}",
+    ]
+
+
+def text_of(lines: list[list[str]]) -> str:
+    """A table in Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in ([*HEAD], ["---"] * len(HEAD), *lines))
+
+
+def column(rows: list[dict[str, str]], key: str) -> np.ndarray:
+    """Of the table, as numbers."""
+    return np.array([float(row[key]) for row in rows])
+
+
 if __name__ == "__main__":
     words = dict(word.split("=", 1) for word in sys.argv[2:])
     if sys.argv[1] == "cases":
         make_cases(words)
+    elif sys.argv[1] == "fit":
+        make_fit(words)
