@@ -1,6 +1,6 @@
 """The cases on which `qs3.evaluation.trust` is calibrated: nets, targets, shifts and the truth.
 
-    python .ci/trust_cases.py cases data=data nets=out/trust objects=FILE.npz out=CASES.csv
+    python .ci/trust_cases.py cases data=data nets=out/trust objects=FILE.npz out=CASES.csv jobs=2
     python .ci/trust_cases.py fit cases=CASES.csv out=qs3/evaluation/trust_weights.json
 
 Nets are those of `.ci/trust_nets.py` and the classifiers that come with qs3. Targets are scans of
@@ -16,8 +16,9 @@ import csv
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,7 +31,6 @@ from qs3.data.importers.object_archive import read_archive
 from qs3.data.store import open_pointset
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
-from qs3.datamodules.splits import Labelled
 from qs3.evaluation.confidences import estimates
 from qs3.evaluation.metrics import predict, predict_rotated
 from qs3.evaluation.trust import (
@@ -44,10 +44,10 @@ from qs3.evaluation.trust import (
 )
 from qs3.evaluation.trust_file import SHIFTS, Calibration, write_calibration
 from qs3.inference.predictor import load
-from qs3.inference.pretrained import FOLDER, SECOND
+from qs3.inference.pretrained import FOLDER
 
-MOST, TURNED = 150, 75
-"""Clouds of a target, and how many of these are turned, too."""
+MOST, TURNED, KNOWN = 150, 75, 50
+"""Clouds of a target, how many of these are turned, and of each kind that a shipped net knows."""
 
 STORES = {
     "M": "test_modelnet10",
@@ -86,9 +86,9 @@ class Target:
     labels: np.ndarray
     floor: float | None = None
 
-    def few(self) -> Target:
-        """At most `MOST`, at even steps."""
-        take = np.unique(np.linspace(0, len(self.labels) - 1, min(MOST, len(self.labels))))
+    def few(self, most: int = MOST) -> Target:
+        """At most so many, at even steps."""
+        take = np.unique(np.linspace(0, len(self.labels) - 1, min(most, len(self.labels))))
         index = take.astype(int)
         some = [self.clouds[i] for i in index]
         return Target(self.name, self.left_out, some, self.labels[index], self.floor)
@@ -136,17 +136,18 @@ def targets(data: Path, objects: Path) -> Iterator[Target]:
             yield Target(f"real_{tier}_{half}", "real", clouds, of, FLOOR["real"])
 
 
-def seen_as(target: Target, points: int, scale: str) -> tuple[Clouds, np.ndarray]:
-    """The target's clouds as a net sees them, and their `COMPARED`; kept for other nets."""
-    key = (target.name, points, scale)
-    if key not in _SEEN:
-        stored = np.stack([of_size(cloud) for cloud in target.clouds])
-        clouds = Clouds.of(stored, sample(stored, points, 1), scale, target.floor or 0.0)
-        _SEEN[key] = clouds, compared(clouds)
-    return _SEEN[key]
+class View(NamedTuple):
+    """A target's clouds as nets see them."""
+
+    points: torch.Tensor
+    measures: np.ndarray
 
 
-_SEEN: dict[tuple[str, int, str], tuple[Clouds, np.ndarray]] = {}
+def view(target: Target, points: int, scale: str) -> View:
+    """Farthest points of each cloud, in the given scale."""
+    stored = np.stack([of_size(cloud) for cloud in target.clouds])
+    clouds = Clouds.of(stored, sample(stored, points, 1), scale, target.floor or 0.0)
+    return View(clouds.all(), compared(clouds))
 
 
 def of_size(cloud: np.ndarray, size: int = 2048) -> np.ndarray:
@@ -163,91 +164,107 @@ def turned(net: torch.nn.Module, points: torch.Tensor, said: np.ndarray) -> floa
     return float((other.argmax(axis=1) == said[index].argmax(axis=1)).mean())
 
 
-def known_of(module: torch.nn.Module, held_out: Labelled, measured: np.ndarray) -> Known:
+def known_of(module: torch.nn.Module, points: torch.Tensor, labels: Any, measured: Any) -> Known:
     """What the net knows of its labelled clouds."""
-    points = held_out.clouds.all()
     said = predict(module, points, 32)
-    turns = turned(module, points, said)
-    return Known(said, held_out.labels.numpy(), measured, turns)
+    return Known(said, np.asarray(labels), measured, turned(module, points, said))
 
 
-def small_nets(data: Path, folder: Path) -> Iterator[Net]:
-    """Those that are trained by now."""
-    of_source: dict[str, tuple[Labelled, np.ndarray]] = {}
-    for path in sorted(folder.glob("*.pt"), key=lambda path: path.stat().st_mtime):
-        model, source, seed = path.stem.split("-")
-        module = MODELS[model](num_classes=10).eval()
-        module.load_state_dict(torch.load(path, weights_only=True))
-        if source not in of_source:
-            clouds = labelled(data, source)
-            of_source[source] = parts(clouds)[1], compared(clouds.clouds)
-        known = known_of(module, *of_source[source])
-        yield Net(model, source, int(seed), module, POINTS, SOURCES[source][2], known)
+def small_net(data: Path, path: Path) -> Net:
+    """One of `.ci/trust_nets.py`."""
+    model, source, seed = path.stem.split("-")
+    module = MODELS[model](num_classes=10).eval()
+    module.load_state_dict(torch.load(path, weights_only=True))
+    clouds = labelled(data, source)
+    held_out = parts(clouds)[1]
+    known = known_of(module, held_out.clouds.all(), held_out.labels, compared(clouds.clouds, 200))
+    return Net(model, source, int(seed), module, POINTS, SOURCES[source][2], known)
 
 
-def shipped_nets(every: dict[str, Target]) -> Iterator[Net]:
-    """The classifiers that come with qs3; known are scans of test meshes by their sensors."""
-    for name, seen in SEEN_BY.items():
-        predictor = load(name)
-        result, parts_of = predictor.result, [every[one] for one in sorted(seen) if one in every]
-        clouds = [cloud for one in parts_of for cloud in one.clouds]
-        labels = np.concatenate([one.labels for one in parts_of])
-        one = Target(name, name, clouds, labels, 0.0)
-        seen_clouds, _ = seen_as(one, result.points, result.scale)
-        held_out = Labelled(seen_clouds, tuple(map(str, labels)), torch.from_numpy(labels))
-        known = known_of(predictor.net, held_out, compared(seen_clouds))
-        yield Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
+def shipped_net(name: str, every: dict[str, Target]) -> Net:
+    """A classifier that comes with qs3; known are scans of test meshes by its sensors."""
+    predictor = load(name)
+    result = predictor.result
+    few = [every[one].few(KNOWN) for one in sorted(SEEN_BY[name])]
+    seen = [view(one, result.points, result.scale) for one in few]
+    known = known_of(
+        predictor.net,
+        torch.cat([one.points for one in seen]),
+        np.concatenate([one.labels for one in few]),
+        np.concatenate([one.measures for one in seen]),
+    )
+    return Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
 
 
-def case(net: Net, target: Target, second: np.ndarray | None) -> dict[str, Any]:
+def case(net: Net, target: Target, seen_as: View) -> dict[str, Any]:
     """A row of the table."""
-    clouds, measured = seen_as(target, net.points, net.scale)
-    points = clouds.all()
-    said = predict(net.module, points, 32)
+    said = predict(net.module, seen_as.points, 32)
     answers = said.argmax(axis=1)
-    seen = Seen(said, measured, turned(net.module, points, said), float((answers == second).mean()))
+    seen = Seen(said, seen_as.measures, turned(net.module, seen_as.points, said))
     by_confidence = estimates(net.known.probabilities, net.known.labels, said)
     values = (
         *(net.name, net.source, net.seed, target.name, target.left_out, len(answers)),
         *(net.known.accuracy, float((answers == target.labels).mean())),
         *(by_confidence[key] for key in ("calibrated", "thresholded", "difference")),
+        *shifts(net.known, seen).values(),
     )
-    found = dict(zip(COLUMNS[: len(values)], values, strict=True))
-    return {**dict.fromkeys(COLUMNS, ""), **found, **shifts(net.known, seen)}
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def wanted(name: str, scale: str, every: dict[str, Target]) -> list[Target]:
+    """The targets of a net: none of its own sensors, and none whose floor it would have to know."""
+    return [
+        one
+        for one in every.values()
+        if one.name not in SEEN_BY.get(name, set())
+        and (scale != "above_floor" or one.floor is not None)
+    ]
+
+
+def cases_of(work: tuple[str, Path, dict[str, Target], dict[Any, View]]) -> list[dict[str, Any]]:
+    """All rows of one net: the name of a classifier that comes with qs3, or a file."""
+    torch.set_num_threads(1)
+    name, data, every, views = work
+    net = shipped_net(name, every) if name in SEEN_BY else small_net(data, Path(name))
+    found = []
+    for target in wanted(net.name, net.scale, every):
+        key = (target.name, net.points, net.scale)
+        found.append(case(net, target, views.get(key) or view(target, net.points, net.scale)))
+    return found
+
+
+def prepared(work: tuple[Target, int, str]) -> tuple[tuple[str, int, str], View]:
+    """A view with its key."""
+    torch.set_num_threads(1)
+    target, points, scale = work
+    return (target.name, points, scale), view(target, points, scale)
 
 
 def make_cases(given: dict[str, str]) -> None:
-    """Make what the table lacks."""
+    """Make what the table lacks, in `jobs` processes."""
     torch.set_num_threads(1)
     data, out = Path(given["data"]), Path(given["out"])
     out.parent.mkdir(parents=True, exist_ok=True)
     every = {target.name: target for target in targets(data, Path(given["objects"]))}
-    asks = given.get("second", "true") == "true"
-    asked: dict[tuple[str, str], np.ndarray] = {}
-    done = {(row["net"], row["source"], row["seed"], row["target"]) for row in read(out)}
-
-    def opinion(name: str, target: Target) -> np.ndarray:
-        if (name, target.name) not in asked:
-            other = load(name)
-            said = predict(other.net, seen_as(target, other.points, "unit_ball")[0].all(), 32)
-            asked[name, target.name] = said.argmax(axis=1)
-        return asked[name, target.name]
-
-    def nets() -> Iterator[Net]:
-        yield from small_nets(data, Path(given["nets"]))
-        yield from shipped_nets(every)
-
-    for net in nets():
-        for target in every.values():
-            if target.name in SEEN_BY.get(net.name, set()):
-                continue
-            if net.scale == "above_floor" and target.floor is None:
-                continue
-            if (net.name, net.source, str(net.seed), target.name) in done:
-                continue
-            other = SECOND if net.name != SECOND else "dgcnn-speckle"
-            append(out, case(net, target, opinion(other, target) if asks else None))
-        print(f"{net.name} {net.source} {net.seed}", flush=True)
+    done = {(row["net"], row["source"], row["seed"]) for row in read(out)}
+    names = [
+        str(path)
+        for path in sorted(Path(given["nets"]).glob("*.pt"))
+        if tuple(path.stem.split("-")) not in done
+    ]
+    if given.get("shipped", "true") == "true":
+        names += [name for name in SEEN_BY if (name, "shipped", "0") not in done]
+    of_small = [(one, POINTS, "unit_ball") for one in every.values()]
+    of_small += [(one, POINTS, "above_floor") for one in every.values() if one.floor is not None]
+    small = any(name not in SEEN_BY for name in names)
+    with get_context("fork").Pool(int(given.get("jobs", "1"))) as pool:
+        views = dict(pool.imap_unordered(prepared, of_small if small else []))
+        print(f"{len(views)} views", flush=True)
+        work = [(name, data, every, views if name not in SEEN_BY else {}) for name in names]
+        for rows in pool.imap_unordered(cases_of, work):
+            for row in rows:
+                append(out, row)
+            print(f"{rows[0]['net']} {rows[0]['source']} {rows[0]['seed']}", flush=True)
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -275,8 +292,6 @@ def make_fit(given: dict[str, str]) -> None:
     rules = {
         "alone": ALONE,
         "turns": (*ALONE, "turns"),
-        "second": (*ALONE, "second"),
-        "both": (*ALONE, "turns", "second"),
     }
     targets_of = [row["left_out"] for row in rows]
     base, truth = (column(rows, key) for key in ("held_out", "accuracy"))

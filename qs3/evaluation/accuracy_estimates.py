@@ -82,8 +82,8 @@ def estimate_accuracy(
         return AccuracyEstimates(**about), None
     about |= estimates(known, labels, judged)
     held_out = Known(known, labels, compared(source))
-    seen = Seen(judged, compared(target.clouds))
-    about["trust"] = judge(held_out, seen, read_calibration())
+    measures = compared(target.clouds)
+    about["trust"] = judge(held_out, Seen(judged, measures), read_calibration())
     if upright:
         turns = [2 * math.pi * i / (TURNS + 1) for i in range(1, TURNS + 1)]
         rotated = [predict_rotated(net, points, turn, batch_size, device) for turn in turns]
@@ -96,6 +96,9 @@ def estimate_accuracy(
         if np.isfinite(known).all() and np.isfinite(theirs).all():
             accuracy = agreement(known, np.eye(len(classes))[labels])
             found = estimates(known, labels, theirs)
+            # A student was taught to be sure of these clouds: its teacher was not.
+            before = Known(known, labels, held_out.measures)
+            about["trust"] = judge(before, Seen(theirs, measures), read_calibration())
             about["teacher"] = Estimates(validation_accuracy=accuracy, **found)
     return AccuracyEstimates(**about), held_out
 

@@ -90,19 +90,17 @@ class Seen:
         probabilities: [n, C] what the net says of them.
         measures: [m, 4] `COMPARED` of some or all of them.
         turns: as in `Known`; None: was not asked.
-        second: share for which another classifier says the same; None: none was asked.
     """
 
     probabilities: Float[np.ndarray, "n c"]
     measures: Float[np.ndarray, "m 4"]
     turns: float | None = None
-    second: float | None = None
 
 
 def shifts(known: Known, seen: Seen) -> dict[str, float]:
     """How far the clouds are from the labelled ones, by name: each >= 0, and 0 for not at all.
 
-    `trust_file.SHIFTS` says what they are. Without `turns` or `second` these two are left out.
+    `trust_file.SHIFTS` says what they are. Without `turns` these are left out.
     """
     t = temperature(known.probabilities, known.labels)
     source, target = scaled(known.probabilities, t), scaled(seen.probabilities, t)
@@ -117,8 +115,6 @@ def shifts(known: Known, seen: Seen) -> dict[str, float]:
     }
     if seen.turns is not None and known.turns is not None:
         found["turns"] = max(0.0, known.turns - seen.turns)
-    if seen.second is not None:
-        found["second"] = 1 - seen.second
     return found
 
 

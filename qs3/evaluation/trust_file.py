@@ -26,7 +26,6 @@ SHIFTS: Mapping[str, str] = {
     "outside": "clouds lie outside the range of the labelled ones",
     "counts": "classes are named more or less often than on held-out labelled clouds",
     "turns": "rotations about the up axis change more answers",
-    "second": "another classifier says otherwise",
 }
 """By name what each shift of `qs3.evaluation.trust` means, in words."""
 
