@@ -55,7 +55,6 @@ STORES = {
     "S_1": "test_specklenet10_view",
     "S_K": "test_specklenet10_kinect",
     "S_tof": "test_specklenet10_tof",
-    "K": "kinectsim10",
 }
 ROOMS = {"R": "sample_kinect", "R_d435": "sample_d435", "R_tof": "sample_tof"}
 SEEN_BY = {

@@ -86,6 +86,9 @@ def _range(quality: Estimates) -> str:
 def table(quality: AccuracyEstimates) -> list[tuple[str, str, str]]:
     """Name, value and meaning of each figure that there is, for people."""
     rows = []
+    if quality.trust is not None:
+        words = trust_in_words(quality.trust)
+        rows.append(("expected accuracy", f"{quality.trust.expected:.1%}", f"{words}."))
     for key, meaning in MEANINGS.items():
         value = getattr(quality, key)
         if value is None:
