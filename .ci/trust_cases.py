@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -43,7 +44,10 @@ from qs3.evaluation.trust import (
     shifts,
 )
 from qs3.evaluation.trust_file import SHIFTS, Calibration, write_calibration
-from qs3.inference.predictor import load
+from qs3.inference.held_out import tensors_of
+from qs3.inference.model_file import values_of
+from qs3.inference.model_folder import CARD, write_folder
+from qs3.inference.predictor import Predictor, load
 from qs3.inference.pretrained import FOLDER
 
 MOST, TURNED, KNOWN = 150, 75, 50
@@ -181,18 +185,28 @@ def small_net(data: Path, path: Path) -> Net:
 
 
 def shipped_net(name: str, every: dict[str, Target]) -> Net:
-    """A classifier that comes with qs3; known are scans of test meshes by its sensors."""
+    """A classifier that comes with qs3; without statistics in its folder they are made first."""
     predictor = load(name)
-    result = predictor.result
-    few = [every[one].few(KNOWN) for one in sorted(SEEN_BY[name])]
-    seen = [view(one, result.points, result.scale) for one in few]
-    known = known_of(
+    result, known = predictor.result, predictor.held_out
+    if known is None:
+        known = known_of_scans(predictor, [every[one] for one in sorted(SEEN_BY[name])])
+        folder, values = FOLDER / name, values_of(result)
+        write_folder(
+            folder, {**values, "held_out": tensors_of(known)}, (folder / CARD).read_text("utf-8")
+        )
+    return Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
+
+
+def known_of_scans(predictor: Predictor, sensors: list[Target]) -> Known:
+    """What a net knows of scans of test meshes by its sensors, `KNOWN` of each."""
+    few = [one.few(KNOWN) for one in sensors]
+    seen = [view(one, predictor.points, predictor.result.scale) for one in few]
+    return known_of(
         predictor.net,
         torch.cat([one.points for one in seen]),
         np.concatenate([one.labels for one in few]),
         np.concatenate([one.measures for one in seen]),
     )
-    return Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
 
 
 def case(net: Net, target: Target, seen_as: View) -> dict[str, Any]:
@@ -240,30 +254,36 @@ def prepared(work: tuple[Target, int, str]) -> tuple[tuple[str, int, str], View]
 
 
 def make_cases(given: dict[str, str]) -> None:
-    """Make what the table lacks, in `jobs` processes."""
+    """Make what the table lacks, in `jobs` processes; `wait`: seconds for more nets to come."""
     torch.set_num_threads(1)
     data, out = Path(given["data"]), Path(given["out"])
     out.parent.mkdir(parents=True, exist_ok=True)
     every = {target.name: target for target in targets(data, Path(given["objects"]))}
-    done = {(row["net"], row["source"], row["seed"]) for row in read(out)}
-    names = [
-        str(path)
-        for path in sorted(Path(given["nets"]).glob("*.pt"))
-        if tuple(path.stem.split("-")) not in done
-    ]
-    if given.get("shipped", "true") == "true":
-        names += [name for name in SEEN_BY if (name, "shipped", "0") not in done]
     of_small = [(one, POINTS, "unit_ball") for one in every.values()]
     of_small += [(one, POINTS, "above_floor") for one in every.values() if one.floor is not None]
-    small = any(name not in SEEN_BY for name in names)
+    until = time.monotonic() + float(given.get("wait", "0"))
     with get_context("fork").Pool(int(given.get("jobs", "1"))) as pool:
-        views = dict(pool.imap_unordered(prepared, of_small if small else []))
-        print(f"{len(views)} views", flush=True)
-        work = [(name, data, every, views if name not in SEEN_BY else {}) for name in names]
-        for rows in pool.imap_unordered(cases_of, work):
-            for row in rows:
-                append(out, row)
-            print(f"{rows[0]['net']} {rows[0]['source']} {rows[0]['seed']}", flush=True)
+        views: dict[Any, View] = {}
+        while True:
+            names = missing(Path(given["nets"]), out, given.get("shipped", "true") == "true")
+            if not views and any(name not in SEEN_BY for name in names):
+                views = dict(pool.imap_unordered(prepared, of_small))
+            work = [(name, data, every, {} if name in SEEN_BY else views) for name in names]
+            for rows in pool.imap_unordered(cases_of, work):
+                append(out, rows)
+                print(f"{rows[0]['net']} {rows[0]['source']} {rows[0]['seed']}", flush=True)
+            if time.monotonic() > until:
+                return
+            time.sleep(10)
+
+
+def missing(nets: Path, out: Path, shipped: bool) -> list[str]:
+    """Nets without a row: files, and names of classifiers that come with qs3."""
+    done = {(row["net"], row["source"], row["seed"]) for row in read(out)}
+    found = [str(path) for path in nets.glob("*.pt") if tuple(path.stem.split("-")) not in done]
+    if shipped:
+        found += [name for name in SEEN_BY if (name, "shipped", "0") not in done]
+    return sorted(found)
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -274,15 +294,15 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def append(path: Path, row: dict[str, Any]) -> None:
-    """A row more; shares to four digits."""
+def append(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Rows more; shares to four digits."""
     begun = path.is_file()
-    shown = {k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()}
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         if not begun:
             writer.writeheader()
-        writer.writerow(shown)
+        for row in rows:
+            writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
 
 
 def make_fit(given: dict[str, str]) -> None:
