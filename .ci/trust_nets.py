@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ SOURCES = {
 def labelled(data: Path, name: str) -> Labelled:
     """The source's labelled clouds, in one sample each."""
     store, variant, scale = SOURCES[name]
-    points = open_pointset(data / store, variant, verify=False)
+    points = replace(open_pointset(data / store, variant, verify=False), floor_m=0.0)
     clouds = load_clouds(points, "train", POINTS, cache_dir=data / ".cache", scale=scale)
     labels = torch.from_numpy(np.array(points.labels[points.indices("train")]))
     return Labelled(clouds.clouds, clouds.ids, labels)
