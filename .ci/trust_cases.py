@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.pool import AsyncResult
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -260,21 +261,24 @@ def make_cases(given: dict[str, str]) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     every = {target.name: target for target in targets(data, Path(given["objects"]))}
     of_small = [(one, POINTS, "unit_ball") for one in every.values()]
-    of_small += [(one, POINTS, "above_floor") for one in every.values() if one.floor is not None]
     until = time.monotonic() + float(given.get("wait", "0"))
+    shipped, nets = given.get("shipped", "true") == "true", Path(given["nets"])
     with get_context("fork").Pool(int(given.get("jobs", "1"))) as pool:
         views: dict[Any, View] = {}
+        if given.get("small", "true") == "true":
+            views = dict(pool.imap_unordered(prepared, of_small))
+        under_way: dict[str, AsyncResult] = {}
         while True:
-            names = missing(Path(given["nets"]), out, given.get("shipped", "true") == "true")
-            if not views and any(name not in SEEN_BY for name in names):
-                views = dict(pool.imap_unordered(prepared, of_small))
-            work = [(name, data, every, {} if name in SEEN_BY else views) for name in names]
-            for rows in pool.imap_unordered(cases_of, work):
-                append(out, rows)
-                print(f"{rows[0]['net']} {rows[0]['source']} {rows[0]['seed']}", flush=True)
-            if time.monotonic() > until:
+            for name in missing(nets, out, shipped):
+                if name not in under_way:
+                    seen = {} if name in SEEN_BY else views
+                    under_way[name] = pool.apply_async(cases_of, ((name, data, every, seen),))
+            for name in [name for name, result in under_way.items() if result.ready()]:
+                append(out, rows := under_way.pop(name).get())
+                print(f"{name}: {len(rows)} cases", flush=True)
+            if not under_way and time.monotonic() > until:
                 return
-            time.sleep(10)
+            time.sleep(2)
 
 
 def missing(nets: Path, out: Path, shipped: bool) -> list[str]:
