@@ -64,9 +64,9 @@ def read_folder(folder: Path) -> dict[str, Any]:
     """
     values = _config(folder / CONFIG)
     weights = _tensors(folder / WEIGHTS, _HASH, values.pop(_HASH, None))
-    held_out = None
-    if _HELD_OUT_HASH in values:
-        held_out = _tensors(folder / HELD_OUT, _HELD_OUT_HASH, values.pop(_HELD_OUT_HASH))
+    held_out, of_held_out = None, values.pop(_HELD_OUT_HASH, None)
+    if of_held_out is not None and (folder / HELD_OUT).exists():  # hubs may carry weights alone
+        held_out = _tensors(folder / HELD_OUT, _HELD_OUT_HASH, of_held_out)
     usual = values.get("usual")
     if isinstance(usual, Mapping):
         values["usual"] = {name: _closed(ends) for name, ends in usual.items()}

@@ -77,9 +77,8 @@ def test_an_exported_folder_keeps_it_and_another_one_s_is_refused(run, tmp_path)
     (damaged / HELD_OUT).write_bytes(data)
     with pytest.raises(DataError, match=r"held_out\.safetensors is damaged"):
         load(damaged)
-    (damaged / HELD_OUT).unlink()
-    with pytest.raises(DataError, match=r"held_out\.safetensors cannot be read"):
-        load(damaged)
+    (damaged / HELD_OUT).unlink()  # a hub may carry the weights alone
+    assert load(damaged).held_out is None
 
 
 def tensors(**changes) -> dict[str, torch.Tensor]:
