@@ -284,7 +284,7 @@ def make_cases(given: dict[str, str]) -> None:
 def missing(nets: Path, out: Path, shipped: bool) -> list[str]:
     """Nets without a row: files, and names of classifiers that come with qs3."""
     done = {(row["net"], row["source"], row["seed"]) for row in read(out)}
-    found = [str(path) for path in nets.glob("*.pt") if tuple(path.stem.split("-")) not in done]
+    found = [str(p) for p in nets.glob("[!.]*.pt") if tuple(p.stem.split("-")) not in done]
     if shipped:
         found += [name for name in SEEN_BY if (name, "shipped", "0") not in done]
     return sorted(found)
