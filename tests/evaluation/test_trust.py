@@ -56,8 +56,13 @@ def test_far_by_hand():
     spaced = np.array([[50.0], [300.0], [-200.0], [20.0]])
     assert far_share(line, spaced) == pytest.approx((0.5 - 0.1) / 0.9)
     assert far_share(line, spaced[[0, 3]]) == 0
-    assert far_share(1000 * line, 1000 * spaced) == far_share(line, spaced)  # no unit
     assert far_share(line[:1], spaced) == 0  # nothing to compare with
+
+
+def test_columns_count_alike_in_any_unit():
+    units, own, others = np.array([1, 1000, 1e-3, 1]), shapes(200, 1), shapes(100, 2, 0.7)
+    assert far_share(own, others) > 0.1
+    assert far_share(own * units, others * units) == pytest.approx(far_share(own, others))
 
 
 def test_a_reference_of_two_kinds_has_an_outside_between_them_and_none_in_them():
