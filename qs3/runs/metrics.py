@@ -210,8 +210,8 @@ class AccuracyEstimates(Estimates):
         unlike_source: share of clouds outside the usual range of the labelled ones.
         never_predicted: classes.
         trust: what to make of it all, of the teacher's answers if there is one: a student was
-            taught to be sure of the target. None of a net that has diverged, of few clouds, and in files
-            of older versions.
+            taught to be sure of the target. None of a net that has diverged, of few clouds, and in
+            files of older versions.
     """
 
     clouds: int
