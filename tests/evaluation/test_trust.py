@@ -142,6 +142,15 @@ def test_no_shift_ever_raises_an_estimate(seed, weights, name, more):
     assert expected(0.7, larger, weights) <= expected(0.7, found, weights)
 
 
+def test_answers_that_are_surer_than_those_to_labelled_clouds_gain_nothing():
+    known = net(right=0.7)
+    sure = np.full((100, 5), 1e-9) + np.eye(5)[np.arange(100) % 5]
+    seen = Seen(sure / sure.sum(axis=1, keepdims=True), known.measures)
+    found = shifts(known, seen)
+    assert found["unsure"] == found["thresholded"] == 0
+    assert judge(known, seen, CALIBRATION).expected <= known.accuracy
+
+
 def test_noise_is_refused_and_the_words_say_why():
     noise = np.random.default_rng(1).dirichlet(np.full(5, 0.3), 100)
     trust = judge(net(), Seen(noise, shapes(100, 1, 8.0)), CALIBRATION)
