@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from qs3.runs.metrics import AccuracyEstimates, Estimates
+from qs3.evaluation.trust_file import SHIFTS
+from qs3.runs.metrics import AccuracyEstimates, Estimates, Trust
+
+DO_NOT_TRUST = "do not trust this"
 
 MEANINGS: Mapping[str, str] = {
     "validation_accuracy": "accuracy on held-out labelled clouds. On others it will be lower",
@@ -30,10 +33,47 @@ MEANINGS: Mapping[str, str] = {
 
 def in_words(quality: AccuracyEstimates) -> str:
     """The estimates in short, for the end of a headline; "" without any."""
+    if quality.trust is not None:
+        return trust_in_words(quality.trust)
     if quality.calibrated is None:
         return ""
     before = f" (before self-training {_range(quality.teacher)})" if quality.teacher else ""
-    return f"accuracy estimated from confidences {_range(quality)}{before}, too high as a rule"
+    return (
+        f"accuracy estimated from confidences alone {_range(quality)}{before}, which is too high "
+        "as a rule, on real clouds by far"
+    )
+
+
+def trust_in_words(trust: Trust) -> str:
+    """How many answers are expected to be right, how far off that can be, and what speaks against.
+
+    Such as "about 62% expected to be right, give or take 9 points" or "do not trust this: ...".
+    """
+    evidence = "; ".join(reasons(trust))
+    why = f": {evidence}" if evidence else ""
+    if trust.trusted:
+        return (
+            f"about {trust.expected:.0%} expected to be right, give or take "
+            f"{100 * trust.error:.0f} points ({trust.held_out:.0%} on held-out labelled clouds"
+            f"{f', less{why}' if evidence else ''})"
+        )
+    return f"{DO_NOT_TRUST}: about {trust.expected:.0%} expected to be right{why}"
+
+
+def reasons(trust: Trust, most: int = 3) -> list[str]:
+    """What took most from the estimate, in words with its figure; at most `most`.
+
+    A shift that took less than a tenth of the largest is not named.
+    """
+    taken = sorted(((lost, name) for name, lost in trust.lost.items() if lost > 0), reverse=True)
+    found = [
+        f"{SHIFTS[name]} ({trust.shifts[name]:.2f})"
+        for lost, name in taken[:most]
+        if lost > taken[0][0] / 10
+    ]
+    if not trust.trusted and trust.held_out < 0.5:
+        found.insert(0, f"even of held-out labelled clouds {trust.held_out:.0%} are right")
+    return found
 
 
 def _range(quality: Estimates) -> str:
@@ -46,6 +86,9 @@ def _range(quality: Estimates) -> str:
 def table(quality: AccuracyEstimates) -> list[tuple[str, str, str]]:
     """Name, value and meaning of each figure that there is, for people."""
     rows = []
+    if quality.trust is not None:
+        words = trust_in_words(quality.trust)
+        rows.append(("expected accuracy", f"{quality.trust.expected:.1%}", f"{words}."))
     for key, meaning in MEANINGS.items():
         value = getattr(quality, key)
         if value is None:

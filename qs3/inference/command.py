@@ -27,6 +27,7 @@ from qs3.inference.predictor import Predictor, load
 from qs3.inference.settings import Inputs, Settings, Source
 from qs3.inference.table import as_csv, as_json, record
 from qs3.inference.told import agreement, chosen, told
+from qs3.inference.trusted import trust_of
 from qs3.inference.units import predict_units
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import make_folder, write_text
@@ -82,21 +83,23 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     trained_on, worth = _trained_on(ckpt), predictor.result.worth
     heights = any(one.needs_floor for one in (predictor, second) if one)
     taken = found.words if found and heights else ""
+    trust, verdict = trust_of(rows, predictor)
     lines = [] if settings.ckpt else [chosen(ckpt, source)]
     lines += [taken] * bool(taken)
     lines += told(rows, records, inputs, predictor, settings, seconds)
+    lines.append(verdict)
     if second:
         lines.append(agreement(rows, classes))
     lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
     lines += [f"what it is worth: {worth}"] * bool(worth)
     if out.suffix.lower() == ".json":
-        text = as_json(records, classes, predictor.result.target)
+        text = as_json(records, classes, predictor.result.target, trust)
     else:
         text = as_csv(records, classes)
     lines.append(_save(out, text))
     if settings.page:
         title = f"{Path(settings.input or settings.depth).name}, as {ckpt} sees it"
-        html = page(title, rows, gallery, classes, trained_on, worth, taken)
+        html = page(title, rows, gallery, classes, trained_on, worth, taken, verdict)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
 

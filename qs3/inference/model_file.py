@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.ood import ALL as MEASURES_OF_CLOUDS
 from qs3.inference import pretrained
+from qs3.inference.held_out import checked_tensors
 from qs3.inference.model_folder import CONFIG, WEIGHTS, read_folder
 from qs3.runs.checkpoints import load, save
 from qs3.utils.memory import check_memory
@@ -108,6 +109,8 @@ class Result:
         weights: of the net.
         floor_m: z of the floor in the target's clouds, of a net that knows heights; else None.
         worth: what it was found to be worth on real objects, in a sentence; "" if nobody looked.
+        held_out: what the net says of held-out labelled clouds, by which its answers to others are
+            judged; see `qs3.inference.held_out`. None in files of older versions.
     """
 
     model: Annotated[dict[str, Any], AfterValidator(_model)]
@@ -121,6 +124,7 @@ class Result:
     weights: Annotated[dict[str, Tensor], Field(min_length=1)]
     floor_m: Annotated[float, Field(strict=True, allow_inf_nan=False)] | None = None
     worth: Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable)] = ""
+    held_out: Annotated[dict[str, Tensor], AfterValidator(checked_tensors)] | None = None
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
 
@@ -256,6 +260,8 @@ def _checked(file: Path, found: Any) -> Result:
             place, why = "points", "should be at most stored_points"
         elif (result.scale == "above_floor") != (result.floor_m is not None):
             place, why = "floor_m", "should be a number for scale above_floor, and for no other"
+        elif result.held_out and result.held_out["probabilities"].shape[1] != len(result.classes):
+            place, why = "held_out", "should have a probability for each class"
         else:
             return result
     raise DataError(f"{file} is not a result that qs3 wrote, or damaged: {place}: {why}")

@@ -3,6 +3,7 @@
     model.safetensors   the net's weights
     config.json         what building and using the net takes, and the weights' SHA-256
     README.md           a card for people, with the metadata that hubs read at its top
+    held_out.safetensors  what the net says of held-out labelled clouds; not in older folders
 
 `config.json` holds plain values by name, as huggingface_hub's `PyTorchModelHubMixin` passes them
 to a class; such a folder can be uploaded as it is (`upload_folder`). It is trusted as little as
@@ -26,12 +27,13 @@ from qs3.utils.memory import read_whole
 from qs3.utils.version import VERSION
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
-_HASH = "weights_sha256"
+HELD_OUT = "held_out.safetensors"
+_HASH, _HELD_OUT_HASH = "weights_sha256", "held_out_sha256"
 _MAX_CONFIG = 1 << 20  # bytes
 
 
 def write_folder(folder: Path, values: Mapping[str, Any], card: str) -> None:
-    """Write the three files; others in the folder are left alone.
+    """Write the files; others in the folder are left alone.
 
     Args:
         folder: made if need be.
@@ -42,9 +44,14 @@ def write_folder(folder: Path, values: Mapping[str, Any], card: str) -> None:
     (folder / CONFIG).unlink(missing_ok=True)  # it is written last, and marks the others as whole
     write_tensors(folder / WEIGHTS, values["weights"], {"format": "pt"})
     write_text(folder / CARD, card)
-    plain = {name: value for name, value in values.items() if name != "weights"}
+    hashes = {_HASH: sha256_file(folder / WEIGHTS)}
+    (folder / HELD_OUT).unlink(missing_ok=True)
+    if values["held_out"] is not None:
+        write_tensors(folder / HELD_OUT, values["held_out"], {})
+        hashes[_HELD_OUT_HASH] = sha256_file(folder / HELD_OUT)
+    plain = {name: value for name, value in values.items() if name not in ("weights", "held_out")}
     plain["usual"] = {name: _open(ends) for name, ends in values["usual"].items()}
-    about = {"library_name": "qs3", "qs3": VERSION, _HASH: sha256_file(folder / WEIGHTS)}
+    about = {"library_name": "qs3", "qs3": VERSION, **hashes}
     write_json(folder / CONFIG, {**about, **plain})
 
 
@@ -56,17 +63,24 @@ def read_folder(folder: Path) -> dict[str, Any]:
             config.json names.
     """
     values = _config(folder / CONFIG)
-    path = folder / WEIGHTS
-    data = _bytes(path, MAX_BYTES)
-    if hashlib.sha256(data).hexdigest() != values.pop(_HASH, None):
-        raise DataError(
-            f"{path} is damaged, or not the weights of the {CONFIG} beside it (its SHA-256 is not "
-            f"{_HASH} there); fetch or export both again"
-        )
+    weights = _tensors(folder / WEIGHTS, _HASH, values.pop(_HASH, None))
+    held_out, of_held_out = None, values.pop(_HELD_OUT_HASH, None)
+    if of_held_out is not None and (folder / HELD_OUT).exists():  # hubs may carry weights alone
+        held_out = _tensors(folder / HELD_OUT, _HELD_OUT_HASH, of_held_out)
     usual = values.get("usual")
     if isinstance(usual, Mapping):
         values["usual"] = {name: _closed(ends) for name, ends in usual.items()}
-    return {**values, "weights": read_tensors(data, path)}
+    return {**values, "weights": weights, "held_out": held_out}
+
+
+def _tensors(path: Path, key: str, expected: Any) -> dict[str, Any]:
+    data = _bytes(path, MAX_BYTES)
+    if hashlib.sha256(data).hexdigest() != expected:
+        raise DataError(
+            f"{path} is damaged, or not of the {CONFIG} beside it (its SHA-256 is not {key} "
+            "there); fetch or export both again"
+        )
+    return read_tensors(data, path)
 
 
 def _config(path: Path) -> dict[str, Any]:

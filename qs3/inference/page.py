@@ -100,6 +100,7 @@ def page(
     trained_on: str = "",
     worth: str = "",
     floor: str = "",
+    verdict: str = "",
 ) -> str:
     """The page as HTML.
 
@@ -111,12 +112,16 @@ def page(
         trained_on: what the net's data are made of; "" if nobody knows.
         worth: what it was found to be worth on real objects; likewise.
         floor: how it is known where that is, if the objects were asked.
+        verdict: how many are expected to be right, without a look at labels; likewise.
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
     parts = _head(found, rows, failed, classes)
     if floor:
         parts.append(f'<p class="note">{escape(floor[:1].upper() + floor[1:])}</p>')
+    if verdict:
+        without = "Without a look at labels: " if found else ""
+        parts.append(f'<p class="note">{without}{escape(verdict)}</p>')
     if trained_on:
         parts.append(f'<p class="soft">The net\'s data: {escape(trained_on)}</p>')
     if worth:

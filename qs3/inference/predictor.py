@@ -38,6 +38,8 @@ from qs3.datamodules.fps_samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
+from qs3.evaluation.trust import COMPARED, Known
+from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.allocator import keep_freed_memory
 
@@ -52,11 +54,13 @@ class Prepared(NamedTuple):
             heights z is that above the floor.
         given: how many points there were.
         strange: how it differs from the clouds of training, as text; see `qs3.evaluation.ood`.
+        measures: `qs3.evaluation.trust.COMPARED` of it.
     """
 
     points: Float[Tensor, "m 3"]
     given: int
     strange: tuple[str, ...]
+    measures: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +115,11 @@ class Predictor:
         return self.result.points
 
     @property
+    def held_out(self) -> Known | None:
+        """What the net says of held-out labelled clouds; None: its file does not tell."""
+        return known_of(self.result.held_out) if self.result.held_out else None
+
+    @property
     def in_metres(self) -> bool:
         """Whether it sees how large clouds are: then they must be in metres."""
         return self.result.scale != "unit_ball"
@@ -163,8 +172,10 @@ class Predictor:
         order = sample(whole, self.points, 1) if some else None
         one = Clouds.of(whole, order, self.result.scale, self._floor(floor))
         usual = relax_min_points(self.result.usual, self.points)
-        found = ood_reasons(measure_one(one, 0), usual)
-        return Prepared(one.all()[0], len(cloud), tuple(found))
+        measured = measure_one(one, 0)
+        found = ood_reasons(measured, usual)
+        compared = tuple(measured[name] for name in COMPARED)
+        return Prepared(one.all()[0], len(cloud), tuple(found), compared)
 
     def _floor(self, given: float | None) -> float:
         if given is None:

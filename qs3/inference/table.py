@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.data.frames.pointed import Caution
+from qs3.runs.metrics import Trust
 from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
 
@@ -35,6 +37,7 @@ class Row(NamedTuple):
         cautions: what was wrong when it was cut.
         up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
         second: the class that another classifier names; "" if none was asked.
+        measures: `qs3.evaluation.trust.COMPARED` of the cloud; () if it failed.
     """
 
     file: str
@@ -47,6 +50,7 @@ class Row(NamedTuple):
     cautions: tuple[Caution, ...] = ()
     up: str = ""
     second: str = ""
+    measures: tuple[float, ...] = ()
 
 
 def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
@@ -88,7 +92,22 @@ def as_csv(records: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> str:
     return csv_text(lines)
 
 
-def as_json(records: Sequence[Mapping[str, Any]], classes: Sequence[str], target: str) -> str:
-    """One document; `target`: the domain that the net was adapted to."""
-    document = {"qs3": VERSION, "target": target, "classes": list(classes), "clouds": records}
+def as_json(
+    records: Sequence[Mapping[str, Any]], classes: Sequence[str], target: str, trust: Trust | None
+) -> str:
+    """One document.
+
+    Args:
+        records: the clouds'.
+        classes: names in the order of the probabilities.
+        target: the domain that the net was adapted to.
+        trust: how many answers are expected to be right; None: cannot be told.
+    """
+    document = {
+        "qs3": VERSION,
+        "target": target,
+        "classes": list(classes),
+        "trust": None if trust is None else dataclasses.asdict(trust),
+        "clouds": records,
+    }
     return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

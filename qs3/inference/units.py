@@ -99,7 +99,7 @@ def _judged(
             prepared.items(), found, others, strict=True
         ):
             row = item.row("; ".join(each.strange), probabilities)
-            rows[i] = row._replace(second=other), item
+            rows[i] = row._replace(second=other, measures=each.measures), item
     return [rows[i] for i in range(len(batch))]
 
 

@@ -175,6 +175,28 @@ class Estimates:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Trust:
+    """How many answers are expected to be right, and why; see `qs3.evaluation.trust`.
+
+    Attributes:
+        expected: accuracy.
+        trusted: whether it is high enough; if not, "do not trust this".
+        held_out: accuracy on held-out labelled clouds, from which it was taken down.
+        shifts: how far the clouds are from these, by name; 0 for not at all.
+        lost: what each shift took, in logits.
+        error, error_90: how far off such estimates were: on average, and nine of ten.
+    """
+
+    expected: float
+    trusted: bool
+    held_out: float
+    shifts: dict[str, float]
+    lost: dict[str, float]
+    error: float
+    error_90: float
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class AccuracyEstimates(Estimates):
     """The reported net's, on the evaluated clouds.
 
@@ -187,6 +209,9 @@ class AccuracyEstimates(Estimates):
         teacher: the same estimates for that net.
         unlike_source: share of clouds outside the usual range of the labelled ones.
         never_predicted: classes.
+        trust: what to make of it all, of the teacher's answers if there is one: a student was
+            taught to be sure of the target. None of a net that has diverged, of few clouds, and in
+            files of older versions.
     """
 
     clouds: int
@@ -197,6 +222,7 @@ class AccuracyEstimates(Estimates):
     teacher: Estimates | None = None
     unlike_source: float
     never_predicted: list[str]
+    trust: Trust | None = None
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

@@ -15,10 +15,11 @@ from jaxtyping import Float
 from torch import nn
 
 from qs3.datamodules.splits import Labelled, Unlabelled
-from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy, ood_fraction
+from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy
 from qs3.evaluation.metrics import adapt_norms, predict, predict_rotated
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.tent import minimise_entropy
+from qs3.evaluation.trust import Known
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.runs.checkpoints import load, weights_sha256
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
@@ -46,6 +47,7 @@ class Outcome:
         rotated: scores of the reported net and of "selected", averaged over rotations.
         validators: its label-free scores.
         quality: estimates of its accuracy.
+        held_out: what it says of held-out labelled clouds; None of one that has diverged.
         training: its accuracy on training clouds, with `data.clouds_a_class` alone.
     """
 
@@ -57,6 +59,7 @@ class Outcome:
     rotated: tuple[Scores | None, Scores | None]
     validators: dict[str, float | None]
     quality: AccuracyEstimates
+    held_out: Known | None
     training: TrainingAccuracy | None
 
 
@@ -138,6 +141,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     net, device = nets(file), nets.device
     predictions = evaluation.predictions_of(nets.of_test(file))
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
+    quality, held_out = _quality(run, loaded, nets, file)
     return Outcome(
         net=net,
         predictions=predictions,
@@ -149,7 +153,8 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
             evaluation.rotation_averaged(partial(nets.of_test, files["selected"])),
         ),
         validators=without_labels(net, data.target, choice, batch_size, device),
-        quality=_quality(run, loaded, nets, file),
+        quality=quality,
+        held_out=held_out,
         training=(
             training_accuracy(net, data.labelled, data.owner, batch_size, device)
             if run.cfg.data.clouds_a_class is not None
@@ -158,7 +163,9 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     )
 
 
-def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> AccuracyEstimates:
+def _quality(
+    run: Run, loaded: Loaded, nets: SavedNets, file: Path
+) -> tuple[AccuracyEstimates, Known | None]:
     def said(weights: Path) -> Said:
         return Said(validation=nets.of_validation(weights), target=nets.of_test(weights))
 
@@ -166,7 +173,8 @@ def _quality(run: Run, loaded: Loaded, nets: SavedNets, file: Path) -> AccuracyE
     return estimate_accuracy(
         said(file),
         data.validation.labels.numpy(),
-        ood_fraction(loaded.evaluation.test.clouds, data.all_labelled),
+        loaded.evaluation.test.clouds,
+        data.all_labelled,
         owner=data.owner,
         classes=loaded.evaluation.classes,
         teacher=said(run.folder / WARMUP_SELECTED) if run.scheme.rounds else None,

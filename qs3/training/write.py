@@ -14,6 +14,7 @@ from qs3.data.manifest import read_manifest
 from qs3.evaluation.accuracy_estimates import source_ranges
 from qs3.evaluation.ood import limits, ood_reasons_of_all
 from qs3.evaluation.selection_rules import LAST
+from qs3.inference.held_out import tensors_of
 from qs3.inference.model_file import FILE as RESULT
 from qs3.inference.model_file import Result, write_result
 from qs3.runs.checkpoints import copy_weights
@@ -146,6 +147,7 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         usual=limits(loaded.data.all_labelled, loaded.data.target.clouds),
         weights=copy_weights(outcome.net),
         floor_m=_floor(run),
+        held_out=tensors_of(outcome.held_out) if outcome.held_out else None,
     )
 
 

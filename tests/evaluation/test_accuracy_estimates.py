@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from qs3.config import hashing
-from qs3.evaluation import accuracy_estimates as quality
-from qs3.evaluation.estimates_text import MEANINGS, in_words, table
+from qs3.evaluation import confidences as quality
+from qs3.evaluation.estimates_text import MEANINGS, in_words, table, trust_in_words
 from qs3.report.runs.data import read_run
 from qs3.report.runs.page import page
-from qs3.runs.metrics import AccuracyEstimates, Estimates, read_metrics
+from qs3.runs.metrics import AccuracyEstimates, Estimates, Trust, read_metrics
 from qs3.runs.predictions import OF_FILES, Predictions, write_predictions_of_files
 from qs3.training.command import headline, train
 from tests.training.toy import CLASSES, toy_config, write_domain
@@ -162,12 +162,19 @@ def test_words_have_a_range_or_one_figure_and_nothing_without_estimates():
     def said(**more):
         return AccuracyEstimates(**{**always, "never_predicted": [], **more})
 
-    assert "66% to 74%, too high as a rule" in in_words(said(**some))
-    assert "71%, too" in in_words(said(**dict.fromkeys(some, 0.71)))
+    assert "alone 66% to 74%, which is too high as a rule" in in_words(said(**some))
+    assert "71%, which" in in_words(said(**dict.fromkeys(some, 0.71)))
     taught = Estimates(validation_accuracy=0.8, **dict.fromkeys(some, 0.5))
-    assert "71% (before self-training 50%), too" in in_words(
+    assert "71% (before self-training 50%), which" in in_words(
         said(**dict.fromkeys(some, 0.71), teacher=taught)
     )
+    some_trust = Trust(
+        expected=0.3, trusted=False, held_out=0.9, shifts={"shapes": 0.6}, lost={"shapes": 2.0},
+        error=0.1, error_90=0.2,
+    )  # fmt: skip
+    words = in_words(said(**some, trust=some_trust))
+    assert words.startswith("do not trust this: about 30% expected to be right: the clouds are sh")
+    assert "too high" not in words
     assert in_words(said()) == in_words(said(**dict.fromkeys(some))) == ""
     rows = {row[0]: row[1:] for row in table(said(**some, never_predicted=["bed", "sofa"]))}
     assert list(rows) == [
@@ -237,9 +244,10 @@ def test_a_run_on_one_s_own_scans_says_what_it_can(own):
     assert all(0 <= getattr(found, name) <= 1 for name in shares)  # none is missing
     assert set(found.never_predicted) <= set(CLASSES)
     assert "no labels to judge own by; predicted " in headline(metrics)
-    assert "accuracy estimated from confidences" in headline(metrics)
     assert 0 <= found.teacher.calibrated <= 1
-    assert "before self-training" in headline(metrics)
+    assert found.trust.held_out <= 1
+    assert trust_in_words(found.trust) in headline(metrics)
+    assert "expected to be right" in headline(metrics)
     folder = hashing.run_folder(cfg)
     assert read_metrics(folder) == metrics
     html = page(read_run(folder), {}, {})

@@ -94,7 +94,13 @@ def _result() -> Any:
     from qs3.evaluation.ood import ALL
 
     usual = {next(iter(ALL)): [0.0, float("inf")]}
-    return Result(model, TWO, 8, 16, "made", "z", "unit_ball", usual, {"w": torch.ones(2, 3)})
+    held_out = {
+        "probabilities": torch.full((3, 2), 0.5),
+        "labels": torch.tensor([0, 1, 1]),
+        "measures": torch.ones(5, 4),
+    }
+    weights = {"w": torch.ones(2, 3)}
+    return Result(model, TWO, 8, 16, "made", "z", "unit_ball", usual, weights, held_out=held_out)
 
 
 def _results(folder: Path) -> list[bytes]:
@@ -109,8 +115,22 @@ def _read_result(path: Path) -> None:
     from qs3.inference.model_file import build_net, read_result
 
     result = read_result(path)
+    if result.held_out:
+        _judge(result.held_out)
     with contextlib.suppress(Qs3Error):  # these weights are not those of the net
         build_net(result)
+
+
+def _judge(held_out: dict[str, Any]) -> None:
+    from qs3.evaluation.trust import Seen, judge
+    from qs3.evaluation.trust_file import read_calibration
+    from qs3.inference.held_out import known_of
+
+    known = known_of(held_out)
+    others = np.full((40, known.probabilities.shape[1]), 1 / known.probabilities.shape[1])
+    trust = judge(known, Seen(others, np.ones((5, 4))), read_calibration())
+    assert trust is not None
+    assert 0 <= trust.expected <= 1
 
 
 def _models(folder: Path) -> list[bytes]:
@@ -128,6 +148,8 @@ def _read_model(path: Path) -> None:
         try:
             about = json.loads(config.read_bytes())
             about["weights_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+            if (held_out := folder / "held_out.safetensors").is_file():
+                about["held_out_sha256"] = hashlib.sha256(held_out.read_bytes()).hexdigest()
             config.write_text(json.dumps(about))
         except (ValueError, TypeError, RecursionError):
             pass
@@ -167,6 +189,22 @@ def _read_judgement(path: Path) -> None:
     assert len(judgement.sentence) < 1000
     assert judgement.sentence.isprintable()
     card(_result(), None, judgement=judgement)
+
+
+def _calibrations(folder: Path) -> list[bytes]:
+    from qs3.evaluation.trust_file import Calibration, write_calibration
+
+    found = Calibration({"shapes": 1.0, "unsure": 0.5}, 50, 8, 0.1, 0.2, 0.25)
+    write_calibration(folder / "weights.json", found)
+    return bytes_of(folder / "weights.json")
+
+
+def _read_calibration(path: Path) -> None:
+    from qs3.evaluation.trust import expected
+    from qs3.evaluation.trust_file import SHIFTS, read_calibration
+
+    weights = read_calibration(path).weights
+    assert 0 <= expected(0.5, dict.fromkeys(SHIFTS, 1.0), weights) <= 0.5
 
 
 def _tables(folder: Path) -> list[bytes]:
@@ -221,6 +259,8 @@ READERS: tuple[Reader, ...] = (
     Reader("judgement .json", _judgements, _read_judgement, "a.json", None,
            ("inference/judgement.py",)),
     Reader("search .json", _searches, _read_search, "a.json", None, ("tuning/state.py",)),
+    Reader("calibration .json", _calibrations, _read_calibration, "a.json", None,
+           ("evaluation/trust_file.py",)),
     Reader("table .yaml", _tables, _read_table, "a.yaml", None, ("report/tables/table.py",)),
     Reader("journal of a sweep", _journals, _read_journal, "a.txt", None, ("sweeps/summary.py",)),
     Reader("cache of samples", _caches, _read_cache, "a.npy", None, ("datamodules/fps_cache.py",)),

@@ -346,7 +346,7 @@ def test_a_net_that_needs_too_much_memory_is_refused_unbuilt(run, tmp_path):
 
 
 def test_a_wrong_number_of_classes_is_noticed(run, tmp_path):
-    found = qs3.load(changed(run, tmp_path, classes=["a", "b"]))
+    found = qs3.load(changed(run, tmp_path, classes=["a", "b"], held_out=None))
     with pytest.raises(DataError, match="3 classes apart, the file names 2"):
         found([np.eye(3)])
 

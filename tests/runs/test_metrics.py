@@ -28,6 +28,7 @@ from qs3.runs.metrics import (
     RunMetrics,
     StudentChoice,
     TrainingAccuracy,
+    Trust,
     Warmup,
     read_metrics,
     write_metrics,
@@ -73,6 +74,10 @@ def whole() -> RunMetrics:
             validated_on="source_val", validation_clouds=40,
             rotation_agreement=0.5, teacher_agrees=0.5,
             teacher=teacher, unlike_source=0.1, never_predicted=["c"],
+            trust=Trust(
+                expected=0.6, trusted=True, held_out=0.8, shifts={"shapes": 0.5},
+                lost={"shapes": 1.0}, error=0.1, error_90=0.2,
+            ),
         ),
         training=TrainingAccuracy(n=12, accuracy=1.0),
     )  # fmt: skip
@@ -139,7 +144,7 @@ def test_an_unknown_key_is_named_wherever_it_is(document, tmp_path):
     objects = [(), *(p for p in places(document) if isinstance(at(document, p), dict))]
     assert len(objects) > 25
     of_any_name = {"predicted", "per_class_recall", "confident", "selected", "mu", "thresholds"}
-    of_any_name |= {"versions", "validators"}  # of classes, packages, scores
+    of_any_name |= {"versions", "validators", "shifts", "lost"}  # of classes, packages, scores
     for place in objects:
         if place and place != ("warmup", "selected") and place[-1] in of_any_name:
             continue

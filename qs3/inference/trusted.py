@@ -1,0 +1,37 @@
+"""Whether the answers of one call of `qs3 predict` can be trusted, and how that is said."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from qs3.evaluation.estimates_text import trust_in_words
+from qs3.evaluation.trust import FEWEST, Seen, judge
+from qs3.evaluation.trust_file import read_calibration
+from qs3.inference.predictor import Predictor
+from qs3.inference.table import Row
+from qs3.runs.metrics import Trust
+
+
+def trust_of(rows: Sequence[Row], predictor: Predictor) -> tuple[Trust | None, str]:
+    """The verdict, and it in words; None with the reason where nothing can be told.
+
+    Labels that somebody gave play no part.
+    """
+    said = [row for row in rows if row.probabilities is not None]
+    known = predictor.held_out
+    if known is None:
+        return None, (
+            "how many are right cannot be told: the classifier's file does not say what it makes "
+            "of held-out labelled clouds, as those of older versions; delete metrics.json in its "
+            "run's folder and repeat the run's command, which trains nothing again"
+        )
+    if len(said) < FEWEST:
+        return None, f"how many are right cannot be told of fewer than {FEWEST} clouds"
+    seen = Seen(
+        np.array([row.probabilities for row in said]), np.array([row.measures for row in said])
+    )
+    trust = judge(known, seen, read_calibration())
+    assert trust is not None
+    return trust, trust_in_words(trust)

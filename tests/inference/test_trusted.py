@@ -1,0 +1,129 @@
+"""What predict says of how many are right, and what it does where it cannot tell."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.data.store import open_pointset
+from qs3.errors import DataError
+from qs3.evaluation.estimates_text import DO_NOT_TRUST
+from qs3.inference.export import export_folder
+from qs3.inference.held_out import MOST, checked_tensors, known_of, tensors_of
+from qs3.inference.model_file import read_result, write_result
+from qs3.inference.model_folder import HELD_OUT
+from qs3.inference.predictor import load
+from qs3.runs.metrics import read_metrics
+from tests.commands import main
+
+
+def predict(net: Path, clouds: np.ndarray, folder: Path, capsys) -> tuple[str, dict, str]:
+    """The text, the JSON and the page."""
+    np.save(folder / "clouds.npy", clouds)
+    out = folder / "said.json"
+    assert main(["predict", f"ckpt={net}", f"input={folder / 'clouds.npy'}", f"out={out}"]) == 0
+    page = out.with_suffix(".html").read_text()
+    return capsys.readouterr().out, json.loads(out.read_text()), page
+
+
+def test_a_run_s_own_source_gets_an_estimate_and_noise_a_refusal(run, data_dir, tmp_path, capsys):
+    source = np.array(open_pointset(data_dir / "specklenet10").points)[::2]
+    text, said, page = predict(run, source, tmp_path, capsys)
+    known = load(run).held_out
+    assert said["trust"]["expected"] <= said["trust"]["held_out"] == pytest.approx(known.accuracy)
+    assert f"about {said['trust']['expected']:.0%} expected to be right" in text
+    flat = np.random.default_rng(0).normal(size=(40, 64, 3)) * [1, 1, 1e-4]
+    text, noise, page = predict(run, flat, tmp_path, capsys)
+    assert noise["trust"]["trusted"] is False
+    assert noise["trust"]["expected"] < said["trust"]["expected"]
+    (line,) = (line for line in text.splitlines() if line.startswith(DO_NOT_TRUST))
+    assert "shaped unlike the labelled ones" in line
+    assert line.split(": ")[1] in page
+
+
+def test_few_clouds_and_older_files_say_that_it_cannot_be_told(run, tmp_path, capsys):
+    clouds = np.random.default_rng(0).normal(size=(29, 64, 3))
+    text, said, _ = predict(run, clouds, tmp_path, capsys)
+    assert said["trust"] is None
+    assert "cannot be told of fewer than 30 clouds" in text
+    older = tmp_path / "result.pt"
+    write_result(older, replace(read_result(run), held_out=None))
+    text, said, _ = predict(older, np.concatenate([clouds, clouds]), tmp_path, capsys)
+    assert said["trust"] is None
+    assert "how many are right cannot be told: the classifier's file does not say" in text
+
+
+def test_a_run_keeps_what_its_net_says_of_the_labelled_clouds(run):
+    known, quality = load(run).held_out, read_metrics(run).quality
+    assert len(known.labels) == quality.validation_clouds
+    right = (known.probabilities.argmax(axis=1) == known.labels).mean()
+    assert right == pytest.approx(quality.validation_accuracy)
+
+
+def test_an_exported_folder_keeps_it_and_another_one_s_is_refused(run, tmp_path):
+    export_folder(run, tmp_path / "model")
+    ours, theirs = load(run).held_out, load(tmp_path / "model").held_out
+    np.testing.assert_array_equal(ours.probabilities, theirs.probabilities)
+    np.testing.assert_array_equal(ours.measures, theirs.measures)
+    damaged = shutil.copytree(tmp_path / "model", tmp_path / "damaged")
+    data = bytearray((damaged / HELD_OUT).read_bytes())
+    data[-1] ^= 1
+    (damaged / HELD_OUT).write_bytes(data)
+    with pytest.raises(DataError, match=r"held_out\.safetensors is damaged"):
+        load(damaged)
+    (damaged / HELD_OUT).unlink()  # a hub may carry the weights alone
+    assert load(damaged).held_out is None
+
+
+def tensors(**changes) -> dict[str, torch.Tensor]:
+    whole = {
+        "probabilities": torch.full((6, 3), 1 / 3),
+        "labels": torch.arange(6) % 3,
+        "measures": torch.ones(9, 4),
+    }
+    return whole | changes
+
+
+def test_statistics_survive_their_file(tmp_path):
+    found = known_of(checked_tensors(tensors(turns=torch.tensor([0.5]))))
+    again = tensors_of(found)
+    assert all(torch.equal(again[name], tensor) for name, tensor in tensors().items())
+    assert found.turns == 0.5
+    assert known_of(tensors()).turns is None
+    large = replace(found, measures=np.ones((3 * MOST, 4)))
+    assert len(tensors_of(large)["measures"]) == MOST
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"more": torch.ones(1)}, "should be labels"),
+        ({"labels": torch.ones(6)}, "int64"),
+        ({"labels": torch.arange(5) % 3}, "should be .v, C"),
+        ({"measures": torch.ones(9, 3)}, "should be .v, C"),
+        ({"measures": torch.full((9, 4), torch.inf)}, "finite"),
+        ({"measures": torch.ones(0, 4)}, "1 to 4096"),
+        ({"probabilities": torch.full((6, 3), torch.nan)}, "shares"),
+        ({"probabilities": torch.full((6, 3), 2.0)}, "shares"),
+        ({"labels": torch.arange(6)}, "numbers of classes"),
+        ({"labels": torch.arange(6) - 3}, "numbers of classes"),
+        ({"turns": torch.ones(2)}, "should be .v, C"),
+    ],
+)
+def test_damaged_statistics_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        checked_tensors(tensors(**changes))
+
+
+def test_a_file_with_statistics_of_other_classes_is_refused(run, tmp_path):
+    result = read_result(run)
+    write_result(tmp_path / "odd.pt", replace(result, held_out=tensors_of(known_of(
+        tensors(probabilities=torch.full((6, 4), 0.25))))))  # fmt: skip
+    with pytest.raises(DataError, match=r"odd\.pt.*held_out: should have a probability for each"):
+        read_result(tmp_path / "odd.pt")
