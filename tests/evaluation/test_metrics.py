@@ -131,7 +131,7 @@ def test_each_tier_is_scored_by_itself(labelled, tiers):
         Unlabelled(clouds, tuple("abcd")), labels, None, ("x", "y"), tiers=tiers
     )
     p = np.array([[0.9, 0.1], [0.8, 0.2], [0.4, 0.6], [0.3, 0.7]], np.float32)
-    of_each = evaluation.predictions(Net()).tiers
+    of_each = evaluation.predictions_of(p).tiers
     assert of_each == (("clean", "hard", "", "clean") if tiers else ())
     found = evaluation.scores_of_tiers(p)
     if not (labelled and tiers):

@@ -34,6 +34,10 @@ def report(found: InfraredFit, base: SpeckleStereo, scenes: int) -> list[str]:
             f"{'f B':28} {found.focal_baseline:.4g} px m; with f = {base.focal_px:g} px a baseline "
             f"of {found.focal_baseline / base.focal_px:.5g} m: f and B alone cannot be told apart"
         )
+    lines.append(
+        "albedo, gain and projector_strength cannot be told apart: only their product is "
+        f"in the pictures; projector_strength {base.projector_strength:g} stays"
+    )
     if found.misfit > 3:
         lines.append(
             f"doubtful: the model is {found.misfit:.1f} standard errors off: other dots than the "
