@@ -44,6 +44,7 @@ OWN = {
     "utils/pool.py": "what processes of our own send each other",
     "utils/seeding.py": "a hash",
     "utils/threads.py": "/proc/stat, the kernel's",
+    "utils/processor_time.py": "/proc, the kernel's",
     "cluster/slurm_arrays.py": "journals of jobs of our own",
     "generation/code_fingerprint.py": "this program's own files",
     "generation/travel.py": "bytes of meshes, for the reader of meshes",

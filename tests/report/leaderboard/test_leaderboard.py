@@ -82,7 +82,7 @@ def test_rows_say_nothing_beyond_the_rules():
             {"protocol.epochs", "protocol.steps"} if rounds <= set(words) else set()
         )
     five = {row["name"] for row in SPEC["rows"] if row.get("seeds") == 5}
-    assert five == {"source only", "QS3 (PCM+QBST)"}
+    assert five == {"source only", "QS3 (PCM+QBST)", "Twins (ours)"}
     assert {row.get("seeds", 3) for row in SPEC["rows"]} == {3, 5}
 
 
