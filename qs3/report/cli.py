@@ -264,7 +264,7 @@ COMPARE = Command(
 
 EFFECTS = Command(
     "qs3 report effects",
-    "differences between columns over all rows, and the reverse, or of factors of rows",
+    "differences between columns over all rows, of rows over columns, or of factors",
     _effects,
     (*_TABLE, _OUT),
     ("qs3 report effects table=factorial", "qs3 report effects table=headline"),
