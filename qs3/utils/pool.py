@@ -184,18 +184,14 @@ class _Worker:
         self.done = 0
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=_work, args=(theirs, make_worker), daemon=True)
-        # A Ctrl-C in the middle would leave the child without the half of what it is to be told,
-        # and it says so in a traceback. It comes after the start; the child unblocks what it got.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
         try:
-            with _a_method_that_it_knows(), _no_script(make_worker):
+            with _held_back(), _a_method_that_it_knows(), _no_script(make_worker):
                 self._process.start()
         except BaseException:
             self.pipe.close()
             raise
         finally:
             theirs.close()
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def give(self, name: str, task: Any) -> None:
         self.task = (name, task)
@@ -223,6 +219,32 @@ class _Worker:
         self._process.join(_STOP_S)
         self._process.kill()
         self._process.join()
+
+
+@contextmanager
+def _held_back() -> Iterator[None]:
+    """Ctrl-C and SIGTERM come after this, so that no process is started by half.
+
+    It would not be told all that it is to know, and says so in a traceback. A process that is
+    started inherits the mask and takes it off itself. The mask is this thread's: a signal that
+    another thread takes is handled in the main one, and waits in a handler of its own.
+    """
+    arrived: list[int] = []
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in _HELD_BACK:
+            if (handler := signal.getsignal(number)) not in (signal.SIG_IGN, None):
+                handlers[number] = handler
+                signal.signal(number, lambda number, frame: arrived.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for late in dict.fromkeys(arrived):
+            signal.raise_signal(late)  # is held back by the mask, still
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

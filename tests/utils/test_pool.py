@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 from joblib import Parallel, delayed
 
 from qs3.errors import DataError
-from qs3.utils.pool import Processes
+from qs3.utils.pool import Processes, _held_back
 
 
 class Strange(Exception):
@@ -239,3 +240,30 @@ def test_a_script_runs_once_and_what_it_defines_is_found(tmp_path, script, said)
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.stdout, done.stderr) == (said, "")
+
+
+@pytest.mark.parametrize("others", [0, 1])
+def test_ctrl_c_waits_until_a_process_has_started(others):
+    """With another thread, which takes the signal in the main one's place, too."""
+    over = threading.Event()
+    threads = [threading.Thread(target=over.wait) for _ in range(others)]
+    for thread in threads:
+        thread.start()
+    started = []
+
+    def start():
+        with _held_back():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+            started.append(True)
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            start()
+        assert started
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
