@@ -1,7 +1,7 @@
 """The main job on embedded data, one command after the other: `qs3 quickstart`.
 
 Prints every command that it runs, so that they can be run and changed one by one. Sizes are
-chosen to fit into 8 minutes on 2 idle cores (it takes 7 min 20 s); the paper's are in
+chosen to fit into 8 minutes on 2 idle cores (it took 6.6 and 7.3); the paper's are in
 conf/experiment/qs3_s2d.yaml.
 """
 
@@ -84,7 +84,7 @@ def _run(command: str) -> int:
 
 QUICKSTART = Command(
     "qs3 quickstart",
-    "the main job on embedded data, 7 min 20 s on 2 idle cores",
+    "the main job on embedded data, about seven minutes on 2 idle cores",
     _quickstart,
     (Option("out", text("FOLDER"), "where it all goes", "out/quickstart"),),
     ("qs3 quickstart", "make quickstart     the same, in a checkout"),
