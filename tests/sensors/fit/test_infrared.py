@@ -209,3 +209,62 @@ def test_folders_and_files_are_explained(tmp_path, capsys):
     assert "no active stereo camera" in capsys.readouterr().err
     assert main(["fit", "base=realsense_d415", "out=x.yaml", "focal=3", "a.npy"]) == 1
     assert "belong to images=" in capsys.readouterr().err
+
+
+def test_dots_over_ambient_are_those_of_the_pictures(scenes):
+    """The brightest percent of what the projector adds, over what is there without it."""
+    found = fit_pictures(scenes, BASE)
+    dim = scenes[2]  # at the middle of the three distances
+    off = np.mean(dim.off, axis=0)[30:-30, 30:-30].mean()
+    added = np.mean(dim.left, axis=0)[30:-30, 30:-30] - off
+    assert found.distance_m == pytest.approx(float(np.nanmedian(dim.depth_m)), rel=1e-3)
+    assert found.dots_over_ambient == pytest.approx(np.quantile(added, 0.99) / off, rel=0.05)
+
+
+SECOND = {
+    "ambient": 0.5,
+    "infrared.psf_px": 0.9,
+    "infrared.speckle_contrast": 0.3,
+    "infrared.electrons_at_white": 5000.0,
+    "infrared.read_noise_e": 25.0,
+}
+
+
+@pytest.fixture(scope="module")
+def of_another_camera(renderer):
+    """Another lens, baseline, light and noise, with speckle; both pictures over the whole row."""
+    camera = InfraredCamera(**{k.split(".")[1]: v for k, v in SECOND.items() if "." in k})
+    sensor = SpeckleStereo(
+        width_px=520, height_px=420, focal_px=480.0, baseline_m=0.061, step_px=1, min_depth_m=0.5,
+        ambient=SECOND["ambient"], infrared=camera, matcher=BASE.matcher,
+        pattern=replace(BASE.pattern, seed=5, columns=480, rows=400), tan_half_width=0.8,
+    )  # fmt: skip
+    taken = []
+    for name, depth_m, gain in (("near", 0.9, 30.0), ("far", 1.4, 40.0), ("dim", 1.1, 12.0)):
+        seen = replace(sensor, infrared=replace(camera, fixed_gain=gain))
+        wall = square(depth_m, 1.5)
+        box = np.array([[depth_m - 0.01, -1.0, -0.8], [depth_m + 0.01, 1.0, 0.8]])
+        still, frames = StillRenderer(renderer, seed=3), []
+        for i in range(6):
+            still.rewind()
+            frames.append(seen.scan((wall,), box, POSE, still, np.random.default_rng([i, 7])))
+        off = replace(seen, projector_strength=1e-9)
+        dark = off.scan((wall,), box, POSE, renderer, np.random.default_rng(9)).images["left"]
+        left, right = ([f.images[side] for f in frames] for side in ("left", "right"))
+        taken.append(Pictures(name, left, right, [dark], frames[0].clean_m))
+    return sensor, taken
+
+
+def test_a_second_camera_with_speckle_and_its_baseline_are_found_together(of_another_camera):
+    sensor, taken = of_another_camera
+    base = replace(
+        sensor, baseline_m=0.05, ambient=0.2, pattern=replace(sensor.pattern, seed=8),
+        infrared=InfraredCamera(
+            psf_px=0.6, speckle_contrast=0.15, electrons_at_white=10_000, read_noise_e=60
+        ),
+    )  # fmt: skip
+    found = fit_pictures(taken, base)
+    assert found.focal_baseline == pytest.approx(480 * 0.061, rel=0.01)
+    for key in ("ambient", "infrared.psf_px", "infrared.speckle_contrast"):
+        assert key not in found.unknown
+        assert found.values[key] == pytest.approx(SECOND[key], rel=0.05), key
