@@ -8,10 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
 from qs3.errors import ConfigError
 from qs3.methods.sd import Sd, spoilt
+from tests.methods.parted import blobs
 from tests.methods.shapes import CLASSES, accuracy, tiny_net, train
 
 
@@ -128,18 +128,6 @@ def test_wrong_settings_name_the_key(settings: dict, message: str) -> None:
         Sd(**settings)
 
 
-def _blobs(right: Tensor | None, left: Tensor, generator: torch.Generator) -> Tensor:
-    """Three points at one of four corners on the right, if any, and seven at one on the left."""
-    corners = torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-
-    def blob(classes: Tensor, side: float, n: int) -> Tensor:
-        centre = torch.cat([torch.full((len(classes), 1), side), corners[classes]], 1)[:, None]
-        return 0.6 * centre + 0.05 * torch.randn(len(classes), n, 3, generator=generator)
-
-    seven = blob(left, -1.0, 7)
-    return torch.cat([seven[:, :3] if right is None else blob(right, 1.0, 3), seven], 1)
-
-
 @pytest.mark.slow
 def test_sd_learns_a_part_that_only_the_target_has() -> None:
     """The source's left side says nothing of the class, the target's does, and test clouds are cut.
@@ -156,9 +144,9 @@ def test_sd_learns_a_part_that_only_the_target_has() -> None:
         generator = torch.Generator().manual_seed(seed)
         labels = torch.arange(256) % CLASSES
         other, of_target = (torch.randint(CLASSES, (256,), generator=generator) for _ in range(2))
-        source = _blobs(labels, other, generator)
-        target = _blobs(of_target, of_target, generator)
-        held_out = _blobs(None, labels, generator)
+        source = blobs(labels, other, generator)
+        target = blobs(of_target, of_target, generator)
+        held_out = blobs(None, labels, generator)
         for i, w in enumerate((5.0, 0.0)):
             net = tiny_net(seed, norm=False)
             method = Sd(w, 0.9, teacher_temperature=0.5, student_temperature=0.5, cut="both")

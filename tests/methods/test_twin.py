@@ -14,6 +14,7 @@ from torch import Tensor
 from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
 from qs3.methods.twin import Twin, distillation, jensen_shannon
+from tests.methods.parted import blobs
 from tests.methods.shapes import CLASSES, accuracy, tiny_net, train
 
 OFF = dict.fromkeys(("twin_weight", "logit_weight", "feature_weight", "view_weight"), 0.0)
@@ -184,18 +185,6 @@ def test_wrong_settings_name_the_key(settings: dict[str, Any], message: str) -> 
         Twin(**settings)
 
 
-def _blobs(right: Tensor | None, left: Tensor, generator: torch.Generator) -> Tensor:
-    """Three points at one of four corners on the right, if any, and seven at one on the left."""
-    corners = torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-
-    def blob(classes: Tensor, side: float, n: int) -> Tensor:
-        centre = torch.cat([torch.full((len(classes), 1), side), corners[classes]], 1)[:, None]
-        return 0.6 * centre + 0.05 * torch.randn(len(classes), n, 3, generator=generator)
-
-    seven = blob(left, -1.0, 7)
-    return torch.cat([seven[:, :3] if right is None else blob(right, 1.0, 3), seven], 1)
-
-
 @pytest.mark.slow
 def test_a_cut_target_cloud_is_taken_for_what_it_was_before_the_cut() -> None:
     """The source's left side says nothing of the class, the target's another corner than the right.
@@ -208,10 +197,10 @@ def test_a_cut_target_cloud_is_taken_for_what_it_was_before_the_cut() -> None:
         generator = torch.Generator().manual_seed(seed)
         labels = torch.arange(256) % CLASSES
         other, of_target = (torch.randint(CLASSES, (256,), generator=generator) for _ in range(2))
-        source = _blobs(labels, other, generator)
+        source = blobs(labels, other, generator)
         left = (of_target + 1) % CLASSES
-        whole, cut = (_blobs(right, left, generator) for right in (of_target, None))
-        held_out = _blobs(None, (labels + 1) % CLASSES, generator)
+        whole, cut = (blobs(right, left, generator) for right in (of_target, None))
+        held_out = blobs(None, (labels + 1) % CLASSES, generator)
         for i, u in enumerate((2.0, 0.0)):
             net = tiny_net(seed, norm=False)
             method = Twin(**{**OFF, "target_weight": u}, momentum=0.9)
@@ -225,7 +214,7 @@ def test_a_cut_target_cloud_is_taken_for_what_it_was_before_the_cut() -> None:
 def _parts(labels: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Wholes, by which a class is plain, and what is left of them: a weak sign among strays."""
     b = len(labels)
-    whole = _blobs(labels, torch.randint(CLASSES, (b,), generator=generator), generator)
+    whole = blobs(labels, torch.randint(CLASSES, (b,), generator=generator), generator)
     sign = torch.tensor([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])[labels]
     part = torch.rand(b, 10, 3, generator=generator) * 2 - 1
     part[:, :, 1:] = part[:, :, 1:] + 0.35 * sign[:, None]
