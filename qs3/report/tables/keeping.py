@@ -13,9 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
+from qs3.errors import DataError
 from qs3.report.tables.aggregate import Run, load_runs
 from qs3.report.tables.cells import Table
-from qs3.runs.metrics import FINISHED, METRICS, write_metrics
+from qs3.runs.metrics import (
+    FINISHED,
+    METRICS,
+    RunMetrics,
+    read_metrics,
+    write_metrics,
+)
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
 
 DIGITS = 4
@@ -41,7 +48,8 @@ def keep(table: Table, folder: str | Path) -> list[Path]:
         if (run.folder / FILE).exists():
             said = read_predictions(run.folder / FILE)
             write_predictions(into / FILE, _rounded(said))
-        write_metrics(into, run.metrics)
+        if not _says_already(into, run.metrics):
+            write_metrics(into, run.metrics)
         if before != {name: _bytes(into / name) for name in before}:
             written.append(into)
     return written
@@ -62,6 +70,14 @@ def with_kept(runs: Iterable[Run], kept: str | Path | None) -> list[Run]:
     added = [run for run in load_runs(kept) if _name(run) not in done]
     known = {_name(run) for run in added}
     return [run for run in runs if _name(run) not in known] + added
+
+
+def _says_already(folder: Path, metrics: RunMetrics) -> bool:
+    """Whether it holds them; an older version did not write fields that have no value."""
+    try:
+        return read_metrics(folder) == metrics
+    except DataError:
+        return False
 
 
 def _rounded(said: Predictions) -> Predictions:

@@ -1,5 +1,6 @@
 """`report keep`: a table is the same from what is kept as from the runs themselves."""
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from qs3.report.tables.formats import markdown
 from qs3.report.tables.keeping import finished_runs, keep
 from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
+from qs3.runs.metrics import METRICS
 from qs3.runs.predictions import FILE, read_predictions, write_predictions
 from tests.commands import main
 from tests.report.tables.test_running import fill
@@ -75,3 +77,16 @@ def test_rounding_never_changes_a_prediction(file, tmp_path):
     write_predictions(run.folder / FILE, replace(said, probabilities=close))
     (into, *_) = keep(build_table(file, tmp_path / "logs"), tmp_path / "kept")
     assert (read_predictions(into / FILE).predicted == 1).all()
+
+
+def test_what_an_older_version_kept_stays_as_it_wrote_it(file, tmp_path):
+    table = fill(tmp_path / "logs", file, {("DANN", PLACE): 14})
+    first, second, _ = keep(table, tmp_path / "kept")
+    older = json.loads((first / METRICS).read_text())
+    del older["quality"]["trust"]  # there was a version without this field
+    (first / METRICS).write_text(before := json.dumps(older))
+    whole = (second / METRICS).read_text()
+    (second / METRICS).write_text("{}")
+    assert keep(table, tmp_path / "kept") == [second]
+    assert (first / METRICS).read_text() == before
+    assert (second / METRICS).read_text() == whole
