@@ -48,12 +48,18 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
         try:
             return compose(command, list(overrides), **more)
         except HydraException as error:
-            raise ConfigError(f"{place}{first_line(error)}") from error
+            raise ConfigError(f"{place}{first_line(error)}{_there(error)}") from error
 
 
 def choices(group: str) -> list[str]:
     """Names of the files of a config group, sorted: `choices("domain")`."""
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def _there(error: BaseException) -> str:
+    """The choices that there are, if a group has not the one that was asked for."""
+    options = getattr(error, "options", None)  # of Hydra's MissingConfigException
+    return f"; there are {', '.join(options)}" if options else ""
 
 
 def first_line(error: BaseException) -> str:

@@ -87,11 +87,11 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     lines = [] if settings.ckpt else [chosen(ckpt, source)]
     lines += [taken] * bool(taken)
     lines += told(rows, records, inputs, predictor, settings, seconds)
-    lines.append(verdict)
-    if second:
-        lines.append(agreement(rows, classes))
-    lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
-    lines += [f"what it is worth: {worth}"] * bool(worth)
+    if any(row.probabilities is not None for row in rows):  # else nothing was said to be judged
+        lines.append(verdict)
+        lines += [agreement(rows, classes)] if second else []
+        lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
+        lines += [f"what it is worth: {worth}"] * bool(worth)
     if out.suffix.lower() == ".json":
         text = as_json(records, classes, predictor.result.target, trust)
     else:
@@ -99,7 +99,8 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     lines.append(_save(out, text))
     if settings.page:
         title = f"{Path(settings.input or settings.depth).name}, as {ckpt} sees it"
-        html = page(title, rows, gallery, classes, trained_on, worth, taken, verdict)
+        where = _floor_m(settings, predictor)
+        html = page(title, rows, gallery, classes, trained_on, worth, taken, verdict, where)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
 
@@ -111,6 +112,15 @@ def _floor(source: Source, settings: Settings, predictor: Predictor) -> Floor | 
     """
     known = bool(settings.ckpt) and predictor.camera_height is not None
     return None if known or source.floor is None or source.floor.z is None else source.floor
+
+
+def _floor_m(settings: Settings, predictor: Predictor) -> float | None:
+    """Where the net takes the floor to be; None if it knows no heights."""
+    if not predictor.needs_floor:
+        return None
+    if settings.camera_height is not None:
+        return -settings.camera_height
+    return predictor.result.floor_m if settings.floor is None else settings.floor
 
 
 def _trained_on(ckpt: str) -> str:

@@ -13,7 +13,7 @@ from html import escape
 
 import numpy as np
 
-from qs3.evaluation.ood import MEASURES
+from qs3.evaluation.ood import MEASURES, OF_HEIGHTS, OF_METRES
 from qs3.inference.inputs import Sample
 from qs3.inference.scores import DISPUTED, STRANGE, Count, Scores, disputed, kinds, right, scores
 from qs3.inference.table import Row
@@ -24,6 +24,7 @@ from qs3.utils.version import VERSION
 MOST_SHOWN = 300
 """Objects with pictures; the others are in the table alone."""
 
+_MEANINGS = {**MEASURES, **OF_METRES, **OF_HEIGHTS}
 _FEW, _COLLAPSED = 20, 0.8
 """With so many predictions and such a share of one class the page has a caution."""
 
@@ -101,6 +102,7 @@ def page(
     worth: str = "",
     floor: str = "",
     verdict: str = "",
+    floor_m: float | None = None,
 ) -> str:
     """The page as HTML.
 
@@ -113,6 +115,7 @@ def page(
         worth: what it was found to be worth on real objects; likewise.
         floor: how it is known where that is, if the objects were asked.
         verdict: how many are expected to be right, without a look at labels; likewise.
+        floor_m: z of the floor, if the net knows heights: cards say how high an object begins.
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
@@ -134,7 +137,9 @@ def page(
         ("Right", "the least confident first", True),
         ("Without a label" if found else "Predicted", "what is in doubt first", None),
     ):
-        cards = [_card(row, of, classes) for row, of in shown if right(row, classes) is wanted]
+        cards = [
+            _card(row, of, classes, floor_m) for row, of in shown if right(row, classes) is wanted
+        ]
         if cards:
             total = sum(
                 row.probabilities is not None and right(row, classes) is wanted for row in rows
@@ -235,7 +240,7 @@ def _matrix(found: Scores, classes: Sequence[str]) -> str:
     return f"<div><h2>What was called what</h2>{table}</div>"
 
 
-def _card(row: Row, sample: Sample, classes: Sequence[str]) -> str:
+def _card(row: Row, sample: Sample, classes: Sequence[str], floor_m: float | None) -> str:
     """One object: pictures, what it was called and is, and what was wrong with its cloud."""
     assert row.probabilities is not None
     order = np.argsort(-row.probabilities, kind="stable")
@@ -254,7 +259,7 @@ def _card(row: Row, sample: Sample, classes: Sequence[str]) -> str:
     if disputed(row, classes):
         tags.append(f'<span class="tag">{DISPUTED}: {escape(row.second)}</span>')
     tier = f", {row.tier}" if row.tier else ""
-    size = f"<br>{_size(_z_up(sample))}" if sample.tier or sample.picture else ""
+    size = f"<br>{_size(_z_up(sample), floor_m)}" if sample.tier or sample.picture else ""
     return (
         f'<div class="card {style}{" two" * (len(images) > 1)}">{"".join(images)}'
         f'<span class="bar" style="width:{sure:.0%}"></span>'
@@ -266,15 +271,21 @@ def _card(row: Row, sample: Sample, classes: Sequence[str]) -> str:
 
 def _strange(words: str) -> str:
     """A measure out of the range of training, explained when pointed at."""
-    meaning = MEASURES.get(words.split(" ")[0], "")
+    meaning = _MEANINGS.get(words.split(" ")[0], "")
     return f'<span class="tag" title="{escape(meaning)}">{STRANGE}: {escape(words)}</span>'
 
 
-def _size(cloud: np.ndarray) -> str:
-    """How large it is: a chair's back and a monitor look alike when both fill their card."""
+def _size(cloud: np.ndarray, floor_m: float | None) -> str:
+    """How large it is: a chair's back and a monitor look alike when both fill their card.
+
+    And how high it begins where the floor is known: what a net that knows heights goes by, too.
+    """
     angles = np.linspace(0, np.pi, 18, endpoint=False)
     across = cloud[:, :2] @ np.stack([np.cos(angles), np.sin(angles)])  # [n, 18]
-    return f"{np.ptp(across, axis=0).max():.2f} m wide, {np.ptp(cloud[:, 2]):.2f} m high"
+    size = f"{np.ptp(across, axis=0).max():.2f} m wide, {np.ptp(cloud[:, 2]):.2f} m high"
+    if floor_m is None:
+        return size
+    return f"{size}, from {cloud[:, 2].min() - floor_m:.2f} m above the floor"
 
 
 def _z_up(sample: Sample) -> np.ndarray:

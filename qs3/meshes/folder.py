@@ -131,6 +131,10 @@ class MeshFolder:
                 folders.setdefault(cls, []).append(entry)
         missing = [name for name in self._wanted if name not in folders]
         if not folders or not set(missing) <= set(self.optional):
+            if not folders and (below := self._below()):
+                raise MissingDataError(
+                    f"the folders of classes are not in {self.path}, but in {below}: give that one"
+                )
             there = [name for name in self.known if name in folders]
             rest = f"leave them out with classes=[{','.join(there)}]" if there else LAYOUTS
             others = ", ".join(map(repr, self.left_alone()))
@@ -140,6 +144,17 @@ class MeshFolder:
                 f"{', '.join((*self.known, *ALIASES))}" * bool(others)
             )
         return folders
+
+    def _below(self) -> Path | None:
+        """The one folder in the root with folders of wanted classes, as archives unpack."""
+        found = [
+            folder
+            for folder in _visible(self.path)
+            if folder.is_dir()
+            and not folder.is_symlink()
+            and any(known_as(name, self.known) in self._wanted for name in _folders_in(folder))
+        ]
+        return found[0] if len(found) == 1 else None
 
     def _groups(self, cls: str, folders: Sequence[Path]) -> dict[str, dict[str, Path]]:
         """Split -> stem -> file of one class, `skip` applied."""
@@ -255,6 +270,11 @@ def _visible(folder: Path) -> list[Path]:
         for entry in sorted(folder.iterdir())
         if not entry.name.startswith(".") and entry.name != "__MACOSX"
     ]
+
+
+def _folders_in(folder: Path) -> list[str]:
+    """Their names; of a folder that cannot be read none."""
+    return next(os.walk(folder), ("", [], []))[1]
 
 
 def _mesh_below(folder: Path) -> Path | None:

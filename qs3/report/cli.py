@@ -254,12 +254,23 @@ KEEP = Command(
     ),
 )
 
+_PAIRED = """
+Paired over test clouds and the seeds that both have, two at least; accuracy and balanced accuracy,
+and both of each tier where the target has tiers. Intervals are at 95 %, over seeds and what clouds
+share: meshes, rooms or blocks of frames. * marks those that do not reach 0.
+"""
+
 COMPARE = Command(
     "qs3 report compare",
     "the difference of each row to one row, with its interval",
     _compare,
-    (*_TABLE, Option("base", text("ROW"), "the row that the others are compared with"), _OUT),
+    (
+        *_TABLE,
+        Option("base", text("ROW"), "the row to compare with; without it all are named"),
+        _OUT,
+    ),
     ('qs3 report compare table=cad10 base="source only"',),
+    about=_PAIRED,
 )
 
 EFFECTS = Command(
@@ -268,6 +279,7 @@ EFFECTS = Command(
     _effects,
     (*_TABLE, _OUT),
     ("qs3 report effects table=factorial", "qs3 report effects table=headline"),
+    about=_PAIRED,
 )
 
 PAGE = Command(

@@ -6,6 +6,7 @@ import pytest
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
+from qs3.config.compose import choices, composed
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from tests.training.toy import toy_config
@@ -50,3 +51,12 @@ def test_tags(tmp_path):
     ]  # fmt: skip
     cfg = toy_config(tmp_path, "logger=wandb", "selftraining=none", "domain@data.target=scannet10")
     assert cfg.logger.wandb.tags == ["specklenet10 -> scannet10", "pcm", "tinynet"]
+
+
+def test_a_choice_that_is_none_is_told_those_that_are():
+    with pytest.raises(ConfigError, match=r"^here: .*'light/nothing'; there are ") as caught:
+        composed("generate", "light=nothing", place="here: ")
+    assert str(caught.value).endswith("; there are " + ", ".join(choices("light")))
+    with pytest.raises(ConfigError, match="lihgt") as caught:  # no such key: nothing to list
+        composed("generate", "lihgt=even")
+    assert "there are" not in str(caught.value)

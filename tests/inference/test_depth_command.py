@@ -132,6 +132,27 @@ def test_the_camera_s_height_is_for_nets_that_know_heights(high_net, frame, caps
     assert np.abs(np.subtract(found[0], found[2])).max() > 1e-3
 
 
+def test_the_page_says_how_high_objects_begin_if_the_net_knows_heights(run, high_net, frame):
+    up = ",".join(map(str, SHOT.up_in_camera))
+    words = [f"depth={frame}/depth.png", f"mask={frame}/mask.png", f"intrinsics={CAMERA}"]
+    assert predict(high_net, frame / "said.csv", *words, f"up={up}", "camera_height=1.9") == 0
+    page = (frame / "said.html").read_text()
+    begins = [float(m) for m in re.findall(r"high, from (-?[\d.]+) m above the floor", page)]
+    stand = 1.9 - SHOT.height_m  # the rod, before a camera that hangs lower; the ball 5 cm higher
+    assert sorted(begins) == pytest.approx([stand, stand + 0.05], abs=0.03)
+    assert predict(run, frame / "said.csv", *words, f"up={up}") == 0
+    assert "above the floor" not in (frame / "said.html").read_text()
+
+
+def test_of_nothing_predicted_nothing_is_judged(run, frame, capsys):
+    words = [f"depth={frame}/depth.png", f"intrinsics={CAMERA}", "box=900,1,950,40"]
+    assert predict(run, frame / "said.csv", *words) == 1
+    said = capsys.readouterr().out
+    assert "lies outside the image" in said
+    assert "cannot be told" not in said
+    assert "the classifier's data" not in said
+
+
 def test_a_box_without_gravity_and_metres_in_npy(run, frame):
     depth, mask = seen()
     np.save(frame / "metres.npy", np.where(depth > 0, depth / 1000, np.nan))

@@ -88,6 +88,16 @@ def test_unknown_folders(tmp_path):
     assert len(MeshFolder(tmp_path, classes=("chair",)).left_alone()) == 11
 
 
+def test_the_folder_that_an_archive_unpacks_to_is_named(tmp_path):
+    make(tmp_path, "raw/chair/train/a.off", "raw/airplane/train/a.off", "notes/chairs/a.txt")
+    with pytest.raises(MissingDataError, match=r"but in .*raw: give that one"):
+        MeshFolder(tmp_path, classes=("chair",)).items()
+    assert ids(tmp_path / "raw", classes=("chair",)) == ["chair/train/a"]
+    make(tmp_path, "copy/chair/train/a.off")  # two of them: it is not said which
+    with pytest.raises(MissingDataError, match="has no folder of chair"):
+        MeshFolder(tmp_path, classes=("chair",)).items()
+
+
 @pytest.mark.parametrize("settings", [{}, {"classes": ("chair", "plant")}])
 def test_missing_classes_and_roots(tmp_path, settings):
     with pytest.raises(MissingDataError, match="no folder of meshes"):

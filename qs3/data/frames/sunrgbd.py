@@ -127,11 +127,11 @@ def open_image(root: Path, frame: Frame) -> DepthImage:
     (path,) = found
     if not path.resolve().is_relative_to(root.resolve()):
         raise DataError(f"{path} is a link that leads out of {root}; copy the files instead")
-    return DepthImage(
-        millimetres(read_png(png_bytes(path), str(path)), str(path)) / 1000.0,
-        frame.camera,
-        frame.world_from_camera,
-    )
+    try:
+        depth_mm = millimetres(read_png(png_bytes(path), str(path)), str(path))
+    except DataError as error:
+        raise DataError(f"{error}; unpack SUNRGBD.zip again") from error
+    return DepthImage(depth_mm / 1000.0, frame.camera, frame.world_from_camera)
 
 
 def millimetres(rotated: np.ndarray, where: str) -> np.ndarray:

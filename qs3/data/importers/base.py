@@ -83,6 +83,11 @@ class Importer(abc.ABC):
         """The folder as an absolute path."""
         return Path(self.folder).absolute()
 
+    @property
+    def place(self) -> Path:
+        """What messages about all clouds name: the folder, or the one file that holds them."""
+        return self.root
+
     @abc.abstractmethod
     def looks_for(self) -> list[str]:
         """The files it reads, as patterns with the whole path, for a message."""
@@ -138,7 +143,7 @@ class Importer(abc.ABC):
                 does not occur in a split, if the dataset is `complete`.
         """
         clouds, rows = [], []
-        for row, where, load in shown(self.items(classes), f"importing {self.root.name}"):
+        for row, where, load in shown(self.items(classes), f"importing {self.place.name}"):
             try:
                 raw = load()
                 cloud = check_cloud(self.thin(raw, where), self.points, where)
@@ -149,8 +154,8 @@ class Importer(abc.ABC):
                 continue
             clouds.append(self.turn(cloud, row.cls))
             rows.append(dataclasses.replace(row, valid_points=len(raw)))
-        _check_complete(rows, classes, self.root, strict=self.complete)
-        _report(rows, self.points, self.root)
+        _check_complete(rows, classes, self.place, strict=self.complete)
+        _report(rows, self.points, self.place)
         return clouds, rows
 
     def settings(self) -> dict[str, Any]:

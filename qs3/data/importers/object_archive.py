@@ -169,6 +169,11 @@ class ObjectArchive(Importer):
         """Where the .npz lies."""
         return self.root / Path(self.file).expanduser()
 
+    @property
+    def place(self) -> Path:
+        """See `Importer`."""
+        return self.path
+
     def made_of(self) -> MadeOf:
         """See `Importer`."""
         return MadeOf(objects=f"real objects cut from depth images, archive {self.path.name}")

@@ -84,7 +84,7 @@ are imported first.
 """,
     bare="domain",
     others={"": _KEYS},
-    interrupted="nothing was saved",
+    interrupted="nothing was saved but frames that an import had cut: the same command goes on",
 )
 
 COMPARE = Command(
@@ -104,5 +104,5 @@ one object of each class from both, as a picture.
 """,
     words="A B",
     others={"": f"{_KEYS}, of both; a.KEY and b.KEY of one"},
-    interrupted="nothing was saved",
+    interrupted="nothing was saved but frames that an import had cut: the same command goes on",
 )

@@ -33,12 +33,12 @@ def columns(rows: Sequence[ManifestRow], meta: Mapping[str, Any]) -> dict[str, A
     counts: dict[str, dict[str, dict[str, int]]] = {}
     for column in _SHOWN:
         found: dict[str, Counter[str]] = {}
-        for row in kept:
+        for row in sorted(kept, key=lambda row: row.cls):  # however splits lie in the manifest
             if value := row.more.get(column):
                 found.setdefault(row.cls, Counter())[value] += 1
         if found:
             counts[column] = {cls: dict(sorted(of.items())) for cls, of in found.items()}
-    refused = Counter(row.cls for row in rows if row.status != OK and row.cls)
+    refused = Counter(sorted(row.cls for row in rows if row.status != OK and row.cls))
     return {"names": names, "counts": counts, "refused": dict(refused)}
 
 

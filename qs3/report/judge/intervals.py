@@ -8,7 +8,10 @@ about the mean, for balanced accuracy about the recall of its class.
 
 Of one seed the interval is over blocks alone. It is no wider than [0, 1]. A class that was seen
 in one block alone adds nothing to the variance of balanced accuracy, although nobody knows how it
-varies from room to room: with such classes that interval is too narrow.
+varies from room to room: with such classes that interval is too narrow. With few rooms it is so
+anyway: of balanced differences over 13 of them it held the truth in 88 % of cases, where the one of
+`qs3.report.tables.paired`, about the mean of all objects, did in 95
+(tests/report/balanced_coverage.py).
 """
 
 from __future__ import annotations

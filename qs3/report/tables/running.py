@@ -73,7 +73,7 @@ def missing(
         if words and not cells:
             raise ConfigError(
                 f"no {kind} of table {table.name} has {' or '.join(map(repr, words))} in its name; "
-                f"{kind}s to run are {', '.join(names)}"
+                f"{kind}s to run are {', '.join(map(repr, names))}"
             )
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in sorted(cells, key=lambda cell: not cell.first):

@@ -96,7 +96,7 @@ def test_the_raw_depth_is_taken(copy):
     first = sorted(at.rglob("depth/*.png"))[0]
     whole = first.read_bytes()
     first.write_bytes(whole[: len(whole) // 2])
-    refused(copy, "broken off")
+    refused(copy, r"broken off; unpack SUNRGBD\.zip again")
     first.write_bytes(cv2.imencode(".png", np.zeros((20, 20), np.uint8))[1].tobytes())
     refused(copy, "16 bits")
     first.rename(copy / "elsewhere.png")

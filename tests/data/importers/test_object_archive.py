@@ -99,6 +99,8 @@ def test_what_looks_at_the_part_that_judges_says_so(file, tmp_path, caplog):
     compose_domain("nyuv2", {}).tell_of_judging()
     compose_domain("roomscan10", {}).tell_of_judging()
     assert "judges" not in caplog.text
+    assert f"{path}: " in caplog.text  # not the folder where published files usually are
+    assert f"{tmp_path / 'published'}: " not in caplog.text
     open_named("objects", keys)
     assert "looks at what judges, part judge of mine.npz" in caplog.text
     domain(path, tmp_path).tell_of_judging("data.target.")

@@ -27,6 +27,14 @@ def test_counts_by_class_with_names_that_do_not_occur():
     assert "left out, for reasons that manifest.csv gives: chair 1" in said
 
 
+def test_classes_have_one_order_in_all_tables():
+    """As in the other tables, also where a class is in one split alone."""
+    rows = [row(0, "sofa", tier="clean"), row(1, "bed", tier="hard"), row(2, "lamp", "skipped")]
+    facts = columns.columns([*rows, row(3, "bathtub", "skipped")], {})
+    assert list(facts["counts"]["tier"]) == ["bed", "sofa"]
+    assert list(facts["refused"]) == ["bathtub", "lamp"]
+
+
 def test_other_datasets_have_nothing_to_say():
     assert columns.columns([ManifestRow("a", "chair", "test")], {}) == {}
     assert columns.text({}) == []

@@ -173,7 +173,7 @@ def test_what_is_published_alone_is_never_run(pointda, tmp_path):
     assert all(command.startswith("python train.py experiment=") for command in to_run(pointda))
     with pytest.raises(ConfigError, match="has 'PCFEA' in its name") as caught:
         missing(replace(pointda, rows={"PCM": pointda.rows["PCM"]}), [0], ["PCFEA"])
-    assert "rows to run are PCM" in str(caught.value)
+    assert "rows to run are 'PCM'" in str(caught.value)
 
 
 def test_failed_seeds_are_in_every_format(tmp_path):
