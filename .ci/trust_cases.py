@@ -8,7 +8,8 @@ Nets are those of `.ci/trust_nets.py`, the classifiers that come with qs3 (`ship
 them out), and finished runs: `runs=` names their folders, or the folder of an experiment.
 `.ci/trust_targets.py` has the targets. A net that the table has is not asked again. With
 `answers=FOLDER` the classes that each net names, and a second classifier of the same clouds, are
-kept there, of which `agree` makes a table. `turns=false` asks no net about turned clouds.
+kept there, of which `agree` makes a table. `turns=false` asks no net about turned clouds,
+`targets=real` of real targets alone.
 """
 
 from __future__ import annotations
@@ -54,6 +55,7 @@ class Asked(NamedTuple):
         views: of these, as far as they were made before.
         answers: folder for what is named; None keeps nothing.
         turns: whether nets are asked about turned clouds, too.
+        only: `left_out` of the targets that are asked about; of all if there are none.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Asked(NamedTuple):
     views: dict[Any, View]
     answers: Path | None
     turns: bool
+    only: tuple[str, ...]
 
 
 _VIEWS: dict[Any, View] = {}  # of this process
@@ -120,6 +123,7 @@ def cases_of(asked: Asked) -> list[dict[str, Any]]:
     _VIEWS.update(asked.views)
     net = net_of(asked)
     every = wanted(net.name, net.scale, asked.every)
+    every = [one for one in every if not asked.only or one.left_out in asked.only]
     rows, named = [], {}
     for target in every:
         row, named[target.name] = case(net, target, view_of(target, net))
@@ -147,6 +151,7 @@ def make_cases(given: dict[str, str]) -> None:
     data, out = Path(given["data"]), Path(given["out"])
     answers = Path(given["answers"]) if "answers" in given else None
     turns = given.get("turns", "true") == "true"
+    only = tuple(filter(None, given.get("targets", "").split(",")))
     out.parent.mkdir(parents=True, exist_ok=True)
     every = {target.name: target for target in targets(data, Path(given["objects"]))}
     until = time.monotonic() + float(given.get("wait", "0"))
@@ -156,11 +161,12 @@ def make_cases(given: dict[str, str]) -> None:
             of_small = [(one, POINTS, "unit_ball") for one in every.values()]
             views = dict(pool.imap_unordered(prepared, of_small))
         under_way: dict[str, AsyncResult] = {}
+        names = missing(given, out)
         while True:
-            for name in missing(given, out):
+            for name in names:
                 if name not in under_way:
                     seen = views if name.endswith(".pt") else {}
-                    asked = Asked(name, data, every, seen, answers, turns)
+                    asked = Asked(name, data, every, seen, answers, turns, only)
                     under_way[name] = pool.apply_async(cases_of, (asked,))
             for name in [name for name, result in under_way.items() if result.ready()]:
                 append(out, rows := under_way.pop(name).get())
@@ -168,6 +174,7 @@ def make_cases(given: dict[str, str]) -> None:
             if not under_way and time.monotonic() > until:
                 return
             time.sleep(2)
+            names = missing(given, out) if time.monotonic() <= until else []
 
 
 def missing(given: dict[str, str], out: Path) -> list[str]:
@@ -175,7 +182,7 @@ def missing(given: dict[str, str], out: Path) -> list[str]:
     done = {(row["net"], row["source"], row["seed"]) for row in read(out)}
     found = []
     if "nets" in given:
-        files = Path(given["nets"]).glob("[!.]*.pt")
+        files = sorted(Path(given["nets"]).glob("[!.]*.pt"))
         found += [str(path) for path in files if tuple(path.stem.split("-")) not in done]
     if given.get("shipped", "true") == "true":
         found += [name for name in SEEN_BY if (name, "shipped", "0") not in done]
@@ -183,7 +190,7 @@ def missing(given: dict[str, str], out: Path) -> list[str]:
         name = run_name(folder)
         if name and tuple(map(str, name)) not in done:
             found.append(str(folder))
-    return sorted(found)
+    return found
 
 
 def runs_in(names: str) -> list[Path]:
