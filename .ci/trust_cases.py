@@ -2,14 +2,14 @@
 
     python .ci/trust_cases.py cases data=data nets=out/trust objects=FILE.npz out=CASES.csv jobs=2
     python .ci/trust_cases.py cases data=data runs=LOGS/EXPERIMENT objects=FILE.npz out=CASES.csv
-    python .ci/trust_cases.py agree cases=CASES.csv answers=out/answers out=AGREEMENT.csv
+    python .ci/trust_cases.py agree cases=FOLDER answers=out/answers
 
 Nets are those of `.ci/trust_nets.py`, the classifiers that come with qs3 (`shipped=false` leaves
 them out), and finished runs: `runs=` names their folders, or the folder of an experiment.
 `.ci/trust_targets.py` has the targets. A net that the table has is not asked again. With
 `answers=FOLDER` the classes that each net names, and a second classifier of the same clouds, are
-kept there, of which `agree` makes a table. `turns=false` asks no net about turned clouds,
-`targets=real` of real targets alone.
+kept there, of which `agree` makes agreement.csv beside cases.csv and adapted.csv. `turns=false`
+asks no net about turned clouds, `targets=real` asks about real targets alone.
 """
 
 from __future__ import annotations
@@ -220,17 +220,23 @@ def append(path: Path, rows: Iterable[dict[str, Any]], columns: Sequence[str] = 
 
 
 def make_agreement(given: dict[str, str]) -> None:
-    """Write how much less often than on held-out clouds others say the same as each case's net."""
-    answers, out = Path(given["answers"]), Path(given["out"])
-    out.unlink(missing_ok=True)
+    """Write how much less often than on held-out clouds others say the same as each case's net.
+
+    Nets whose answers were not kept are left out.
+    """
+    answers, folder = Path(given["answers"]), Path(given["cases"])
     files: dict[tuple[str, ...], dict[str, np.ndarray]] = {}
-    rows = read(Path(given["cases"]))
-    for row in rows:
+    rows = []
+    for row in read(folder / "cases.csv") + read(folder / "adapted.csv"):
         key = (row["net"], row["source"], row["seed"])
-        if key not in files:
-            with np.load(answers / f"{'-'.join(key)}.npz") as file:
-                files[key] = dict(file)
-    append(out, [_agreement(row, files) for row in rows], AGREEMENT)
+        path = answers / f"{'-'.join(key)}.npz"
+        if path.is_file():
+            rows.append(row)
+            if key not in files:
+                with np.load(path) as file:
+                    files[key] = dict(file)
+    (folder / "agreement.csv").unlink(missing_ok=True)
+    append(folder / "agreement.csv", [_agreement(row, files) for row in rows], AGREEMENT)
 
 
 def _agreement(

@@ -95,15 +95,15 @@ def test_agreement_by_hand(tmp_path):
     answers(0, "0123", "0123", "0129", "0999")
     answers(2, "0123", "0199", "9999", "0123")
     cases = tmp_path / "cases.csv"
-    cases.write_text("net,source,seed,target\nn,S,0,T\nn,S,2,T\n")
-    given = {"answers": str(tmp_path), "cases": str(cases), "out": str(tmp_path / "out.csv")}
+    cases.write_text("net,source,seed,target\nn,S,0,T\nn,S,2,T\nother,S,0,T\n")
+    given = {"answers": str(tmp_path), "cases": str(tmp_path)}
     trust_cases.make_agreement(given)
-    first, second = trust_cases.read(tmp_path / "out.csv")
+    first, second = trust_cases.read(tmp_path / "agreement.csv")
     assert (first["second"], first["seeds"]) == ("0.5000", "0.5000")  # 3/4 - 1/4, 1 - 1/2
     assert (second["second"], second["seeds"]) == ("0.0000", "0.5000")  # more than held out: 0
     cases.write_text("net,source,seed,target\nn,S,0,T\n")
     trust_cases.make_agreement(given)
-    (alone,) = trust_cases.read(tmp_path / "out.csv")
+    (alone,) = trust_cases.read(tmp_path / "agreement.csv")
     assert (alone["second"], alone["seeds"]) == ("0.5000", "")
 
 
