@@ -242,10 +242,11 @@ def make_agreement(given: dict[str, str]) -> None:
 def _agreement(
     row: dict[str, str], files: dict[tuple[str, ...], dict[str, np.ndarray]]
 ) -> dict[str, Any]:
-    """Of one case; `seeds` is empty where no net differs in its seed alone."""
+    """Of one case; `seeds` is empty if no net of another seed was asked about its target."""
     net, source, seed = row["net"], row["source"], row["seed"]
     own, target = files[net, source, seed], row["target"]
-    seeds = sorted((key[2] for key in files if key[:2] == (net, source)), key=int)
+    asked = [key for key in files if key[:2] == (net, source) and target in files[key]]
+    seeds = sorted((key[2] for key in asked), key=int)
     following = seeds[(seeds.index(seed) + 1) % len(seeds)]
     other = files[net, source, following]
     found = {key: row[key] for key in AGREEMENT[:4]}

@@ -159,7 +159,7 @@ def main(given: dict[str, str]) -> None:
     lines = [score(name, Fitted(rows, column(rows, key))) for name, key in CONFIDENCES.items()]
     for rule, asks in RULES.items():
         some = [row for row in rows if all(row[name] for name in asks)]
-        if some:
+        if len({target_of(row) for row in some}) > 1:
             lines.append(score(f"rule {rule}", left_out(asks, some)))
             if len(some) < len(rows):
                 lines.append(score("rule alone, the same cases", left_out(ALONE, some)))

@@ -101,9 +101,11 @@ def test_agreement_by_hand(tmp_path):
     first, second = trust_cases.read(tmp_path / "agreement.csv")
     assert (first["second"], first["seeds"]) == ("0.5000", "0.5000")  # 3/4 - 1/4, 1 - 1/2
     assert (second["second"], second["seeds"]) == ("0.0000", "0.5000")  # more than held out: 0
-    cases.write_text("net,source,seed,target\nn,S,0,T\n")
+    arrays = dict(np.load(tmp_path / "n-S-0.npz"))
+    np.savez(tmp_path / "n-S-0.npz", **arrays, U=arrays["T"], **{"second/U": arrays["second/T"]})
+    cases.write_text("net,source,seed,target\nn,S,0,U\nn,S,2,T\n")
     trust_cases.make_agreement(given)
-    (alone,) = trust_cases.read(tmp_path / "agreement.csv")
+    alone, _ = trust_cases.read(tmp_path / "agreement.csv")  # seed 2 was not asked about U
     assert (alone["second"], alone["seeds"]) == ("0.5000", "")
 
 
