@@ -1,13 +1,15 @@
 """The cases on which `qs3.evaluation.trust` is calibrated: nets, targets, shifts and the truth.
 
     python .ci/trust_cases.py cases data=data nets=out/trust objects=FILE.npz out=CASES.csv jobs=2
-    python .ci/trust_cases.py fit cases=CASES.csv out=qs3/evaluation/trust_weights.json
+    python .ci/trust_cases.py cases data=data runs=LOGS/EXPERIMENT objects=FILE.npz out=CASES.csv
+    python .ci/trust_cases.py agree cases=FOLDER answers=out/answers
 
-Nets are those of `.ci/trust_nets.py` and the classifiers that come with qs3. Targets are scans of
-test meshes, which no net has seen, as the stores `data/test_NAME` (docs/results/trust.md has the
-commands), the sample of room scans that comes with qs3, and an archive of real objects, of which
-only the part `adapt` is looked at. At most 150 clouds of each, at even steps. A case that the
-table has is not made again.
+Nets are those of `.ci/trust_nets.py`, the classifiers that come with qs3 (`shipped=false` leaves
+them out), and finished runs: `runs=` names their folders, or the folder of an experiment.
+`.ci/trust_targets.py` has the targets. A net that the table has is not asked again. With
+`answers=FOLDER` the classes that each net names, and a second classifier of the same clouds, are
+kept there, of which `agree` makes agreement.csv beside cases.csv and adapted.csv. `turns=false`
+asks no net about turned clouds, `targets=real` asks about real targets alone.
 """
 
 from __future__ import annotations
@@ -15,8 +17,8 @@ from __future__ import annotations
 import csv
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from multiprocessing import get_context
 from multiprocessing.pool import AsyncResult
 from pathlib import Path
@@ -24,205 +26,72 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.stats import spearmanr
-from trust_nets import MODELS, POINTS, SOURCES, labelled, parts
+from trust_known import SEEN_BY, Net, run_name, run_net, second, shipped_net, small_net, turned
+from trust_nets import POINTS
+from trust_targets import Target, View, targets, view
 
 from qs3.classes import CLASSES
-from qs3.data.importers.arrays import named_arrays
-from qs3.data.importers.object_archive import read_archive
-from qs3.data.store import open_pointset
-from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.fps_samples import sample
+from qs3.errors import DataError
 from qs3.evaluation.confidences import estimates
-from qs3.evaluation.metrics import predict, predict_rotated
-from qs3.evaluation.trust import (
-    LEAST_TRUSTED,
-    Known,
-    Seen,
-    compared,
-    fit_weights,
-    left_out_estimates,
-    shifts,
-)
-from qs3.evaluation.trust_file import SHIFTS, Calibration, write_calibration
-from qs3.inference.held_out import tensors_of
-from qs3.inference.model_file import values_of
-from qs3.inference.model_folder import CARD, write_folder
-from qs3.inference.predictor import Predictor, load
-from qs3.inference.pretrained import FOLDER
-
-MOST, TURNED, KNOWN = 150, 75, 50
-"""Clouds of a target, how many of these are turned, and of each kind that a shipped net knows."""
-
-STORES = {
-    "M": "test_modelnet10",
-    "S": "test_specklenet10",
-    "S_1": "test_specklenet10_view",
-    "S_K": "test_specklenet10_kinect",
-    "S_tof": "test_specklenet10_tof",
-}
-ROOMS = {"R": "sample_kinect", "R_d435": "sample_d435", "R_tof": "sample_tof"}
-SEEN_BY = {
-    "dgcnn-speckle": {"M", "S_1", "S_K", *ROOMS},
-    "pointnet-speckle": {"M", "S_1", "S_K", *ROOMS},
-    "dgcnn-rooms": {*ROOMS},
-}
-"""What the classifiers that come with qs3 learnt from: their labelled clouds, and no targets."""
-
-FLOOR = {"real": -1.18, "rooms": 0.0}
-"""z of the floor, of targets in metres of which it is known."""
+from qs3.evaluation.metrics import predict
+from qs3.evaluation.trust import Seen, shifts
+from qs3.inference.predictor import load
+from qs3.runs.folder import METRICS
 
 FIRST = ("net", "source", "seed", "target", "left_out", "clouds", "held_out", "accuracy")
-ALONE = ("unsure", "thresholded", "answers", "shapes", "outside", "counts")
-"""Shifts that take nothing but the clouds and the net's answers."""
-
 CONFIDENCE = ("calibrated", "thresholded_confidence", "difference")
+SHIFTS = ("unsure", "thresholded", "answers", "shapes", "outside", "counts", "turns")
 COLUMNS = (*FIRST, *CONFIDENCE, *SHIFTS)
+AGREEMENT = ("net", "source", "seed", "target", "second", "seeds")
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
-    """Clouds with their classes; `left_out` names what is never on both sides of a fit."""
+class Asked(NamedTuple):
+    """What a process needs to make the cases of one net.
 
-    name: str
-    left_out: str
-    clouds: list[np.ndarray]
-    labels: np.ndarray
-    floor: float | None = None
-
-    def few(self, most: int = MOST) -> Target:
-        """At most so many, at even steps."""
-        take = np.unique(np.linspace(0, len(self.labels) - 1, min(most, len(self.labels))))
-        index = take.astype(int)
-        some = [self.clouds[i] for i in index]
-        return Target(self.name, self.left_out, some, self.labels[index], self.floor)
-
-
-@dataclass(frozen=True, eq=False)
-class Net:
-    """A net with what it knows, and how its clouds are made."""
+    Attributes:
+        name: of a classifier that comes with qs3, of a file, or of a run's folder.
+        data: folder of the stores.
+        every: targets by name.
+        views: of these, as far as they were made before.
+        answers: folder for what is named; None keeps nothing.
+        turns: whether nets are asked about turned clouds, too.
+        only: `left_out` of the targets that are asked about; of all if there are none.
+    """
 
     name: str
-    source: str
-    seed: int
-    module: torch.nn.Module
-    points: int
-    scale: str
-    known: Known
+    data: Path
+    every: dict[str, Target]
+    views: dict[Any, View]
+    answers: Path | None
+    turns: bool
+    only: tuple[str, ...]
 
 
-def targets(data: Path, objects: Path) -> Iterator[Target]:
-    """All of them that are there."""
-    for name, store in STORES.items():
-        if not (data / store / "meta.yaml").is_file():
-            print(f"{data / store} is not there: left out")
-            continue
-        found = open_pointset(data / store, verify=False)
-        yield Target(name, name, list(found.points), np.array(found.labels)).few()
-    arrays = named_arrays(FOLDER / "source_sample.npz")
-    labels = np.array([CLASSES.index(cls) for cls in arrays["cls"].tolist()])
-    for name, ending in ROOMS.items():
-        rows = [i for i, one in enumerate(arrays["name"].tolist()) if one.endswith(ending)]
-        clouds = [arrays["points"][i].astype(np.float32) for i in rows]
-        yield Target(name, name, clouds, labels[rows], FLOOR["rooms"]).few()
-    archive = read_archive(objects)
-    adapt = np.array(archive.of_part("adapt"))
-    middle = np.median(archive.frame[adapt])
-    for tier in ("clean", "hard"):
-        for half, other_rooms in (("a", False), ("b", True)):
-            wanted = (archive.tier[adapt] == tier) & (
-                (archive.frame[adapt] > middle) == other_rooms
-            )
-            rows = adapt[wanted].tolist()
-            few = Target("", "", rows, np.zeros(len(rows))).few().clouds
-            clouds = [archive.cloud(i, inliers_only=True) for i in few]
-            of = np.array([CLASSES.index(str(archive.cls[i])) for i in few])
-            yield Target(f"real_{tier}_{half}", "real", clouds, of, FLOOR["real"])
+_VIEWS: dict[Any, View] = {}  # of this process
 
 
-class View(NamedTuple):
-    """A target's clouds as nets see them."""
-
-    points: torch.Tensor
-    measures: np.ndarray
-
-
-def view(target: Target, points: int, scale: str) -> View:
-    """Farthest points of each cloud, in the given scale."""
-    stored = np.stack([of_size(cloud) for cloud in target.clouds])
-    clouds = Clouds.of(stored, sample(stored, points, 1), scale, target.floor or 0.0)
-    return View(clouds.all(), compared(clouds))
+def view_of(target: Target, net: Net) -> View:
+    """A target as a net sees it, made once in a process."""
+    key = (target.name, net.points, net.scale)
+    if key not in _VIEWS:
+        _VIEWS[key] = view(target, net.points, net.scale)
+    return _VIEWS[key]
 
 
-def of_size(cloud: np.ndarray, size: int = 2048) -> np.ndarray:
-    """Points repeated from the first one on, as a store has them."""
-    return np.ascontiguousarray(np.resize(cloud, (max(size, len(cloud)), 3)), dtype=np.float32)[
-        :size
-    ]
-
-
-def turned(net: torch.nn.Module, points: torch.Tensor, said: np.ndarray) -> float:
-    """The share of the first `TURNED` clouds that keep their class after a quarter turn."""
-    index = np.unique(np.linspace(0, len(points) - 1, min(TURNED, len(points)))).astype(int)
-    other = predict_rotated(net, points[index], np.pi / 2, 32)
-    return float((other.argmax(axis=1) == said[index].argmax(axis=1)).mean())
-
-
-def known_of(module: torch.nn.Module, points: torch.Tensor, labels: Any, measured: Any) -> Known:
-    """What the net knows of its labelled clouds."""
-    said = predict(module, points, 32)
-    return Known(said, np.asarray(labels), measured, turned(module, points, said))
-
-
-def small_net(data: Path, path: Path) -> Net:
-    """One of `.ci/trust_nets.py`."""
-    model, source, seed = path.stem.split("-")
-    module = MODELS[model](num_classes=10).eval()
-    module.load_state_dict(torch.load(path, weights_only=True))
-    clouds = labelled(data, source)
-    held_out = parts(clouds)[1]
-    known = known_of(module, held_out.clouds.all(), held_out.labels, compared(clouds.clouds, 200))
-    return Net(model, source, int(seed), module, POINTS, SOURCES[source][2], known)
-
-
-def shipped_net(name: str, every: dict[str, Target]) -> Net:
-    """A classifier that comes with qs3; without statistics in its folder they are made first."""
-    predictor = load(name)
-    result, known = predictor.result, predictor.held_out
-    if known is None:
-        known = known_of_scans(predictor, [every[one] for one in sorted(SEEN_BY[name])])
-        folder, values = FOLDER / name, values_of(result)
-        write_folder(
-            folder, {**values, "held_out": tensors_of(known)}, (folder / CARD).read_text("utf-8")
-        )
-    return Net(name, "shipped", 0, predictor.net, result.points, result.scale, known)
-
-
-def known_of_scans(predictor: Predictor, sensors: list[Target]) -> Known:
-    """What a net knows of scans of test meshes by its sensors, `KNOWN` of each."""
-    few = [one.few(KNOWN) for one in sensors]
-    seen = [view(one, predictor.points, predictor.result.scale) for one in few]
-    return known_of(
-        predictor.net,
-        torch.cat([one.points for one in seen]),
-        np.concatenate([one.labels for one in few]),
-        np.concatenate([one.measures for one in seen]),
-    )
-
-
-def case(net: Net, target: Target, seen_as: View) -> dict[str, Any]:
-    """A row of the table."""
+def case(net: Net, target: Target, seen_as: View) -> tuple[dict[str, Any], np.ndarray]:
+    """A row of the table, and the classes that the net named; turns are asked if it knows them."""
     said = predict(net.module, seen_as.points, 32)
     answers = said.argmax(axis=1)
-    seen = Seen(said, seen_as.measures, turned(net.module, seen_as.points, said))
+    turns = turned(net.module, seen_as.points, said) if net.known.turns is not None else None
+    seen = Seen(said, seen_as.measures, turns)
     by_confidence = estimates(net.known.probabilities, net.known.labels, said)
     values = (
         *(net.name, net.source, net.seed, target.name, target.left_out, len(answers)),
         *(net.known.accuracy, float((answers == target.labels).mean())),
         *(by_confidence[key] for key in ("calibrated", "thresholded", "difference")),
-        *shifts(net.known, seen).values(),
     )
-    return dict(zip(COLUMNS, values, strict=True))
+    found = shifts(net.known, seen)
+    return dict(zip(FIRST + CONFIDENCE, values, strict=True)) | found, answers
 
 
 def wanted(name: str, scale: str, every: dict[str, Target]) -> list[Target]:
@@ -235,16 +104,38 @@ def wanted(name: str, scale: str, every: dict[str, Target]) -> list[Target]:
     ]
 
 
-def cases_of(work: tuple[str, Path, dict[str, Target], dict[Any, View]]) -> list[dict[str, Any]]:
-    """All rows of one net: the name of a classifier that comes with qs3, or a file."""
+def net_of(asked: Asked) -> Net:
+    """With what it knows."""
+    if asked.name in SEEN_BY:
+        net = shipped_net(asked.name, asked.every)
+        return net if asked.turns else replace(net, known=replace(net.known, turns=None))
+    path = Path(asked.name)
+    if not path.is_dir():
+        return small_net(asked.data, path)
+    if load(path).classes != CLASSES:
+        raise DataError(f"{path}: the net has other classes than the targets")
+    return run_net(path, asked.data / ".cache", asked.turns)
+
+
+def cases_of(asked: Asked) -> list[dict[str, Any]]:
+    """All rows of one net; its answers go into a file of `answers`."""
     torch.set_num_threads(1)
-    name, data, every, views = work
-    net = shipped_net(name, every) if name in SEEN_BY else small_net(data, Path(name))
-    found = []
-    for target in wanted(net.name, net.scale, every):
-        key = (target.name, net.points, net.scale)
-        found.append(case(net, target, views.get(key) or view(target, net.points, net.scale)))
-    return found
+    _VIEWS.update(asked.views)
+    net = net_of(asked)
+    every = wanted(net.name, net.scale, asked.every)
+    every = [one for one in every if not asked.only or one.left_out in asked.only]
+    rows, named = [], {}
+    for target in every:
+        row, named[target.name] = case(net, target, view_of(target, net))
+        rows.append(row)
+    if asked.answers is not None:
+        other = second(net.name)
+        named |= {f"second/{target.name}": other.of_target(target) for target in every}
+        named["held_out"] = net.known.probabilities.argmax(axis=1)
+        named["second/held_out"] = other.answers(net.held_out)
+        asked.answers.mkdir(parents=True, exist_ok=True)
+        np.savez(asked.answers / f"{net.name}-{net.source}-{net.seed}.npz", **named)
+    return rows
 
 
 def prepared(work: tuple[Target, int, str]) -> tuple[tuple[str, int, str], View]:
@@ -258,36 +149,55 @@ def make_cases(given: dict[str, str]) -> None:
     """Make what the table lacks, in `jobs` processes; `wait`: seconds for more nets to come."""
     torch.set_num_threads(1)
     data, out = Path(given["data"]), Path(given["out"])
+    answers = Path(given["answers"]) if "answers" in given else None
+    turns = given.get("turns", "true") == "true"
+    only = tuple(filter(None, given.get("targets", "").split(",")))
     out.parent.mkdir(parents=True, exist_ok=True)
     every = {target.name: target for target in targets(data, Path(given["objects"]))}
-    of_small = [(one, POINTS, "unit_ball") for one in every.values()]
     until = time.monotonic() + float(given.get("wait", "0"))
-    shipped, nets = given.get("shipped", "true") == "true", Path(given["nets"])
     with get_context("fork").Pool(int(given.get("jobs", "1"))) as pool:
         views: dict[Any, View] = {}
-        if given.get("small", "true") == "true":
+        if "nets" in given:
+            of_small = [(one, POINTS, "unit_ball") for one in every.values()]
             views = dict(pool.imap_unordered(prepared, of_small))
         under_way: dict[str, AsyncResult] = {}
+        names = missing(given, out)
         while True:
-            for name in missing(nets, out, shipped):
+            for name in names:
                 if name not in under_way:
-                    seen = {} if name in SEEN_BY else views
-                    under_way[name] = pool.apply_async(cases_of, ((name, data, every, seen),))
+                    seen = views if name.endswith(".pt") else {}
+                    asked = Asked(name, data, every, seen, answers, turns, only)
+                    under_way[name] = pool.apply_async(cases_of, (asked,))
             for name in [name for name, result in under_way.items() if result.ready()]:
                 append(out, rows := under_way.pop(name).get())
                 print(f"{name}: {len(rows)} cases", flush=True)
             if not under_way and time.monotonic() > until:
                 return
             time.sleep(2)
+            names = missing(given, out) if time.monotonic() <= until else []
 
 
-def missing(nets: Path, out: Path, shipped: bool) -> list[str]:
-    """Nets without a row: files, and names of classifiers that come with qs3."""
+def missing(given: dict[str, str], out: Path) -> list[str]:
+    """Nets without a row: files, folders of finished runs, and names of those that are shipped."""
     done = {(row["net"], row["source"], row["seed"]) for row in read(out)}
-    found = [str(p) for p in nets.glob("[!.]*.pt") if tuple(p.stem.split("-")) not in done]
-    if shipped:
+    found = []
+    if "nets" in given:
+        files = sorted(Path(given["nets"]).glob("[!.]*.pt"))
+        found += [str(path) for path in files if tuple(path.stem.split("-")) not in done]
+    if given.get("shipped", "true") == "true":
         found += [name for name in SEEN_BY if (name, "shipped", "0") not in done]
-    return sorted(found)
+    for folder in runs_in(given.get("runs", "")):
+        name = run_name(folder)
+        if name and tuple(map(str, name)) not in done:
+            found.append(str(folder))
+    return found
+
+
+def runs_in(names: str) -> list[Path]:
+    """Folders of finished runs: those named, and those in a named folder."""
+    found = [Path(name) for name in names.split(",") if name]
+    every = [run for path in found for run in (path, *sorted(path.glob("seed*")))]
+    return [run for run in every if (run / METRICS).is_file()]
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -298,97 +208,64 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def append(path: Path, rows: list[dict[str, Any]]) -> None:
+def append(path: Path, rows: Iterable[dict[str, Any]], columns: Sequence[str] = COLUMNS) -> None:
     """Rows more; shares to four digits."""
     begun = path.is_file()
     with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
         if not begun:
             writer.writeheader()
         for row in rows:
             writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
 
 
-def make_fit(given: dict[str, str]) -> None:
-    """Fit the rules on the table, score them leave-one-target-out, and write the weights."""
-    rows = read(Path(given["cases"]))
-    rules = {
-        "alone": ALONE,
-        "turns": (*ALONE, "turns"),
-    }
-    targets_of = [row["left_out"] for row in rows]
-    base, truth = (column(rows, key) for key in ("held_out", "accuracy"))
-    lines = [["calibrated confidence (AC)", *score(column(rows, "calibrated"), truth, rows)]]
-    lines.append(["ATC", *score(column(rows, "thresholded_confidence"), truth, rows)])
-    lines.append(["DoC", *score(column(rows, "difference"), truth, rows)])
-    for rule, names in rules.items():
-        table = np.stack([column(rows, name) for name in names], axis=1)
-        found = left_out_estimates(names, table, base, truth, targets_of)
-        lines.append([f"rule {rule}", *score(found, truth, rows)])
-        weights = fit_weights(names, table, base, truth, targets_of)
-        print(rule, {name: round(value, 3) for name, value in weights.items()})
-        if rule == given.get("rule", "alone"):
-            kept, estimate = weights, found
-    print(text_of(lines))
-    off = np.abs(estimate - truth)
-    by = {}
-    for i, row in enumerate(rows):
-        by.setdefault(row["target"], []).append(i)
-    print(text_of([[name, *score(estimate[index], truth[index], [rows[i] for i in index])]
-                   for name, index in by.items()]))  # fmt: skip
-    if "out" in given:
-        found = Calibration(
-            weights={name: round(value, 4) for name, value in kept.items() if value > 0},
-            cases=len(rows),
-            targets=len(set(targets_of)),
-            mean_error=round(float(off.mean()), 4),
-            error_90=round(float(np.quantile(off, 0.9)), 4),
-            most_too_high=round(float((estimate - truth).max()), 4),
-        )
-        write_calibration(Path(given["out"]), found)
-    if "estimates" in given:
-        with Path(given["estimates"]).open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["net", "source", "seed", "target", "clouds", "accuracy", "expected"])
-            for row, value in zip(rows, estimate, strict=True):
-                cells = [row[key] for key in ("net", "source", "seed", "target", "clouds")]
-                writer.writerow([*cells, row["accuracy"], f"{value:.4f}"])
+def make_agreement(given: dict[str, str]) -> None:
+    """Write how much less often than on held-out clouds others say the same as each case's net.
+
+    Nets whose answers were not kept are left out.
+    """
+    answers, folder = Path(given["answers"]), Path(given["cases"])
+    files: dict[tuple[str, ...], dict[str, np.ndarray]] = {}
+    rows = []
+    for row in read(folder / "cases.csv") + read(folder / "adapted.csv"):
+        key = (row["net"], row["source"], row["seed"])
+        path = answers / f"{'-'.join(key)}.npz"
+        if path.is_file():
+            rows.append(row)
+            if key not in files:
+                with np.load(path) as file:
+                    files[key] = dict(file)
+    (folder / "agreement.csv").unlink(missing_ok=True)
+    append(folder / "agreement.csv", [_agreement(row, files) for row in rows], AGREEMENT)
 
 
-HEAD = ("", "cases", "mean error", "mean", "most too high", "refused", "right", "wrong", "rank")
+def _agreement(
+    row: dict[str, str], files: dict[tuple[str, ...], dict[str, np.ndarray]]
+) -> dict[str, Any]:
+    """Of one case; `seeds` is empty if no net of another seed was asked about its target."""
+    net, source, seed = row["net"], row["source"], row["seed"]
+    own, target = files[net, source, seed], row["target"]
+    asked = [key for key in files if key[:2] == (net, source) and target in files[key]]
+    seeds = sorted((key[2] for key in asked), key=int)
+    following = seeds[(seeds.index(seed) + 1) % len(seeds)]
+    other = files[net, source, following]
+    found = {key: row[key] for key in AGREEMENT[:4]}
+    found["second"] = agree_less(own, own, target, "second/")
+    found["seeds"] = agree_less(own, other, target) if following != seed else ""
+    return found
 
 
-def score(found: np.ndarray, truth: np.ndarray, rows: list[dict[str, str]]) -> list[str]:
-    """The cells of `HEAD`: errors in points, of all cases / of those that are not refused."""
-    off, kept = 100 * (found - truth), found >= LEAST_TRUSTED
-    one = [f"{np.abs(x).mean():.1f}" if len(x) else "-" for x in (off, off[kept])]
-    high = [f"{x.max():+.1f}" if len(x) else "-" for x in (off, off[kept])]
-    rank = spearmanr(found, truth).statistic if len(found) > 2 and np.ptp(found) > 0 else np.nan
-    return [
-        str(len(rows)),
-        " / ".join(one),
-        f"{off.mean():+.1f}",
-        " / ".join(high),
-        str(int((~kept).sum())),
-        str(int((~kept & (truth < 0.5)).sum())),
-        str(int((~kept & (truth > 0.7)).sum())),
-        f"{rank:.2f}",
-    ]
-
-
-def text_of(lines: list[list[str]]) -> str:
-    """A table in Markdown."""
-    return "\n".join(f"| {' | '.join(line)} |" for line in ([*HEAD], ["---"] * len(HEAD), *lines))
-
-
-def column(rows: list[dict[str, str]], key: str) -> np.ndarray:
-    """Of the table, as numbers."""
-    return np.array([float(row[key]) for row in rows])
+def agree_less(
+    one: dict[str, np.ndarray], other: dict[str, np.ndarray], target: str, of: str = ""
+) -> float:
+    """Agreement on the held-out clouds less that on the target, at least 0."""
+    same = [float((one[key] == other[of + key]).mean()) for key in ("held_out", target)]
+    return max(0.0, same[0] - same[1])
 
 
 if __name__ == "__main__":
     words = dict(word.split("=", 1) for word in sys.argv[2:])
     if sys.argv[1] == "cases":
         make_cases(words)
-    elif sys.argv[1] == "fit":
-        make_fit(words)
+    elif sys.argv[1] == "agree":
+        make_agreement(words)

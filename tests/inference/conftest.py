@@ -48,8 +48,9 @@ def over_the_floor(metric: Predictor) -> Predictor:
     return replace(metric, result=replace(metric.result, scale="above_floor", floor_m=-1.25))
 
 
-def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
-    overrides = [
+def overrides_of(data_dir: Path, log_dir: Path) -> list[str]:
+    """What `run` was trained with."""
+    return [
         *("experiment=quickstart", "method=source_only", "selftraining=none"),
         f"paths.data_dir={data_dir}",
         f"paths.log_dir={log_dir}",
@@ -57,8 +58,10 @@ def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
         *("protocol.epochs=3", "protocol.steps=null", "trainer.threads=1", "callbacks=none"),
         "logger=csv",
         "report.pictures=false",
-        *more,
     ]
-    cfg = compose("train", overrides)
+
+
+def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
+    cfg = compose("train", [*overrides_of(data_dir, log_dir), *more])
     train(cfg)
     return hashing.run_folder(cfg)
