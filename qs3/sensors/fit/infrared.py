@@ -28,6 +28,7 @@ _SIDE_PX = 480  # of the plane that the twin shows
 _FAR = 5.0  # the search ends at factors of e to this power
 _TEXTURE_ERROR = 0.02  # of what two pictures of other dots differ by
 _CLIPPED = 0.01
+_DOTS = 2.0  # variance by the choice of dots over the pictures' own: the twin has as many
 _PRIOR = 1.5  # standard deviation of a number's logarithm before any picture is seen
 UNKNOWN = 0.2  # a number that is less sure than this share is said to be unknown
 WITHIN = 0.05  # what is promised of the others, at two standard errors; or they are called rough
@@ -144,7 +145,9 @@ def fit_pictures(
     covariance = torch.linalg.inv(torch.from_numpy(solved.jac.T @ solved.jac))
     rest = torch.from_numpy(solved.fun[: -len(KEYS)])
     scale = max(1.0, float(rest.square().sum() / max(len(rest) - len(KEYS), 1)))
-    spread = torch.sqrt(covariance.diagonal()) * math.sqrt(scale)
+    numbers = {key: start[key] * torch.exp(log) for key, log in zip(KEYS, found, strict=True)}
+    tiles = _tile_scatter(targets, numbers, covariance @ torch.from_numpy(solved.jac.T))
+    spread = torch.sqrt(torch.maximum(scale * covariance.diagonal(), _DOTS * tiles))
     errors = {key: float(one) for key, one in zip(KEYS, spread, strict=True)}
     unknown = _unknown(errors, covariance, targets)
     values = {
@@ -232,7 +235,8 @@ def _residuals(target: _Target, values: Mapping[str, torch.Tensor]) -> torch.Ten
     """What the twin's statistics are off by, in standard errors."""
     ambient, width, contrast, electrons, read = (values[key] for key in KEYS)
     # Light from all sides stays what it is through the lens; only the middle counts.
-    picture = target.dots.picture(ambient, width, contrast)
+    fields = target.dots.behind(width)
+    picture = target.dots.picture(fields, ambient, contrast)
     parts = []
     if not target.clipped:
         ours, theirs = statistics(picture, ambient + target.shading), target
@@ -243,9 +247,33 @@ def _residuals(target: _Target, values: Mapping[str, torch.Tensor]) -> torch.Ten
         added = inner(picture).mean() / ambient - 1
         parts.append(((added / target.added - 1) / _TEXTURE_ERROR)[None])
     if (noise := target.noise) is not None:
-        speckle = target.dots.noise(noise.level, noise.sorters, ambient, width, contrast)
+        speckle = target.dots.noise(fields, noise, ambient, contrast)
         parts.append(noise_residuals(noise, speckle, electrons / 255, read))
     return torch.cat([torch.zeros(0, dtype=torch.float64), *parts])
+
+
+def _tile_scatter(
+    targets: Sequence[_Target], values: Mapping[str, torch.Tensor], answer: torch.Tensor
+) -> torch.Tensor:
+    """[n] variance of the found logarithms between tiles of the pictures: a jackknife.
+
+    One grain lies in several bins of brightness, which the curvature of the fit takes for
+    independent. `answer` [n, R] is how the numbers follow the residuals, near the solution.
+    """
+    total, row = torch.zeros(len(answer), dtype=torch.float64), 0
+    for target in targets:
+        whole = _residuals(target, values)
+        row += len(whole)
+        if (noise := target.noise) is None:
+            continue
+        ambient, width, contrast, electrons, read = (values[key] for key in KEYS)
+        speckle = target.dots.noise(target.dots.behind(width), noise, ambient, contrast)
+        parts = [
+            noise_residuals(noise, speckle, electrons / 255, read, part) for part in noise.parts
+        ]
+        moved = torch.stack(parts) @ answer[:, row - len(parts[0]) : row].T
+        total += (len(parts) - 1) * moved.var(dim=0, correction=0)
+    return total
 
 
 def _unknown(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
+import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
 
 from qs3.sensors.fit.infrared_statistics import inner
@@ -28,7 +29,10 @@ _TILES = 6  # along each side, of the jackknife
 # What the variance of speckle in one bin differs by between two patterns of dots: a share of it
 # and, where it is no more than what the lens spreads from dots, of its mean.
 _DOTS_ERROR, _TAILS_ERROR = 0.05, 0.002
-_STEP = 1 / 12  # variance of rounding to grey values
+Fields = dict[str, torch.Tensor]
+
+_STEP = 1 / 12  # variance of rounding to grey values ...
+_FINE = 0.4  # ... which is noise of its own if there is this much in all (else it is the level's)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +44,15 @@ class OverTime:
         moments: [B, APART] covariance over time of a pixel with those 0, 1 and 2 px away.
         root: [B, APART, APART] inverse Cholesky factor of the moments' own covariance, from tiles
             of the picture; what is multiplied by it is in standard errors.
-        known: [B] bool; the bin is neither black nor white.
+        parts: [T, B, APART] the moments where one tile of the picture is left out.
+        known: [B] bool; the bin is neither black nor white, and its noise is above rounding.
         sorters: frames whose mean the bins are made of.
     """
 
     level: torch.Tensor
     moments: torch.Tensor
     root: torch.Tensor
+    parts: torch.Tensor
     known: torch.Tensor
     sorters: int
 
@@ -77,8 +83,8 @@ def over_time(frames: Sequence[torch.Tensor]) -> OverTime | None:
     floor = torch.diag_embed((2e-3 * moments[:, :1]).expand(-1, APART) ** 2 + 1e-12)
     root = torch.linalg.inv(torch.linalg.cholesky(scatter + floor))
     spread = 3 * moments[:, 0].sqrt()
-    known = (level > spread) & (level < 255 - spread)
-    return OverTime(level, moments, root, known, len(halves[0][0]))
+    known = (level > spread) & (level < 255 - spread) & (moments[:, 0] > _FINE)
+    return OverTime(level, moments, root, each, known, len(halves[0][0]))
 
 
 def _tiled(brightness: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
@@ -103,7 +109,7 @@ def _tiled(brightness: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
 
 
 class Speckled:
-    """A patch of the twin's dots under speckle, as a function of the lens.
+    """A patch of the twin's dots under speckle.
 
     Args:
         projected: [h, w] radiance by the projector before the lens.
@@ -113,20 +119,21 @@ class Speckled:
 
     def __init__(self, projected: torch.Tensor, grain: torch.Tensor, everywhere: bool) -> None:
         self._projected, self._grain, self._everywhere = projected, grain, everywhere
-        # The search asks for the same lens again, with other light.
-        self._kept = lru_cache(maxsize=2)(self._fields)
-        self._sorted = lru_cache(maxsize=1)(self._order)
+        self._kept = lru_cache(maxsize=2)(lambda width: self._through(torch.tensor(width)))
+        self._orders: dict[tuple[float, ...], torch.Tensor] = {}
+        drawn = torch.randn(projected.shape, generator=torch.Generator().manual_seed(0))
+        self._own = inner(drawn.double()).flatten()  # noise of each pixel's own
 
-    def _at(self, width: torch.Tensor) -> dict[str, torch.Tensor]:
-        tangent = torch.autograd.forward_ad.unpack_dual(width).tangent
-        if tangent is not None:
-            return self._fields(width)
-        return self._kept(float(width))
+    def behind(self, width: torch.Tensor) -> Fields:
+        """What a lens of this width, px, makes of light and grains."""
+        if forward_ad.unpack_dual(width).tangent is not None:
+            return self._through(width)
+        return self._kept(float(width))  # the search asks for it again, with other light
 
-    def _fields(self, width: torch.Tensor | float) -> dict[str, torch.Tensor]:
-        width = torch.as_tensor(width, dtype=torch.float64)
-        kernel, light = gaussian(width.clamp_min(1e-3)), self._projected
+    def _through(self, width: torch.Tensor) -> Fields:
+        kernel, light = gaussian(width.double().clamp_min(1e-3)), self._projected
         out = {
+            "width": width.detach(),
             "dots": through(light, kernel, kernel),
             "grains": through(light * self._grain, kernel, kernel),
         }
@@ -134,10 +141,11 @@ class Speckled:
             out["even"] = through(self._grain, kernel, kernel)
         squares = kernel**2
         for lag in range(APART):
-            both = torch.zeros_like(kernel)
-            if lag < len(kernel):
-                both[: len(kernel) - lag] += kernel[lag:] * kernel[: len(kernel) - lag] / 2
-                both[lag:] += kernel[lag:] * kernel[: len(kernel) - lag] / 2
+            length = max(0, len(kernel) - lag)
+            shared = kernel[lag:] * kernel[:length] / 2
+            both = F.pad(shared, (0, len(kernel) - length)) + F.pad(
+                shared, (len(kernel) - length, 0)
+            )
             for power in (1, 2) if self._everywhere else (2,):
                 field = through(light**power, squares, both) + through(light**power, both, squares)
                 out[f"{power} {lag}"] = field / 2
@@ -145,41 +153,47 @@ class Speckled:
         return out
 
     def picture(
-        self, ambient: torch.Tensor, width: torch.Tensor, contrast: torch.Tensor
+        self, fields: Fields, ambient: torch.Tensor, contrast: torch.Tensor
     ) -> torch.Tensor:
-        """[h, w] radiance of one frame."""
-        fields = self._at(width)
+        """[h, w] radiance of one frame, behind a lens."""
         grains = fields["grains"]
         if self._everywhere:
             grains = grains + ambient * fields["even"]
         return ambient + fields["dots"] + contrast * grains
 
     def noise(
-        self, level: torch.Tensor, sorters: int, ambient: torch.Tensor, width: torch.Tensor,
-        contrast: torch.Tensor,
-    ) -> torch.Tensor:  # fmt: skip
-        """[B, APART] covariances over time by speckle, in bins of brightness of these levels."""
-        still = self.picture(ambient, width, torch.zeros_like(contrast))
-        order = self._sorted(float(ambient), float(width), float(contrast) / math.sqrt(sorters))
-        parts = torch.tensor_split(order, len(level))
-        fields, covariances = self._at(width), []
+        self, fields: Fields, found: OverTime, ambient: torch.Tensor, contrast: torch.Tensor
+    ) -> torch.Tensor:
+        """[B, APART] covariances over time by speckle, in the bins that were found."""
+        key = tuple(float(one) for one in (fields["width"], ambient, contrast))
+        if key not in self._orders:
+            self._orders = {key: self._order(fields, found, *key[1:])}
+        order = self._orders[key]
+        bright = inner(ambient + fields["dots"]).flatten()
+        covariances = []
         for lag in range(APART):
             squares = fields[f"2 {lag}"]
             if self._everywhere:
                 squares = squares + 2 * ambient * fields[f"1 {lag}"]
                 squares = squares + ambient**2 * fields[f"0 {lag}"]
             covariances.append(inner(squares).flatten())
-        bright = inner(still).flatten()
         rows = []
-        for part, one in zip(parts, level, strict=True):
-            gain = one / bright[part].mean()
+        for part, level in zip(
+            torch.tensor_split(order, len(found.level)), found.level, strict=True
+        ):
+            gain = level / bright[part].mean()
             rows.append(torch.stack([c[part].mean() * gain**2 for c in covariances]))
         return contrast**2 * torch.stack(rows)
 
-    def _order(self, *light: float) -> torch.Tensor:
-        """[n] pixels by brightness in a picture of this ambient light, lens and contrast."""
-        numbers = (torch.tensor(one, dtype=torch.float64) for one in light)
-        return inner(self.picture(*numbers)).flatten().argsort()
+    def _order(
+        self, fields: Fields, found: OverTime, ambient: float, contrast: float
+    ) -> torch.Tensor:
+        """[n] pixels by brightness in the mean of a few frames, with what noise there is in it."""
+        light = torch.tensor(ambient), torch.tensor(contrast / math.sqrt(found.sorters))
+        seen = inner(self.picture(fields, *light)).detach().flatten()
+        white = found.moments[:, 0] - found.moments[:, 1]  # at least; dark bins have little else
+        spread = white.clamp_min(0).min().sqrt() * seen.mean() / found.level.mean()
+        return (seen + spread / math.sqrt(found.sorters) * self._own).argsort()
 
 
 def through(image: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
@@ -194,8 +208,9 @@ def through(image: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) -> t
 
 
 def noise_residuals(
-    found: OverTime, speckle: torch.Tensor, per_grey: torch.Tensor, read_e: torch.Tensor
-) -> torch.Tensor:
+    found: OverTime, speckle: torch.Tensor, per_grey: torch.Tensor, read_e: torch.Tensor,
+    moments: torch.Tensor | None = None,
+) -> torch.Tensor:  # fmt: skip
     """What the model of noise is off by, in standard errors.
 
     How strong speckle is in a bin depends on dots that are not known: it may be off by a factor,
@@ -206,13 +221,14 @@ def noise_residuals(
         speckle: [B, APART] of the model.
         per_grey: electrons to a grey value.
         read_e: read-out noise, electrons.
+        moments: [B, APART] in place of those found.
     """
     strength = speckle[:, 0].detach()
     error = _DOTS_ERROR + _TAILS_ERROR * strength.mean() / strength.clamp_min(1e-30)
     white = found.level / per_grey + (read_e / per_grey) ** 2 + _STEP
     own = torch.zeros_like(speckle)
     own = torch.cat([white[:, None], own[:, 1:]], dim=1)
-    rest = torch.einsum("bij,bj->bi", found.root, found.moments - own)
+    rest = torch.einsum("bij,bj->bi", found.root, (found.moments if moments is None else moments) - own)
     by_speckle = torch.einsum("bij,bj->bi", found.root, speckle)
     sure = 1 / error**2
     factor = ((rest * by_speckle).sum(1) + sure) / (by_speckle.square().sum(1) + sure)

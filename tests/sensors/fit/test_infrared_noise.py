@@ -69,8 +69,8 @@ def test_on_even_light_neighbours_share_what_the_lens_spreads():
 def test_speckle_on_dots_is_that_of_the_camera_s_frames(everywhere):
     light, contrast, width = dotted(0), 0.25, 0.9
     found = over_time(frames(light, 0.1, contrast, width, 12, everywhere))
-    numbers = [number(x) for x in (0.1, width, contrast)]
-    expected = speckled(light, contrast, everywhere).noise(found.level, found.sorters, *numbers)
+    model = speckled(light, contrast, everywhere)
+    expected = model.noise(model.behind(number(width)), found, number(0.1), number(contrast))
     seen = found.moments.clone()
     seen[:, 0] -= white(found.level)
     for lag in range(3):
@@ -84,8 +84,8 @@ def cost(found, model, contrast, width, electrons, read):
     """Of the best contrast near the one given."""
     sums = []
     for share in (0.9, 0.95, 1.0, 1.05, 1.1):
-        numbers = [number(x) for x in (0.1, width, share * contrast)]
-        speckle = model.noise(found.level, found.sorters, *numbers)
+        fields = model.behind(number(width))
+        speckle = model.noise(fields, found, number(0.1), number(share * contrast))
         rest = noise_residuals(found, speckle, number(electrons / 255), number(read))
         sums.append(float(rest.square().sum()))
     return min(sums)
