@@ -140,7 +140,9 @@ def fit_pictures(
             columns.append(torch.zeros_like(out) if slope is None else slope)
         return torch.stack(columns, dim=1).detach().numpy()
 
-    solved = least_squares(at, np.zeros(len(KEYS)), jac=slopes, bounds=(-_FAR, _FAR), ftol=1e-5, xtol=1e-4)
+    solved = least_squares(
+        at, np.zeros(len(KEYS)), jac=slopes, bounds=(-_FAR, _FAR), ftol=1e-5, xtol=1e-4
+    )
     found = torch.from_numpy(solved.x)
     covariance = torch.linalg.inv(torch.from_numpy(solved.jac.T @ solved.jac))
     rest = torch.from_numpy(solved.fun[: -len(KEYS)])

@@ -228,7 +228,9 @@ def noise_residuals(
     white = found.level / per_grey + (read_e / per_grey) ** 2 + _STEP
     own = torch.zeros_like(speckle)
     own = torch.cat([white[:, None], own[:, 1:]], dim=1)
-    rest = torch.einsum("bij,bj->bi", found.root, (found.moments if moments is None else moments) - own)
+    rest = torch.einsum(
+        "bij,bj->bi", found.root, (found.moments if moments is None else moments) - own
+    )
     by_speckle = torch.einsum("bij,bj->bi", found.root, speckle)
     sure = 1 / error**2
     factor = ((rest * by_speckle).sum(1) + sure) / (by_speckle.square().sum(1) + sure)
