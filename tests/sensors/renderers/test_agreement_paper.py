@@ -159,7 +159,7 @@ def test_disparities_agree_on_bodies_of_several_materials(name, lit):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["chair", "bookshelf"])
-def test_disparities_agree_less_on_clear_bodies(name):
+def test_disparities_agree_on_clear_bodies(name):
     """conf/materials/clear.yaml with as much glass as all the rest.
 
     Whether a sample passes is drawn, and in Blender only what is behind depends on it, so that 16
