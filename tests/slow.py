@@ -44,7 +44,7 @@ PATTERNS = (
     r"sensors/renderers/test_agreement_paper\.py::.*\[(?!chair|table)",
     r"sensors/fit/test_fit\.py::test_(hidden_parameters|noise_far_below|holes_of_any_size|a_lens_that)",
     r"sensors/fit/test_fit\.py::test_(walls_that_face|other_things_before|whole_millimetres|real_kinect)",
-    r"sensors/fit/test_infrared\.py::test_(light_lens|one_frame|the_command|dots_over|a_second)",
+    r"sensors/fit/test_infrared\.py::test_(light_lens|one_frame|the_command|dots_over|a_second|two_frames)",
     r"report/runs/test_pictures\.py::test_(offline_wandb|command_line|files_and_page|missing_round|unlabelled)",
     r"training/test_fit\.py::test_seed_1_alone",
     r"generation/test_(disk|blensor|forty_classes)\.py::",

@@ -18,7 +18,8 @@ from scipy.optimize import least_squares
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.fit.infrared_statistics import BRIGHTNESSES, SMOOTH_PX, inner, smooth, statistics
+from qs3.sensors.fit.infrared_noise import OverTime, Speckled, noise_residuals, over_time
+from qs3.sensors.fit.infrared_statistics import SMOOTH_PX, inner, smooth, statistics
 from qs3.sensors.gradients.twin import Twin, blurred, settings_of
 from qs3.sensors.gradients.views import Pair, View
 from qs3.sensors.optics.infrared import InfraredCamera
@@ -27,8 +28,10 @@ _SIDE_PX = 480  # of the plane that the twin shows
 _FAR = 5.0  # the search ends at factors of e to this power
 _TEXTURE_ERROR = 0.02  # of what two pictures of other dots differ by
 _CLIPPED = 0.01
+_DOTS = 2.0  # variance by the choice of dots over the pictures' own: the twin has as many
 _PRIOR = 1.5  # standard deviation of a number's logarithm before any picture is seen
 UNKNOWN = 0.2  # a number that is less sure than this share is said to be unknown
+WITHIN = 0.05  # what is promised of the others, at two standard errors; or they are called rough
 
 KEYS = (
     "ambient", "infrared.psf_px", "infrared.speckle_contrast", "infrared.electrons_at_white",
@@ -66,6 +69,7 @@ class InfraredFit:
             the base preset's.
         errors: standard error of each over its value, from the curvature of the fit.
         unknown: keys that the pictures do not tell, with the reason.
+        rough: keys that they tell, but not to within `WITHIN`.
         focal_baseline: f B in px m by disparity and depth; None without both.
         dots_over_ambient: at `distance_m`, as `qs3 bench` has it.
         distance_m: median over the scenes.
@@ -75,6 +79,7 @@ class InfraredFit:
     values: Mapping[str, float]
     errors: Mapping[str, float]
     unknown: Mapping[str, str]
+    rough: tuple[str, ...]
     focal_baseline: float | None
     dots_over_ambient: float
     distance_m: float
@@ -88,16 +93,12 @@ class _Target:
     distance_m: float
     shared: torch.Tensor
     skewness: torch.Tensor
-    noise: torch.Tensor  # [B] variance over time, grey values squared; empty: one frame
-    level: torch.Tensor  # [B]
-    pixels: int
-    frames: int
+    noise: OverTime | None  # None: one frame
     white: float  # grey value at the exposure's quantile
     added: torch.Tensor | None  # mean of on - off over mean of off
     clipped: bool  # too many pixels are black or white for the texture to be what it was
-    projected: torch.Tensor  # [h, w] radiance of white by the base's projector there
+    dots: Speckled  # white under the base's projector there
     shading: torch.Tensor  # [h, w] the same without its dots
-    grain: torch.Tensor  # [h, w] laser speckle: mean 0, variance 1, skewed as a Gamma variable
 
 
 def fit_pictures(
@@ -118,31 +119,37 @@ def fit_pictures(
     targets = [_target(scene, base, distance_m) for scene in scenes]
     start = {key: _first(key, base) for key in KEYS}
 
-    def residuals(logs: torch.Tensor) -> torch.Tensor:
+    def residuals(logs: Sequence[torch.Tensor]) -> torch.Tensor:
         values = {key: start[key] * torch.exp(log) for key, log in zip(KEYS, logs, strict=True)}
         parts = [_residuals(target, values) for target in targets]
-        return torch.cat([*parts, logs / _PRIOR])
+        return torch.cat([*parts, torch.stack(list(logs)) / _PRIOR])
 
     def at(logs: np.ndarray) -> np.ndarray:
         with torch.no_grad():
-            return residuals(torch.from_numpy(logs)).numpy()
+            return residuals(list(torch.from_numpy(logs))).numpy()
 
     def slopes(logs: np.ndarray) -> np.ndarray:
         # Forward mode: as many passes as numbers, where backward would take one for each residual.
         at, columns = torch.from_numpy(logs), []
-        for step in torch.eye(len(KEYS), dtype=torch.float64):
+        for i in range(len(KEYS)):
             with forward_ad.dual_level():
-                out = residuals(forward_ad.make_dual(at, step))
+                # Only what depends on this number gets a slope, and is computed anew.
+                one = forward_ad.make_dual(at[i], torch.ones((), dtype=torch.float64))
+                out = residuals([*at[:i], one, *at[i + 1 :]])
                 slope = forward_ad.unpack_dual(out).tangent
             columns.append(torch.zeros_like(out) if slope is None else slope)
         return torch.stack(columns, dim=1).detach().numpy()
 
-    solved = least_squares(at, np.zeros(len(KEYS)), jac=slopes, bounds=(-_FAR, _FAR))
+    solved = least_squares(
+        at, np.zeros(len(KEYS)), jac=slopes, bounds=(-_FAR, _FAR), ftol=1e-5, xtol=1e-4
+    )
     found = torch.from_numpy(solved.x)
     covariance = torch.linalg.inv(torch.from_numpy(solved.jac.T @ solved.jac))
     rest = torch.from_numpy(solved.fun[: -len(KEYS)])
     scale = max(1.0, float(rest.square().sum() / max(len(rest) - len(KEYS), 1)))
-    spread = torch.sqrt(covariance.diagonal()) * math.sqrt(scale)
+    numbers = {key: start[key] * torch.exp(log) for key, log in zip(KEYS, found, strict=True)}
+    tiles = _tile_scatter(targets, numbers, covariance @ torch.from_numpy(solved.jac.T))
+    spread = torch.sqrt(torch.maximum(scale * covariance.diagonal(), _DOTS * tiles))
     errors = {key: float(one) for key, one in zip(KEYS, spread, strict=True)}
     unknown = _unknown(errors, covariance, targets)
     values = {
@@ -155,6 +162,7 @@ def fit_pictures(
         values,
         errors,
         unknown,
+        tuple(key for key in KEYS if key not in unknown and 2 * errors[key] > WITHIN),
         _focal_baseline(scenes, base),
         _dots_over_ambient(base, middle, values),
         middle,
@@ -206,7 +214,6 @@ def _target(scene: Pictures, base: SpeckleStereo, distance_m: float | None) -> _
     shared = torch.stack([one.shared for one in each]).mean(dim=0)
     if shared[0] <= 0:
         raise DataError(f"{scene.name}: no dots are seen, neighbours are not alike")
-    noise, level = _over_time(tensors)
     added = None
     if scene.off:
         off = np.mean([np.asarray(image, dtype=np.float64) for image in scene.off], axis=0)
@@ -221,31 +228,17 @@ def _target(scene: Pictures, base: SpeckleStereo, distance_m: float | None) -> _
     grain = torch.from_numpy((drawn - 1) / contrast)
     ends = np.mean([(image <= 0) | (image >= 255) for image in images])
     return _Target(
-        where, shared, skewness, noise, level, each[0].pixels, len(images), white, added,
-        bool(ends > _CLIPPED), projected, smooth(projected), grain,
+        where, shared, skewness, over_time(tensors), white, added, bool(ends > _CLIPPED),
+        Speckled(projected, grain, _camera(base).ambient_speckles), smooth(projected),
     )  # fmt: skip
-
-
-def _over_time(frames: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Variance of a pixel over the frames of a still scene, by brightness, and the brightness."""
-    if len(frames) < 2:
-        return torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-    stack = torch.stack(list(frames))
-    mean, variance = stack.mean(dim=0).flatten(), stack.var(dim=0).flatten()
-    parts = torch.tensor_split(mean.argsort(), BRIGHTNESSES)
-    noise = torch.stack([variance[part].mean() for part in parts])
-    level = torch.stack([mean[part].mean() for part in parts])
-    # Noise that reaches black or white is cut off there.
-    whole = (level > 3 * noise.sqrt()) & (level < 255 - 3 * noise.sqrt())
-    return torch.where(whole, noise, torch.nan), level
 
 
 def _residuals(target: _Target, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """What the twin's statistics are off by, in standard errors."""
-    ambient, width = values["ambient"], values["infrared.psf_px"]
+    ambient, width, contrast, electrons, read = (values[key] for key in KEYS)
     # Light from all sides stays what it is through the lens; only the middle counts.
-    grains = 1 + values["infrared.speckle_contrast"] * target.grain
-    picture = ambient + blurred(target.projected * grains, width)
+    fields = target.dots.behind(width)
+    picture = target.dots.picture(fields, ambient, contrast)
     parts = []
     if not target.clipped:
         ours, theirs = statistics(picture, ambient + target.shading), target
@@ -255,32 +248,34 @@ def _residuals(target: _Target, values: Mapping[str, torch.Tensor]) -> torch.Ten
     if target.added is not None:
         added = inner(picture).mean() / ambient - 1
         parts.append(((added / target.added - 1) / _TEXTURE_ERROR)[None])
-    if len(target.noise):
-        per_grey = values["infrared.electrons_at_white"] / 255
-        read = values["infrared.read_noise_e"] / per_grey
-        speckle = values["infrared.speckle_contrast"] ** 2 * _speckle(target, picture, width)
-        expected = target.level / per_grey + read**2 + 1 / 12 + speckle
-        each = target.pixels / BRIGHTNESSES * (target.frames - 1)
-        error = math.sqrt(2 / each) + 0.002
-        known = torch.isfinite(target.noise)
-        parts.append(torch.log(target.noise[known] / expected[known]) / error)
+    if (noise := target.noise) is not None:
+        speckle = target.dots.noise(fields, noise, ambient, contrast)
+        parts.append(noise_residuals(noise, speckle, electrons / 255, read))
     return torch.cat([torch.zeros(0, dtype=torch.float64), *parts])
 
 
-def _speckle(target: _Target, picture: torch.Tensor, width: torch.Tensor) -> torch.Tensor:
-    """[B] variance in grey values that speckle of contrast 1 has, by brightness.
+def _tile_scatter(
+    targets: Sequence[_Target], values: Mapping[str, torch.Tensor], answer: torch.Tensor
+) -> torch.Tensor:
+    """[n] variance of the found logarithms between tiles of the pictures: a jackknife.
 
-    Speckle lies on the dots before the lens, which averages it: the squares of the Gaussian's
-    weights are 1 / (4 pi width^2) times a Gaussian that is narrower by the root of 2.
+    One grain lies in several bins of brightness, which the curvature of the fit takes for
+    independent. `answer` [n, R] is how the numbers follow the residuals, near the solution.
     """
-    squares = blurred(target.projected**2, width / math.sqrt(2)) / (4 * math.pi * width**2)
-    brightness, squares = inner(picture).flatten(), inner(squares).flatten()
-    order = brightness.detach().argsort()
-    out = []
-    for part, level in zip(torch.tensor_split(order, BRIGHTNESSES), target.level, strict=True):
-        gain = level / brightness[part].mean()
-        out.append(squares[part].mean() * gain**2)
-    return torch.stack(out)
+    total, row = torch.zeros(len(answer), dtype=torch.float64), 0
+    for target in targets:
+        whole = _residuals(target, values)
+        row += len(whole)
+        if (noise := target.noise) is None:
+            continue
+        ambient, width, contrast, electrons, read = (values[key] for key in KEYS)
+        speckle = target.dots.noise(target.dots.behind(width), noise, ambient, contrast)
+        parts = [
+            noise_residuals(noise, speckle, electrons / 255, read, part) for part in noise.parts
+        ]
+        moved = torch.stack(parts) @ answer[:, row - len(parts[0]) : row].T
+        total += (len(parts) - 1) * moved.var(dim=0, correction=0)
+    return total
 
 
 def _unknown(
@@ -289,7 +284,7 @@ def _unknown(
     """Keys that pictures do not tell, and why."""
     out = {}
     electrons, read = KEYS[3], KEYS[4]
-    if not any(len(target.noise) for target in targets):
+    if all(target.noise is None for target in targets):
         return dict.fromkeys(NOISE, "needs two or more frames of a still scene") | {
             key: "the pictures hold too few dots" for key in KEYS[:2] if errors[key] > UNKNOWN
         }

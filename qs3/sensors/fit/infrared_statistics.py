@@ -19,9 +19,6 @@ LAGS = 6
 FRAME_PX = math.ceil(2 * SMOOTH_PX)
 """Left out around a picture, where its shading is not known."""
 
-BRIGHTNESSES = 4
-"""Bins of brightness, as many pixels in each, in which the variance is taken."""
-
 
 @dataclass(frozen=True)
 class Statistics:
@@ -30,28 +27,19 @@ class Statistics:
     Attributes:
         shared: [LAGS] covariance of pixels 1, 2, ... apart, over rows and columns: texture
             alone, because a camera's noise is each pixel's own.
-        variance: [B] of pixels by brightness: texture and noise.
         skewness: third moment of the texture; noise has none.
-        level: [B] mean grey value of each bin.
-        pixels: how many there were.
     """
 
     shared: torch.Tensor
-    variance: torch.Tensor
     skewness: torch.Tensor
-    level: torch.Tensor
-    pixels: int
 
 
-def statistics(
-    grey: torch.Tensor, mean: torch.Tensor | None = None, bins: int = BRIGHTNESSES
-) -> Statistics:
+def statistics(grey: torch.Tensor, mean: torch.Tensor | None = None) -> Statistics:
     """Of one image [h, w] float64, but for a frame of `FRAME_PX` around it.
 
     Args:
         grey: grey values.
         mean: [h, w] its shading; None: `smooth(grey)`.
-        bins: of brightness.
     """
     grey, mean = inner(grey), inner(smooth(grey) if mean is None else mean)
     texture = (grey - mean) / mean.clamp_min(1e-9)
@@ -59,13 +47,7 @@ def statistics(
         torch.stack([(one[:, lag:] * one[:, :-lag]).mean() for one in (texture, texture.T)]).mean()
         for lag in range(1, LAGS + 1)
     ]
-    values, levels = texture.flatten(), mean.flatten()
-    order = levels.detach().argsort()
-    parts = torch.tensor_split(order, bins)
-    variance = torch.stack([values[part].square().mean() for part in parts])
-    level = torch.stack([levels[part].mean() for part in parts])
-    third = values.pow(3).mean()
-    return Statistics(torch.stack(shared), variance, third, level, values.numel())
+    return Statistics(torch.stack(shared), texture.pow(3).mean())
 
 
 def inner(image: torch.Tensor) -> torch.Tensor:

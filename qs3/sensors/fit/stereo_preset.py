@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.fit.infrared import InfraredFit
+from qs3.sensors.fit.infrared import WITHIN, InfraredFit
 from qs3.utils.files import write_text
 
 _WORDS = {
@@ -25,7 +25,9 @@ def report(found: InfraredFit, base: SpeckleStereo, scenes: int) -> list[str]:
         if key in found.unknown:
             lines.append(f"{key:28} unknown: {found.unknown[key]}; {found.values[key]:.4g} stays")
             continue
-        error = f" +- {found.errors[key]:.0%}" if key in found.errors else ""
+        error = f" +- {found.errors[key]:.1%}" if key in found.errors else ""
+        if key in found.rough:
+            error += f", rough: not sure within {WITHIN:.0%}"
         lines.append(f"{key:28} {found.values[key]:.4g}{error}   ({words})")
     dots = f"{found.dots_over_ambient:.3g} at {found.distance_m:.2f} m"
     lines.append(f"{'dots over ambient':28} {dots}")
@@ -53,6 +55,7 @@ def save(path: Path, found: InfraredFit, name: str, base: SpeckleStereo, command
         f"# Fitted to infrared pictures from {found.distance_m:.2f} m.",
         f"# {command}",
         *(f"# not known: {key}: {why}" for key, why in found.unknown.items()),
+        *(f"# rough: {key}: +- {found.errors[key]:.0%}" for key in found.rough),
         "defaults:",
         f"  - {name}",
         "  - _self_",

@@ -115,14 +115,19 @@ class Twin:
         Args:
             settings: see `settings_of`.
             noise: of speckle, photons and read-out, drawn anew at each call; None: none, and
-                no rounding either.
+                no rounding either. Ambient light has speckle where the sensor's has.
             whole: noisy images are rounded to grey values; gradients pass as if they were not.
         """
         camera = self.pair.sensor.infrared
-        longest = camera.max_exposure if isinstance(camera, InfraredCamera) else None
+        longest, apart = None, False
+        if isinstance(camera, InfraredCamera):
+            longest, apart = camera.max_exposure, not camera.ambient_speckles
+        light = settings["albedo"] * settings["ambient"]
         first, second = (
-            exposed(image, settings, noise, whole, max_exposure=longest)
-            for image in self.radiance(settings)
+            exposed(image, settings, noise, whole, light * view.albedo if apart else None, longest)
+            for image, view in zip(
+                self.radiance(settings), (self.pair.left, self.pair.right), strict=True
+            )
         )
         return first, second
 
@@ -202,15 +207,20 @@ def _slide_at(
 
 def blurred(image: torch.Tensor, sigma_px: torch.Tensor) -> torch.Tensor:
     """[h, w] through a Gaussian whose width may want a gradient; 0 outside the image."""
-    width = float(sigma_px.detach())
-    if width <= 0:
+    if float(sigma_px.detach()) <= 0:
         return image
-    reach = max(1, math.ceil(_REACH * width))
-    place = torch.arange(-reach, reach + 1, dtype=image.dtype)
-    kernel = torch.exp(-(place**2) / (2 * sigma_px**2))
-    kernel = kernel / kernel.sum()
+    kernel = gaussian(sigma_px).to(image.dtype)
+    reach = len(kernel) // 2
     rows = F.conv2d(image[None, None], kernel[None, None, None], padding=(0, reach))
     return F.conv2d(rows, kernel[None, None, :, None], padding=(reach, 0))[0, 0]
+
+
+def gaussian(sigma_px: torch.Tensor) -> torch.Tensor:
+    """[n] the lens's kernel along one axis, n odd; sums to 1. Its width may want a gradient."""
+    reach = max(1, math.ceil(_REACH * float(sigma_px.detach())))
+    place = torch.arange(-reach, reach + 1, dtype=sigma_px.dtype)
+    kernel = torch.exp(-(place**2) / (2 * sigma_px**2))
+    return kernel / kernel.sum()
 
 
 def _gamma_like(

@@ -44,6 +44,7 @@ from qs3.sensors.renderers.exr import read_exr
 # How far behind a surface its shadow caster lies, relative to the distance from the projector:
 # 0.2 mm at 2 m, about the gap that Mitsuba leaves.
 _SHADOW_GAP = 1e-4
+_SHEETS = 32  # clear faces on the way from the camera and on to the light; Cycles' own limit is 8
 _BACKGROUND_M = 1e9  # Cycles writes 1e10 m where nothing is hit
 _PACKAGES = "libxi6 libxxf86vm1 libxfixes3 libxrender1 libxkbcommon0 libsm6 libgl1 libegl1"
 
@@ -114,6 +115,8 @@ class BlenderRenderer:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         target = bpy.context.scene
         _configure(target, self.settings)
+        if scene.clear:  # a camera's and a light's ray count together
+            target.cycles.transparent_max_bounces = _SHEETS
         blender_devices.use(bpy, target.cycles, self.device)
         try:
             bodies = [_add_body(bpy, target, body, scene) for body in scene.bodies]

@@ -18,7 +18,7 @@ _MATT = Gloss(roughness=1.0, specular=0.0)
 _STEPS = (1779033703, 3144134277, 1013904242, 2773480762)
 _BOUNCE_STEPS = (1359893119, 2600822924)  # of 11 and 13
 _CLEAR_STEP = 528734636  # of 17
-_SHEETS = 4  # a ray passes through so many clear faces; the next one is as good as opaque
+_SHEETS = 8  # a ray passes through so many clear faces; the next one is as good as opaque
 
 
 class GlossyScene(JitScene):
@@ -87,7 +87,10 @@ class GlossyScene(JitScene):
 
         # A branch, not a mask: beside the object, which is much of a window, nothing is computed.
         seen = hit.prim_index, point, mi.Vector3f(ray.d), numbers
-        return dr.if_stmt(seen, hit.is_valid(), self._reflected, none)
+        there = hit.is_valid()
+        if self._clear:  # it may have passed the last face: `is_valid` still says what it met first
+            there &= dr.isfinite(hit.t)
+        return dr.if_stmt(seen, there, self._reflected, none)
 
     def _reflected(self, face: Any, point: Any, way: Any, numbers: list[Any]) -> Any:
         """Radiance of a face at a point that is seen along `way`."""

@@ -17,6 +17,7 @@ from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.fit.infrared import Pictures, fit_pictures
 from qs3.sensors.fit.infrared_statistics import statistics
 from qs3.sensors.fit.pictures import read_pictures
+from qs3.sensors.fit.stereo_preset import report
 from qs3.sensors.matching import StereoBlockMatcher
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.misalignment import Misalignment
@@ -119,7 +120,6 @@ def test_statistics_of_shifted_noise():
     expected = 0.01 * np.array([1 / 3, 1 / 6, 0, 0, 0, 0])
     np.testing.assert_allclose(plain.shared, expected, atol=3e-4)
     np.testing.assert_allclose(noisy.shared, expected, atol=3e-4)
-    np.testing.assert_allclose(noisy.variance - plain.variance, 0.0025, rtol=0.15)
     assert abs(float(plain.skewness)) < 1e-4
 
 
@@ -265,6 +265,15 @@ def test_a_second_camera_with_speckle_and_its_baseline_are_found_together(of_ano
     )  # fmt: skip
     found = fit_pictures(taken, base)
     assert found.focal_baseline == pytest.approx(480 * 0.061, rel=0.01)
-    for key in ("ambient", "infrared.psf_px", "infrared.speckle_contrast"):
-        assert key not in found.unknown
-        assert found.values[key] == pytest.approx(SECOND[key], rel=0.05), key
+    for key, value in SECOND.items():
+        assert key not in (*found.unknown, *found.rough), key
+        assert found.values[key] == pytest.approx(value, rel=0.05), key
+
+
+def test_two_frames_of_a_dim_wall_do_not_tell_noise_within_five_percent(of_another_camera):
+    sensor, (*_, dim) = of_another_camera
+    found = fit_pictures([replace(dim, left=dim.left[:2], right=[])], sensor)
+    for key in ("infrared.electrons_at_white", "infrared.read_noise_e"):
+        assert key in (*found.unknown, *found.rough)
+    said = [line for line in report(found, sensor, 1) if "not sure within 5%" in line]
+    assert len(said) == len(found.rough)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from qs3.errors import ConfigError
+from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.gradients.twin import Twin, blurred, correlations, settings_of, soft_argmax
 from qs3.sensors.gradients.views import pair_of
@@ -72,6 +73,33 @@ def test_its_images_and_disparities_are_those_of_the_ordinary_sensor(name, rende
     assert np.median(np.abs(found - truth)[both]) < 0.04
     depth = twin.depth_m(torch.from_numpy(found), settings).numpy()
     assert np.median(np.abs(depth / frame.clean_m - 1)[both]) < 0.002
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_speckle_is_on_the_same_light_as_the_ordinary_sensor_s(everywhere, renderer):
+    """Variance over frames, in pixels between dots, where ambient light is all, and on dots."""
+    camera = replace(
+        QUIET, speckle_contrast=0.2, ambient_speckles=everywhere, fixed_gain=12.0,
+        electrons_at_white=5000.0, read_noise_e=10.0,
+    )  # fmt: skip
+    sensor = replace(SENSOR, ambient=4.0, infrared=camera)
+    bodies = (plane(1.5, 0.14, tilt_deg=25),)
+    still, taken = StillRenderer(renderer), []
+    for i in range(12):
+        still.rewind()
+        frame = sensor.scan(bodies, box_of(*bodies), POSE, still, np.random.default_rng(i))
+        taken.append(frame.images["left"].astype(float))
+    pair = pair_of(sensor, bodies, box_of(*bodies), POSE, renderer)
+    twin, settings = Twin(pair), settings_of(pair, camera.fixed_gain)
+    drawn = torch.Generator().manual_seed(0)
+    ours = np.stack([twin.grey(settings, drawn)[0].numpy() for _ in range(12)])
+    theirs = np.stack(taken)
+    inner = cv2.erode(pair.left.smooth.numpy().astype(np.uint8), np.ones((7, 7))) > 0
+    bright = twin.grey(settings)[0].numpy()[inner]
+    a, b = (frames.var(axis=0, ddof=1)[inner] for frames in (ours, theirs))
+    low, high = np.quantile(bright, [0.3, 0.8])
+    for part in (bright < low, bright > high):
+        assert a[part].mean() == pytest.approx(b[part].mean(), rel=0.04)
 
 
 KEYS = (

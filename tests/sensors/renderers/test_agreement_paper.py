@@ -49,8 +49,12 @@ def mesh_of(name):
     return items[{"lamp": 1, "plant": 2}.get(name, 3)].load()
 
 
-def compare(name, samples, window_px=None, gloss=None, light=None, materials=None, median_px=0.05):
+def compare(
+    name, samples, window_px=None, gloss=None, light=None, materials=None, median_px=0.05, more=1
+):
     """Check Blender against Mitsuba on one object; `window_px` limits the render to its middle.
+
+    Mitsuba takes `more` times as many samples.
 
     `materials` dresses it, in place of `gloss`. With a wider `median_px` nothing is said of the
     tail and of the bias.
@@ -82,7 +86,8 @@ def compare(name, samples, window_px=None, gloss=None, light=None, materials=Non
     images, found = [], []
     # Other seeds, so that it is not the same sampling pattern that makes them agree.
     for seed, make in enumerate((BlenderRenderer, MitsubaRenderer)):
-        seen = make(samples=samples).render(scene, pair, seed=seed, geometry=[True, False])
+        many = samples * (more if make is MitsubaRenderer else 1)
+        seen = make(samples=many).render(scene, pair, seed=seed, geometry=[True, False])
         gain = NO_NOISE.gain(seen[0].radiance, seen[0].label > 0)
         grey = [NO_NOISE.expose(image.radiance, gain, rng) for image in seen]
         images.append(seen[0])
@@ -154,14 +159,15 @@ def test_disparities_agree_on_bodies_of_several_materials(name, lit):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["chair", "bookshelf"])
-def test_disparities_agree_less_on_clear_bodies(name):
-    """conf/materials/clear.yaml with as much glass as all the rest: not within 0.05 px.
+def test_disparities_agree_on_clear_bodies(name):
+    """conf/materials/clear.yaml with as much glass as all the rest.
 
-    Whether a sample passes is drawn, so 16 of them are noisy: Mitsuba differs from itself with
-    another seed by 0.10 px on the chair, from Blender by 0.15 px there and 0.09 px on the shelf.
+    Whether a sample passes is drawn, and in Blender only what is behind depends on it, so that 16
+    of Mitsuba's are much noisier: it differs from itself with another seed by 0.10 px on the chair.
+    With 256 the two differ by 0.05 px there and by 0.035 px on the shelf, with 16 by 0.08.
     """
     materials = materials_of("clear", glass=1.0)
-    compare(name, samples=16, window_px=180, materials=materials, median_px=0.2)
+    compare(name, samples=16, window_px=140, materials=materials, median_px=0.06, more=16)
 
 
 @pytest.mark.slow

@@ -136,6 +136,24 @@ def test_two_sheets_hold_back_twice(mitsuba):
     assert middle_of(image.radiance).mean() == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.parametrize("count", [1, 6])
+def test_behind_sheets_there_may_be_nothing(count, mitsuba, blender):
+    """Each adds a share of its own light, which those before it hold back; then it is dark."""
+    t, ambient, albedo = 0.8, 0.5, 0.6
+    places = [1.0 + 0.1 * i for i in range(count)]
+    scene = Scene(tuple(sheet(t, albedo, z, 0.2 * z, 3) for z in places), projector(), ambient)
+    unlit = replace(scene, projector=None)
+    own = [(1 - t) * albedo * t**i for i in range(count)]
+    for renderer in (mitsuba, blender):
+        lit, even = (
+            renderer.render(one, [CAMERA], seed=0, geometry=[False])[0].radiance
+            for one in (scene, unlit)
+        )
+        assert middle_of(even).mean() == pytest.approx(ambient * sum(own), rel=0.02)
+        dots = sum(a * t**i / z**2 for i, (a, z) in enumerate(zip(own, places, strict=True)))
+        assert middle_of(lit - even).mean() == pytest.approx(dots, rel=0.02)
+
+
 def test_the_area_light_passes_through_a_sheet(mitsuba, blender):
     pose = moved(0.0)
     area = AreaLight(pose, side_m=0.02, radiance=50.0)  # before the camera's middle
