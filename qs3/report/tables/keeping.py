@@ -16,13 +16,7 @@ import numpy as np
 from qs3.errors import DataError
 from qs3.report.tables.aggregate import Run, load_runs
 from qs3.report.tables.cells import Table
-from qs3.runs.metrics import (
-    FINISHED,
-    METRICS,
-    RunMetrics,
-    read_metrics,
-    write_metrics,
-)
+from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
 
 DIGITS = 4

@@ -29,10 +29,11 @@ _TILES = 6  # along each side, of the jackknife
 # What the variance of speckle in one bin differs by between two patterns of dots: a share of it
 # and, where it is no more than what the lens spreads from dots, of its mean.
 _DOTS_ERROR, _TAILS_ERROR = 0.05, 0.002
-Fields = dict[str, torch.Tensor]
-
 _STEP = 1 / 12  # variance of rounding to grey values ...
 _FINE = 0.4  # ... which is noise of its own if there is this much in all (else it is the level's)
+
+Fields = dict[str, torch.Tensor]
+"""What a lens makes of light and grains, by name; [h, w] each, but for its width."""
 
 
 @dataclass(frozen=True, eq=False)
