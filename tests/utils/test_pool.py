@@ -242,6 +242,15 @@ def test_a_script_runs_once_and_what_it_defines_is_found(tmp_path, script, said)
     assert (done.stdout, done.stderr) == (said, "")
 
 
+@pytest.fixture
+def ctrl_c_counts():
+    """As in a terminal: what a shell starts behind an & ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c_counts")
 @pytest.mark.parametrize("others", [0, 1])
 def test_ctrl_c_waits_until_a_process_has_started(others):
     """With another thread, which takes the signal in the main one's place, too."""
