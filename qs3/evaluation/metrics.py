@@ -109,9 +109,13 @@ def adapt_norms(
 def even_batches(
     points: Float[Tensor, "n p 3"], batch_size: int, seed: int
 ) -> Iterator[Float[Tensor, "b p 3"]]:
-    """All clouds in random order, in batches of about `batch_size`, as equal as they can be."""
-    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
-    for index in torch.tensor_split(order, max(1, round(len(points) / batch_size))):
+    """All clouds in random order, in batches of about `batch_size`, as equal as they can be.
+
+    Of at least two clouds, if there are two: batch norm cannot use a single one.
+    """
+    n = len(points)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
+    for index in torch.tensor_split(order, max(1, min(round(n / batch_size), n // 2))):
         yield points[index]
 
 

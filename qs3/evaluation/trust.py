@@ -211,24 +211,6 @@ def fit_weights(
     return dict(zip(names, nnls(left, right)[0].tolist(), strict=True))
 
 
-def left_out_estimates(
-    names: Sequence[str],
-    table: Float[np.ndarray, "n k"],
-    base: Float[np.ndarray, " n"],
-    truth: Float[np.ndarray, " n"],
-    targets: Sequence[str],
-) -> Float[np.ndarray, " n"]:
-    """What is expected of each case by weights that were fitted without any case of its target."""
-    of, found = np.array(targets), np.empty(len(truth))
-    for target in np.unique(of):
-        rest = of != target
-        weights = fit_weights(names, table[rest], base[rest], truth[rest], of[rest].tolist())
-        for i in np.flatnonzero(~rest):
-            row = dict(zip(names, table[i].tolist(), strict=True))
-            found[i] = expected(float(base[i]), row, weights)
-    return found
-
-
 def judge(known: Known, seen: Seen, calibration: Calibration) -> Trust | None:
     """What to make of a net's answers; None of fewer than `FEWEST` clouds.
 

@@ -33,8 +33,6 @@ from qs3.runs.metrics import read_metrics
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.progress import progress_bar
 
-_SHOWN = 10  # failures in the text for the terminal
-
 
 def predict_command(settings: Settings) -> tuple[str, int]:
     """Predict and save.

@@ -136,7 +136,7 @@ def export_folder(
     Args:
         ckpt: what is exported.
         folder: where to.
-        judged: a table of `qs3 report judge runs=CKPT out=TABLE.csv`, for the card.
+        judged: what `qs3 report judge runs=CKPT out=FILE.json` wrote, for the card; "" for none.
         half: matrices as numbers of 16 bits: half the size, and other probabilities in the fourth
             digit. They count as 32 bits again when the net is built.
 

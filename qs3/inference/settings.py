@@ -14,8 +14,6 @@ from qs3.inference.floor import Floor
 from qs3.inference.inputs import Unit
 from qs3.inference.predictor import Predictor
 
-_SHOWN = 10  # failures in the text for the terminal
-
 
 @dataclass(frozen=True)
 class Settings:

@@ -20,8 +20,6 @@ from qs3.inference.settings import Settings
 from qs3.inference.table import Row
 from qs3.models.norms import norms_for, use_domain
 
-_SHOWN = 10  # failures in the text for the terminal
-
 
 def predict_units(
     predictor: Predictor,

@@ -207,13 +207,16 @@ def check_selection(
     )
     facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
     if total < 2:
-        one_class = int((selection.confident > 0).sum()) == 1
-        why = (
-            "all confident samples are of one class, so its mu is 0; train the teacher longer "
-            "(protocol.epochs), or set selftraining.selector.mu=one"
-            if one_class
-            else "lower selftraining.theta, or train the teacher longer (protocol.epochs)"
-        )
+        own_mu = selection.mu[selection.confident > 0]
+        if len(own_mu) == 1 and own_mu[0] == 0:
+            why = (
+                "all confident samples are of one class, so its mu is 0; train the teacher longer "
+                "(protocol.epochs), or set selftraining.selector.mu=one"
+            )
+        else:
+            own = selection.thresholds is not None
+            key = "raise selftraining.selector.portion" if own else "lower selftraining.theta"
+            why = f"{key}, or train the teacher longer (protocol.epochs)"
         raise SelectionError(f"only {total} pseudo-labels selected in {facts}; {why}")
     if missing and missing_class == "error":
         raise SelectionError(

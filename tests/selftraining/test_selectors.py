@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from qs3.errors import ConfigError, SelectionError
+from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.selectors import (
     Qbst,
     Selection,
@@ -110,6 +111,20 @@ def test_two_pseudo_labels_are_the_least(confident, advice):
     one_short = replace(chosen([1, 1, 0]), confident=np.array([1, 1]))
     with pytest.raises(ValueError, match="zip"):
         check_selection(one_short, ("x", "y", "z"), 0, "warn")
+
+
+def test_advice_is_about_the_selector_in_use():
+    """One sure sample of one class: QBST's mu is 0, SPST has none, CBST has no use for theta."""
+    probabilities = np.array([[0.9, 0.1], [0.6, 0.4], [0.6, 0.4]])
+    teacher = TeacherPredictions.of(probabilities, ["a", "b", "c"])
+    for selector, theta, advice in (
+        (Qbst(), 0.8, "so its mu is 0; .*mu=one$"),
+        (Qbst(mu="one"), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
+        (Spst(), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
+        (Cbst(), 0.0, r"b 0/0; raise selftraining.selector.portion, or train"),
+    ):
+        with pytest.raises(SelectionError, match=advice):
+            check_selection(selector.select(teacher, theta), ("a", "b"), 0, "warn")
 
 
 def test_predictions_selections_and_rules_cannot_be_changed():

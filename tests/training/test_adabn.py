@@ -65,6 +65,9 @@ def test_order_of_clouds_is_mixed_and_batches_are_even():
     flat = [value for batch in seen for value in batch]
     assert sorted(flat) == list(range(65))
     assert flat != sorted(flat)
+    seen.clear()
+    adapt_norms(Net(3), points[:7], 2, seed=0)  # 3.5 batches, which rounds to 4
+    assert [len(batch) for batch in seen] == [3, 2, 2]
 
 
 def test_adabn_finds_a_target_that_lies_elsewhere():

@@ -17,6 +17,7 @@ The centre of the top left pixel is (0, 0). Sizes are read and judged before a p
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -273,7 +274,8 @@ def _of_mapping(given: Any, where: str) -> Intrinsics:
         raise DataError(f"{where}: no fx, fy, cx, cy and no matrix K")
     matrix = next((given[key] for key in _MATRICES if key in given), None)
     if isinstance(matrix, Mapping) and "data" not in matrix:
-        return _of_mapping(matrix, where)
+        beside = {*itertools.chain(*_SIZES), *_BENT}  # may stand within, or about it
+        return _of_mapping({key: given[key] for key in beside & {*given}} | {**matrix}, where)
     if isinstance(matrix, Mapping):
         matrix = matrix["data"]
     if matrix is not None:

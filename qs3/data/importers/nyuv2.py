@@ -165,7 +165,7 @@ class NYUv2(FrameImporter):
         """How the vertical of each frame of a split was found, and up in its camera."""
         chosen = [i for i, split in enumerate(splits) if split]
         floors: dict[int, np.ndarray] = {}
-        if "planes" not in self.vertical[:1]:
+        if {*self.vertical} & {_FLOOR, "accelerometer"}:  # whose mounting the floors tell
             floors = self._floors(frames, chosen)
         seat = _checked_mounting(frames, floors) if "accelerometer" in self.vertical else None
         found: dict[int, tuple[str, np.ndarray] | None] = {}

@@ -66,18 +66,20 @@ def difference(
     blocks: Int[np.ndarray, " n"],
     *,
     balanced: bool = False,
+    same_seeds: bool = True,
 ) -> Share:
     """Share of a less that of b, paired: object by object, and seed by seed.
 
-    If they have not as many seeds each, their seeds are averaged first, and the interval is over
+    If they have other seeds, or not as many, these are averaged first, and the interval is over
     blocks alone: it then tells nothing of other seeds.
 
     Args:
-        a, b: as in `share`; row k of both is of the same seed.
+        a, b: as in `share`.
         labels, blocks, balanced: as in `share`.
+        same_seeds: whether row k of both is of the same seed.
     """
     x, y = a.astype(float), b.astype(float)
-    if len(x) != len(y):
+    if len(x) != len(y) or not same_seeds:
         x, y = x.mean(axis=0, keepdims=True), y.mean(axis=0, keepdims=True)
     return _over(x - y, labels, blocks, balanced, (-1.0, 1.0))
 

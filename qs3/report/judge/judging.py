@@ -229,7 +229,9 @@ def _differences(
             len(common),
             *(
                 difference(
-                    right[:, of], base_right[:, of], truth[of], blocks[of], balanced=balanced
+                    *(right[:, of], base_right[:, of], truth[of], blocks[of]),
+                    balanced=balanced,
+                    same_seeds=bool(common),
                 )
                 for balanced in (False, True)
             ),

@@ -26,10 +26,11 @@ DIGITS = 4
 def keep(table: Table, folder: str | Path) -> list[Path]:
     """Copy what a table needs of its finished runs; returns the folders that are new or changed.
 
-    Layout: `<folder>/<experiment>/seed<seed>-<hash>/`, as below `paths.log_dir`.
+    Layout: `<folder>/<experiment>/seed<seed>-<hash>/`, as below `paths.log_dir`. Of a run without
+    predictions the result alone is kept.
 
     Raises:
-        DataError: a run's predictions are not there, or damaged.
+        DataError: a run's predictions are damaged.
     """
     written = []
     for run in finished_runs(table):

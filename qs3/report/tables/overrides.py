@@ -41,15 +41,16 @@ def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[s
 def chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
     """Names that are meant by the words: the one that is the word, else all that contain it.
 
-    Case and spaces do not count, and an arrow may be typed as "->"; no words mean all.
+    Case and spaces do not count, unless two names differ in nothing else, and an arrow may be typed
+    as "->"; no words mean all.
     """
     typed = {name: _typed(name) for name in names}
     if not words:
         return set(typed)
     found: set[str] = set()
-    for word in map(_typed, words):
-        exact = {name for name, text in typed.items() if text == word}
-        found |= exact or {name for name, text in typed.items() if word in text}
+    for word, own in zip(words, map(_typed, words), strict=True):
+        exact = {word} & {*typed} or {name for name, text in typed.items() if text == own}
+        found |= exact or {name for name, text in typed.items() if own in text}
     return found
 
 

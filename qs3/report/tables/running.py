@@ -66,15 +66,16 @@ def missing(
         ConfigError: `rows` fit no row, `columns` no column, or both together no cell.
     """
     cells = [c for c in table.cells if c.runnable and not c.missing]
-    for kind, words in (("row", rows), ("column", columns)):
+    for kind, words, every in (("row", rows, table.rows), ("column", columns, table.columns)):
         names = dict.fromkeys(getattr(c, kind) for c in cells)
-        meant = chosen(names, words)
+        meant = chosen(every, words)  # also one that cannot be run: no other is meant by its name
         cells = [c for c in cells if getattr(c, kind) in meant]
         if words and not cells:
-            raise ConfigError(
-                f"no {kind} of table {table.name} has {' or '.join(map(repr, words))} in its name; "
-                f"{kind}s to run are {', '.join(map(repr, names))}"
-            )
+            named = " or ".join(map(repr, words))
+            why = f"of table {table.name} has {named} in its name"
+            if meant:  # published figures alone, or what it needs is not there
+                why = f"{named} of table {table.name} can be run"
+            raise ConfigError(f"no {kind} {why}; {kind}s to run are {', '.join(map(repr, names))}")
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in sorted(cells, key=lambda cell: not cell.first):
         done = set(cell.group.seeds) if cell.group else set()

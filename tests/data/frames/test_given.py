@@ -164,6 +164,15 @@ MATRIX = [[525.0, 0, 319.5], [0, 526.0, 239.5], [0, 0, 1]]
             True,
         ),
         ("e.json", {"K": MATRIX}, None, False),
+        (
+            "h.json",  # size and lens about the numbers
+            {
+                **{"width": 640, "height": 480, "D": [0.1, 0, 0, 0]},
+                "intrinsics": {"fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5},
+            },
+            (640, 480),
+            True,
+        ),
         ("f.txt", "525 0 319.5\n0 526 239.5\n0 0 1\n", None, False),
         ("g.txt", "525 0 319.5 0\n0 526 239.5 0\n0 0 1 0\n0 0 0 1\n", None, False),
     ],

@@ -156,7 +156,7 @@ def test_other_processes_cut_the_same(opened, nyuv2, tmp_path):
     assert compose_domain("nyuv2", keys).open().sha256 == opened[1].sha256
 
 
-def test_accelerometer_where_enough_floors_agree(tmp_path):
+def test_accelerometer_where_enough_floors_agree(tmp_path, monkeypatch):
     """Ten frames with a floor tell how the sensor sits; the eleventh has none."""
     rng = np.random.default_rng(3)
     size = (240, 320)
@@ -178,6 +178,10 @@ def test_accelerometer_where_enough_floors_agree(tmp_path):
     assert [task.vertical for task in tasks] == ["floor"] * 11 + ["accelerometer"]
     up = np.array(tasks[11].world_from_camera)[2]
     assert np.degrees(np.arccos(up @ shots[11].up_in_camera)) < 0.5
+    monkeypatch.setattr("qs3.data.importers.nyuv2.planes_up", lambda *_: None)
+    keys["published.vertical"] = "[planes,floor,accelerometer]"  # the next ways, if the first fails
+    after = compose_domain("nyuv2", keys).importer().tasks()
+    assert [task.vertical for task in after] == [task.vertical for task in tasks]
 
 
 @pytest.fixture

@@ -192,6 +192,17 @@ def test_the_others_are_compared_with_the_first(archive, logs):
     assert first[0].accuracy.sem is not None
 
 
+def test_other_seeds_are_not_paired(archive, logs, tmp_path):
+    """As many of them, and none in common: what is said of the interval holds."""
+    for seed in (6, 7):
+        add_net(write_run(tmp_path, experiment="apart", hash="eeee0000", seed=seed), seed)
+    verdict = judge([str(logs / "exp"), str(tmp_path / "apart")], archive)
+    for d in verdict.differences:
+        assert d.seeds == 0
+        assert (d.accuracy.sem, d.balanced.sem) == (None, None)
+    assert "fewer than two common seeds: the interval is over blocks alone" in text(verdict)
+
+
 def test_balanced_takes_each_class_alike():
     right = np.array([[1, 1, 1, 1, 1, 1, 0, 0]], dtype=bool)
     labels = np.array([0, 0, 0, 0, 0, 0, 3, 3])

@@ -80,6 +80,23 @@ def test_one_cell(tmp_path):
         missing(table, [0], columns=["x"])
 
 
+def test_a_name_means_its_own_row_alone(tmp_path):
+    """Not one that is written otherwise, and, if it cannot be run, none that holds the word."""
+    names = ["DANN", "dann", "GAST"]
+    assert chosen(names, ["dann"]) == {"dann"}
+    assert chosen(names, ["Dann"]) == {"DANN", "dann"}
+    path = tmp_path / "own.yaml"
+    path.write_text(
+        "title: Own\nmetrics: [accuracy]\ncolumns: [T]\nrows:\n"
+        "  - {name: GAST, paper: [70]}\n"
+        "  - {name: GAST + SPST, T: {run: experiment=qs3_s2d}}\n"
+    )
+    table = build_table(str(path), tmp_path)
+    assert [job.name for job in missing(table, [0], ["spst"])] == ["GAST + SPST, seed 0"]
+    with pytest.raises(ConfigError, match="no row 'GAST' of table own can be run; rows to run are"):
+        missing(table, [0], ["GAST"])
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
