@@ -29,6 +29,7 @@ from qs3.clouds.pcd import read_pcd
 from qs3.clouds.text import read_text
 from qs3.errors import DataError, MeshError, Qs3Error
 from qs3.utils.memory import check_memory
+from qs3.utils.plural import counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +144,7 @@ def _of_array(path: Path, array: np.ndarray, labels: np.ndarray | None = None) -
     clouds = array[..., :3] if many else array[None, :, :3]
     if labels is not None and labels.shape != (len(clouds),):
         raise DataError(
-            f"{path}: {len(clouds)} clouds, but the labels have the shape {labels.shape}"
+            f"{path}: {counted(len(clouds), 'cloud')}, but the labels have the shape {labels.shape}"
         )
     words = None if labels is None else tuple(labels.tolist())
     return CloudFile(tuple(clouds), words, many=many)

@@ -19,7 +19,8 @@ def measured(cloud: np.ndarray, where: str) -> tuple[np.ndarray, int]:
     if finite.all():
         return cloud, 0
     if not finite.any():
-        raise DataError(f"{where}: all {len(cloud)} points are not finite (NaN or infinite)")
+        them = f"all {len(cloud)} points are" if len(cloud) > 1 else "its only point is"
+        raise DataError(f"{where}: {them} not finite (NaN or infinite)")
     return cloud[finite], int((~finite).sum())
 
 

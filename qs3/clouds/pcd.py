@@ -16,6 +16,7 @@ import numpy as np
 
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.memory import check_memory
+from qs3.utils.plural import counted
 
 _MAX_HEADER_BYTES = 1 << 16
 _MAX_WORD_BYTES = 64  # of one number in a text file
@@ -170,7 +171,9 @@ def _fields(entries: dict[str, list[str]]) -> tuple[tuple[_Field, ...], int, int
     if not names:
         raise DataError("has no fields")
     if len(kinds) != len(names):
-        raise DataError(f"has {len(kinds)} values in TYPE for {len(names)} fields")
+        raise DataError(
+            f"has {counted(len(kinds), 'value')} in TYPE for {counted(len(names), 'field')}"
+        )
     sizes = _whole(entries, "SIZE", len(names))
     counts = _whole(entries, "COUNT", len(names)) if "COUNT" in entries else [1] * len(names)
     fields: dict[str, _Field] = {}
@@ -191,7 +194,7 @@ def _fields(entries: dict[str, list[str]]) -> tuple[tuple[_Field, ...], int, int
 def _whole(entries: dict[str, list[str]], key: str, count: int) -> list[int]:
     words = entries.get(key, [])
     if len(words) != count:
-        raise DataError(f"has {len(words)} values in {key}, not {count}")
+        raise DataError(f"has {counted(len(words), 'value')} in {key}, not {count}")
     if not all(w.isascii() and w.isdigit() and len(w) <= 10 for w in words):
         raise DataError(f"has a {key} that is not whole numbers: {' '.join(words)[:60]!r}")
     return [int(word) for word in words]
@@ -205,7 +208,7 @@ def _from_text(header: _Header, body: bytes) -> dict[str, np.ndarray]:
     check_memory(48 * wanted + (_MAX_WORD_BYTES + 16) * header.points, "")
     words = body.split()
     if len(words) != wanted:
-        raise DataError(f"has {len(words)} numbers where its header promises {wanted}")
+        raise DataError(f"has {counted(len(words), 'number')} where its header promises {wanted}")
     if max(map(len, words), default=0) > _MAX_WORD_BYTES:
         raise DataError(f"has a number of more than {_MAX_WORD_BYTES} characters")
     return {f.name: _numbers(f, words[f.numbers :: header.numbers]) for f in header.fields}

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from qs3.errors import DataError
 from qs3.utils.memory import check_memory
+from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
 
 
@@ -71,6 +72,7 @@ def _bad_line(path: Path, lines: list[bytes]) -> str:
         except ValueError:
             return f"{path}, line {number}: '{shown}' is not a row of numbers"
         if len(words) < 3 or (width is not None and len(words) != width):
-            return f"{path}, line {number}: '{shown}' has {len(words)} numbers, not {width or 3}"
+            has = counted(len(words), "number")
+            return f"{path}, line {number}: '{shown}' has {has}, not {width or 3}"
         width = len(words)
     return f"{path}: not a text file of rows with numbers"

@@ -21,6 +21,7 @@ from typing import Any
 
 from qs3.config.checks import check_float, check_int
 from qs3.errors import ClusterError, ConfigError
+from qs3.utils.plural import counted
 from qs3.utils.pool import Outcome, Result, Task
 
 log = logging.getLogger(__name__)
@@ -193,9 +194,9 @@ class _Run:
     def _report(self) -> None:
         """Who did how much, and what went wrong on the way."""
         shares = ", ".join(f"{n} by {node}" for node, n in self.nodes.most_common())
-        log.info("%d nodes: %s", len(self.nodes), shares)
+        log.info("%s: %s", counted(len(self.nodes), "node"), shares)
         for what, count in self.troubles.items():
-            log.warning("%d times %s; what it had was done again", count, what)
+            log.warning("%s %s; what it had was done again", counted(count, "time"), what)
 
 
 _WORKERS: dict[bytes, Any] = {}
@@ -237,7 +238,7 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
             ) from error
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         cpus = int(ray.cluster_resources().get("CPU", 0))
-        log.info("Ray: %d nodes, %d cores", len(nodes), cpus)
+        log.info("Ray: %s, %s", counted(len(nodes), "node"), counted(cpus, "core"))
         if not any(
             has.get("CPU", 0) >= how.cpus
             and has.get("GPU", 0) >= how.gpus
@@ -245,9 +246,9 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
             for has in nodes
         ):
             raise ConfigError(
-                f"no node of the cluster has {how.place}.cpus={how.cpus} cores, "
-                f"{how.place}.gpus={how.gpus} cards and {how.place}.memory_gb={how.memory_gb or 0} "
-                "of memory"
+                f"no node of the cluster has {how.place}.cpus={counted(how.cpus, 'core')}, "
+                f"{how.place}.gpus={counted(how.gpus, 'card')} and "
+                f"{how.place}.memory_gb={how.memory_gb or 0} of memory"
             )
         yield
     finally:

@@ -28,6 +28,7 @@ from qs3.data.store import (
     read_meta,
 )
 from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -114,8 +115,9 @@ class Domain:
         for split, counts in (self.expected_counts or {}).items():
             if len(counts) != len(classes):
                 raise ConfigError(
-                    f"domain {self.name}: expected_counts.{split} has {len(counts)} numbers for "
-                    f"{len(classes)} classes"
+                    f"domain {self.name}: expected_counts.{split} has "
+                    f"{counted(len(counts), 'number')} for "
+                    f"{counted(len(classes), 'class', 'classes')}"
                 )
 
     @property

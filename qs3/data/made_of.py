@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from qs3.errors import DataError
+from qs3.utils.plural import counted
 
 KEY = "made_of"
 """Its key in meta.yaml."""
@@ -67,7 +68,7 @@ class MadeOf:
 
     def __str__(self) -> str:
         """Such as "embedded catalogue, speckle_stereo, 5 views"."""
-        views = f"{self.views} view{'s' * (self.views > 1)}" if self.views else ""
+        views = counted(self.views, "view") if self.views else ""
         without = f"without {self.without}" if self.without else ""
         parts = (self.objects, self.sensor, views, without, self.benchmark)
         return ", ".join(filter(None, parts))

@@ -13,6 +13,7 @@ from typing import Any
 
 from qs3.errors import DataError
 from qs3.utils.memory import TABLE_PEAK, read_whole
+from qs3.utils.plural import counted
 from qs3.utils.text_table import csv_text
 
 MANIFEST = "manifest.csv"
@@ -148,7 +149,8 @@ def _from_csv(text: str, path: Path) -> list[ManifestRow]:
     rows = []
     for number, values in enumerate(lines, start=2):
         if len(values) != len(header):
-            raise DataError(f"{path}, line {number}: {len(values)} columns, not {len(header)}")
+            has = counted(len(values), "column")
+            raise DataError(f"{path}, line {number}: {has}, not {len(header)}")
         fields: dict[str, Any] = {}
         for name, value in zip(_FIELDS, values, strict=False):
             try:

@@ -31,6 +31,7 @@ from qs3.data.store import PointSet, is_begun, is_finished, write_pointset
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.neighbours import knn
 from qs3.geometry.sampling import farthest_point_sampling_np
+from qs3.utils.plural import counted
 
 
 class Clouds(InMemoryDataset):
@@ -129,8 +130,8 @@ def from_pyg(
     for (split, number), (pos, y, key) in taken.items():
         if len(pos) < points:
             raise DataError(
-                f"cloud {number} of {split!r} has {len(pos)} points, fewer than points={points}; "
-                "leave it out or give a smaller number"
+                f"cloud {number} of {split!r} has {counted(len(pos), 'point')}, fewer than "
+                f"points={points}; leave it out or give a smaller number"
             )
         thinned = farthest_point_sampling_np(pos, points) if len(pos) > points else slice(None)
         clouds.append(pos[thinned])
@@ -180,7 +181,8 @@ def _classes(given: Sequence[str] | None, dataset: Any, labels: list[int | None]
     names = [str(name) for name in (class_list(None) if names is None else names)]
     if known and not 0 <= min(known) <= max(known) < len(names):
         raise DataError(
-            f"labels are {min(known)} to {max(known)}, but there are {len(names)} classes"
+            f"labels are {min(known)} to {max(known)}, but there "
+            f"{'is 1 class' if len(names) == 1 else f'are {len(names)} classes'}"
         )
     return names
 

@@ -55,6 +55,7 @@ from qs3.data.sharded import ShardedArray
 from qs3.errors import DataError
 from qs3.utils import text_table
 from qs3.utils.files import make_folder, remove_leftovers, sha256_file, write_text
+from qs3.utils.plural import counted
 from qs3.utils.version import VERSION
 
 __all__ = [
@@ -287,8 +288,8 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
     kept = [row for row in rows if row.status == OK]
     if len(kept) != meta["clouds"]:
         raise DataError(
-            f"{folder / MANIFEST} has {len(kept)} rows with status ok, but {META} promises "
-            f"{meta['clouds']} clouds; generate or import the dataset again"
+            f"{folder / MANIFEST} has {counted(len(kept), 'row')} with status ok, but {META} "
+            f"promises {counted(meta['clouds'], 'cloud')}; generate or import the dataset again"
         )
     points = open_array(folder, variant, meta, 3, verify)
     check_finite(folder / f"{variant}.npy", points, [row.id for row in kept])
@@ -369,7 +370,7 @@ def _check_arrays(
         if array.shape[:2] != arrays["points"].shape[:2] or len(array) != clouds:
             raise DataError(
                 f"array {key!r} of dataset {name!r} has shape {array.shape}, 'points' has "
-                f"{arrays['points'].shape}, and {clouds} rows have status ok"
+                f"{arrays['points'].shape}, and {counted(clouds, 'row has', 'rows have')} status ok"
             )
         array.check_finite()
     n, p, _ = arrays["points"].shape

@@ -24,6 +24,7 @@ from qs3.datamodules.fps_samples import sample_all
 from qs3.errors import ConfigError, Qs3Error
 from qs3.utils.files import atomic_path
 from qs3.utils.locks import locked
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +69,8 @@ def prepare(
     starts = min(starts, stored)
 
     def work() -> np.ndarray:
-        log.info("sampling %d of %d points of %d clouds, %dx (%s)", count, stored, n, starts, key)
+        clouds = counted(n, "cloud")
+        log.info("sampling %d of %d points of %s, %dx (%s)", count, stored, clouds, starts, key)
         return sample_all(points, count, starts)
 
     if cache_dir is None:

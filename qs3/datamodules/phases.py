@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from qs3.config.checks import check_choice, check_float, check_int
 from qs3.errors import ConfigError
+from qs3.utils.plural import counted
 
 
 @dataclass(frozen=True)
@@ -165,8 +166,8 @@ class SelfTrainingConfig:
         step = check_float("selftraining.weight_step", self.weight_step)
         if not 0.0 <= step * (epochs - 1) < 1.0:
             raise ConfigError(
-                f"selftraining.weight_step must be >= 0, and below 1 after {epochs - 1} epochs, "
-                f"got {self.weight_step}"
+                "selftraining.weight_step must be >= 0, and below 1 after "
+                f"{counted(epochs - 1, 'epoch')}, got {self.weight_step}"
             )
         last = self.theta_of(self.rounds - 1)
         if not (0.0 < last < 1.0 or (free and last == 0)):

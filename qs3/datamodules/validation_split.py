@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Int
 
 from qs3.errors import DataError
+from qs3.utils.plural import counted
 from qs3.utils.seeding import derive
 
 STRATIFIED_SEED = 0
@@ -37,8 +38,8 @@ def lineage(
     validates = place[order] % 10 >= 8
     if not validates.any():
         raise DataError(
-            f"only {len(objects)} labelled training objects; at least 9 are needed, so that every "
-            "ninth and tenth can validate"
+            f"only {counted(len(objects), 'labelled training object')}; at least 9 are needed, so "
+            "that every ninth and tenth can validate"
         )
     return order[~validates], order[validates]
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from qs3.evaluation.trust_file import SHIFTS
 from qs3.runs.metrics import AccuracyEstimates, Estimates, Trust
+from qs3.utils.plural import counted
 
 DO_NOT_TRUST = "do not trust this"
 
@@ -54,8 +55,8 @@ def trust_in_words(trust: Trust) -> str:
     if trust.trusted:
         return (
             f"about {trust.expected:.0%} expected to be right, give or take "
-            f"{100 * trust.error:.0f} points ({trust.held_out:.0%} on held-out labelled clouds"
-            f"{f', less{why}' if evidence else ''})"
+            f"{counted(round(100 * trust.error), 'point')} ({trust.held_out:.0%} on held-out "
+            f"labelled clouds{f', less{why}' if evidence else ''})"
         )
     return f"{DO_NOT_TRUST}: about {trust.expected:.0%} expected to be right{why}"
 

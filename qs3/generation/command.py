@@ -54,6 +54,7 @@ from qs3.generation.workers import COLLIDERS, Job, Outcome, renderer_provenance,
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import write_text
 from qs3.utils.locks import owned
+from qs3.utils.plural import counted
 from qs3.utils.pool import Pool
 from qs3.utils.progress import progress_bar
 
@@ -194,9 +195,8 @@ def _collect(
         outcomes.append(outcome)
     if all(outcome.cloud is None for outcome in outcomes):
         delete_dataset(folder)  # nothing is lost, and corrected settings are not refused
-        raise DataError(
-            f"all {len(items)} objects failed; the first: {items[0].id}: {outcomes[0].reason}"
-        )
+        one = "the only object" if len(items) == 1 else f"all {len(items)} objects"
+        raise DataError(f"{one} failed; the first: {items[0].id}: {outcomes[0].reason}")
     return outcomes
 
 
@@ -298,20 +298,20 @@ def _report(
         more = len(failures) - _FAILURES_SHOWN
         log.warning("and %d more: %s says why", more, folder / "manifest.csv")
     if noted := sum(COLLIDERS in outcome.note for outcome in outcomes):
-        log.info(
-            "%d files hold colliders, which were left out (manifest.csv); colliders=keep", noted
-        )
+        hold = counted(noted, "file holds", "files hold")
+        log.info("%s colliders, which were left out (manifest.csv); colliders=keep", hold)
     if drawn := sum(DRAWN in outcome.note for outcome in outcomes):
         log.info(
-            "%d of %d files do not say of all their faces what they are made of: for the others "
-            "materials were drawn (manifest.csv)",
+            "files that do not say of all their faces what they are made of: %d of %d; for the "
+            "other faces materials were drawn (manifest.csv)",
             drawn,
             len(outcomes),
         )
     if others := pointset.meta.get("folders_left_alone"):
         names, count = others["names"][:_FOLDERS_SHOWN], others["count"]
         more = ", ..." * (count > len(names))
-        log.info("%d folders of other classes were left alone: %s%s", count, ", ".join(names), more)
+        left = counted(count, "folder of another class was", "folders of other classes were")
+        log.info("%s left alone: %s%s", left, ", ".join(names), more)
     log.info("made of: %s", pointset.made_of)
     pictures = " and ".join(n for n in (CLOUDS, INFRARED) if (folder / n).is_file())
     log.info("in %s: look at %s", folder, pictures)

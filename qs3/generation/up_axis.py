@@ -26,6 +26,7 @@ from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import DECLARE_UP
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -116,18 +117,19 @@ def with_up_axis(cfg: DictConfig) -> DictConfig:
 def _said(found: Evidence) -> str:
     """The axis to take, after all has been said about it."""
     judged = sum(map(len, found.scores.values()))
+    meshes = counted(judged, "mesh", "meshes")
     shares = f"better with z up than with y up: {found.shares()}" if judged else "no class is known"
     axis = found.axis
     if axis not in ("+z", "+y"):
         why = "do not tell" if axis is None else f"say {axis}, which is neither z nor y"
         log.warning(
-            "up=auto: unknown: the shapes of %d meshes %s (%s). z is taken: if it is wrong, all "
-            "objects are scanned lying. Say up=z or up=y",
-            judged, why, shares,
+            "up=auto: unknown: the shapes of %s %s (%s). z is taken: if it is wrong, all objects "
+            "are scanned lying. Say up=z or up=y",
+            meshes, why, shares,
         )  # fmt: skip
         taken = "+z"
     else:
-        log.info("up=auto: %s is up, by the shapes of %d meshes (%s)", axis[1], judged, shares)
+        log.info("up=auto: %s is up, by the shapes of %s (%s)", axis[1], meshes, shares)
         taken = axis
     for cls, direction in found.by_class.items():
         if direction not in (None, taken):

@@ -20,6 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from qs3.utils.plural import counted
+
 FEWEST = 30
 ABOUT_M = 0.25
 ON_IT, BELOW_IT = 0.25, 0.01
@@ -51,7 +53,8 @@ def floor_under(clouds: Iterable[Float[np.ndarray, "n 3"]]) -> Floor:
     """
     ends = np.array([np.percentile(cloud[:, 2], _END) for cloud in clouds])
     if len(ends) < FEWEST:
-        return Floor(None, f"{len(ends)} objects are too few to tell where the floor is")
+        few = counted(len(ends), "object is", "objects are")
+        return Floor(None, f"{few} too few to tell where the floor is")
     z = round(float(np.percentile(ends, _EDGE)), 2)
     near = float((abs(ends - z) <= ABOUT_M).mean())
     below = float((ends < z - ABOUT_M).mean())

@@ -8,6 +8,7 @@ import re
 from qs3.inference.judgement import Judgement, percent
 from qs3.inference.model_file import Result
 from qs3.runs.metrics import RunMetrics
+from qs3.utils.plural import counted
 from qs3.utils.version import VERSION
 
 _Z = 1.959964  # of a normal distribution: 95 % lie within so many standard deviations
@@ -114,8 +115,8 @@ def _accuracy(metrics: RunMetrics | None) -> str:
         return "Not known: the target has no labels."
     low, high = wilson(round(final.accuracy * final.n), final.n)
     return (
-        f"On {final.n} test clouds of {metrics.target_text}: {final.accuracy:.1%} (95 % interval "
-        f"{low:.1%} to {high:.1%} if clouds are independent), balanced "
+        f"On {counted(final.n, 'test cloud')} of {metrics.target_text}: {final.accuracy:.1%} (95 % "
+        f"interval {low:.1%} to {high:.1%} if clouds are independent), balanced "
         f"{final.balanced_accuracy:.1%}; always the commonest class {final.majority_rate:.1%}."
     )
 

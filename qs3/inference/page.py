@@ -19,6 +19,7 @@ from qs3.inference.scores import DISPUTED, STRANGE, Count, Scores, disputed, kin
 from qs3.inference.table import Row
 from qs3.inference.thumbnails import cloud_png, depth_png
 from qs3.utils import html
+from qs3.utils.plural import counted
 from qs3.utils.version import VERSION
 
 MOST_SHOWN = 300
@@ -168,7 +169,7 @@ def _head(
     label, times = found.majority
     parts = [
         f'<p class="big">{found.all.right} of {found.all.of} right ({found.all.share:.0%})</p>',
-        f"<p>Always saying {escape(label)} would be right {times} times "
+        f"<p>Always saying {escape(label)} would be right {counted(times, 'time')} "
         f"({times / found.all.of:.0%}). Mean confidence is {found.confidence:.0%}: the net is "
         f"{_surety(found)}.</p>",
         *often,
@@ -259,13 +260,14 @@ def _card(row: Row, sample: Sample, classes: Sequence[str], floor_m: float | Non
     if disputed(row, classes):
         tags.append(f'<span class="tag">{DISPUTED}: {escape(row.second)}</span>')
     tier = f", {row.tier}" if row.tier else ""
+    points = counted(row.points or 0, "point")
     size = f"<br>{_size(_z_up(sample), floor_m)}" if sample.tier or sample.picture else ""
     return (
         f'<div class="card {style}{" two" * (len(images) > 1)}">{"".join(images)}'
         f'<span class="bar" style="width:{sure:.0%}"></span>'
         f'<div><span class="said">{escape(best)} {sure:.0%}</span>{is_}</div>'
         f'<div class="soft">then {second}</div><div>{"".join(tags)}</div>'
-        f'<div class="file">{escape(row.file)}, {row.points} points{tier}{size}</div></div>'
+        f'<div class="file">{escape(row.file)}, {points}{tier}{size}</div></div>'
     )
 
 

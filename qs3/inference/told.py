@@ -12,6 +12,7 @@ from qs3.inference.pretrained import HEIGHTS
 from qs3.inference.scores import Count, disputed, right, scores
 from qs3.inference.settings import Inputs, Settings, Source
 from qs3.inference.table import Row
+from qs3.utils.plural import counted
 
 _SHOWN = 10  # failures in the text for the terminal
 
@@ -30,7 +31,8 @@ def told(
     counts = Counter(one["class"] for one in good)
     rate = len(good) / max(seconds, 1e-9)
     lines = [
-        f"{len(good)} clouds, {rate:.1f} clouds a second, from {len(inputs.units)} {inputs.kind}"
+        f"{counted(len(good), 'cloud')}, {rate:.1f} clouds a second, from "
+        f"{counted(len(inputs.units), inputs.kind.removesuffix('s'))}"
     ]
     if inputs.part:
         lines.append(f"taken: {inputs.part}")
@@ -43,13 +45,10 @@ def told(
         lines.append(f"{cautioned} of them with a caution (column caution)")
     lines += _vertical(rows)
     if holed := [one["dropped"] for one in good if one["dropped"]]:
-        lines.append(
-            f"{sum(holed)} points of {len(holed)} clouds are NaN or infinite and were left out "
-            "(column dropped)"
-            if inputs.kind == "files"
-            else f"{sum(holed)} points of {len(holed)} objects have no depth or are stray (column "
-            "dropped)"
-        )
+        files = inputs.kind == "files"
+        of = counted(len(holed), "cloud" if files else "object")
+        why = "NaN or infinite" if files else "without depth or stray"
+        lines.append(f"left out of {of}: {counted(sum(holed), 'point')}, {why} (column dropped)")
     if predictor.in_metres and inputs.kind == "files":
         lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
     if predictor.needs_floor and settings.floor is None and settings.camera_height is None:
@@ -62,7 +61,8 @@ def told(
     if predictor.result.gravity == "none" and inputs.kind != "depth images":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
     if inputs.others:
-        lines.append(f"{inputs.others} files of other kinds passed over")
+        others = counted(inputs.others, "file of another kind", "files of other kinds")
+        lines.append(f"{others} passed over")
     if failed:
         lines.append(f"{len(failed)} failed:")
         lines += [f"  {one['file']}: {one['reason']}" for one in failed[:_SHOWN]]

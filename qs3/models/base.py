@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from qs3.errors import DataError
 from qs3.geometry.neighbours import exporting
 from qs3.models.norms import head_norm, make_norm
+from qs3.utils.plural import counted
 
 
 class Features(NamedTuple):
@@ -123,6 +124,6 @@ def check_points(points: Tensor) -> None:
     bad = (~torch.isfinite(points)).flatten(1).sum(1)  # [B]
     item = int(bad.nonzero()[0, 0])
     raise DataError(
-        f"batch item {item} has {int(bad[item])} coordinates that are NaN or infinite "
-        f"({int((bad > 0).sum())} of {len(bad)} items have some); check the dataset behind it"
+        f"batch item {item} has {counted(int(bad[item]), 'coordinate')} NaN or infinite (so have "
+        f"{int((bad > 0).sum())} of {len(bad)} items); check the dataset behind it"
     )

@@ -27,6 +27,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.geometry.neighbours import exporting
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.utils.memory import check_memory
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -75,8 +76,9 @@ class Encoder:
         inputs, outputs = self.session.get_inputs(), self.session.get_outputs()
         if len(inputs) != 1 or len(outputs) != 1:
             raise DataError(
-                f"{where} has {len(inputs)} inputs and {len(outputs)} outputs; expected one of "
-                "each: clouds [B, N, 3] to features [B, D]"
+                f"{where} has {counted(len(inputs), 'input')} and "
+                f"{counted(len(outputs), 'output')}; expected one of each: clouds [B, N, 3] to "
+                "features [B, D]"
             )
         self.name = inputs[0].name
         size = outputs[0].shape[-1] if outputs[0].shape else None
@@ -131,7 +133,7 @@ class Encoder:
         name, shape = f"features {self.sha256} {data}", (len(digests), self.dim)
 
         def work() -> Float[np.ndarray, "n d"]:
-            log.info("features of %d clouds by %s", len(digests), self.where)
+            log.info("features of %s by %s", counted(len(digests), "cloud"), self.where)
             return np.concatenate([self.compute(batch) for batch in points])
 
         if folder is None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from qs3.config.compose import choices
 from qs3.errors import ConfigError
 from qs3.utils.cli import Command, Group, Option, several, text, whole
+from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
     from qs3.report.tables.cells import Table
@@ -77,7 +78,7 @@ def _train(
     only = () if given["target"] else columns  # another target renames them
     table = _built(**given, runs=False, columns=only)
     todo = missing(table, seeds, rows, columns)
-    print(f"table {table.name}: {len(todo)} runs to do", flush=True)
+    print(f"table {table.name}: {counted(len(todo), 'run')} to do", flush=True)
     launcher = launcher or ("joblib" if (jobs or 1) > 1 else "basic")
     status = launch(todo, launcher, jobs, given["log_dir"] or "logs", more)
     if not status:
@@ -92,7 +93,8 @@ def _keep(into: str, **given: Any) -> None:
     written = keep(table, into)
     for folder in written:
         print(f"kept {folder}")
-    print(f"{len(finished_runs(table))} finished runs of table {table.name}, {len(written)} new")
+    runs = counted(len(finished_runs(table)), "finished run")
+    print(f"{runs} of table {table.name}, {len(written)} new")
 
 
 def _compare(base: str | None, out: str | None, **given: Any) -> None:

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.config.checks import check_choice
 from qs3.errors import SelectionError
+from qs3.utils.plural import counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +218,7 @@ def check_selection(
             own = selection.thresholds is not None
             key = "raise selftraining.selector.portion" if own else "lower selftraining.theta"
             why = f"{key}, or train the teacher longer (protocol.epochs)"
-        raise SelectionError(f"only {total} pseudo-labels selected in {facts}; {why}")
+        raise SelectionError(f"only {counted(total, 'pseudo-label')} selected in {facts}; {why}")
     if missing and missing_class == "error":
         raise SelectionError(
             f"no pseudo-label for {', '.join(missing)} in {facts}; lower selftraining.theta, or "

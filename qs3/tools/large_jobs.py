@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.utils.cli import NUMBER, Command, Option, one_of, path, several, whole
+from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -186,15 +187,17 @@ def _about(
     needed = workers * np.quantile(of.memory_mb, 0.99) / 1e3
     views = objects * of.view_bytes / 1e9
     lines = [
-        f"measured on {n} objects: {np.median(of.seconds):.3g} s in the middle, "
+        f"measured on {counted(n, 'object')}: {np.median(of.seconds):.3g} s in the middle, "
         f"{of.seconds.mean():.3g} on average, at most {of.seconds.max():.3g}; "
         f"at most {of.memory_mb.max():.0f} MB a process",
         f"{objects:,} objects: {total / 3600:.3g} core-hours; {gigabytes:.3g} GB when it is done, "
         f"{during:.3g} GB on the way" + (f", and {views:.3g} GB of views" if views else ""),
-        f"a node with {workers} workers: {needed:.2g} GB of memory",
+        f"a node with {counted(workers, 'worker')}: {needed:.2g} GB of memory",
     ]
     if n < _FEW:
-        lines.append(f"of {n} objects the longest may be missing: measure {_FEW} or more")
+        lines.append(
+            f"of {counted(n, 'object')} the longest may be missing: measure {_FEW} or more"
+        )
     if node_gb is not None and needed > node_gb:
         fits = int(node_gb / needed * workers)
         lines.append(f"node_gb={node_gb:g} is not enough for them: workers={max(fits, 1)}")

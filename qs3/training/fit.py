@@ -28,6 +28,7 @@ from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
 from qs3.utils.cli import TERMINATED
+from qs3.utils.plural import counted
 from qs3.utils.processor_time import Moment, processor_seconds
 from qs3.utils.threads import cores, number_of
 
@@ -81,9 +82,8 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     if not run.cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
         built.shared_warmup.take()
     last = run.folder / LAST
-    log.info(
-        "%s, %d epochs", "fitting, continued" if last.is_file() else "fitting", run.phases.total
-    )
+    how = "fitting, continued" if last.is_file() else "fitting"
+    log.info("%s, %s", how, counted(run.phases.total, "epoch"))
     try:
         built.trainer.fit(
             built.classifier,

@@ -28,6 +28,7 @@ from qs3.tuning.features import ROUGHNESS, Descriptor, Distance, NetFeatures, ro
 from qs3.tuning.scenes import Still, check_recipe, sampled, still_of
 from qs3.tuning.search import search, settled
 from qs3.tuning.state import State, read_state
+from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar, shown
 
 log = logging.getLogger(__name__)
@@ -198,7 +199,7 @@ def target_clouds(
     rows = np.flatnonzero(data.splits == "train")
     if len(rows) < _LEAST:
         raise DataError(
-            f"{folder} has {len(rows)} clouds in its part for training; 4 are the least"
+            f"{folder} has {counted(len(rows), 'cloud')} in its part for training; 4 are the least"
         )
     drawn = np.random.default_rng(seed).permutation(rows)[:sample]
     return [sampled(data.points[i], points) for i in np.sort(drawn)], data.sha256
@@ -209,8 +210,8 @@ def _drawn(items: Sequence[MeshItem], wanted: Wanted) -> tuple[list[MeshItem], l
     count = wanted.objects + wanted.held_out
     if len(items) < count:
         raise ConfigError(
-            f"objects={wanted.objects} and held_out={wanted.held_out} are more than the "
-            f"{len(items)} meshes of the part for training: ask for fewer, or raise limit="
+            f"objects={wanted.objects} and held_out={wanted.held_out} are more than the part for "
+            f"training has, {counted(len(items), 'mesh', 'meshes')}: ask for fewer, or raise limit="
         )
     order = np.random.default_rng([wanted.seed, 1]).permutation(len(items))[:count]
     drawn = [items[i] for i in order]

@@ -27,6 +27,7 @@ from qs3.sensors.gradients.twin import STEPS, Twin, correlations, exposed, setti
 from qs3.sensors.gradients.views import Pair, pair_of
 from qs3.sensors.renderers.base import Renderer
 from qs3.tuning.parameters import check_sensor, values_of, with_values
+from qs3.utils.plural import counted
 from qs3.utils.seeding import derive, object_rng
 
 _AROUND_PX = 3  # disparities beyond those of the object that are looked at
@@ -99,7 +100,8 @@ class Still:
         place = every.detach().numpy()
         every = every[torch.from_numpy(self.recipe.crop.inside(place, self.box_m))]
         if len(every) < _FEWEST:
-            raise DataError(f"{self.id}: {len(every)} points of the twin are in its box")
+            found = counted(len(every), "point is", "points are")
+            raise DataError(f"{self.id}: of the twin {found} in its box")
         order = farthest_point_sampling_np(every.detach().numpy().astype(np.float32), points)
         return in_unit_ball(every[torch.from_numpy(order)])
 

@@ -83,7 +83,7 @@ def test_test_clouds_get_what_the_run_said(run, data_dir, clouds, tmp_path, caps
         assert (row["out_of_range"] == "yes") == bool(row["reason"])
     said = capsys.readouterr().out
     assert "24 clouds, " in said
-    assert "clouds a second, from 1 files" in said
+    assert "clouds a second, from 1 file\n" in said
     assert said.endswith(f"saved {out}\nsaved {out.with_suffix('.html')}\n")
     assert predict(run, tmp_path / "test.npy", out, "page=false") == 0
     assert capsys.readouterr().out.endswith(f"saved {out} (replaced what was there)\n")
@@ -195,7 +195,8 @@ def test_points_that_are_not_finite_are_left_out_and_counted(run, clouds, tmp_pa
     assert "finite" not in first["reason"]
     assert [row["dropped"] for row in others] == ["0"] * ("many" in suffix)
     assert json.loads((tmp_path / "said.json").read_text())["clouds"][0]["dropped"] == 3
-    assert "3 points of 1 clouds are NaN or infinite and were left out" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "left out of 1 cloud: 3 points, NaN or infinite (column dropped)" in told
 
 
 def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):

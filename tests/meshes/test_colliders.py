@@ -108,7 +108,7 @@ def test_below_a_node_in_memory():
 
 def test_nothing_but_colliders_in_memory():
     scene = trimesh.Scene({"a_collider": PYRAMID})
-    with pytest.raises(MeshError, match=r"no faces but in 1 colliders.*colliders=keep"):
+    with pytest.raises(MeshError, match=r"no faces but in 1 collider, which is.*colliders=keep"):
         Mesh.from_trimesh(scene)
     assert len(Mesh.from_trimesh(scene, keep_colliders=True).faces) == len(PYRAMID.faces)
     assert len(Mesh.from_trimesh(PYRAMID).faces) == len(PYRAMID.faces)

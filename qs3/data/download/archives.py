@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple
 
 from qs3.errors import DataError, Qs3Error
+from qs3.utils.plural import counted
 from qs3.utils.progress import shown
 from qs3.utils.tars import DAMAGE, members_of, open_tar
 
@@ -137,6 +138,6 @@ def find_folder(files: Iterable[str], holds: str, named: str = "", at_least: int
 def outline(files: Iterable[str], most: int = 12) -> str:
     """What an archive holds, for a message: folders down to the third level, with counts."""
     counts = Counter("/".join(file.split("/")[:-1][:3]) or "." for file in files)
-    lines = [f"  {folder}: {count} files" for folder, count in sorted(counts.items())]
-    more = [f"  ... and {len(lines) - most} folders more"] if len(lines) > most else []
+    lines = [f"  {folder}: {counted(count, 'file')}" for folder, count in sorted(counts.items())]
+    more = [f"  ... and {counted(len(lines) - most, 'folder')} more"] if len(lines) > most else []
     return "\n".join([*lines[:most], *more])

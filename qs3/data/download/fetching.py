@@ -21,6 +21,7 @@ from qs3.errors import DataError, Qs3Error
 from qs3.utils.files import write_json
 from qs3.utils.locks import locked
 from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.plural import counted
 from qs3.utils.progress import byte_bar
 
 log = logging.getLogger(__name__)
@@ -102,7 +103,7 @@ class Resuming:
             except _DROPPED as error:
                 failures = 1 if self._done() > before else failures + 1
                 if failures >= self.tries:
-                    what = f"{url}: {error}, {failures} times in a row"
+                    what = f"{url}: {error}, {counted(failures, 'time')} in a row"
                     raise DownloadError(what, url) from error
                 wait_s = min(self.wait_s * 2 ** (failures - 1), 60.0)
                 log.warning("%s: %s; next try in %.0f s", url, error, wait_s)

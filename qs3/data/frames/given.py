@@ -29,6 +29,7 @@ from qs3.clouds.arrays import read_npy
 from qs3.data.frames.images import MAX_SIDE_PX, MOST_DEPTH_M, Pinhole
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.pictures import png_header, read_png
+from qs3.utils.plural import counted
 from qs3.utils.yamls import load_yaml
 
 MILLIMETRE = 1e-3
@@ -256,7 +257,8 @@ def _camera(values: list[float], where: str) -> Pinhole:
             raise DataError(f"{where}: {values} is not a matrix fx 0 cx, 0 fy cy, 0 0 1")
         values = [fx, fy, cx, cy]
     if len(values) != 4:
-        raise DataError(f"{where}: {len(values)} numbers; expected fx,fy,cx,cy or a 3 x 3 matrix")
+        found = counted(len(values), "number")
+        raise DataError(f"{where}: {found}; expected fx,fy,cx,cy or a 3 x 3 matrix")
     try:
         return Pinhole(*values)
     except DataError as error:

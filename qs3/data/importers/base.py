@@ -22,6 +22,7 @@ from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
 from qs3.errors import DataError
 from qs3.utils.locks import locked
+from qs3.utils.plural import counted
 from qs3.utils.progress import shown
 
 log = logging.getLogger(__name__)
@@ -352,8 +353,9 @@ def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
     short = sum(row.valid_points is not None and row.valid_points < points for row in rows)
     skipped = sum(row.status != "ok" for row in rows)
     if short:
-        log.warning("%s: %d clouds have under %d points and repeat some", where, short, points)
+        have = counted(short, "cloud has", "clouds have")
+        log.warning("%s: %s under %d points: some are repeated", where, have, points)
     if skipped:
         for row in [row for row in rows if row.status != "ok"][:_SHOWN]:
             log.warning("left out: %s", row.reason)
-        log.warning("%s: %d clouds left out; manifest.csv says why", where, skipped)
+        log.warning("%s: %s left out; manifest.csv says why", where, counted(skipped, "cloud"))

@@ -44,6 +44,7 @@ from qs3.data.importers.base import (
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError, DataError
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -240,10 +241,11 @@ class _LastFile:
         """[n, 3] float32, without points that are not finite, and checked."""
         clouds = self.read(path).clouds
         if len(clouds) != of:
-            raise DataError(f"{path} has {len(clouds)} clouds, a moment ago it had {of}")
+            raise DataError(f"{path} has {counted(len(clouds), 'cloud')}, a moment ago it had {of}")
         cloud, dropped = measured(clouds[number], where)
         if dropped:
-            log.info("%s: %d points that are NaN or infinite left out", where, dropped)
+            points = counted(dropped, "point that is", "points that are")
+            log.info("%s: %s NaN or infinite left out", where, points)
         return checked(cloud, where)
 
 

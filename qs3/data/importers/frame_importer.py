@@ -28,6 +28,7 @@ from qs3.data.importers.base import Importer, Item, check_cloud
 from qs3.data.manifest import OK, SPLITS, ManifestRow
 from qs3.data.parts import PartFiles
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
+from qs3.utils.plural import counted
 from qs3.utils.pool import Processes
 from qs3.utils.progress import progress_bar
 from qs3.utils.version import VERSION
@@ -179,7 +180,7 @@ class FrameImporter(Importer):
         rows = [row for row, _ in found]
         clouds = [cloud for row, cloud in found if row.status == OK and cloud is not None]
         if not clouds:
-            raise DataError(f"{self.root}: no object of {len(tasks)} frames can be used")
+            raise DataError(f"{self.root}: no object of {counted(len(tasks), 'frame')} can be used")
         _report(rows, self.points, self.root)
         return clouds, rows
 
@@ -307,13 +308,15 @@ def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
     cut = [row for row in rows if row.status == OK]
     tiers = Counter(row.more.get("tier", "") for row in cut)
     log.info(
-        "%s: %d objects cut (%s)",
+        "%s: %s cut (%s)",
         where,
-        len(cut),
+        counted(len(cut), "object"),
         ", ".join(f"{tier} {n}" for tier, n in sorted(tiers.items())),
     )
     if len(cut) < len(rows):
-        log.info("%s: %d objects left out; manifest.csv says why", where, len(rows) - len(cut))
+        left_out = counted(len(rows) - len(cut), "object")
+        log.info("%s: %s left out; manifest.csv says why", where, left_out)
     few = sum((row.valid_points or 0) < points for row in cut)
     if few:
-        log.info("%s: %d objects have under %d points and repeat some", where, few, points)
+        have = counted(few, "object has", "objects have")
+        log.info("%s: %s under %d points: some are repeated", where, have, points)

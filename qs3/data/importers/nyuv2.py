@@ -26,6 +26,7 @@ from qs3.data.frames.vertical import Mounting, angle_deg, floor_up, mounting, pl
 from qs3.data.importers.frame_importer import Cut, Cutter, FrameImporter, FrameTask
 from qs3.data.made_of import MadeOf
 from qs3.errors import ConfigError, DataError
+from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar
 
 log = logging.getLogger(__name__)
@@ -101,9 +102,9 @@ class NYUv2(FrameImporter):
             lost = [i + 1 for i in ups if ups[i] is None]
             if lost:
                 log.warning(
-                    "%s: %d frames are left out, since nobody can tell what is up, first %d",
+                    "%s: %s left out, since nobody can tell what is up, first %d",
                     frames.path,
-                    len(lost),
+                    counted(len(lost), "frame is", "frames are"),
                     lost[0],
                 )
             return [

@@ -37,6 +37,7 @@ from qs3.data.importers.base import Importer, Item, class_of
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -265,7 +266,7 @@ class ObjectArchive(Importer):
         blocks = np.unique(frames[ours] // self.block)
         if len(blocks) < self.folds:
             raise DataError(
-                f"{self.path}: {len(blocks)} blocks of frames for training, too few for "
+                f"{self.path}: {counted(len(blocks), 'block')} of frames for training, too few for "
                 f"{self.folds} folds"
             )
         tested = np.array_split(blocks, self.folds)[self.fold or 0]

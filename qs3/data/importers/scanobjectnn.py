@@ -20,6 +20,7 @@ import numpy as np
 
 from qs3.data.importers.base import Importer, Item, by_class, turned
 from qs3.data.importers.pointda_h5 import h5_items
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,8 @@ class ScanObjectNN(Importer):
         items = [i for s, path in self._files() for i in h5_items(path, self.root, s, names, 5)]
         ours = [item for item in items if item.row.cls in classes]
         if other := len(items) - len(ours):
-            log.warning("%s: %d clouds of other classes are left out", self.root, other)
+            them = counted(other, "cloud of another class is", "clouds of other classes are")
+            log.warning("%s: %s left out", self.root, them)
         return by_class(ours, classes)
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:

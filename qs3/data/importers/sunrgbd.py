@@ -31,6 +31,7 @@ from qs3.data.frames.sunrgbd import (
 from qs3.data.importers.frame_importer import Cut, Cutter, FrameImporter, FrameTask
 from qs3.data.made_of import MadeOf
 from qs3.errors import ConfigError
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +81,8 @@ class SUNRGBD(FrameImporter):
         splits = read_splits(self.root, self.splits)
         known = [one for one in frames if one.folder in splits]
         if len(known) < len(frames):
-            log.info("%d frames are in neither split and are left out", len(frames) - len(known))
+            strangers = counted(len(frames) - len(known), "frame")
+            log.info("%s in neither split left out", strangers)
         others = Counter(
             box.name for one in known for box in one.boxes if box.name not in self.names
         )

@@ -8,6 +8,7 @@ from typing import Any
 from qs3.data.inspection import columns
 from qs3.data.inspection.gap import PLATE_M
 from qs3.utils import text_table
+from qs3.utils.plural import counted
 
 Numbers = dict[str, Any]
 
@@ -18,12 +19,13 @@ def of_domain(facts: Numbers) -> str:
     parts = [
         f"{facts['domain']}: {facts['folder']}, {facts['variant']}",
         f"made of: {facts['made_of']}",
-        f"{counts['clouds']} clouds of {facts['points']} points; content {facts['sha256'][:16]}",
+        f"{counted(counts['clouds'], 'cloud')} of {facts['points']} points; "
+        f"content {facts['sha256'][:16]}",
     ]
     if facts["looked_at"] < counts["clouds"]:
         parts.append(
-            f"sizes and spacing: of {facts['looked_at']} clouds drawn with seed {facts['seed']} "
-            "(sample=N for more)"
+            f"sizes and spacing: of {counted(facts['looked_at'], 'cloud')} drawn with seed "
+            f"{facts['seed']} (sample=N for more)"
         )
     parts += ["", "clouds", _counts(counts)]
     for split, of in counts["splits"].items():
@@ -82,7 +84,8 @@ def of_pair(facts: Numbers) -> str:
         "## Told apart by their nearest neighbours",
         _markdown(rows),
         "Share of clouds whose most similar cloud is of their own domain (50 %: cannot be told "
-        f"apart, 100 %: two worlds). {apart['clouds']} clouds of each, equally many a class.",
+        f"apart, 100 %: two worlds). {counted(apart['clouds'], 'cloud')} of each, equally many a "
+        "class.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -114,7 +117,7 @@ def _valid(valid: Numbers) -> list[str]:
     if valid["known"]:
         found.append(
             f"points before sampling: {valid['median']:.0f} (median), at least {valid['min']}; "
-            f"{valid['repeating']} clouds have too few and repeat some"
+            f"{counted(valid['repeating'], 'cloud has', 'clouds have')} too few: some are repeated"
         )
     return found + [f"left out: {n} {status}" for status, n in valid["left_out"].items()]
 
@@ -194,13 +197,17 @@ def _copies(copies: Numbers, points: float) -> list[str]:
     lines.append(f"clouds that repeat another one: {copies['clouds']}")
     lines += [f"  {' = '.join(group)}" for group in copies["groups"][:5]]
     if copies["leaks"]:
-        lines.append(f"WARNING: {copies['leaks']} clouds of the test split are in another one, too")
+        leaks = counted(copies["leaks"], "cloud")
+        lines.append(f"WARNING: in the test split and in another one, too: {leaks}")
     if copies["contradicting_labels"]:
-        lines.append(f"WARNING: {copies['contradicting_labels']} of them have several labels")
+        torn = counted(copies["contradicting_labels"], "of them has", "of them have")
+        lines.append(f"WARNING: {torn} several labels")
     if copies["leaking_meshes"]:
-        lines.append(f"WARNING: {copies['leaking_meshes']} meshes are in test and in another split")
+        meshes = counted(copies["leaking_meshes"], "mesh is", "meshes are")
+        lines.append(f"WARNING: {meshes} in test and in another split")
     elif copies["meshes"]:
-        lines.append(f"{copies['meshes']} different meshes, none in test and another split")
+        meshes = counted(copies["meshes"], "mesh", "different meshes")
+        lines.append(f"{meshes}, none in test and another split")
     return lines
 
 

@@ -42,6 +42,7 @@ from qs3.data.store import (
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.utils.files import make_folder, sha256_file, write_text
 from qs3.utils.locks import locked
+from qs3.utils.plural import counted
 from qs3.utils.pool import Pool, Processes
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import csv_text
@@ -204,7 +205,7 @@ def _write(
     if not clouds:
         first = next((r for r in results if r.reason), None)
         why = f"; the first that failed: {first.files.scene}: {first.reason}" if first else ""
-        raise DataError(f"no object of {len(results)} scenes gave a cloud{why}")
+        raise DataError(f"no object of {counted(len(results), 'scene')} gave a cloud{why}")
     write_text(out / SCENES, table)
     return write_pointset(
         out,
@@ -275,7 +276,8 @@ def _report(pointset: PointSet, results: Sequence[SceneResult], out: Path) -> No
     missed = (o.labelled.cls for result in results for o in result.objects if o.cloud is None)
     for line in counts_text(pointset, "skipped", Counter(missed)):
         log.info("%s", line)
-    log.info("%d frames were left out for their pose", sum(r.frames_lost for r in results))
+    lost = counted(sum(r.frames_lost for r in results), "frame was", "frames were")
+    log.info("%s left out for their pose", lost)
     failed = [result for result in results if result.reason]
     for result in failed[:_FAILURES_SHOWN]:
         log.warning("failed: %s: %s", result.files.scene, result.reason)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from qs3.data.scannet.labels import is_scene
 from qs3.errors import DataError, MissingDataError
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -79,14 +80,15 @@ def find_scenes(scans: Path, train: Sequence[str], test: Sequence[str]) -> list[
     scenes = [SceneFiles.find(scans / name, split_of[name]) for name in there if name in split_of]
     if not scenes:
         raise MissingDataError(
-            f"{scans} holds none of the {len(split_of)} scenes of the lists, only {len(there)} "
-            "others; it should hold folders like scene0000_00 (ScanNet's folder `scans`)"
+            f"{scans} holds none of the {len(split_of)} scenes of the lists, only "
+            f"{counted(len(there), 'other')}; it should hold folders like scene0000_00 (ScanNet's "
+            "folder `scans`)"
         )
     splits = [files.split for files in scenes]
-    log.info("%d scenes of train and %d of test are there", *map(splits.count, ("train", "test")))
+    log.info("scenes that are there: train %d, test %d", *map(splits.count, ("train", "test")))
     absent = sorted(set(split_of) - set(there))
     unlisted = [name for name in there if name not in split_of]
-    for names, what in ((absent, "of the lists are not there"), (unlisted, "are unlisted")):
+    for names, what in ((absent, "of the lists not there"), (unlisted, "there, but in no list")):
         if names:
-            log.info("%d scenes %s, first %s", len(names), what, names[0])
+            log.info("%s %s, first %s", counted(len(names), "scene"), what, names[0])
     return scenes

@@ -23,6 +23,7 @@ from pathlib import Path
 from qs3.classes import ALIASES, CLASSES
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.plural import counted
 
 NAMES: tuple[str, ...] = (
     "bathtub", "bed", "shelf", "cabinet", "chair", "lamp", "monitor", "plant", "couch", "table",
@@ -132,7 +133,7 @@ def read_objects(path: str | Path, label_map: LabelMap) -> tuple[list[Labelled],
     ]
     notes = [f"objectId {number} has labels of two classes" for number in sorted(torn)]
     if others:
-        notes.append(f"{others} objects have another id than objectId")
+        notes.append(f"{counted(others, 'object has', 'objects have')} another id than objectId")
     return objects, notes
 
 

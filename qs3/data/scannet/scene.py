@@ -202,7 +202,10 @@ def _finish(
         )
     if not crops:
         return replace(
-            nothing, reason=f"the label masks of all {denied} chosen frames give it another class"
+            nothing,
+            reason=f"the label masks of all {denied} chosen frames give it another class"
+            if denied > 1
+            else "the label mask of the only chosen frame gives it another class",
         )
     fused = np.concatenate([crops[frame] for frame in sorted(crops)]).astype(np.float64)
     return replace(

@@ -20,6 +20,7 @@ from qs3.classes import ALIASES, CLASSES
 from qs3.errors import DataError, MissingDataError
 from qs3.generation.released.pickles import load_npy_object
 from qs3.geometry.cameras import rotation_xyz
+from qs3.utils.plural import counted
 from qs3.utils.tars import DAMAGE, is_whole, members_of, open_tar
 
 SPLITS = ("train", "test")
@@ -129,7 +130,9 @@ def read_poses(path: Path) -> PoseTable:
     ids = tuple(sorted(rows))
     views = {len(rows[name][1]) for name in ids}
     if len(views) != 1:
-        raise DataError(f"{path}: some shapes have {min(views)} views and some {max(views)}")
+        raise DataError(
+            f"{path}: some shapes have {counted(min(views), 'view')} and some {max(views)}"
+        )
     return PoseTable(
         ids, np.stack([rows[name][0] for name in ids]), np.stack([rows[name][1] for name in ids])
     )

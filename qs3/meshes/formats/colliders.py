@@ -14,6 +14,8 @@ import re
 from collections.abc import Hashable
 from typing import TYPE_CHECKING
 
+from qs3.utils.plural import counted
+
 if TYPE_CHECKING:
     import trimesh
 
@@ -64,5 +66,5 @@ class Colliders:
     @property
     def exception(self) -> str:
         """What follows "has no faces" where colliders were left out."""
-        but = f" but in {self.count} colliders, which are left out: colliders=keep keeps them"
-        return but if self.count else ""
+        some = counted(self.count, "collider, which is", "colliders, which are")
+        return f" but in {some} left out; see colliders=keep" if self.count else ""

@@ -12,6 +12,7 @@ import numpy as np
 
 from qs3.errors import MeshError
 from qs3.meshes.formats.arrays import Triangles, fan, lines, numbers
+from qs3.utils.plural import counted
 
 
 def read(data: bytes) -> Triangles:
@@ -27,7 +28,7 @@ def read(data: bytes) -> Triangles:
             continue
         if tokens[0] == b"v":
             if len(tokens) < 4:
-                raise MeshError(f"has a vertex with {len(tokens) - 1} coordinates")
+                raise MeshError(f"has a vertex with {counted(len(tokens) - 1, 'coordinate')}")
             coordinates += tokens[1:4]
         elif tokens[0] == b"f":
             sizes.append(len(tokens) - 1)

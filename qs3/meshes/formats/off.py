@@ -15,6 +15,7 @@ import numpy as np
 
 from qs3.errors import MeshError
 from qs3.meshes.formats.arrays import Triangles, check_counts, fan, lines, numbers, whole
+from qs3.utils.plural import counted
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)(4?n?)OFF[ \t]*(BINARY)?")
 _COUNTS = re.compile(rb"\s*(\d{1,12})[ \t]+(\d{1,12})(?:[ \t]+-?\d{1,12})?(?=\s|$)")
@@ -65,7 +66,7 @@ def _by_lines(body: bytes, vertex_count: int, face_count: int) -> Triangles:
     if len(rows) < vertex_count + face_count:
         raise MeshError(
             f"is truncated: {vertex_count} vertices and {face_count} faces were promised, "
-            f"{len(rows)} lines are there"
+            f"{counted(len(rows), 'line is', 'lines are')} there"
         )
     if len(rows) > vertex_count + face_count:  # of what? A vertex could pass for a face
         raise MeshError(

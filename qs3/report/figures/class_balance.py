@@ -11,6 +11,7 @@ from qs3.data.store import PointSet
 from qs3.errors import DataError
 from qs3.report.figures.canvas import grouped_bars, new_figure, say
 from qs3.utils.plotting import BLUE, INK, PALE_BLUE, save_png
+from qs3.utils.plural import counted
 
 _COLOURS = {"train": BLUE, "test": PALE_BLUE}
 
@@ -43,6 +44,6 @@ def _summary(data: PointSet) -> str:
         some = [number for number in numbers if number]
         said = [f"largest class / smallest {max(some) / min(some):.1f}"] if some else []
         if none := len(numbers) - len(some):
-            said.append(f"none of {none} class{'es' if none > 1 else ''}")
+            said.append(f"none of {counted(none, 'class', 'classes')}")
         words.append(f"{total:,} {split}" + (f" ({', '.join(said)})" if said else ""))
     return ", ".join(words)

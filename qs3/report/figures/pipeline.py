@@ -26,6 +26,7 @@ from qs3.generation.view_files import KeptView, load_views
 from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
+from qs3.utils.plural import counted
 from qs3.utils.seeding import object_rng
 
 _OFTEN_THERE = "chair/train/chair_0000"
@@ -240,4 +241,4 @@ def _near(name: str, known: Any) -> str:
     some = (alike or list(known))[:3]
     if not some:
         raise DataError("it holds no objects")
-    return f"; there are {len(known)} objects, such as {', '.join(some)}"
+    return f"; {counted(len(known), 'object is', 'objects are')} there, such as {', '.join(some)}"

@@ -19,6 +19,7 @@ from qs3.geometry.orthographic import axes_of, unit
 from qs3.report.figures.pipeline import ScannedObject
 from qs3.sensors.pixel_status import Reason
 from qs3.utils.plotting import DARK, GRID, INK, PANEL, SOFT, blank, cloud_colours, save_png
+from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +55,7 @@ def pipeline_figure(one: ScannedObject, view: int = 0) -> Figure:
     words = f"{one.name}, {one.domain}"
     if shown is not None:
         by = f" rendered by {one.renderer.capitalize()}" if one.renderer else ""
-        words += f": {one.sensor}{by}, {len(one.views)} views"
+        words += f": {one.sensor}{by}, {counted(len(one.views), 'view')}"
         draw_images(axes[0], shown)
         draw_reasons(axes[1, 0], shown)
     else:
@@ -131,7 +132,7 @@ def draw_clouds(axes: Any, one: ScannedObject) -> None:
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius = 1.04 * float(np.abs((corners - middle) @ turn[:2].T).max())
     bar = _round(0.6 * radius, (1, 2, 5), up=False)
-    views = f"{len(one.views)} views fused" if one.views else "surface samples"
+    views = counted(len(one.views), "view", "views fused") if one.views else "surface samples"
     kinds = ((f"cloud: {views}", one.cloud), ("clean twin: true depth, same views", one.clean))
     for ax, (title, cloud) in zip(axes, kinds, strict=False):
         if cloud is None:

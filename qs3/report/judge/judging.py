@@ -155,9 +155,10 @@ def judge(
         DataError: one is damaged.
         ConfigError: nothing is left to judge on, or runs that cannot be judged so.
     """
-    predictors = _loaded(find_runs(runs), floor, device)
+    files = find_runs(runs)
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
+    predictors = _loaded(files, floor, device)  # after it: no floor mends a wrong archive
     common = _common([one.classes for one in predictors.values()], classes)
     names = [known_as(str(name), common) for name in archive.cls]
     kept = [i for i in chosen if names[i] is not None]

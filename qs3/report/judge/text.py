@@ -8,6 +8,7 @@ from typing import Any
 
 from qs3.report.judge.intervals import Share
 from qs3.report.judge.judging import Verdict
+from qs3.utils.plural import counted
 from qs3.utils.text_table import aligned
 from qs3.utils.text_table import csv_text as csv_of
 
@@ -42,7 +43,8 @@ def text(verdict: Verdict) -> str:
         if any(d.seeds < 2 for d in v.differences):
             lines.append("(!) fewer than two common seeds: the interval is over blocks alone")
     if v.left_out:
-        lines.append(f"{v.left_out} objects of other classes are left out.")
+        others = counted(v.left_out, "object of another class is", "objects of other classes are")
+        lines.append(f"{others} left out.")
     return "\n".join([*lines, "", "recall %", *aligned(_classes(verdict), numbers=True)])
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from qs3.config.compose import choices
 from qs3.errors import ConfigError
 from qs3.utils.cli import Command, Option, path, several, text, whole
+from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
     from qs3.report.tables.cells import Table
@@ -56,7 +57,7 @@ def _leaderboard(
     before, name = built(), row["name"]
     _check_class(before, name)
     todo = missing(before, seeds, [name], columns)
-    print(f"{name}: {len(todo)} runs to do", flush=True)
+    print(f"{name}: {counted(len(todo), 'run')} to do", flush=True)
     status = launch(todo, "joblib" if (jobs or 1) > 1 else "basic", jobs, log_dir)
     shown = beside(built(), name)
     at = Path(out or Path(log_dir) / "tables") / f"{shown.name}-{method.stem}"

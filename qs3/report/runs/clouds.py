@@ -16,6 +16,7 @@ from qs3.report.figures.class_balance import class_picture
 from qs3.report.runs.data import RunFiles
 from qs3.report.runs.domains import domain_of, open_domain
 from qs3.runs.predictions import Predictions
+from qs3.utils.plural import counted
 
 ROLES = ("source", "target")
 _SHEET, _ROW = 30, 6
@@ -93,7 +94,7 @@ class _Domains:
         wrong = (said.labels >= 0) & (said.predicted != said.labels)
         if not wrong.any():
             raise NothingToDrawError("the result makes no mistake")
-        known = f"{wrong.sum()} mistakes in {(said.labels >= 0).sum()} clouds"
+        known = f"{counted(wrong.sum(), 'mistake')} in {(said.labels >= 0).sum()} clouds"
         self._sheet_of(said, _surest(said, wrong)[:_SHEET], f"most confident of {known}", path)
 
     def named(self, path: Path) -> None:

@@ -16,6 +16,7 @@ from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs.data import RunFiles
 from qs3.report.runs.domains import domain_of, open_domain
 from qs3.runs.predictions import Predictions
+from qs3.utils.plural import counted
 
 
 def worst_first(run: RunFiles, match: str = "") -> list[int]:
@@ -90,7 +91,7 @@ def _about(run: RunFiles, said: Predictions, count: int) -> str:
     wrong = int((labelled & (said.predicted != said.labels)).sum())
     order = "in doubt first"
     if labelled.any():
-        order = f"{wrong} are wrong, the most confident first"
+        order = f"{counted(wrong, 'is wrong', 'are wrong, the most confident first')}"
     text = f"{run.title}, target {run.target}: {count} of {len(said.ids)} clouds; {order}"
     m = run.metrics
     if m is None:

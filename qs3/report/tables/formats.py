@@ -10,6 +10,7 @@ from qs3.report.tables.aggregate import FEW_SEEDS, Group, data_lines, task
 from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Metric, Table
 from qs3.report.tables.made_of import OTHER_DATA, data_marks, is_other, results_of
 from qs3.utils import text_table
+from qs3.utils.plural import counted
 from qs3.utils.text_table import latex_row, latex_text
 
 _ACCURACY: Metric = "accuracy"  # what papers give
@@ -207,7 +208,7 @@ def remarks(table: Table) -> list[str]:
     if found:
         counts = sorted({len(g.finished) for g in found})
         few, most = counts[0], counts[-1]
-        seeds = f"{few} seed{'s' * (few > 1)}" if few == most else f"{few} to {most} seeds"
+        seeds = counted(few, "seed") if few == most else f"{few} to {most} seeds"
         lines.append(f"mean ± standard error over {seeds}; (n=...) marks fewer than {FEW_SEEDS}")
         if any(seconds(g) for g in found):
             lines.append(

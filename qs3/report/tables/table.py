@@ -27,6 +27,7 @@ from qs3.report.tables.cells import SEEDS, Cell, Metric, Published, Table
 from qs3.report.tables.keeping import with_kept
 from qs3.report.tables.overrides import ALONE, by_column, chosen
 from qs3.utils.memory import YAML_PEAK, read_whole
+from qs3.utils.plural import counted
 from qs3.utils.yamls import load_yaml
 
 _SUPERVISED = "qs3.methods.supervised.Supervised"
@@ -210,8 +211,8 @@ def _cell(
     numbers = row.get("paper")
     if numbers is not None and len(numbers) != len(spec.columns):
         raise ConfigError(
-            f"table row {row['name']!r}: paper: has {len(numbers)} numbers, one for each of the "
-            f"{len(spec.columns)} columns is needed"
+            f"table row {row['name']!r}: paper: has {counted(len(numbers), 'number')} for "
+            f"{counted(len(spec.columns), 'column')}: one for each is needed"
         )
     number = own.get("paper", numbers[i] if numbers else None)
     if line is None and number is None:

@@ -30,6 +30,7 @@ from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.runs.data import is_run, read_run
 from qs3.report.runs.viewed import part_of_run, worst_first
 from qs3.utils.files import write_text
+from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import printable
 
@@ -168,7 +169,7 @@ def _files(place: Path, most: int, settings: Settings) -> Part:
             advance()
     shown = [shown[i] for i in drawn(np.arange(len(shown)), most)]
     about = f"{len(few)} of {len(files)} files in {place.name}" if place.is_dir() else place.name
-    clouds = f", {len(shown)} clouds" if len(shown) != len(few) else ""
+    clouds = f", {counted(len(shown), 'cloud')}" if len(shown) != len(few) else ""
     return Part(shown, about + clouds, failed=failed)
 
 
@@ -196,7 +197,9 @@ def _of_mesh(path: Path, name: str, settings: Settings, files: int) -> Iterator[
         return
     if path.suffix.lower() not in DECLARE_UP:
         cloud = turned(cloud, settings.up)
-    yield Shown(name, cloud, label=_folder(name), note=f"samples of {len(mesh.faces)} faces")
+    yield Shown(
+        name, cloud, label=_folder(name), note=f"samples of {counted(len(mesh.faces), 'face')}"
+    )
 
 
 def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]:
@@ -218,7 +221,7 @@ def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]
         except DataError as error:
             yield f"{own}: {reason_of(error, own)}"
             continue
-        note = f"{dropped} points are not finite" if dropped else ""
+        note = f"{counted(dropped, 'point is', 'points are')} not finite" if dropped else ""
         one = Shown(own, cloud, label=label, note=note)
         yield thinned(one, MOST_POINTS)  # of a large file nothing else stays in memory
 

@@ -18,6 +18,7 @@ from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics
 from qs3.sensors.base import DepthFrame, DepthSensor, Shot, check_depths
 from qs3.sensors.pixel_status import Reason, first_reason
+from qs3.utils.plural import counted
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class FittedDepth(DepthSensor):
         check_depths(self)
         if len(self.tilts_deg) != len(self.fill_rates) or not self.tilts_deg:
             raise ConfigError(
-                f"sensor.tilts_deg has {len(self.tilts_deg)} values and fill_rates "
+                f"sensor.tilts_deg has {counted(len(self.tilts_deg), 'value')} and fill_rates "
                 f"{len(self.fill_rates)}: give as many of each, one at least"
             )
         if any(b <= a for a, b in zip(self.tilts_deg, self.tilts_deg[1:], strict=False)):

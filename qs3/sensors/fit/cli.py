@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from qs3.config.location import CONF, typed
 from qs3.errors import ConfigError
 from qs3.utils.cli import NUMBER, Command, Option, one_of, several, text
+from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
     from qs3.sensors.fit.preset import FittedPreset
@@ -87,7 +88,8 @@ def fit(
     else:
         raise ConfigError("give the camera: intrinsics=fx,fy,cx,cy, or focal=PIXELS")
     if distances is not None and len(distances) != len(frames):
-        raise ConfigError(f"distances= has {len(distances)} values for {len(frames)} frames")
+        values, of = counted(len(distances), "value"), counted(len(frames), "frame")
+        raise ConfigError(f"distances= has {values} for {of}")
     steps = find_steps(frames)
     walls = [find_wall(frame.name, frame.depth_m, camera) for frame in frames]
     noise = find_noise(walls, steps, float(power) if power else None)

@@ -7,6 +7,7 @@ from pathlib import Path
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.fit.infrared import WITHIN, InfraredFit
 from qs3.utils.files import write_text
+from qs3.utils.plural import counted
 
 _WORDS = {
     "ambient": "ambient light; a lit dot on white at 4 m has 1 at projector_strength 16",
@@ -20,7 +21,7 @@ _WORDS = {
 
 def report(found: InfraredFit, base: SpeckleStereo, scenes: int) -> list[str]:
     """A line for each number, and for each that is not known."""
-    lines = [f"{scenes} scene{'s' if scenes > 1 else ''}, {found.distance_m:.2f} m away"]
+    lines = [f"{counted(scenes, 'scene')}, {found.distance_m:.2f} m away"]
     for key, words in _WORDS.items():
         if key in found.unknown:
             lines.append(f"{key:28} unknown: {found.unknown[key]}; {found.values[key]:.4g} stays")

@@ -109,7 +109,7 @@ def test_any_number_of_points(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
     assert (clouds[0][0] == large[0].astype("f4")).all()
     assert len(np.unique(clouds[0], axis=0)) == 16
     np.testing.assert_array_equal(clouds[1], np.tile(CLOUD, (4, 1)).astype("f4"))
-    assert "1 clouds have under 16 points" in caplog.text
+    assert "1 cloud has under 16 points" in caplog.text
 
 
 @pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])

@@ -177,7 +177,7 @@ def test_what_a_scene_lacks_is_told(written, tmp_path):
         with pytest.raises(DataError, match=f"{VAL}{suffix} is not there; download it"):
             run(root, tmp_path / "out")
     shutil.rmtree(root / "scans" / VAL)
-    with pytest.raises(MissingDataError, match="none of the 3 scenes of the lists, only 1 others"):
+    with pytest.raises(MissingDataError, match="none of the 3 scenes of the lists, only 1 other;"):
         run(root, tmp_path / "out")
 
 

@@ -93,7 +93,7 @@ def test_an_id_that_is_not_the_object_id_is_noted(tmp_path, label_map):
     path.write_text(json.dumps({"segGroups": groups}))
     objects, notes = read_objects(path, label_map)
     assert [one.object_id for one in objects] == [0, 1]
-    assert notes == ["1 objects have another id than objectId"]
+    assert notes == ["1 object has another id than objectId"]
 
 
 @pytest.mark.parametrize(

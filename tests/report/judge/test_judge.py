@@ -108,6 +108,10 @@ def test_runs_of_other_classes_are_judged_on_what_all_know(archive, logs, tmp_pa
     low, high = (judge([str(standing)], archive, floor=floor) for floor in (-1.2, -40.0))
     assert low.families[0].figures != high.families[0].figures
     assert "the floor lies at -1.2 m" in text(low)
+    with pytest.raises(MissingDataError, match=r"none\.npz"):
+        judge([str(standing)], tmp_path / "none.npz")
+    with pytest.raises(ConfigError, match="part=x"):
+        judge([str(standing)], archive, part="x")
     camera = add_net(tmp_path, 3, gravity="none")
     with pytest.raises(ConfigError, match="frame of their camera"):
         judge([str(camera)], archive)

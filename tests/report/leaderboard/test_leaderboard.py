@@ -282,6 +282,6 @@ def test_the_commands_train_and_print(toy):
     first = qs3(
         "report", "train", "table=leaderboard", "rows=cpcm", "columns=S -> K", "seeds=0", *report
     )
-    assert "table leaderboard: 1 runs to do" in first
+    assert "table leaderboard: 1 run to do" in first
     table = qs3("report", "table=leaderboard", *report)
     assert re.search(r"\| CPCM +\| not run .*\| \d+\.\d \(n=1\) ", table)

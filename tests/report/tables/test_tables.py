@@ -178,7 +178,7 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
         ("HEAD\ntilte: y\nrows: []", "x.yaml: tilte: Unexpected"),
         ("HEAD\nlayout: wide\nrows: []", "x.yaml: layout: Input should be '' or 'benchmark'"),
         ("HEAD\nnotes: [a: b]\nrows: []", r"x.yaml: notes\.0: .*put quotes around it"),
-        ("HEAD\nrows:\n- {name: r, paper: [1]}", "row 'r': paper: has 1 numbers.*2 columns"),
+        ("HEAD\nrows:\n- {name: r, paper: [1]}", "row 'r': paper: has 1 number for 2 columns"),
         ("HEAD\nrows:\n- {name: r, a: {paper: 101}}", "paper: 101.0.*from 0 to 100"),
         ("HEAD\nrows:\n- {name: r, a: {paper: [1, 2, 3]}}", "x.yaml: missing or wrong entry"),
         (f"HEAD\nrows:\n- {{name: r, a: {{paper: 1{'0' * 400}}}}}", "wrong entry int too large"),
