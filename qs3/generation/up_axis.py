@@ -133,7 +133,8 @@ def _said(found: Evidence) -> str:
         if direction not in (None, taken):
             said = direction in ("+z", "+y")  # by `up`; the other four it cannot say
             log.warning(
-                "up=auto: the shapes of %s say %s is up, not %s: they are scanned %s. Turn its files%s",
+                "up=auto: the shapes of %s say %s is up, not %s: they are scanned %s. Turn its "
+                "files%s",
                 cls, direction, taken[1], "upside down" if direction[1] == taken[1] else "lying",
                 f", or scan the class alone: classes=[{cls}] up={direction[1]}" * said,
             )  # fmt: skip
