@@ -102,10 +102,10 @@ def generate(cfg: DictConfig) -> PointSet:
         owned(folder, doing="making the dataset in", advice=other),
         disk_errors_explained(folder, lambda: parts.state(len(items))),
     ):
-        if cfg.force:
-            delete_dataset(folder)
         renderer = renderer_provenance(job)
         recipe = describe(cfg, items, renderer)
+        if cfg.force:  # not before: without a renderer nothing would take its place
+            delete_dataset(folder)
         if is_finished(folder):
             parts.check(recipe)
             parts.clear()  # a kill after the last write leaves them

@@ -136,6 +136,11 @@ def check_recipe(recipe: Any, cfg: DictConfig) -> None:
                 f"this sensor adds noise to the true depth and sees no light, so {key}= says "
                 "nothing to it: leave it out, or take a sensor such as sensor=speckle_stereo"
             )
+    if (cfg.get("light") or {}).get("bounces") and not recipe.sensor.sees_bounces:
+        raise ConfigError(
+            "this sensor measures how far light went, and of light between surfaces no renderer "
+            "says it: leave light=bounced out, or set light.bounces=0"
+        )
 
 
 def mesh_items(cfg: DictConfig) -> list[MeshItem]:

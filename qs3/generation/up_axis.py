@@ -133,10 +133,12 @@ def _said(found: Evidence) -> str:
         taken = axis
     for cls, direction in found.by_class.items():
         if direction not in (None, taken):
+            said = direction in ("+z", "+y")  # by `up`; the other four it cannot say
             log.warning(
-                "up=auto: the shapes of %s say %s is up, not %s: they are scanned lying. Turn its "
-                "files, or scan the class alone: classes=[%s] up=%s",
-                cls, direction, taken[1], cls, direction[1],
+                "up=auto: the shapes of %s say %s is up, not %s: they are scanned %s. Turn its "
+                "files%s",
+                cls, direction, taken[1], "upside down" if direction[1] == taken[1] else "lying",
+                f", or scan the class alone: classes=[{cls}] up={direction[1]}" * said,
             )  # fmt: skip
     return taken[1]
 

@@ -211,9 +211,11 @@ class DepthSensor(ABC):
         width_px, height_px, focal_px: of its camera, or of both.
         sees_light: whether what it measures depends on materials and light; one that adds noise
             to the true depth says False.
+        sees_bounces: whether also on light between surfaces.
     """
 
     sees_light: ClassVar[bool] = True
+    sees_bounces: ClassVar[bool] = True
 
     width_px: int = 640
     height_px: int = 480

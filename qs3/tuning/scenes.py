@@ -25,6 +25,7 @@ from qs3.sensors.base import on_grid
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.gradients.twin import STEPS, Twin, correlations, exposed, settings_of, soft_argmax
 from qs3.sensors.gradients.views import Pair, pair_of
+from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.renderers.base import Renderer
 from qs3.tuning.parameters import check_sensor, values_of, with_values
 from qs3.utils.plural import counted
@@ -214,19 +215,22 @@ def _points(
     lit = radiance[0][view.even[0] > 0]
     if len(lit) == 0:
         return torch.zeros(0, 3, dtype=torch.float64)
-    if getattr(camera, "fixed_gain", None) is None:
+    assert isinstance(camera, InfraredCamera)  # `check_sensor`
+    longest = camera.max_exposure
+    if camera.fixed_gain is None:
         # torch.quantile takes 16 million values at most; a window has fewer.
-        white = torch.quantile(lit, camera.white_quantile)  # type: ignore[union-attr]
-        gain = every["infrared.white_level"] / white
+        gain = every["infrared.white_level"] / torch.quantile(lit, camera.white_quantile)
+        if longest is not None:
+            gain = gain.clamp(max=longest * camera.max_gain)
     else:
-        gain = torch.tensor(float(camera.fixed_gain), dtype=torch.float64)  # type: ignore
-    speckled = camera.ambient_speckles  # type: ignore[union-attr]
+        gain = torch.tensor(camera.fixed_gain, dtype=torch.float64)
     grey = [
         exposed(
             image,
             every | {"gain": gain},
             noise,
-            even=None if speckled else every["ambient"] * even.double(),
+            even=None if camera.ambient_speckles else every["ambient"] * even.double(),
+            max_exposure=longest,
         )
         for image, even in zip(radiance, view.even, strict=True)
     ]

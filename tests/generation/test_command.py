@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -13,7 +14,7 @@ import pytest
 import trimesh
 
 from qs3.data.store import open_pointset, read_manifest
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, DataError, MissingDataError, RenderError
 from qs3.generation.command import generate
 from qs3.generation.object_parts import Parts
 from qs3.generation.recipes import Cloud
@@ -81,6 +82,14 @@ def test_a_finished_dataset_is_left_alone_and_other_settings_are_refused(finishe
     with pytest.raises(ConfigError, match=r"renderer\.samples: 2 there, 3 now") as error:
         generate(config(folder.parent, meshes, "workers=0", "renderer.samples=3"))
     assert "force=true" in str(error.value)
+
+
+def test_force_deletes_nothing_where_the_renderer_cannot_start(finished, meshes, tmp_path):
+    folder = tmp_path / "specklenet10"
+    shutil.copytree(finished[0], folder)
+    with pytest.raises(RenderError, match="is unknown"):
+        generate(config(tmp_path, meshes, "workers=0", "force=true", "renderer.variant=scalar_x"))
+    assert fingerprint(folder) == fingerprint(finished[0])
 
 
 def test_a_resume_with_another_version_is_refused(finished, meshes, tmp_path):

@@ -160,6 +160,16 @@ def test_domains_and_sensors_that_see_no_light_refuse_them(word):
         check_recipe(build(cfg.recipe), cfg)
 
 
+@pytest.mark.parametrize("light", [("light=bounced",), ("light=area", "light.bounces=1")])
+def test_time_of_flight_refuses_light_between_surfaces(light):
+    """It would render a frame's other light twice as long, change nothing and be named so."""
+    cfg = composed("domain=specklenet10", "sensor=time_of_flight", *light)
+    with pytest.raises(ConfigError, match=r"how far light went.*set light\.bounces=0"):
+        check_recipe(build(cfg.recipe), cfg)
+    cfg = composed("domain=specklenet10", "sensor=time_of_flight", *light, "light.bounces=0")
+    check_recipe(build(cfg.recipe), cfg)
+
+
 # --- the light
 
 

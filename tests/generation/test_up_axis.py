@@ -8,13 +8,13 @@ import pytest
 import trimesh
 
 import qs3
-from qs3.data.inspection.gravity import catalogue_model
+from qs3.data.inspection.gravity import UPS, catalogue_model
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.errors import ConfigError
 from qs3.generation.command import generate
 from qs3.generation.plan import check, mesh_items
-from qs3.generation.up_axis import evidence, up_direction, with_up_axis
+from qs3.generation.up_axis import Evidence, _said, evidence, up_direction, with_up_axis
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.folder import MeshFolder
 from tests.generation.generating import composed, config
@@ -124,6 +124,19 @@ def test_classes_that_disagree_are_named(tmp_path, caplog):
     assert axis == "z"
     assert "the shapes of lamp say +y is up, not z" in text
     assert "classes=[lamp] up=y" in text
+
+
+def test_directions_that_up_cannot_say_are_not_advised(caplog):
+    """Chairs on their heads and lamps along x among tables that stand: only turning helps."""
+    found = {cls: np.zeros((12, 6)) for cls in CLASSES}
+    for cls, direction in zip(CLASSES, ("-z", "+x", "+z"), strict=True):
+        found[cls][:, UPS.index(direction)] = 1
+    found["table"] = np.tile(found["table"], (4, 1))
+    assert _said(Evidence(found, 72)) == "z"
+    assert "the shapes of chair say -z is up, not z: they are scanned upside down." in caplog.text
+    assert "the shapes of lamp say +x is up, not z: they are scanned lying." in caplog.text
+    assert caplog.text.count("Turn its files") == 2
+    assert "classes=" not in caplog.text
 
 
 def test_files_that_say_which_axis_is_up_are_not_asked(tmp_path, caplog):

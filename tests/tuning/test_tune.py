@@ -1,5 +1,7 @@
 """qs3 tune with the real sensor, its twin and stores."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -53,6 +55,25 @@ def test_the_twin_s_cloud_without_noise_is_the_true_surface():
     ours = one.cloud(values, 400, 0)
     again = one.cloud(values, 400, 0)
     assert torch.equal(ours, again)  # the same noise at each call
+
+
+def test_the_twin_amplifies_where_the_longest_exposure_is_not_enough():
+    """Noise as of so many electrons fewer; where the amplifier ends, the picture stays dark."""
+    (one,) = stills(1)
+    sensor, view = one.recipe.sensor, one.views[0]
+
+    def points(electrons, **limits):
+        camera = replace(sensor.infrared, read_noise_e=0.0, **limits)
+        values = {"infrared.electrons_at_white": torch.tensor(electrons, dtype=torch.float64)}
+        noise = torch.Generator().manual_seed(0)
+        return _points(view, replace(sensor, infrared=camera), values, noise)
+
+    few = points(500.0, fixed_gain=200.0)
+    torch.testing.assert_close(points(5000.0, fixed_gain=200.0, max_exposure=20.0), few)
+    plain = points(1e4)
+    assert torch.equal(points(1e4, max_exposure=1e4), plain)
+    dark = points(1e4, max_exposure=0.01)
+    assert (dark - plain).abs().median() > 0.05  # m: nothing is matched in the dark
 
 
 @pytest.mark.slow

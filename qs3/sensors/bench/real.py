@@ -44,7 +44,8 @@ def statistics(depth_m: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         holes: share of pixels without depth within the outline of what has depth.
         run_median_px, run_90_px: median and 90 % quantile of the holes' lengths.
         left_share: see `shadow_side`.
-        mixed: see `mixed_share`. mixed_steps, steps: its counts.
+        mixed: share of the steps with a pixel between; see `depth_steps`. mixed_steps, steps: its
+            counts.
     """
     flat = depth_m[np.isfinite(depth_m)].astype(np.float64)
     values = np.unique(np.rint(flat[flat > 0.8] * 1000)) / 1000
@@ -137,12 +138,6 @@ def shadow_side(depth_m: np.ndarray, gaps: np.ndarray) -> float:
                 right_px += end - start
     total = left_px + right_px
     return left_px / total if total else float("nan")
-
-
-def mixed_share(depth_m: np.ndarray, step_m: float = 0.1, apart_m: float = 0.02) -> float:
-    """Share of the steps in depth with a pixel that lies between; see `depth_steps`."""
-    mixed, steps = depth_steps(depth_m, step_m, apart_m)
-    return mixed / steps if steps else float("nan")
 
 
 def depth_steps(depth_m: np.ndarray, step_m: float = 0.1, apart_m: float = 0.02) -> tuple[int, int]:

@@ -23,14 +23,15 @@ the distance where the read-out or other light does. Several frequencies, each w
 1 / sigma^2, give the sigma of f = sqrt(f_1^2 + f_2^2 + ...). One frequency cannot tell d from
 d + c / (2 f).
 
-Not simulated: light that bounces between surfaces (multipath), because renderers give direct
-light only; higher harmonics of the modulation; motion between buckets.
+Not simulated: light that bounces between surfaces (multipath), because renderers do not say how far
+it went; higher harmonics of the modulation; motion between buckets.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -72,6 +73,7 @@ class TimeOfFlight(DepthSensor):
         min_depth_m, max_depth_m: depths outside are dropped.
     """
 
+    sees_bounces: ClassVar[bool] = False
     width_px: int = 320
     height_px: int = 288
     focal_px: float = 252.0

@@ -284,13 +284,19 @@ def _unknown(
     """Keys that pictures do not tell, and why."""
     out = {}
     electrons, read = KEYS[3], KEYS[4]
+    clipped = all(target.clipped for target in targets) and (
+        f"over {_CLIPPED:.0%} of the pixels are black or white, which hides texture: expose so "
+        "that they are not"
+    )
     if all(target.noise is None for target in targets):
         return dict.fromkeys(NOISE, "needs two or more frames of a still scene") | {
-            key: "the pictures hold too few dots" for key in KEYS[:2] if errors[key] > UNKNOWN
+            key: clipped or "the pictures hold too few dots"
+            for key in KEYS[:2]
+            if errors[key] > UNKNOWN
         }
     for key in KEYS:
         if errors[key] > UNKNOWN:
-            out[key] = "its effect on the pictures is smaller than their own scatter"
+            out[key] = clipped or "its effect on the pictures is smaller than their own scatter"
     if electrons in out and read in out:
         i, j = KEYS.index(electrons), KEYS.index(read)
         shared = float(covariance[i, j] / torch.sqrt(covariance[i, i] * covariance[j, j]))

@@ -203,10 +203,10 @@ def test_a_trimmed_normal_error_is_smaller_by_the_factor_stated():
 def test_a_mixed_pixel_is_one_between_two_surfaces():
     depth = np.full((4, 9), 1.0)
     depth[:, 5:] = 2.0
-    assert real.mixed_share(depth) == 0
+    assert real.depth_steps(depth) == (0, 4)
     depth[1, 5] = 1.5  # along the row between both; in its column 1.5 beside 2.0 twice
     # Rows: 3 sharp steps and the mixed one. Column 5: two steps, on the sides of the pixel.
-    assert real.mixed_share(depth) == pytest.approx(1 / 6)
+    assert real.depth_steps(depth) == (1, 6)
     depth[1, 5] = np.nan
-    assert real.mixed_share(depth) == 0
-    assert np.isnan(real.mixed_share(np.ones((5, 5))))
+    assert real.depth_steps(depth) == (0, 3)
+    assert real.depth_steps(np.ones((5, 5))) == (0, 0)

@@ -109,6 +109,15 @@ def test_one_frame_does_not_tell_noise(scenes):
         assert found.values[key] == getattr(BASE.infrared, key.split(".")[1])
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_clipped_pictures_are_said_to_be_clipped(scenes, frames):
+    """Not that they hold too few dots, or too much noise: another exposure helps."""
+    white = [np.clip(4.0 * image, 0, 255) for image in scenes[0].left[:frames]]
+    found = fit_pictures([replace(scenes[0], left=white, off=())], BASE)
+    for key in ("ambient", "infrared.psf_px"):
+        assert found.unknown[key].startswith("over 1% of the pixels are black or white")
+
+
 def test_statistics_of_shifted_noise():
     """Texture of the shape of a box: neighbours share what overlaps; noise is not shared."""
     rng = np.random.default_rng(0)
