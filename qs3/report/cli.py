@@ -204,12 +204,12 @@ _TABLE = (
         "table", text("NAME"), "of conf/table, or a file", None, True, partial(choices, "table")
     ),
     Option("log_dir", text("FOLDER"), "paths.log_dir of the runs (default logs)"),
-    Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
+    Option("data_dir", text("FOLDER"), "paths.data_dir of the runs (default: data)"),
     Option("target", text("NAME"), "another target domain for all of the table"),
     Option(
-        "overrides", text('"A=B ..."'), "further ones of the runs; COLUMN:A=B: of a column's", ""
+        "overrides", text('"A=B ..."'), "more settings of all runs; COLUMN:A=B of a column's", ""
     ),
-    Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: taken up, not run"),
+    Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: shown, not trained"),
 )
 _OUT = Option("out", text("FOLDER"), "where the files go (default LOG_DIR/tables)")
 
@@ -232,7 +232,9 @@ TRAIN = Command(
         *_TABLE,
         Option("seeds", several(whole(0)), "of each cell (default: the table's, mostly 0,1,2)", ()),
         Option("rows", several(text("WORD")), "only rows of this name, or with it in theirs", ()),
-        Option("columns", several(text("WORD")), "likewise", ()),
+        Option(
+            "columns", several(text("WORD")), "only columns of this name, or with it in theirs", ()
+        ),
         Option("jobs", whole(), "runs at the same time (default 1, or what the launcher does)"),
         Option("launcher", text("NAME"), "of Hydra: joblib, submitit_local or slurm"),
     ),
@@ -268,7 +270,7 @@ COMPARE = Command(
     _compare,
     (
         *_TABLE,
-        Option("base", text("ROW"), "the row to compare with; without it all are named"),
+        Option("base", text("ROW"), "the row to compare with (default: an error that names them)"),
         _OUT,
     ),
     ('qs3 report compare table=cad10 base="source only"',),
@@ -307,7 +309,7 @@ PICTURES = Command(
     _pictures,
     (
         Option("domains", several(text("NAME")), "of conf/domain", required=True),
-        Option("data_dir", text("FOLDER"), "paths.data_dir of a run", "data"),
+        Option("data_dir", text("FOLDER"), "where datasets lie, paths.data_dir of a run", "data"),
         Option("split", text("NAME"), "train or test", "train"),
         Option("out", text("PATH"), "default DATA_DIR/pictures; NAME.png: the comparison alone"),
     ),

@@ -69,20 +69,27 @@ TUNE = Command(
     "a sensor preset whose clouds are like those of an unlabelled target",
     _tune,
     (
-        Option("target", path("FOLDER"), "of the target's dataset", required=True),
+        Option("target", path("FOLDER"), "the target's dataset", required=True),
         Option("out", path("FILE"), "the preset, conf/sensor/NAME.yaml", required=True),
-        Option("objects", whole(4), "of the source, to search with", 40),
-        Option("held_out", whole(4), "others, to judge by", 20),
-        Option("sample", whole(4), "clouds of the target", 256),
-        Option("steps", whole(), "of the search", 60),
+        Option("objects", whole(4), "objects of the source to search with", 40),
+        Option("held_out", whole(4), "other objects, to judge the result by", 20),
+        Option("sample", whole(4), "clouds of the target to compare with", 256),
+        Option("steps", whole(), "steps of the search", 60),
         Option("batch", whole(2), "objects a step", 8),
         Option("points", whole(64), "of a cloud", 1024),
         Option(
             "features", text("NAME"), "roughness, or a net: a run, or dgcnn-speckle", "roughness"
         ),
-        Option("slopes", one_of("differences", "twin"), "where they come from", "differences"),
+        Option(
+            "slopes",
+            one_of("differences", "twin"),
+            "how slopes are found, see below",
+            "differences",
+        ),
         Option("parameters", several(text("KEY")), "that are tuned", _PARAMETERS),
-        Option("rate", NUMBER, "of Adam, in logits of a number's range", 0.15),
+        Option(
+            "rate", NUMBER, "step size of Adam, on the logit of a number's place in its range", 0.15
+        ),
         Option("seed", whole(0), "of draws and noise (default 0)", 0),
     ),
     (

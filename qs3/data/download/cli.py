@@ -74,9 +74,13 @@ DOWNLOAD = Command(
     (
         Option("into", text("FOLDER"), "the data folder, paths.data_dir of a run", "data"),
         Option("accept_terms", text("WORD"), "the agreement that you have made, e.g. scannet", ""),
-        Option("mirror", text("ADDRESS"), f"of a copy of the archives (default ${MIRROR})", ""),
+        Option(
+            "mirror", text("ADDRESS"), f"address of a copy of the archives (default ${MIRROR})", ""
+        ),
         Option("archive", text("FILE"), "unpack this, e.g. what your browser downloaded"),
-        Option("root", text("FOLDER"), "of the archive, to take if it cannot be found out", ""),
+        Option(
+            "root", text("FOLDER"), "folder in the archive to take, if it cannot be found out", ""
+        ),
         Option("keep", FLAG, "false deletes the archive when it is unpacked", True),
     ),
     (

@@ -9,10 +9,14 @@ from qs3.errors import ConfigError
 from qs3.utils.cli import Command, Option, path, text, whole
 
 _COMMON = (
-    Option("data_dir", text("FOLDER"), "paths.data_dir of a run"),
+    Option(
+        "data_dir", text("FOLDER"), "where datasets lie, paths.data_dir of a run (default: data)"
+    ),
     Option("sample", whole(), "clouds measured one by one; larger sets are drawn from", 3000),
-    Option("seed", whole(0), "of all draws (default 0)", 0),
-    Option("meshes", path("FOLDER"), "that it was generated from, if not from the catalogue"),
+    Option("seed", whole(0), "of all random draws (default 0)", 0),
+    Option(
+        "meshes", path("FOLDER"), "meshes that it was generated from (default: the catalogue's)"
+    ),
 )
 _KEYS = "of the domain's config, e.g. variant=points_clean path=PATH published.folder=PATH"
 
@@ -69,7 +73,7 @@ INSPECT = Command(
         ),
         *_COMMON,
         Option("sheets", whole(0), "clouds of each class on its sheet; 0: no sheets", 48),
-        Option("out", text("FOLDER"), "out/inspection/NAME by default"),
+        Option("out", text("FOLDER"), "where pages and pictures go (default out/inspection/NAME)"),
     ),
     (
         "qs3 inspect modelnet10",
@@ -91,7 +95,10 @@ COMPARE = Command(
     "qs3 compare",
     "two datasets and the gap between them",
     _compare,
-    (*_COMMON, Option("out", text("FOLDER"), "out/inspection/A-B by default")),
+    (
+        *_COMMON,
+        Option("out", text("FOLDER"), "where text and pictures go (default out/inspection/A-B)"),
+    ),
     (
         "qs3 compare modelnet10 specklenet10",
         "qs3 compare specklenet10 specklenet10 a.variant=points_clean",

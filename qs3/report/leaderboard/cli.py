@@ -146,7 +146,7 @@ LEADERBOARD = Command(
     (
         Option("method", path("FILE"), "Python, with one class derived from Method", None, True),
         Option("name", text("NAME"), "of its row (default: the file's)"),
-        Option("selftraining", text("NAME"), "rounds after the warm-up by it", "none"),
+        Option("selftraining", text("NAME"), "of conf/selftraining, after the warm-up", "none"),
         Option(
             "table", text("NAME"), "whose rows and columns: of conf/table, or a file", "leaderboard"
         ),
@@ -156,14 +156,16 @@ LEADERBOARD = Command(
         Option(
             "log_dir", text("FOLDER"), "paths.log_dir of the runs, these and the table's", "logs"
         ),
-        Option("data_dir", text("FOLDER"), "paths.data_dir of the runs"),
+        Option("data_dir", text("FOLDER"), "paths.data_dir of the runs (default: data)"),
         Option(
             "overrides",
             text('"A=B ..."'),
-            "further ones of the runs; COLUMN:A=B: of a column's",
+            "more settings of all runs; COLUMN:A=B of a column's",
             "",
         ),
-        Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: taken up"),
+        Option(
+            "kept", text("FOLDER"), "results that `qs3 report keep` has kept: shown, not trained"
+        ),
         Option("out", text("FOLDER"), "where the page goes (default LOG_DIR/tables)"),
     ),
     (

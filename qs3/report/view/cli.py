@@ -27,7 +27,11 @@ VIEW = Command(
     (
         Option("out", text("FILE"), "the page", "view.html"),
         Option("clouds", whole(), f"at most so many; up to {MOST_CLOUDS}", 50),
-        Option("points", whole(), f"of each, up to {MOST_POINTS} (default: of 50 clouds 2048)"),
+        Option(
+            "points",
+            whole(),
+            f"of each cloud, up to {MOST_POINTS} (default: 102400 shared among them)",
+        ),
         Option("colour", one_of(*COLOURS), "what is shown first (default height)", ""),
         Option("match", text("WORDS"), "only clouds with this in their names", ""),
         Option("up", text("AXIS"), "of files, what points up: x y z -x -y or -z", "z"),

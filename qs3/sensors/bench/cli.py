@@ -59,9 +59,9 @@ BENCH = Command(
     (
         Option("sensor", several(text("NAME")), "of conf/sensor; all presets by default", ()),
         Option("quick", FLAG, "few conditions: seconds a sensor", False),
-        Option("samples", whole(), "a pixel", 16),
+        Option("samples", whole(), "rays a pixel of the renderer", 16),
         Option("out", text("FOLDER"), "of the page, its figures and all numbers", "out/bench"),
-        Option("real", text("FOLDER"), "of a real Kinect's clouds (.pcd), for kinect_v1"),
+        Option("real", text("FOLDER"), "clouds of a real Kinect (.pcd), beside kinect_v1"),
     ),
     (
         "qs3 bench",

@@ -18,59 +18,12 @@ from qs3.sensors.fit.infrared import Pictures, fit_pictures
 from qs3.sensors.fit.infrared_statistics import statistics
 from qs3.sensors.fit.pictures import read_pictures
 from qs3.sensors.fit.stereo_preset import report
-from qs3.sensors.matching import StereoBlockMatcher
 from qs3.sensors.optics.infrared import InfraredCamera
-from qs3.sensors.optics.misalignment import Misalignment
 from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.commands import main
-from tests.sensors.scenery import POSE, box_of, square
-
-BASE = build(composed(None, "+sensor=realsense_d415").sensor)
-HIDDEN = {
-    "ambient": 1.2,
-    "infrared.psf_px": 1.2,
-    "infrared.electrons_at_white": 2500.0,
-    "infrared.read_noise_e": 40.0,
-}
-
-
-def camera(**more):
-    """The preset with other light, lens and noise, and other dots of the same kind."""
-    infrared = replace(
-        BASE.infrared,
-        psf_px=HIDDEN["infrared.psf_px"],
-        electrons_at_white=HIDDEN["infrared.electrons_at_white"],
-        read_noise_e=HIDDEN["infrared.read_noise_e"],
-        speckle_contrast=0.0,
-        **more,
-    )
-    return replace(
-        BASE,
-        ambient=HIDDEN["ambient"],
-        infrared=infrared,
-        pattern=replace(BASE.pattern, seed=77),
-        misalignment=Misalignment(),
-        matcher=StereoBlockMatcher(num_disparities=128),  # its depth is not looked at
-        filters=(),
-    )
-
-
-def pictures(sensor, depth_m, name, renderer, frames=8, half_px=220):
-    """Frames of a wall that faces the camera, and one with the projector off."""
-    half = half_px * depth_m / sensor.focal_px
-    wall = square(depth_m, 2 * half)
-    box = box_of(square(depth_m, half))
-    off = replace(sensor, projector_strength=1e-9)
-    # Frames of a still scene: the renderer's own sampling noise is the same in all of them.
-    still, taken = StillRenderer(renderer, seed=round(100 * depth_m)), []
-    for i, one in enumerate([sensor] * frames + [off]):
-        if one is sensor:
-            still.rewind()
-        rng = np.random.default_rng([i, round(100 * depth_m)])
-        taken.append(one.scan((wall,), box, POSE, still if one is sensor else renderer, rng))
-    *left, dark = (frame.images["left"] for frame in taken)
-    return Pictures(name, left, (), [dark], taken[0].depth_m)
+from tests.sensors.fit.simulated_pictures import BASE, HIDDEN, save, three_walls
+from tests.sensors.scenery import POSE, square
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +33,7 @@ def renderer():
 
 @pytest.fixture(scope="module")
 def scenes(renderer):
-    bright, dim = camera(fixed_gain=35.0), camera(fixed_gain=15.0)
-    return [
-        pictures(bright, 0.9, "near", renderer),
-        pictures(bright, 1.5, "far", renderer),
-        pictures(dim, 1.1, "dim", renderer),
-    ]
+    return three_walls(HIDDEN, renderer)
 
 
 def test_light_lens_and_noise_are_found_within_five_percent(scenes):
@@ -130,16 +78,6 @@ def test_statistics_of_shifted_noise():
     np.testing.assert_allclose(plain.shared, expected, atol=3e-4)
     np.testing.assert_allclose(noisy.shared, expected, atol=3e-4)
     assert abs(float(plain.skewness)) < 1e-4
-
-
-def save(folder, scenes):
-    folder.mkdir()
-    for scene in scenes:
-        for kind, images in (("left", scene.left), ("right", scene.right)):
-            for i, image in enumerate(images):
-                cv2.imwrite(str(folder / f"{scene.name}_{kind}_{i}.png"), image)
-        if scene.depth_m is not None:
-            np.save(folder / f"{scene.name}_depth.npy", scene.depth_m)
 
 
 def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
