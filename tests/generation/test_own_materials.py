@@ -214,7 +214,7 @@ def test_what_is_drawn_is_said_of_each_object_and_counted(folder, tmp_path, capl
         "table": "",
         "lamp": "materials drawn: the file has none that are read",
     }
-    assert "1 of 3 files do not say of all their faces what they are made of" in caplog.text
+    assert "files that do not say of all their faces what they are made of: 1 of 3;" in caplog.text
     assert str(made.made_of.sensor) == "speckle_stereo_small, the files' materials"
 
 
