@@ -87,7 +87,7 @@ def test_each_object_of_a_mask_gets_what_the_net_says_of_its_cloud(run, frame, c
         assert int(row["dropped"]) == one.without_depth
     said = capsys.readouterr().out
     assert "2 clouds, " in said
-    assert "from 1 depth images" in said
+    assert "from 1 depth image\n" in said
     assert f"saved {frame}/said.html" in said
     page = (frame / "said.html").read_text()
     assert page.count('<img alt="cloud"') == page.count('<img alt="depth image"') == 2

@@ -103,7 +103,7 @@ def _bytes(path):
     [
         (_bytes, "not an ONNX file, or damaged|cannot be run by onnxruntime"),
         (lambda p: write_encoder(p, external=True), "keeps weights in files beside it"),
-        (lambda p: write_encoder(p, inputs=["mask"]), "has 2 inputs and 1 outputs"),
+        (lambda p: write_encoder(p, inputs=["mask"]), "has 2 inputs and 1 output;"),
         (
             lambda p: write_encoder(p, some=True, out=["b", "d"]),
             r"its output is \['b', .*a known D",
