@@ -91,7 +91,7 @@ def _about(run: RunFiles, said: Predictions, count: int) -> str:
     wrong = int((labelled & (said.predicted != said.labels)).sum())
     order = "in doubt first"
     if labelled.any():
-        order = f"{counted(wrong, 'is wrong', 'are wrong, the most confident first')}"
+        order = counted(wrong, "is wrong", "are wrong, the most confident first")
     text = f"{run.title}, target {run.target}: {count} of {len(said.ids)} clouds; {order}"
     m = run.metrics
     if m is None:
