@@ -262,6 +262,8 @@ def _ray() -> ModuleType:
     try:
         import ray
     except ImportError as error:
-        raise ConfigError("Ray is not installed: pip install 'qs3[cluster]'") from error
+        raise ConfigError(
+            "Ray is not installed: pip install '.[cluster]' in the folder of qs3"
+        ) from error
     module: ModuleType = ray
     return module

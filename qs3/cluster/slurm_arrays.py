@@ -135,7 +135,9 @@ class SlurmArrays:
         try:
             import submitit
         except ImportError as error:
-            raise ConfigError("engine=slurm needs submitit: pip install 'qs3[slurm]'") from error
+            raise ConfigError(
+                "engine=slurm needs submitit: pip install '.[slurm]' in the folder of qs3"
+            ) from error
         try:
             executor = submitit.AutoExecutor(
                 folder=Path(self.folder).absolute(), cluster=self.cluster

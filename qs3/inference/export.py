@@ -289,7 +289,7 @@ def check_packages() -> None:
     if missing:
         raise ConfigError(
             f"an .onnx file needs {', '.join(missing)}, not installed here: "
-            "pip install 'qs3[onnx]'; out=model.pt2 needs torch alone"
+            "pip install '.[onnx]' in the folder of qs3; out=model.pt2 needs torch alone"
         )
 
 

@@ -229,9 +229,9 @@ def _filled(make: Any, settings: dict[str, Any], result: Result, target: str) ->
 
 
 def _maker(target: str, packages: Sequence[str]) -> Any:
-    """The class or function, if it is defined in one of the packages itself."""
+    """The class or function, if it is defined in one of the packages (or modules) itself."""
     module_name, _, name = target.rpartition(".")
-    if not any(module_name.startswith(f"{package}.") for package in packages):
+    if not any(f"{module_name}.".startswith(f"{package}.") for package in packages):
         raise DataError(
             f"the file's model is {target}, which is not in {' or '.join(packages)}; refused"
         )

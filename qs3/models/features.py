@@ -49,7 +49,8 @@ class Encoder:
             import onnxruntime  # type: ignore[import-untyped]
         except ImportError as error:
             raise ConfigError(
-                f"model=features needs onnxruntime ({error}); pip install 'qs3[onnx]'"
+                f"model=features needs onnxruntime ({error}): "
+                "pip install '.[onnx]' in the folder of qs3"
             ) from error
         self.sha256, self.where = sha256, where
         self.known: dict[bytes, Float[np.ndarray, " d"]] = {}

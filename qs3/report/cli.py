@@ -236,7 +236,7 @@ TRAIN = Command(
             "columns", several(text("WORD")), "only columns of this name, or with it in theirs", ()
         ),
         Option("jobs", whole(), "runs at the same time (default 1, or what the launcher does)"),
-        Option("launcher", text("NAME"), "of Hydra: joblib, submitit_local or slurm"),
+        Option("launcher", text("NAME"), "of Hydra: joblib, submitit_local, slurm or ray"),
     ),
     (
         "qs3 report train table=cad10",

@@ -70,7 +70,9 @@ class LabelFreeSearch(OverLauncher):
         try:
             import optuna
         except ImportError as error:
-            raise ConfigError("the search needs Optuna: pip install 'qs3[search]'") from error
+            raise ConfigError(
+                "the search needs Optuna: pip install '.[search]' in the folder of qs3"
+            ) from error
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         loader = self.hydra_context.config_loader
         fixed, searched = split(arguments, self.params, OverridesParser.create(loader))

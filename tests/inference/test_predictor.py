@@ -279,14 +279,15 @@ def test_only_our_nets_are_built(run, tmp_path, model):
     assert not mark.exists()
 
 
-def test_a_net_of_ones_own_is_asked_for_by_package(run, tmp_path):
+@pytest.mark.parametrize("package", ["tests.training", "tests.training.toy"])
+def test_a_net_of_ones_own_is_asked_for_by_package_or_module(run, tmp_path, package):
     from tests.training.toy import TinyNet
 
     torch.manual_seed(0)
     net = TinyNet(3).eval()
     model = {"_target_": "tests.training.toy.TinyNet", "num_classes": 3}
     file = changed(run, tmp_path, model=model, weights=net.state_dict())
-    found = load(file, packages=("qs3.models", "tests.training"))
+    found = load(file, packages=("qs3.models", package))
     assert isinstance(found.net, TinyNet)
     assert not found.net.training
     for name, value in net.state_dict().items():

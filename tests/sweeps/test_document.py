@@ -13,9 +13,10 @@ from qs3.config.hydra import build
 from tests.commands import ROOT
 from tests.training.toy import CONF
 
+PAGE = (ROOT / "docs" / "how-to" / "sweep.md").read_text("utf-8")
 COMMANDS = [
     re.split(r"   +|; ", line.strip())[0]
-    for line in (ROOT / "docs" / "how-to" / "sweep.md").read_text().splitlines()
+    for line in re.sub(r"\\\n\s*", "", PAGE).splitlines()  # commands of several lines
     if line.startswith("    python train.py")
 ]
 

@@ -166,7 +166,7 @@ LEADERBOARD = Command(
         Option(
             "kept", text("FOLDER"), "results that `qs3 report keep` has kept: shown, not trained"
         ),
-        Option("out", text("FOLDER"), "where the page goes (default LOG_DIR/tables)"),
+        Option("out", text("FOLDER"), "where the files go (default LOG_DIR/tables)"),
     ),
     (
         "qs3 leaderboard method=my_method.py",
