@@ -229,6 +229,24 @@ def same_data(results: Iterable[RunMetrics | None], role: str) -> bool:
     )
 
 
+def data_differences(results: Iterable[RunMetrics], role: str) -> str:
+    """What tells the datasets of runs apart: their names, or of one name the hashes and recipes.
+
+    Args:
+        results: of runs that did not see the same data, see `same_data`.
+        role: "source" or "target".
+    """
+    runs = list(results)
+    names = list(dict.fromkeys(getattr(run, role) for run in runs))
+    if len(names) > 1:
+        return f"the runs have different {role}s: {' and '.join(names)}"
+    seen = {getattr(run.data, role)[:12]: str(getattr(run.made_of, role)) for run in runs}
+    versions = [f"{sha} ({made})" for sha, made in seen.items()]
+    if len(set(seen.values())) == 1:
+        versions = list(seen)
+    return f"the runs saw different versions of {names[0]}: {' and '.join(versions)}"
+
+
 def _list(seeds: Sequence[int | None]) -> str:
     return ", ".join(str(seed) for seed in seeds)
 
