@@ -89,7 +89,7 @@ class Group:
         experiment: name.
         hash: of the config.
         finished: runs with a result, by seed.
-        problems: for the reader: unfinished seeds, different datasets, a seed twice.
+        problems: for the reader: unfinished or diverged seeds, different datasets, a seed twice.
         comparable: whether the finished runs may be averaged.
     """
 
@@ -198,6 +198,11 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
     if twice:
         comparable = False
         problems.append(f"seeds {_list(twice)} occur more than once: not averaged")
+    diverged = [run.seed for run in finished if run.metrics and run.metrics.diverged]
+    if diverged:
+        problems.append(
+            f"seeds {_list(diverged)}: the net has diverged and calls every cloud alike: averaged"
+        )
     for role in ("source", "target"):
         hashes = defaultdict(list)
         for run in finished:
