@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
 from numbers import Real
@@ -20,9 +21,11 @@ def check_int(key: str, value: Any, least: int) -> int:
 
 
 def check_float(key: str, value: Any, allowed: str = "") -> float:
-    """The value; ConfigError unless it is a number, within `allowed` if given (`check_ranges`)."""
+    """The value; ConfigError unless it is a finite number, `allowed` if given (`check_ranges`)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ConfigError(f"{key} must be a number, got {value!r}")
+    if not math.isfinite(value):
+        raise ConfigError(f"{key} must be a finite number, got {value}")
     if allowed:
         _check_range(key, value, allowed)
     return value
@@ -46,7 +49,7 @@ def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
     """Check numbers of an object, e.g. `check_ranges(self, "sensor.", fill_px=">= 0")`.
 
     A range is as a message says it: "> 0", ">= 1", "odd >= 3", an interval such as "[0, 1)", or
-    "odd [3, 15]". None passes; NaN and what is not a number do not.
+    "odd [3, 15]". None passes; NaN, infinity and what is not a number do not.
 
     Raises:
         ConfigError: names the first that is outside, after `prefix`.
@@ -57,6 +60,8 @@ def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
 
 
 def _check_range(key: str, value: Any, allowed: str) -> None:
+    if isinstance(value, float) and math.isinf(value):
+        raise ConfigError(f"{key} must be a finite number, got {value}")
     if not _inside(value, allowed):
         word = "in " if allowed[0] in "[(" else ""
         raise ConfigError(f"{key} must be {word}{allowed}, got {value!r}")

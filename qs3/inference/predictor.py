@@ -15,7 +15,6 @@ probabilities of its predictions.csv.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -180,9 +179,7 @@ class Predictor:
     def _floor(self, given: float | None) -> float:
         if given is None:
             return self.result.floor_m or 0.0
-        if not math.isfinite(floor := check_float("floor", given)):
-            raise ConfigError(f"floor={floor}: expected metres")
-        return floor
+        return check_float("floor", given)
 
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH

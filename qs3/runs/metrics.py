@@ -310,6 +310,11 @@ class RunMetrics:
     versions: dict[str, str]
 
     @property
+    def diverged(self) -> bool:
+        """Whether the reported net's predictions are no numbers: every cloud is of class 0 then."""
+        return self.validators.get("entropy", 0.0) is None
+
+    @property
     def target_text(self) -> str:
         """The target's name, with "(simulated)" where that is so."""
         return f"{self.target}{' (simulated)' if self.simulated else ''}"

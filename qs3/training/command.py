@@ -135,17 +135,19 @@ def judged(cfg: DictConfig, metrics: RunMetrics) -> str:
 
 def headline(metrics: RunMetrics) -> str:
     """The result in one line; says what the data are made of, and when the target is simulated."""
-    final, run = metrics.final, f"{metrics.experiment}, seed {metrics.seed}"
+    final, run = metrics.final, f"{metrics.experiment}, seed {metrics.seed}: "
+    if metrics.diverged:
+        run += "the net has diverged, its predictions are no numbers; "
     target = metrics.target_text
     if final.accuracy is None:
         counts = ", ".join(f"{name} {count}" for name, count in final.predicted.items() if count)
         estimate = in_words(metrics.quality)
         return (
-            f"{run}: no labels to judge {target} by; predicted {counts}"
+            f"{run}no labels to judge {target} by; predicted {counts}"
             f"{f'; {estimate}' if estimate else ''}; data: {metrics.data_text}{_chosen(metrics)}"
         )
     return (
-        f"{run}: accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
+        f"{run}accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
         f"on {target}, majority rate {final.majority_rate:.1%}; data: {metrics.data_text}"
         f"{_chosen(metrics)}"
     )

@@ -8,15 +8,18 @@ The hash covers everything that the warm-up depends on, datasets and versions in
 of the same hash begins from that copy as if it had been interrupted there: it trains the last
 epoch itself, so teacher, pseudo-labels and result are the same, to the bit, as without it.
 `started.json` is written last and has the hashes of the other two: a copy that has changed since is
-as good as none, and replaced.
+as good as none, and replaced. Who copies holds a lock there, which ends with its process: of runs
+that started together the first gives its warm-up, and who comes meanwhile waits for whole files.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +32,7 @@ from qs3.errors import DataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
 from qs3.utils.files import copy_file, sha256_file, write_json
+from qs3.utils.locks import locked
 
 log = logging.getLogger(__name__)
 
@@ -71,29 +75,47 @@ class SharedWarmup(Checkpoint):
 
     def take(self) -> bool:
         """Begin from a shared warm-up, if there is one and the run has no checkpoint yet."""
-        if self.shared is None or (self.folder / LAST).exists():
+        if self.shared is None or not self.shared.is_dir() or (self.folder / LAST).exists():
             return False
-        if not self._is_there():
-            if (self.shared / runs.STARTED).exists():
-                log.warning("the warm-up in %s is damaged: it is trained again", self.shared)
-            return False
-        log.info("the warm-up was trained before: going on from %s", self.shared)
-        for name in _FILES:  # the checkpoint last: with it a run counts as begun
-            copy_file(self.shared / name, self.folder / name)
+        with self._alone():
+            if not self._is_there():
+                if (self.shared / runs.STARTED).exists():
+                    log.warning("the warm-up in %s is damaged: it is trained again", self.shared)
+                return False
+            log.info("the warm-up was trained before: going on from %s", self.shared)
+            for name in _FILES:  # the checkpoint last: with it a run counts as begun
+                copy_file(self.shared / name, self.folder / name)
         return True
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Copy the checkpoint that has just been written, one epoch before the warm-up's end."""
         if trainer.current_epoch != self.last_but_one or not trainer.is_global_zero:
             return
-        if self.shared is None or self._is_there():
-            return
         try:
-            for name in _FILES:
-                copy_file(self.folder / name, self.shared / name)
-            write_json(self.shared / runs.STARTED, _mark(self.sha256, self.folder))
+            if self.shared is not None:
+                with self._alone():
+                    self._give()
         except Exception as error:  # a full disk, say: sharing is a convenience
             log.warning("the warm-up cannot be shared (%s); training goes on", error)
+
+    def _give(self) -> None:
+        """Copy the run's files, unless a complete warm-up is there; a kill leaves no mark."""
+        assert self.shared is not None
+        if self._is_there():
+            return
+        (self.shared / runs.STARTED).unlink(missing_ok=True)
+        for name in _FILES:
+            copy_file(self.folder / name, self.shared / name)
+        write_json(self.shared / runs.STARTED, _mark(self.sha256, self.folder))
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Wait until nobody copies there, as far as there can be a lock: it needs a file."""
+        assert self.shared is not None
+        with contextlib.ExitStack() as stack:
+            if not self.shared.exists() or os.access(self.shared, os.W_OK):
+                stack.enter_context(locked(self.shared / ".lock"))
+            yield
 
     def _is_there(self) -> bool:
         """Whether a complete one of this hash lies there, as it was written."""

@@ -64,7 +64,7 @@ class Found:
         before, after: their values; where the preset has one out of its range, it began there.
         path: distance at each step, of that step's objects, by the ordinary sensor.
         held_out: distances by the ordinary sensor of objects that the search did not see, "before"
-            and "after", and "floor", that of as many clouds of the target itself.
+            and "after", and "floor", that of as many other clouds of the target.
         trained_on: the same of those that it saw.
         counts: objects of both, and clouds of the target.
         features: what was compared.
@@ -241,5 +241,5 @@ def _judged(
         before, after = (float(distance([pair[k] for pair in pairs])) for k in (0, 1))
     return {
         "before": before, "after": after, "objects": len(pairs),
-        "floor": distance.floor(len(pairs), seed=wanted.seed),
+        "floor": distance.floor(len(pairs)),
     }  # fmt: skip

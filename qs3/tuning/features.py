@@ -77,8 +77,8 @@ class Distance:
             found = torch.cat([describe(cloud[None]) for cloud in target])
         self.mean, self.spread = found.mean(dim=0), found.std(dim=0) + 1e-6
         self.target = (found - self.mean) / self.spread
-        apart = torch.pdist(self.target)
-        self.sigmas = [max(width * float(apart.median()), 1e-3) for width in _WIDTHS]
+        self._apart = torch.pdist(self.target)
+        self.sigmas = [max(width * float(self._apart.median()), 1e-3) for width in _WIDTHS]
 
     def __call__(self, clouds: Sequence[Float[Tensor, "n 3"]]) -> Float[Tensor, ""]:
         """In [0, 8]; of few clouds it is larger, as each of them is also compared with itself."""
@@ -88,11 +88,11 @@ class Distance:
         """The same of clouds that have been described."""
         return mmd2((described - self.mean) / self.spread, self.target, self.sigmas)
 
-    def floor(self, count: int, draws: int = 20, seed: int = 0) -> float:
-        """Mean distance of `count` target clouds from all of them: what a perfect source has."""
-        noise = torch.Generator().manual_seed(seed)
-        found = []
-        for _ in range(draws):
-            some = torch.randint(len(self.target), (count,), generator=noise)
-            found.append(float(mmd2(self.target[some], self.target, self.sigmas)))
-        return sum(found) / draws
+    def floor(self, count: int) -> float:
+        """Mean distance of `count` other clouds of the target: what a perfect source has.
+
+        (1/m + 1/n) (k(x, x) - E k(x, x')), for m clouds and the n that are known: the estimate is
+        biased by comparing each cloud of either sample with itself, too. E is over the n's pairs.
+        """
+        pairs = sum(torch.exp(self._apart.square() / (-2 * s**2)).mean() for s in self.sigmas)
+        return float((1 / count + 1 / len(self.target)) * (len(self.sigmas) - pairs))

@@ -45,7 +45,8 @@ def markdown(found: Found, command: str) -> str:
         f"    {command}",
         "",
         f"Squared MMD of {found.features} to {found.counts['target']} unlabelled clouds of the "
-        "target, by the ordinary sensor; the floor is that of as many clouds of the target itself.",
+        "target, by the ordinary sensor; the floor is what as many other clouds of the target have "
+        "in the mean.",
         "",
         "| objects | | before | after | floor |",
         "|---|---|---|---|---|",

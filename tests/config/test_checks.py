@@ -22,6 +22,15 @@ def test_float(value):
         check_float("a.b", value)
 
 
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])
+def test_what_is_not_finite_is_no_setting(value):
+    for allowed in ("", ">= 0"):
+        with pytest.raises(ConfigError, match=rf"a\.b must be a finite number, got {value}"):
+            check_float("a.b", value, allowed)
+    with pytest.raises(ConfigError, match=r"sensor\.a_m must be"):
+        check_ranges(SimpleNamespace(a_m=value), "sensor.", a_m=">= 0")
+
+
 def test_choice():
     assert check_choice("a.b", "x", ("x", "y")) == "x"
     with pytest.raises(ConfigError, match=r"a\.b must be one of \('x', 'y'\), got 'z'"):

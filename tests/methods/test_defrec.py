@@ -88,6 +88,7 @@ def test_no_voxel_to_deform_is_no_loss_and_no_nan() -> None:
     [
         ({"defrec_weight": 1.5}, r"method.defrec_weight must be in \[0, 1\]"),
         ({"scale": -1.0}, "method.scale must be >= 0"),
+        ({"scale": float("inf")}, "method.scale must be a finite number, got inf"),
         ({"min_points": 0}, "method.min_points"),
     ],
 )

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shutil
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,9 +19,10 @@ from qs3.config import hashing
 from qs3.engine.checkpointing import SaveLast
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import read_metrics
+from qs3.training import shared_warmup
 from qs3.training.command import train
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
-from qs3.utils.files import sha256_file
+from qs3.utils.files import copy_file, sha256_file
 from tests.training.conftest import result_of
 
 
@@ -139,6 +143,78 @@ def test_without_its_mark_it_is_half_a_copy_and_replaced(tmp_path, caplog):
     assert "damaged" not in caplog.text
     trained(tmp_path / "b", mine, epochs=2)
     assert mark.is_file()
+
+
+def started(folder: Path) -> Path:
+    """The folder of a run that is one epoch away from its warm-up's end; no two are alike."""
+    folder.mkdir()
+    for name in ("history.csv", "last.ckpt"):
+        (folder / name).write_text(f"{name} of {folder.name}")
+    return folder
+
+
+def give(warmups: Path, folder: Path) -> None:
+    over = SimpleNamespace(current_epoch=0, is_global_zero=True)
+    SharedWarmup(folder, warmups, SHA256, 7, 2).on_train_epoch_end(over, None)
+
+
+def test_runs_that_start_together_share_one(tmp_path, caplog, monkeypatch):
+    """Others come while the first one's files are there and their mark is not."""
+    warmups, second = tmp_path / "warmups", started(tmp_path / "second")
+    (tmp_path / "third").mkdir()
+    third = SharedWarmup(tmp_path / "third", warmups, SHA256, 7, 2)
+    found, threads = [], []
+
+    def come_meanwhile(source: Path, target: Path) -> None:
+        copy_file(source, target)
+        if source.name == "last.ckpt" and not threads:
+            jobs = (lambda: give(warmups, second)), (lambda: found.append(third.take()))
+            threads.extend(threading.Thread(target=job) for job in jobs)
+            for thread in threads:
+                thread.start()
+                thread.join(0.2)
+
+    monkeypatch.setattr(shared_warmup, "copy_file", come_meanwhile)
+    give(warmups, started(tmp_path / "first"))
+    for thread in threads:
+        thread.join()
+    assert found == [True]  # it waited for the mark
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    assert (tmp_path / "third" / "last.ckpt").read_text() == "last.ckpt of first"
+    (tmp_path / "fourth").mkdir()
+    assert SharedWarmup(tmp_path / "fourth", warmups, SHA256, 7, 2).take()
+
+
+def test_one_killed_while_it_replaces_a_damaged_one_leaves_none(tmp_path, caplog, monkeypatch):
+    warmups = tmp_path / "warmups"
+    give(warmups, started(tmp_path / "first"))
+    (where,) = warmups.iterdir()
+    (where / "last.ckpt").write_text("damaged")
+
+    def killed(source: Path, target: Path) -> None:
+        raise SystemExit
+
+    with monkeypatch.context() as during:
+        during.setattr(shared_warmup, "copy_file", killed)
+        with pytest.raises(SystemExit):
+            give(warmups, started(tmp_path / "second"))
+    (tmp_path / "third").mkdir()
+    third = SharedWarmup(tmp_path / "third", warmups, SHA256, 7, 2)
+    assert not third.take()
+    assert "is damaged" not in caplog.text
+    give(warmups, started(tmp_path / "fourth"))
+    assert third.take()
+
+
+def test_where_one_may_not_write_one_may_take(tmp_path, monkeypatch):
+    warmups = tmp_path / "warmups"
+    give(warmups, started(tmp_path / "first"))
+    (where,) = warmups.iterdir()
+    (where / ".lock").unlink()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != where)
+    (tmp_path / "second").mkdir()
+    assert SharedWarmup(tmp_path / "second", warmups, SHA256, 7, 2).take()
+    assert not (where / ".lock").exists()
 
 
 def test_the_hash_covers_what_comes_before():

@@ -117,8 +117,23 @@ def test_distance_of_the_target_is_its_floor(distance):
     assert float(distance(clouds)) == pytest.approx(0, abs=1e-9)
     other = [Bent(200 + i).measured(TRUTH, 300) for i in range(8)]
     far = [Bent(200 + i).measured(START, 300) for i in range(8)]
-    assert float(distance(other)) < 4 * distance.floor(8)
+    assert float(distance(other)) < 3 * distance.floor(8)
     assert float(distance(far)) > 4 * float(distance(other))
+
+
+def test_the_floor_is_the_mean_distance_of_other_clouds_of_the_target():
+    generator = torch.Generator().manual_seed(0)
+    clouds = torch.randn(600, 5, generator=generator, dtype=torch.float64)
+    floors, expected = [], []
+    for _ in range(20):
+        clouds = clouds[torch.randperm(600, generator=generator)]
+        distance = Distance(lambda each: each, list(clouds[:100]))
+        floors.append(distance.floor(50))
+        for _ in range(40):
+            others = 100 + torch.randperm(500, generator=generator)[:50]
+            expected.append(float(distance.of(clouds[others])))
+    assert np.mean(floors) == pytest.approx(np.mean(expected), rel=0.08)
+    assert np.std(floors) < 0.05 * np.mean(floors)
 
 
 def test_roughness_of_a_noisy_plane_is_its_noise():

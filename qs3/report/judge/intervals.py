@@ -4,14 +4,18 @@ Objects of one room are not independent: same furniture, same light, same distan
 p = Σ_{s,i} w_i a_{s,i} / S (a is 1 if the run of seed s is right about object i; w_i is 1/n, or
 1/(C n_class) for balanced accuracy, C the classes that are there) therefore gets the variance of
 errors clustered by block and by seed (`qs3.report.clustered`). What an object adds is its error
-about the mean, for balanced accuracy about the recall of its class.
+about the mean. So it is for differences, too, whose intervals are those of
+`qs3.report.tables.paired`.
+
+For a balanced share that would count how many objects of easy classes a block happens to have. Its
+errors are about the recall of the class, over √(1 - h): h is the share of the class's objects that
+lie in this block, by which they pull the recall towards themselves (CR2: Bell and McCaffrey, "Bias
+Reduction in Standard Errors for Linear Regression with Multi-Stage Samples", Survey Methodology
+2002, for a mean). How often these intervals hold the truth: tests/report/balanced_coverage.py.
 
 Of one seed the interval is over blocks alone. It is no wider than [0, 1]. A class that was seen
-in one block alone adds nothing to the variance of balanced accuracy, although nobody knows how it
-varies from room to room: with such classes that interval is too narrow. With few rooms it is so
-anyway: of balanced differences over 13 of them it held the truth in 88 % of cases, where the one of
-`qs3.report.tables.paired`, about the mean of all objects, did in 95
-(tests/report/balanced_coverage.py).
+in one block alone adds nothing to the variance of a balanced share, although nobody knows how it
+varies from room to room: with such classes that interval is too narrow.
 """
 
 from __future__ import annotations
@@ -56,7 +60,9 @@ def share(
         blocks: cluster of each object, any numbers.
         balanced: mean of the recalls.
     """
-    return _over(right.astype(float), labels, blocks, balanced, (0.0, 1.0))
+    values, weight = right.astype(float), weights(labels, balanced)
+    errors = _about_recalls(values, labels, blocks) if balanced else values - values.mean()
+    return _over(values, errors, weight, blocks, (0.0, 1.0))
 
 
 def difference(
@@ -81,31 +87,39 @@ def difference(
     x, y = a.astype(float), b.astype(float)
     if len(x) != len(y) or not same_seeds:
         x, y = x.mean(axis=0, keepdims=True), y.mean(axis=0, keepdims=True)
-    return _over(x - y, labels, blocks, balanced, (-1.0, 1.0))
+    values, weight = x - y, weights(labels, balanced)
+    return _over(values, values - (values @ weight).mean(), weight, blocks, (-1.0, 1.0))
+
+
+def _about_recalls(
+    values: Float[np.ndarray, "s n"], labels: Int[np.ndarray, " n"], blocks: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "s n"]:
+    """Errors about the recall of each class, larger by what each block pulls it towards itself."""
+    _, kind, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    recalls = np.bincount(kind, values.mean(axis=0)) / counts
+    _, both, together = np.unique(
+        np.stack([labels, blocks]), axis=1, return_inverse=True, return_counts=True
+    )
+    left = 1 - together[both] / counts[kind]  # 0: all of the class is here, and its errors cancel
+    return (values - recalls[kind]) / np.sqrt(np.where(left > 0, left, 1))
 
 
 def _over(
     values: Float[np.ndarray, "s n"],
-    labels: Int[np.ndarray, " n"],
+    errors: Float[np.ndarray, "s n"],
+    weight: Float[np.ndarray, " n"],
     blocks: Int[np.ndarray, " n"],
-    balanced: bool,
     ends: tuple[float, float],
 ) -> Share:
     """The weighted mean of each seed's and object's value, with its interval within `ends`."""
-    seeds, n = values.shape
-    weight = weights(labels, balanced)
-    expected = np.full(n, values.mean())
-    if balanced:
-        _, kind, counts = np.unique(labels, return_inverse=True, return_counts=True)
-        expected = (np.bincount(kind, values.mean(axis=0)) / counts)[kind]
-    each = values @ weight
+    seeds, each = len(values), values @ weight
     mean = float(each.mean())
     sem = float(each.std(ddof=1) / math.sqrt(seeds)) if seeds > 1 else None
     _, block = np.unique(blocks, return_inverse=True)
     m = int(block.max()) + 1
     if m < 2:
         return Share(mean, sem, None, None)
-    of_seeds, of_blocks = variances((values - expected) * weight, block)
+    of_seeds, of_blocks = variances(errors * weight, block)
     half2 = t2(m) * of_blocks + (t2(seeds) * of_seeds if seeds > 1 else 0.0)
     half = math.sqrt(half2)
     return Share(mean, sem, max(ends[0], mean - half), min(ends[1], mean + half))

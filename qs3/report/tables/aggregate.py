@@ -89,7 +89,7 @@ class Group:
         experiment: name.
         hash: of the config.
         finished: runs with a result, by seed.
-        problems: for the reader: unfinished seeds, different datasets, a seed twice.
+        problems: for the reader: unfinished or diverged seeds, different datasets, a seed twice.
         comparable: whether the finished runs may be averaged.
     """
 
@@ -198,6 +198,11 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
     if twice:
         comparable = False
         problems.append(f"seeds {_list(twice)} occur more than once: not averaged")
+    diverged = [run.seed for run in finished if run.metrics and run.metrics.diverged]
+    if diverged:
+        problems.append(
+            f"seeds {_list(diverged)}: the net has diverged and calls every cloud alike: averaged"
+        )
     for role in ("source", "target"):
         hashes = defaultdict(list)
         for run in finished:
@@ -227,6 +232,24 @@ def same_data(results: Iterable[RunMetrics | None], role: str) -> bool:
     return len({getattr(result.data, role) for result in known}) < 2 or (
         len(recipes) == 1 and "" not in recipes
     )
+
+
+def data_differences(results: Iterable[RunMetrics], role: str) -> str:
+    """What tells the datasets of runs apart: their names, or of one name the hashes and recipes.
+
+    Args:
+        results: of runs that did not see the same data, see `same_data`.
+        role: "source" or "target".
+    """
+    runs = list(results)
+    names = list(dict.fromkeys(getattr(run, role) for run in runs))
+    if len(names) > 1:
+        return f"the runs have different {role}s: {' and '.join(names)}"
+    seen = {getattr(run.data, role)[:12]: str(getattr(run.made_of, role)) for run in runs}
+    versions = [f"{sha} ({made})" for sha, made in seen.items()]
+    if len(set(seen.values())) == 1:
+        versions = list(seen)
+    return f"the runs saw different versions of {names[0]}: {' and '.join(versions)}"
 
 
 def _list(seeds: Sequence[int | None]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from qs3.data.importers.object_archive import TIERS
 from qs3.errors import ConfigError, DataError
 from qs3.report.clustered import LEVEL
-from qs3.report.tables.aggregate import data_lines, same_data
+from qs3.report.tables.aggregate import data_differences, data_lines, same_data
 from qs3.report.tables.cells import Cell, Table
 from qs3.report.tables.formats import SIMULATED, marks
 from qs3.report.tables.made_of import data_marks, results_of
@@ -216,18 +216,19 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) -> C
     for cell in cells:
         if cell.group and not cell.group.comparable:
             return Compared(name, None, f"{cell.row}, {cell.column}: not averaged, see the table")
-    results = [runs[seed].metrics for runs in finished for seed in seeds]
+    every = [runs[seed].metrics for runs in finished for seed in seeds]
+    results = [result for result in every if result]
     if not same_data(results, "target"):
-        return Compared(name, None, "the runs saw different versions of the target")
+        return Compared(name, None, data_differences(results, "target"))
     try:
         said = [[read_predictions(runs[seed].folder / FILE) for seed in seeds] for runs in finished]
         both = list(zip(said[::2], said[1::2], strict=True))
         found = _pair_of(both)
     except DataError as error:
         return Compared(name, None, str(error))
-    first, target = said[0][0], results[0].data.target if results[0] else ""
+    first, target = said[0][0], results[0].data.target
     known = tiers(target, first.ids)
-    has_tiers = any(result and result.evaluation.tiers for result in results)
+    has_tiers = any(result.evaluation.tiers for result in results)
     return Compared(
         name,
         found,

@@ -15,9 +15,11 @@ from qs3.errors import ConfigError, MissingDataError
 from qs3.inference.model_file import Result, write_result
 from qs3.inference.predictor import load
 from qs3.models.pointnet import pointnet
+from qs3.report.clustered import weights
 from qs3.report.judge.intervals import difference, share
 from qs3.report.judge.judging import find_runs, judge
 from qs3.report.judge.text import text
+from qs3.report.tables.paired import interval
 from qs3.utils.version import VERSION, commit, in_words
 from tests.fixtures.frame_files import write_archive
 from tests.report.made_runs import write_run
@@ -168,6 +170,30 @@ def test_intervals_by_hand():
     assert found.low == pytest.approx(max(0, 5 / 8 - half))
     assert found.high == pytest.approx(min(1, 5 / 8 + half))
     assert share(right, labels, np.zeros(8)).low is None
+
+
+def test_balanced_intervals_by_hand():
+    """Class 0 twice in each of five rooms, class 1 once in four of them, class 2 in one alone."""
+    right = np.array([[1, 1, 1, 0, 1, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 0]], dtype=bool)
+    labels, blocks = np.repeat([0, 1, 2], [10, 4, 2]), [*np.repeat(range(5), 2), 0, 1, 2, 3, 4, 4]
+    found = share(right, labels, np.array(blocks), balanced=True)
+    first = np.array([0.4, -0.6, 0.4, -0.6, 0.4]) / 10 / 3 / np.sqrt(1 - 1 / 5)  # about 0.8
+    second = np.array([0.25, 0.25, -0.75, 0.25, 0]) / 4 / 3 / np.sqrt(1 - 1 / 4)  # about 0.75
+    half = 2.776445 * np.sqrt(((first + second) ** 2).sum() * 5 / 4)
+    mean = (0.8 + 0.75 + 0.5) / 3
+    assert (found.low, found.mean, found.high) == pytest.approx((mean - half, mean, mean + half))
+
+
+@pytest.mark.parametrize("balanced", [False, True])
+def test_differences_are_those_of_report_compare(balanced):
+    rng = np.random.default_rng(2)
+    labels, blocks = rng.integers(0, 4, 80), np.sort(rng.integers(0, 9, 80))
+    a, b = rng.random((3, 80)) < 0.5, rng.random((3, 80)) < 0.5
+    found = difference(a, b, labels, blocks, balanced=balanced)
+    theirs = interval(a.astype(float) - b, weights(labels, balanced), blocks)
+    assert (found.mean, found.low, found.high) == pytest.approx(
+        (theirs.mean, theirs.low, theirs.high)
+    )
 
 
 def test_differences_are_paired():

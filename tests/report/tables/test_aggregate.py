@@ -19,6 +19,7 @@ from qs3.report.tables.aggregate import (
     summarise,
 )
 from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
+from qs3.training.command import headline
 from tests.report.made_runs import CATALOGUE, metrics, scores, write_run
 
 
@@ -146,6 +147,17 @@ def test_scores_that_a_seed_lacks_have_no_mean(tmp_path):
     assert found.stat("calibration_error") is None
     assert found.stat("accuracy").mean == pytest.approx(0.6)
     assert found.stat("accuracy", "warmup").mean == 0.5
+
+
+def test_a_diverged_seed_is_averaged_and_said(tmp_path):
+    for seed, entropy in ((0, -0.4), (1, None)):
+        write_run(tmp_path, seed=seed, accuracy=0.5, validators={"entropy": entropy})
+    (one,) = group(load_runs(tmp_path))
+    assert one.comparable
+    assert one.problems == ("seeds 1: the net has diverged and calls every cloud alike: averaged",)
+    said = [headline(result) for result in one.results]
+    assert "diverged" not in said[0]
+    assert "seed 1: the net has diverged, its predictions are no numbers; accuracy 50.0%" in said[1]
 
 
 def test_without_labels_there_is_no_mean(tmp_path):

@@ -187,7 +187,19 @@ def test_what_a_table_does_not_average_is_not_compared(tmp_path):
     compared(folders[1], "c" * 64)
     one = compared(folders[2], "c" * 64)  # all of its seeds, but not the base's
     assert one.differences is None
-    assert "different versions of the target" in one.why
+    target = cells["DANN"].group.first.target
+    versions = f"the runs saw different versions of {target}: cccccccccccc and bbbbbbbbbbbb"
+    assert one.why == versions
+    for run in cells["DANN"].group.finished:
+        change(run.folder, made_of=DataMadeOf(source=CATALOGUE, target=replace(CATALOGUE, views=3)))
+    one = compared(folders[2], "c" * 64)
+    assert f"cccccccccccc ({replace(CATALOGUE, views=3)}) and bbbbbbbbbbbb (" in one.why
+    for run in cells["DANN"].group.finished:
+        change(run.folder, target="nyuv2")
+    one = compared(folders[2], "c" * 64)
+    assert one.why == f"the runs have different targets: nyuv2 and {target}"
+    for run in cells["DANN"].group.finished:
+        change(run.folder, target=target)
     made = DataMadeOf(source=CATALOGUE, target=replace(CATALOGUE, recipe="1" * 12))
     for cell in cells.values():  # other bytes of one recipe are one target
         for run in cell.group.finished:
