@@ -31,8 +31,10 @@ def _mesh(name: str, *more: str) -> Reader:
         return [made[one]() if one in made else export(one) for one in (name, *more)]
 
     def read(path: Path) -> None:
+        from qs3.meshes.formats.gltf import buffer_files
         from qs3.meshes.io import load_mesh
 
+        buffer_files(path)
         load_mesh(path, materials=True)
 
     suffix = name.rpartition(".")[2]
