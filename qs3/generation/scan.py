@@ -112,6 +112,17 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
             raise ConfigError(
                 f"{key}= is for files: a scan of meshes from memory has no use for it"
             )
+    for key, nothing in (("limit", None), ("fraction", 1.0), ("splits", None)):
+        if cfg[key] != nothing:
+            raise ConfigError(
+                f"{key}= chooses among the objects of a dataset; meshes from memory are all "
+                "scanned: leave it out, and give those that you want"
+            )
+    if cfg.scans != 1:
+        raise ConfigError(
+            "scans= is for datasets; a mesh from memory is scanned once under each id: give it "
+            'under several, {"a": mesh, "a~1": mesh}'
+        )
     scanner = Scanner(cfg)
     return {name: _scan(scanner, name, solid, cfg) for name, solid in solids.items()}
 
