@@ -33,6 +33,7 @@ from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_pict
 from qs3.generation.disk import check_folder, disk_errors_explained
 from qs3.generation.made_of import made_of
 from qs3.generation.materials import DRAWN
+from qs3.generation.mesh_sizes import warn_of_sizes
 from qs3.generation.object_parts import InParts, Parts
 from qs3.generation.plan import (
     benchmark,
@@ -114,6 +115,7 @@ def generate(cfg: DictConfig) -> PointSet:
             _check_strict(cfg, pointset, items, folder)
             return pointset
         start = time.perf_counter()
+        warn_of_sizes(getattr(job.recipe, "placing", None), items)
         parts.begin(recipe)
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None

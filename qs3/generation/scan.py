@@ -112,8 +112,8 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
             raise ConfigError(
                 f"{key}= is for files: a scan of meshes from memory has no use for it"
             )
-    for key, nothing in (("limit", None), ("fraction", 1.0), ("splits", None)):
-        if cfg[key] != nothing:
+    for key, everything in (("limit", None), ("fraction", 1.0), ("splits", None)):
+        if cfg[key] != everything:
             raise ConfigError(
                 f"{key}= chooses among the objects of a dataset; meshes from memory are all "
                 "scanned: leave it out, and give those that you want"
