@@ -213,3 +213,15 @@ def test_letters_that_do_not_exist_are_refused(letter, order, tmp_path):
         parse_clouds(tmp_path / "b.npy")
     np.savez(tmp_path / "c.npz", points=np.ones((2, 4, 3)), label=np.array(["chaise", "été"]))
     assert parse_clouds(tmp_path / "c.npz").labels == ("chaise", "été")
+
+
+@pytest.mark.parametrize("columns", [3, 6])
+def test_one_organised_cloud_is_not_taken_for_as_many_as_it_has_rows(columns, tmp_path):
+    image = np.zeros((240, 320, columns), np.float32)
+    np.save(tmp_path / "a.npy", image)
+    with pytest.raises(DataError, match=rf"320 x 240 px.*save cloud\.reshape\(-1, {columns}\)"):
+        parse_clouds(tmp_path / "a.npy")
+    np.save(tmp_path / "a.npy", image.reshape(-1, columns))
+    assert len(parse_clouds(tmp_path / "a.npy").clouds) == 1
+    np.save(tmp_path / "a.npy", image[:239])
+    assert len(parse_clouds(tmp_path / "a.npy").clouds) == 239
