@@ -201,6 +201,38 @@ def test_decimal_commas(text, expected, tmp_path):
     np.testing.assert_array_equal(parse_cloud(path), expected)
 
 
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("x y z", "0.5 1.25 2.75"),
+        ("X,Y,Z,intensity", "0.5,1.25,2.75,3"),
+        ('\ufeff"x";"y";"z"', "0,5;1,25;2,75"),
+        ("# from a robot\n\nx y z", "0,5 1,25 2,75"),
+        ("\ufeff# x y z", "0.5 1.25 2.75"),
+    ],
+)
+def test_a_row_of_names_is_passed_over(head, row, tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text(f"{head}\r\n{row}\r\n{row}\r\n", encoding="utf-8")
+    np.testing.assert_array_equal(parse_cloud(path), [[0.5, 1.25, 2.75]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x y\n1 2 3\n", "line 1: 'x y' is not a row of numbers"),
+        ("t x y z\n1 2 3 4\n", "line 1: 't x y z' is not a row of numbers"),
+        ("x y z\nx y z\n1 2 3\n", "line 2: 'x y z' is not a row of numbers"),
+        ("x y z\n", "there are no points"),
+    ],
+)
+def test_other_words_are_not(text, message, tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    with pytest.raises(DataError, match=message):
+        parse_cloud(path)
+
+
 @pytest.mark.parametrize("letter", [0x110000, 0xFFFFFFFF, 0xD800])
 @pytest.mark.parametrize("order", "<>")
 def test_letters_that_do_not_exist_are_refused(letter, order, tmp_path):

@@ -68,6 +68,8 @@ def _cloud(suffix: str, module: str, shape: Any = None) -> Reader:
             made.append(write(folder / "a.txt"))
             made.append(folder / "commas.txt")
             made[-1].write_text("0,5;1,25;2,75\n1;2;3 # a\n")
+            made.append(folder / "names.txt")
+            made[-1].write_text("x,y,z\n1,2,3\n4,5,6\n")
         if suffix == ".pcd":
             made += _pcds(folder)
         if suffix in (".npy", ".npz"):
