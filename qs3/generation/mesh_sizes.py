@@ -12,8 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from qs3.errors import MeshError
+from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import RealSize
 from qs3.meshes.source import MeshItem
+from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)
 
@@ -30,24 +32,31 @@ def warn_of_sizes(placing: object, items: Sequence[MeshItem]) -> None:
     if not isinstance(placing, RealSize) or not files:
         return
     few = np.unique(np.linspace(0, len(files) - 1, min(len(files), JUDGED)).round().astype(int))
-    sides = np.array([side for i in few if (side := _largest_side(files[i])) is not None])
-    other = sides[[not placing.keeps(side) for side in sides]] if len(sides) else sides
-    if not len(other):
+    warn_of_lost(placing, [mesh for i in few if (mesh := _read(files[i])) is not None])
+
+
+def warn_of_lost(placing: object, meshes: Sequence[Mesh]) -> None:
+    """A warning if some meshes have a size that `placing` will not keep."""
+    if not isinstance(placing, RealSize):
+        return
+    sides = [float(np.ptp(mesh.bounds, axis=0).max()) for mesh in meshes]
+    other = [side for side in sides if not placing.keeps(side)]
+    if not other:
         return
     middle, (low, high) = float(np.median(other)), _FURNITURE_M
     unit = next((f" as in {name}" for name, m in _UNITS if low <= middle * m <= high), "")
     log.warning(
-        "%d of %d meshes that were looked at have a largest side of %.4g to %.4g%s, not of %g to "
-        "%g m: each is scaled to %g m, and its size is lost. To keep it, save them in metres",
-        len(other), len(sides), other.min(), other.max(), unit, placing.min_side_m,
-        placing.max_side_m, placing.fallback_side_m,
+        "%d of %s looked at %s a largest side of %.4g to %.4g%s, not of %g to %g m: each is scaled "
+        "to %g m, and its size is lost. To keep it, give meshes in metres",
+        len(other), counted(len(sides), "mesh", "meshes"), "has" if len(other) == 1 else "have",
+        min(other), max(other), unit, placing.min_side_m, placing.max_side_m,
+        placing.fallback_side_m,
     )  # fmt: skip
 
 
-def _largest_side(item: MeshItem) -> float | None:
-    """Of the mesh; None if it cannot be read, which is said when it is scanned."""
+def _read(item: MeshItem) -> Mesh | None:
+    """None if it cannot be read, which is said when it is scanned."""
     try:
-        low, high = item.load().bounds
+        return item.load()
     except MeshError:
         return None
-    return float((high - low).max())

@@ -4,6 +4,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import qs3
 from qs3.errors import MeshError
 from qs3.generation.command import generate
 from qs3.generation.mesh_sizes import warn_of_sizes
@@ -100,7 +101,7 @@ def test_pieces_are_watertight():
 @pytest.mark.parametrize(
     ("per_metre", "said"),
     [
-        (1000, "3 of 3 meshes that were looked at have a largest side of 600 to 1800 as in milli"),
+        (1000, "3 of 3 meshes looked at have a largest side of 600 to 1800 as in milli"),
         (100, "a largest side of 60 to 180 as in centimetres, not of 0.15 to 4 m: each is scaled"),
         (10, "a largest side of 6 to 18, not of"),
         (1, ""),
@@ -126,7 +127,16 @@ def test_they_are_said_before_the_scans(tmp_path, caplog):
     words = ("classes=[chair]", "workers=0", "~recipe.placing.yaw", "up=z", "recipe.points=64")
     placing = "recipe.placing._target_=qs3.meshes.placement.RealSize"
     generate(config(tmp_path / "data", tmp_path, placing, *words, domain="modelnet10"))
-    assert "2 of 2 meshes that were looked at have a largest side of 900 to 900" in caplog.text
+    assert "2 of 2 meshes looked at have a largest side of 900 to 900" in caplog.text
+
+
+def test_of_a_mesh_from_memory_too(caplog):
+    words = ("domain=modelnet10", "~recipe.placing.yaw", "recipe.points=64")
+    placing = "recipe.placing._target_=qs3.meshes.placement.RealSize"
+    for side, said in ((0.9, 0), (900, 1)):
+        qs3.generate(trimesh.creation.box([side] * 3), *words, placing)
+        assert len(caplog.records) == said
+    assert "1 of 1 mesh looked at has a largest side of 900" in caplog.text
 
 
 def test_the_catalogue_is_in_metres(caplog):
