@@ -42,6 +42,7 @@ from qs3.generation.plan import (
     describe,
     keep,
     left_alone,
+    mesh_folder,
     mesh_items,
     mesh_root,
     stated_hash,
@@ -115,7 +116,7 @@ def generate(cfg: DictConfig) -> PointSet:
             _check_strict(cfg, pointset, items, folder)
             return pointset
         start = time.perf_counter()
-        warn_of_sizes(getattr(job.recipe, "placing", None), items)
+        _warn_of_meshes(cfg, job, items)
         parts.begin(recipe)
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
@@ -137,6 +138,16 @@ def generate(cfg: DictConfig) -> PointSet:
         )
     _check_strict(cfg, pointset, items, folder)
     return pointset
+
+
+def _warn_of_meshes(cfg: DictConfig, job: Job, items: list[MeshItem]) -> None:
+    """What of the user's meshes will not come out as one may think."""
+    if cfg.meshes is not None and (unread := mesh_folder(cfg).unread()):
+        log.warning(
+            "left out, because this format is not read: %s: export STL, OBJ or glTF",
+            unread[0] if len(unread) == 1 else f"{unread[0]} and {len(unread) - 1} more",
+        )
+    warn_of_sizes(getattr(job.recipe, "placing", None), items)
 
 
 def _check_place(domain: Domain, force: bool) -> None:

@@ -120,14 +120,16 @@ def test_sizes_that_will_be_lost_are_said(per_metre, said, tmp_path, caplog):
     assert [said in record.getMessage() for record in caplog.records] == [True] * bool(said)
 
 
-def test_they_are_said_before_the_scans(tmp_path, caplog):
+def test_they_are_said_before_the_scans_and_what_is_left_out(tmp_path, caplog):
     (tmp_path / "chair").mkdir()
     for name in "ab":
         trimesh.creation.box([500, 300, 900]).export(tmp_path / "chair" / f"{name}.stl")
+    (tmp_path / "chair" / "c.step").touch()
     words = ("classes=[chair]", "workers=0", "~recipe.placing.yaw", "up=z", "recipe.points=64")
     placing = "recipe.placing._target_=qs3.meshes.placement.RealSize"
     generate(config(tmp_path / "data", tmp_path, placing, *words, domain="modelnet10"))
     assert "2 of 2 meshes looked at have a largest side of 900 to 900" in caplog.text
+    assert "left out, because this format is not read: chair/c.step: export STL" in caplog.text
 
 
 def test_of_a_mesh_from_memory_too(caplog):
