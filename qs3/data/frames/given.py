@@ -174,7 +174,8 @@ def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where
             f"{where}: the intrinsics are of pictures of {given.size[0]} x {given.size[1]} px, "
             f"this one has {width} x {height}"
         )
-    if not (-0.5 <= camera.cx_px <= width - 0.5 and -0.5 <= camera.cy_px <= height - 0.5):
+    # Strictly: at twice the size the middle is the corner of this picture.
+    if not (-0.5 < camera.cx_px < width - 0.5 and -0.5 < camera.cy_px < height - 0.5):
         raise DataError(
             f"{where}: the principal point ({camera.cx_px:g}, {camera.cy_px:g}) is outside of the "
             f"picture of {width} x {height} px; are the intrinsics those of another resolution, or "

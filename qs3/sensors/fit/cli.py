@@ -14,6 +14,8 @@ from qs3.utils.plural import counted
 if TYPE_CHECKING:
     from qs3.sensors.fit.preset import FittedPreset
 
+_LONGEST_M = 2.0  # baseline of a depth camera: a longer one is in another unit
+
 
 def _fit(
     words: Sequence[str],
@@ -89,6 +91,12 @@ def fit(
         camera = Intrinsics.centred(width, height, focal)
     else:
         raise ConfigError("give the camera: intrinsics=fx,fy,cx,cy, or focal=PIXELS")
+    if baseline is not None and not 0 < abs(baseline) < _LONGEST_M:
+        hint = f"; if these are millimetres, give {baseline / 1000:g}"
+        raise ConfigError(
+            f"baseline={baseline:g}: metres from camera to projector, such as 0.075"
+            + hint * (abs(baseline) >= _LONGEST_M)
+        )
     if distances is not None and len(distances) != len(frames):
         values, of = counted(len(distances), "value"), counted(len(frames), "frame")
         raise ConfigError(f"distances= has {values} for {of}")

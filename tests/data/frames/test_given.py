@@ -243,6 +243,7 @@ def test_what_is_no_intrinsics_is_told(tmp_path, text, message):
     [
         ((525, 525, 640, 240), None, "outside of the picture of 640 x 480"),
         ((525, 525, 320, -3), None, "another resolution"),
+        ((1050, 1050, 639.5, 479.5), None, "another resolution"),  # the middle, at twice the size
         ((0.9, 0.9, 320, 240), None, "focal lengths are in pixels"),
         ((90_000, 525, 320, 240), None, "field of view"),
         ((525, 525, 320, 240), (1280, 720), "of pictures of 1280 x 720 px, this one has 640 x 480"),
