@@ -73,7 +73,8 @@ def generate(*arguments: Any) -> Any:
     are left out as those of files are, unless the words have "colliders=keep". Everything happens
     in this process, and nothing is written. An object's bytes depend on the seed and on its id:
     the key of a dict, "object" for a single mesh, "0", "1", ... in a list. With the id of a
-    dataset's object they are those of the dataset.
+    dataset's object they are those of the dataset. What chooses among a dataset's objects (limit,
+    fraction, splits, scans) is refused.
 
     Returns:
         Of words the dataset; of a mesh a `qs3.generation.scan.Scan`; of a list or dict one each.

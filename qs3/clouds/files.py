@@ -2,7 +2,8 @@
 
     .xyz .txt   text, a row a point: x y z and perhaps more columns, by blanks, commas or
                 semicolons; # and // begin a comment
-    .npy        [n, >= 3], or [m, n, >= 3]: m clouds
+    .npy        [n, >= 3], or [m, n, >= 3]: m clouds, unless m and n are a depth camera's height
+                and width, as of one organised cloud: that is refused
     .npz        the array `points` (or the only one) as in .npy; perhaps `label` or `cls`
     .ply        the vertices, text or binary; faces are passed over
     .pcd        x y z
@@ -157,7 +158,19 @@ def _check_array(path: Path, shape: tuple[int, ...] | None, dtype: np.dtype) -> 
         raise DataError(f"{path}: the array holds {dtype}, not numbers")
     if len(shape) not in (2, 3) or shape[-1] < 3:
         raise DataError(f"{path}: the array has shape {shape}, expected [n, 3] or [m, n, 3]")
+    if len(shape) == 3 and shape[:2] in _PICTURES:
+        raise DataError(
+            f"{path}: the array has shape {shape}: is it one organised cloud, of a depth camera "
+            f"with {shape[1]} x {shape[0]} px? Then save cloud.reshape(-1, {shape[2]}); if it is "
+            f"{shape[0]} clouds, save them in two files"
+        )
 
+
+_PICTURES = {
+    *((240, 320), (480, 640), (424, 512), (576, 640), (270, 480), (360, 640), (480, 848)),
+    *((540, 960), (720, 1280), (960, 1280), (1080, 1920)),
+}
+"""Height and width of depth cameras' pictures; so many clouds of so many points are not likely."""
 
 _READERS: dict[str, Callable[[Path], CloudFile]] = {
     **{".xyz": _text, ".txt": _text, ".npy": _npy, ".npz": _npz, ".ply": _ply, ".pcd": _pcd},

@@ -1,7 +1,7 @@
 """Clouds as text: a row a point, in the dialects that programs write.
 
 Columns are x y z and perhaps more, by blanks, commas or semicolons, with decimal points or commas;
-# and // begin a comment.
+# and // begin a comment. A first row of names, x y z and perhaps more, is passed over.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from qs3.utils.memory import check_memory
 from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
 
+_FIRST = re.compile(rb"^[ \t]*[^\s#][^\r\n]*", re.MULTILINE)  # row that is not empty
+
 
 def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
     """Coordinates of all rows, float64.
@@ -28,7 +30,7 @@ def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
     data = path.read_bytes()
     # Copies and numbers, eight bytes from two letters; and each line is an object.
     check_memory(8 * len(data) + 48 * (data.count(b"\n") + data.count(b"\r")), path)
-    rows = data.replace(b"//", b"#")
+    rows = _without_names(data.removeprefix(b"\xef\xbb\xbf").replace(b"//", b"#"))
     if _decimal_commas(rows):
         rows = rows.replace(b",", b".").replace(b";", b" ")
     elif b"," in rows or b";" in rows:
@@ -47,9 +49,19 @@ def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
     return table[:, :3]
 
 
+def _without_names(rows: bytes) -> bytes:
+    """The same with an empty line in place of a first row "x y z ..."."""
+    first = _FIRST.search(rows)
+    if first is None:
+        return rows
+    words = re.split(rb"[,;\s]+", first[0].split(b"#")[0].strip())[:3]
+    names = [word.strip(b'"').lower() for word in words]
+    return rows[: first.start()] + rows[first.end() :] if names == [b"x", b"y", b"z"] else rows
+
+
 def _decimal_commas(rows: bytes) -> bool:
     """Whether the first row is as "0,5;1,25;2,75" or "0,5 1,25 2,75": commas within numbers."""
-    first = re.search(rb"^[ \t]*[^\s#][^\r\n]*", rows, re.MULTILINE)
+    first = _FIRST.search(rows)
     words = re.split(rb"[;\s]+", first[0].split(b"#")[0].strip()) if first else []
     if not any(b"," in word for word in words):
         return first is not None and b";" in first[0]  # between numbers there is something else

@@ -230,12 +230,9 @@ class AdaptationData(LightningDataModule):
         y = f"y_{self.owner}"
         balance = y if self.labelled_domain.sampler == "balanced" else None
         table = self.labelled_domain.training_table({y: self.labelled.labels}, balance)
-        beside = dict(table.beside)
         if wants.again:
-            beside["again"] = table.sources["points"]
-        if wants.twin:
-            beside["twin"] = self.labelled_domain.twins_of(self.labelled.clouds)
-        return replace(table, beside=beside)
+            table = replace(table, beside={**table.beside, "again": table.sources["points"]})
+        return self.labelled_domain.with_twins(table) if wants.twin else table
 
     def _pseudo_labelled(self) -> Table:
         assert self.pseudo is not None, "a round has begun without pseudo-labels"

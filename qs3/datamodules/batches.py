@@ -29,12 +29,14 @@ class Table:
         balance: the owner whose classes are drawn equally often; None draws each cloud once.
         beside: further clouds of the same objects, by their key in a batch (see
             `qs3.datamodules.twins`); under "points" what comes in place of `clouds`.
+        repeated: further keys under which a batch has the very clouds of "points".
     """
 
     clouds: Clouds
     labels: Mapping[str, Tensor]
     balance: str | None = None
     beside: Mapping[str, Clouds | RandomViews] = field(default_factory=dict)
+    repeated: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.clouds)
@@ -46,7 +48,7 @@ class Table:
         """
         labels = {key: y[index] for key, y in self.labels.items()}
         found = {key: some.take(index, draws.get(key)) for key, some in self.sources.items()}
-        return {**found, **labels}
+        return {**found, **{key: found["points"] for key in self.repeated}, **labels}
 
     @property
     def sources(self) -> dict[str, Any]:

@@ -199,11 +199,15 @@ class DomainData(LightningDataModule):
         drawn = self.random_views
         return Table(clouds, labels, balance, {"points": drawn.at(clouds.rows)} if drawn else {})
 
-    def twins_of(self, clouds: Clouds) -> Clouds:
-        """The twins of some of the training clouds, row by row."""
-        if self.twins is None:  # "scan": each cloud is its own
-            return clouds
-        return self.twins.at(clouds.rows)
+    def with_twins(self, table: Table) -> Table:
+        """A table of training clouds with their twins, row by row, under "twin"."""
+        if self.twins is not None:
+            twins = self.twins.at(table.clouds.rows)
+        elif self.random_views is not None:  # "scan": each cloud is its own, as it was drawn
+            return replace(table, repeated=("twin",))
+        else:
+            twins = table.clouds
+        return replace(table, beside={**table.beside, "twin": twins})
 
     def _fewer(self, dataset: PointSet) -> PointSet:
         few = self.clouds_a_split
@@ -266,8 +270,7 @@ class DomainData(LightningDataModule):
         if shuffle:
             table = self.training_table(labels, balance)
             if self.twin:
-                beside = {**table.beside, "twin": self.twins_of(part.clouds)}
-                table = replace(table, beside=beside)
+                table = self.with_twins(table)
 
         def batches(epoch: int) -> Batches:
             return Batches(

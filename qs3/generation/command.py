@@ -33,6 +33,7 @@ from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_pict
 from qs3.generation.disk import check_folder, disk_errors_explained
 from qs3.generation.made_of import made_of
 from qs3.generation.materials import DRAWN
+from qs3.generation.mesh_sizes import warn_of_sizes
 from qs3.generation.object_parts import InParts, Parts
 from qs3.generation.plan import (
     benchmark,
@@ -41,6 +42,7 @@ from qs3.generation.plan import (
     describe,
     keep,
     left_alone,
+    mesh_folder,
     mesh_items,
     mesh_root,
     stated_hash,
@@ -114,6 +116,7 @@ def generate(cfg: DictConfig) -> PointSet:
             _check_strict(cfg, pointset, items, folder)
             return pointset
         start = time.perf_counter()
+        _warn_of_meshes(cfg, job, items)
         parts.begin(recipe)
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
@@ -135,6 +138,16 @@ def generate(cfg: DictConfig) -> PointSet:
         )
     _check_strict(cfg, pointset, items, folder)
     return pointset
+
+
+def _warn_of_meshes(cfg: DictConfig, job: Job, items: list[MeshItem]) -> None:
+    """What of the user's meshes will not come out as one may think."""
+    if cfg.meshes is not None and (unread := mesh_folder(cfg).unread()):
+        log.warning(
+            "left out, because this format is not read: %s: export STL, OBJ or glTF",
+            unread[0] if len(unread) == 1 else f"{unread[0]} and {len(unread) - 1} more",
+        )
+    warn_of_sizes(getattr(job.recipe, "placing", None), items)
 
 
 def _check_place(domain: Domain, force: bool) -> None:

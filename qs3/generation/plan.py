@@ -26,6 +26,7 @@ from qs3.generation.provenance import Keep
 from qs3.generation.released.poses import read_poses
 from qs3.generation.twins import TWINS, VIEWS
 from qs3.meshes.folder import SPLITS, MeshFolder
+from qs3.meshes.formats.gltf import buffer_files
 from qs3.meshes.formats.mtl import libraries
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import sha256_file
@@ -370,7 +371,7 @@ def plan_hash(recipe: dict[str, Any]) -> str:
 def _name_and_content(item: MeshItem, with_materials: bool) -> str:
     if item.path is None:
         return f"{item.id} {item.origin}"
-    files = [item.path]
+    files = [item.path, *buffer_files(item.path)]
     if with_materials:
         with contextlib.suppress(MeshError):  # of one object, which will fail by it
             files += libraries(item.path)

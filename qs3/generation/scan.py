@@ -13,6 +13,7 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
 from qs3.generation.materials import MixedMaterials
 from qs3.generation.materials_file import with_materials
+from qs3.generation.mesh_sizes import warn_of_lost
 from qs3.generation.plan import check, check_recipe
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud
@@ -112,6 +113,17 @@ def scan_meshes(solids: Mapping[str, Solid], overrides: Sequence[str]) -> dict[s
             raise ConfigError(
                 f"{key}= is for files: a scan of meshes from memory has no use for it"
             )
+    for key, everything in (("limit", None), ("fraction", 1.0), ("splits", None)):
+        if cfg[key] != everything:
+            raise ConfigError(
+                f"{key}= chooses among the objects of a dataset; meshes from memory are all "
+                "scanned: leave it out, and give those that you want"
+            )
+    if cfg.scans != 1:
+        raise ConfigError(
+            "scans= is for datasets; a mesh from memory is scanned once under each id: give it "
+            'under several, {"a": mesh, "a~1": mesh}'
+        )
     scanner = Scanner(cfg)
     return {name: _scan(scanner, name, solid, cfg) for name, solid in solids.items()}
 
@@ -125,6 +137,7 @@ def _scan(scanner: Scanner, name: str, solid: Any, cfg: DictConfig) -> Scan:
             mesh = Mesh.from_trimesh(solid, keep_colliders=cfg.colliders == "keep")
         if cfg.up == "y":
             mesh = mesh.at(mesh.vertices @ Y_UP_TO_Z_UP.T)
+        warn_of_lost(getattr(scanner.recipe, "placing", None), [mesh])
         cloud = scanner.cloud(mesh, name, keep)
         materials: MixedMaterials | None = getattr(scanner.recipe, "materials", None)
         if materials is not None and (note := materials.note(mesh)):

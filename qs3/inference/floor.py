@@ -14,12 +14,15 @@ No label takes part, nor the class that a net names.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from qs3.config.checks import check_float
+from qs3.errors import ConfigError
 from qs3.utils.plural import counted
 
 FEWEST = 30
@@ -31,6 +34,25 @@ CAMERA_M = (1.0, 1.8)
 _END = 1.0
 _EDGE = 10.0
 """Percentiles: of a cloud's points, where it ends; of these ends, the floor."""
+
+
+_HIGHEST_M = 30.0  # of a camera: centimetres and millimetres lie above it
+
+
+def check_camera_height(metres: float) -> float:
+    """The height of a camera above the floor; else ConfigError, with what may be meant."""
+    check_float("camera_height", metres)
+    if 0 < metres < _HIGHEST_M:
+        return metres
+    said = f"camera_height={metres:g} is not a height above the floor in metres"
+    if metres == 0:
+        raise ConfigError(f"{said}: if it is not known, leave it out")
+    if not math.isfinite(metres):
+        raise ConfigError(said)
+    if metres < 0:
+        raise ConfigError(f"{said}: it is measured from the floor up; {-metres:g}?")
+    per_metre, unit = (100, "centimetres") if metres < 10 * _HIGHEST_M else (1000, "millimetres")
+    raise ConfigError(f"{said}: if these are {unit}, give {metres / per_metre:g}")
 
 
 class Floor(NamedTuple):

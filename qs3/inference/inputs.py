@@ -24,8 +24,9 @@ from qs3.data.frames.given import check_intrinsics, read_depth, read_intrinsics,
 from qs3.data.frames.pointed import RULES, Caution, Pointed, point_out
 from qs3.data.importers.object_archive import ADAPT, JUDGE, Archive
 from qs3.errors import DataError, MissingDataError, Qs3Error
-from qs3.inference.depth_list import Shown
+from qs3.inference.depth_list import IMAGES, Shown
 from qs3.inference.table import Row
+from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.utils.text_table import printable
 
 ALL = "all"
@@ -91,7 +92,8 @@ def find_files(
     place = Path(place).expanduser()
     if place.is_file():
         if place.suffix.lower() not in suffixes:
-            raise DataError(f"{key}{place}: unknown format; known are {', '.join(suffixes)}")
+            hint = _instead(place.suffix.lower()) if key == "input=" else ""
+            raise DataError(f"{key}{place}: unknown format; known are {', '.join(suffixes)}{hint}")
         return [place], place.parent, 0
     if not place.is_dir():
         raise MissingDataError(f"{key}{place} is not there")
@@ -108,6 +110,17 @@ def find_files(
     if not found:
         raise MissingDataError(f"{key}{place} holds no file of {' '.join(suffixes)}")
     return sorted(found), place, others
+
+
+def _instead(suffix: str) -> str:
+    """What is done with files of another kind, for a message."""
+    if suffix in MESHES:
+        return (
+            ". A mesh is scanned first: qs3-generate meshes=FOLDER, or qs3.generate(mesh) in Python"
+        )
+    if suffix in IMAGES:
+        return ". For depth images there is depth=FILE"
+    return ". Rows of x y z are .txt or .xyz" if suffix == ".csv" else ""
 
 
 def cloud_units(files: Sequence[Path], root: Path, axis: str, classes: Sequence[str]) -> list[Unit]:

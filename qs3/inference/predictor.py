@@ -38,6 +38,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
 from qs3.evaluation.trust import COMPARED, Known
+from qs3.inference.floor import check_camera_height
 from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.allocator import keep_freed_memory
@@ -257,7 +258,9 @@ class Predictor:
         Raises:
             DataError: no depth image, a mask of another size, a box beside the picture, or
                 intrinsics that cannot be the picture's.
+            ConfigError: `camera_height` is no height in metres.
         """
+        floor = None if camera_height is None else -check_camera_height(camera_height)
         depth = np.asarray(depth_m)
         if depth.ndim != 2 or depth.dtype.kind != "f":
             raise DataError(
@@ -269,9 +272,6 @@ class Predictor:
             camera = Pinhole(*values)
         check_intrinsics(Intrinsics(camera), depth, "the depth image")
         found = point_out(depth, camera, mask=mask, box=box, up=up)
-        floor = (
-            None if camera_height is None else -check_float("camera_height", camera_height, ">= 0")
-        )
         return [self._of_depth(one, floor) for one in found]
 
     def _of_depth(self, one: Pointed, floor: float | None) -> DepthPrediction:

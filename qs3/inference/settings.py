@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from qs3.config.checks import check_choice, check_float
+from qs3.config.checks import check_choice
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError
-from qs3.inference.floor import Floor
+from qs3.inference.floor import Floor, check_camera_height
 from qs3.inference.inputs import Unit
 from qs3.inference.predictor import Predictor
 
@@ -62,15 +62,16 @@ class Settings:
     def __post_init__(self) -> None:
         if bool(self.input) == bool(self.depth):
             raise ConfigError("give input=PATH for clouds, or depth=PATH for depth images")
-        of_depth = {"mask", "box", "intrinsics", "depth_scale", "camera_height"}
-        if odd := [key for key in sorted(of_depth) if getattr(self, key) and not self.depth]:
-            raise ConfigError(f"{odd[0]}= is for depth images; give depth=IMAGE, not input=")
+        of_depth = ("box", "camera_height", "depth_scale", "intrinsics", "mask")
+        given = [key for key in of_depth if getattr(self, key) not in ("", None)]
+        if given and not self.depth:
+            raise ConfigError(f"{given[0]}= is for depth images; give depth=IMAGE, not input=")
         if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
             raise ConfigError(f"depth_scale={self.depth_scale:g}: metres a unit, in (0, 1]")
         if self.depth and self.floor is not None:
             raise ConfigError("floor= is for clouds; of depth images give camera_height=METRES")
         if self.camera_height is not None:
-            check_float("camera_height", self.camera_height, ">= 0")
+            check_camera_height(self.camera_height)
         if self.input:
             check_choice("up", self.up or "z", UP_AXES)
         if Path(self.out).suffix.lower() not in (".csv", ".json"):

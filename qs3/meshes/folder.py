@@ -36,6 +36,11 @@ SPLIT_FOLDERS = {
 }
 HALVES = ("all", "first", "second")
 LAYOUTS = "expected class/train/name.off with class/test/name.off, or class/name.off"
+UNREAD = (
+    *(".step", ".stp", ".iges", ".igs", ".sldprt", ".skp", ".blend", ".fbx", ".3ds", ".wrl"),
+    *(".x3d", ".usd", ".usda", ".usdc", ".usdz"),
+)
+"""Suffixes of other formats of shapes, which somebody may think are read."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,17 @@ class MeshFolder:
             and _mesh_below(entry)
         ]
 
+    def unread(self) -> list[str]:
+        """Files of the formats of `UNREAD` in folders of wanted classes; sorted."""
+        return sorted(
+            self._origin(Path(parent, name))
+            for folders in self._class_folders().values()
+            for folder in folders
+            for parent, _, names in os.walk(folder)
+            for name in names
+            if Path(name).suffix.lower() in UNREAD
+        )
+
     @property
     def _wanted(self) -> tuple[str, ...]:
         return self.classes or self.known
@@ -136,14 +152,28 @@ class MeshFolder:
                     f"the folders of classes are not in {self.path}, but in {below}: give that one"
                 )
             there = [name for name in self.known if name in folders]
-            rest = f"leave them out with classes=[{','.join(there)}]" if there else LAYOUTS
+            rest = f"add them, or leave them out with classes=[{','.join(there)}]"
             others = ", ".join(map(repr, self.left_alone()))
             raise MissingDataError(
-                f"{self.path} has no folder of {', '.join(missing)}: add them, or {rest}"
+                f"{self.path} has no folder of {', '.join(missing)}: "
+                + (rest if there else self._other_layout() or LAYOUTS)
                 + f". Its folders of other names: {others}; known names are "
                 f"{', '.join((*self.known, *ALIASES))}" * bool(others)
             )
         return folders
+
+    def _other_layout(self) -> str:
+        """What to do where the meshes lie in a layout that people have and that is not read."""
+        entries = _visible(self.path)
+        if flat := next((e for e in entries if e.suffix.lower() in SUFFIXES and e.is_file()), None):
+            return f"{flat.name} lies right in it; put meshes into a folder named after their class"
+        for split in entries:
+            if split.is_dir() and split.name.lower() in SPLIT_FOLDERS:
+                for cls in _folders_in(split):
+                    if known_as(cls, self.known):
+                        where = f"{split.name}/{cls} to {cls}/{split.name}"
+                        return f"the class comes first; move {where}"
+        return ""
 
     def _below(self) -> Path | None:
         """The one folder in the root with folders of wanted classes, as archives unpack."""

@@ -49,11 +49,16 @@ class RealSize:
     max_side_m: float = 4.0
     fallback_side_m: float = 1.0
 
+    def keeps(self, side: float) -> bool:
+        """Whether this is the largest side of a mesh in metres."""
+        return self.min_side_m <= side <= self.max_side_m
+
     def place(self, mesh: Mesh, rng: np.random.Generator, object_id: str = "") -> Mesh:
         """A turned copy on the floor."""
         side = _largest_side(mesh)
-        plausible = self.min_side_m <= side <= self.max_side_m
-        return _place(mesh, 1.0 if plausible else self.fallback_side_m / side, True, _yaw_rad(rng))
+        return _place(
+            mesh, 1.0 if self.keeps(side) else self.fallback_side_m / side, True, _yaw_rad(rng)
+        )
 
 
 @dataclass(frozen=True)

@@ -201,6 +201,38 @@ def test_decimal_commas(text, expected, tmp_path):
     np.testing.assert_array_equal(parse_cloud(path), expected)
 
 
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("x y z", "0.5 1.25 2.75"),
+        ("X,Y,Z,intensity", "0.5,1.25,2.75,3"),
+        ('\ufeff"x";"y";"z"', "0,5;1,25;2,75"),
+        ("# from a robot\n\nx y z", "0,5 1,25 2,75"),
+        ("\ufeff# x y z", "0.5 1.25 2.75"),
+    ],
+)
+def test_a_row_of_names_is_passed_over(head, row, tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text(f"{head}\r\n{row}\r\n{row}\r\n", encoding="utf-8")
+    np.testing.assert_array_equal(parse_cloud(path), [[0.5, 1.25, 2.75]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x y\n1 2 3\n", "line 1: 'x y' is not a row of numbers"),
+        ("t x y z\n1 2 3 4\n", "line 1: 't x y z' is not a row of numbers"),
+        ("x y z\nx y z\n1 2 3\n", "line 2: 'x y z' is not a row of numbers"),
+        ("x y z\n", "there are no points"),
+    ],
+)
+def test_other_words_are_not(text, message, tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    with pytest.raises(DataError, match=message):
+        parse_cloud(path)
+
+
 @pytest.mark.parametrize("letter", [0x110000, 0xFFFFFFFF, 0xD800])
 @pytest.mark.parametrize("order", "<>")
 def test_letters_that_do_not_exist_are_refused(letter, order, tmp_path):
@@ -213,3 +245,15 @@ def test_letters_that_do_not_exist_are_refused(letter, order, tmp_path):
         parse_clouds(tmp_path / "b.npy")
     np.savez(tmp_path / "c.npz", points=np.ones((2, 4, 3)), label=np.array(["chaise", "été"]))
     assert parse_clouds(tmp_path / "c.npz").labels == ("chaise", "été")
+
+
+@pytest.mark.parametrize("columns", [3, 6])
+def test_one_organised_cloud_is_not_taken_for_as_many_as_it_has_rows(columns, tmp_path):
+    image = np.zeros((240, 320, columns), np.float32)
+    np.save(tmp_path / "a.npy", image)
+    with pytest.raises(DataError, match=rf"320 x 240 px.*save cloud\.reshape\(-1, {columns}\)"):
+        parse_clouds(tmp_path / "a.npy")
+    np.save(tmp_path / "a.npy", image.reshape(-1, columns))
+    assert len(parse_clouds(tmp_path / "a.npy").clouds) == 1
+    np.save(tmp_path / "a.npy", image[:239])
+    assert len(parse_clouds(tmp_path / "a.npy").clouds) == 239

@@ -128,7 +128,7 @@ def test_each_twin_is_normalised_by_itself(stores: Path) -> None:
 def test_what_the_teacher_sees(stores: Path, sees: str) -> None:
     data = adaptation(stores, Wants(sees))
     stored = {"whole": 200, "clean": 100, "scan": 0}[sees]
-    twins = data.labelled_domain.twins_of(data.labelled.clouds)
+    twins = data.train_dataloader().tables["source"].beside["twin"]
     assert [round(float(cloud[:, 0].mean())) for cloud in twins.stored[twins.rows]] == [
         stored + int(row) for row in data.labelled.clouds.rows
     ]
@@ -228,6 +228,21 @@ def test_random_views_are_a_function_of_seed_epoch_and_cloud(stores: Path) -> No
     assert torch.equal(
         data.validation.clouds.all(), adaptation(stores, Wants()).validation.clouds.all()
     )
+
+
+def test_of_random_views_the_scan_that_a_teacher_sees_is_the_one_that_was_drawn(
+    stores: Path,
+) -> None:
+    for batch in adaptation(stores, Wants("scan", again=True), views="random").train_dataloader():
+        assert torch.equal(batch["source"]["twin"], batch["source"]["points"])
+        assert not torch.equal(batch["source"]["again"], batch["source"]["points"])
+    data = DomainData(
+        domain(stores / "s", views="random"), points=M, scale="metres", batch_size=4, twin="scan"
+    )
+    data.prepare_data()
+    data.setup()
+    for batch in data.train_dataloader():
+        assert torch.equal(batch["twin"], batch["points"])
 
 
 def test_a_store_of_one_view_varies_its_error(stores: Path, tmp_path: Path) -> None:

@@ -117,6 +117,9 @@ def test_of_clouds_in_metres_the_size_counts_too():
     millimetres = prepare(1000 * clouds[:1], 64, scale="metres")
     (reason,) = ood_reasons(measure_one(millimetres, 0), usual)
     assert reason.startswith("size ")
+    assert reason.endswith(f" is over {usual['size'][1]:.4g}, as of other units than metres")
+    (reason,) = ood_reasons(measure_one(prepare(3 * clouds[:1], 64, scale="metres"), 0), usual)
+    assert reason.endswith(f" is over {usual['size'][1]:.4g}")  # large, and in metres
 
 
 def test_of_clouds_over_the_floor_the_lowest_point_counts_too():

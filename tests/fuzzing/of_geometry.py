@@ -31,8 +31,10 @@ def _mesh(name: str, *more: str) -> Reader:
         return [made[one]() if one in made else export(one) for one in (name, *more)]
 
     def read(path: Path) -> None:
+        from qs3.meshes.formats.gltf import buffer_files
         from qs3.meshes.io import load_mesh
 
+        buffer_files(path)
         load_mesh(path, materials=True)
 
     suffix = name.rpartition(".")[2]
@@ -66,6 +68,8 @@ def _cloud(suffix: str, module: str, shape: Any = None) -> Reader:
             made.append(write(folder / "a.txt"))
             made.append(folder / "commas.txt")
             made[-1].write_text("0,5;1,25;2,75\n1;2;3 # a\n")
+            made.append(folder / "names.txt")
+            made[-1].write_text("x,y,z\n1,2,3\n4,5,6\n")
         if suffix == ".pcd":
             made += _pcds(folder)
         if suffix in (".npy", ".npz"):
@@ -169,7 +173,20 @@ def _intrinsics(folder: Path) -> list[bytes]:
         json.dumps({"width": 640, "height": 480, "intrinsic_matrix": matrix}).encode(),
         json.dumps({"fx": 1, "fy": 1, "ppx": 0, "ppy": 0, "coeffs": [0, 0, 0]}).encode(),
         f"{opencv}  data: {matrix}\nD: [0.1, 0]\n".encode(),
+        f"K: {matrix}\nwidth: 640\nheight: 480\n---\nK: {matrix}\n---\n".encode(),
     ]
+
+
+def _matrices(folder: Path) -> list[bytes]:
+    np.save(folder / "K.npy", np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
+    np.save(folder / "four.npy", np.array([500, 500, 320, 240]))
+    return bytes_of(folder / "K.npy", folder / "four.npy")
+
+
+def _read_matrix(path: Path) -> None:
+    from qs3.data.frames.given import read_intrinsics
+
+    read_intrinsics(str(path))
 
 
 def _read_intrinsics(path: Path) -> None:
@@ -237,6 +254,7 @@ READERS: tuple[Reader, ...] = (
     Reader("frame to fit .png", depth_pngs, _read_frame, "a.png", PNG, ("sensors/fit/frames.py",)),
     Reader("frame to fit .npy", _depth_npys, _read_frame, "a.npy"),
     Reader("intrinsics", _intrinsics, _read_intrinsics, "a.json"),
+    Reader("intrinsics .npy", _matrices, _read_matrix, "a.npy"),
     Reader("list of pictures", _lists, _read_list, "a.yaml", None,
            ("inference/depth_list.py", "utils/yamls.py")),
     Reader("materials .yaml", _materials, _read_materials, "a.yaml", None,

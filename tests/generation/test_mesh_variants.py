@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from qs3.data.store import open_pointset
 from qs3.generation.command import generate
+from qs3.generation.plan import describe, mesh_items
+from qs3.utils.files import sha256_file
 from tests.generation.generating import ROOT, config
 
 
@@ -200,3 +202,21 @@ def test_two_million_faces(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(cloud, axis=1), 0.5, atol=1e-3)
     # The largest child so far, in KiB on Linux: well within a small machine.
     assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < 4 << 20
+
+
+def test_vertices_in_a_file_beside_a_gltf_are_part_of_the_plan(tmp_path):
+    folder = tmp_path / "chair" / "train"
+    folder.mkdir(parents=True)
+    for name, data in stool().export(file_type="gltf").items():
+        (folder / name.replace("model", "a")).write_bytes(data)
+    (folder / "b.glb").write_bytes(stool().export(file_type="glb"))
+
+    def objects():
+        cfg = config(tmp_path, tmp_path, "classes=[chair]")
+        return describe(cfg, mesh_items(cfg), {})["objects"]
+
+    before = objects()
+    beside = max(folder.glob("*.bin"))
+    beside.write_bytes(beside.read_bytes()[::-1])
+    assert [a == b for a, b in zip(before, objects(), strict=True)] == [False, True]
+    assert before[1].endswith(sha256_file(folder / "b.glb")[:16])  # alone, as it always was

@@ -244,6 +244,9 @@ def test_up_and_flags(run, clouds, tmp_path):
             ["predict", "ckpt={run}", "input={run}/metrics.json"],
             "metrics.json: unknown format; known are",
         ),
+        (["predict", "ckpt={run}", "input={other}.stl"], "A mesh is scanned first: qs3-generate"),
+        (["predict", "ckpt={run}", "input={other}.png"], "For depth images there is depth=FILE"),
+        (["predict", "ckpt={run}", "input={other}.csv"], "Rows of x y z are .txt or .xyz"),
         (["predict", "ckpt={run}/nothing", "input={clouds}"], "is not there"),
         (["export", "ckpt={run}", "out=model.h5"], "must end in .onnx or .pt2"),
         (["export"], "ckpt=RUN is missing"),
@@ -254,7 +257,10 @@ def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     write(tmp_path / "a.xyz", clouds[0])
+    for suffix in (".stl", ".png", ".csv"):
+        (tmp_path / f"other{suffix}").touch()
     places = {"run": run, "clouds": tmp_path / "a.xyz", "empty": tmp_path / "empty"}
+    places["other"] = tmp_path / "other"
     threads = torch.get_num_threads()
     assert main([word.format(**places) for word in words]) == 1
     assert torch.get_num_threads() == threads

@@ -20,7 +20,7 @@ from PIL import Image
 import qs3
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import point_out
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.inference.depth_list import Shown, find_shown
 from qs3.inference.model_file import write_result
 from qs3.runs.metrics import read_metrics
@@ -97,6 +97,8 @@ def test_each_object_of_a_mask_gets_what_the_net_says_of_its_cloud(run, frame, c
     assert 0.7 < ball[0] < 1.05  # a side to the diagonal
     assert 0.2 < rod[0] < 0.35
     assert [ball[1], rod[1]] == pytest.approx([0.7, 1.0], abs=0.06)
+    with pytest.raises(ConfigError, match="camera_height=0 is not a height"):
+        predictor.predict_depth(depth / 1000, SHOT.camera, mask=mask, camera_height=0)
     in_python = predictor.predict_depth(depth / 1000, SHOT.camera, mask=mask, up=SHOT.up_in_camera)
     np.testing.assert_allclose([one.probabilities for one in in_python], expected, atol=1e-6)
     assert [one.cls for one in in_python] == [row["class"] for row in rows]
@@ -251,7 +253,8 @@ def test_two_folders_go_together_by_name(run, frame):
         (["depth={at}/depth.png", "depth_scale=5"], "depth_scale=5: metres a unit"),
         (["input={at}", "camera_height=1"], "camera_height= is for depth images"),
         (["depth={at}/depth.png", "floor=0"], "floor= is for clouds"),
-        (["depth={at}/depth.png", "camera_height=-1"], "camera_height must be >= 0"),
+        (["input={at}", "camera_height=0"], "camera_height= is for depth images"),
+        (["depth={at}/depth.png", "camera_height=0"], "camera_height=0 is not a height above"),
     ],
 )
 def test_mistakes_are_told_in_words(run, frame, capsys, words, message):

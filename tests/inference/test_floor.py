@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from qs3.data.importers.arrays import named_arrays
+from qs3.errors import ConfigError
 from qs3.inference import pretrained
-from qs3.inference.floor import CAMERA_M, FEWEST, floor_under
+from qs3.inference.floor import CAMERA_M, FEWEST, check_camera_height, floor_under
 
 
 def boxes(ends, seed=0):
@@ -28,6 +31,27 @@ def test_the_floor_is_where_many_end_and_none_goes_below():
     assert floor_under([*stray, *raised]).z == pytest.approx(found.z, abs=0.02)
     through = boxes([-camera - 0.7], seed=2)  # in a mirror
     assert floor_under([*on_it, *raised, *through]).z == pytest.approx(found.z, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (0, "if it is not known, leave it out"),
+        (-1.2, "measured from the floor up; 1.2?"),
+        (1250, "if these are millimetres, give 1.25"),
+        (125.0, "if these are centimetres, give 1.25"),
+        (np.nan, "camera_height=nan is not a height above the floor in metres"),
+        (np.inf, "camera_height=inf is not a height above the floor in metres"),
+        ("1.2", "camera_height must be a number"),
+    ],
+)
+def test_a_height_that_is_none_says_what_may_be_meant(given, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        check_camera_height(given)
+
+
+def test_heights_that_cameras_have_pass():
+    assert [check_camera_height(one) for one in (0.05, 1.25, 29.9)] == [0.05, 1.25, 29.9]
 
 
 @pytest.mark.parametrize("camera", [1.1, 1.4, 1.7])

@@ -11,7 +11,7 @@ from qs3.meshes.formats.mtl import MAX_BYTES, libraries
 from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh, merge
 from qs3.meshes.placement import RealSize, UnitCube
-from tests.meshes.coloured import BRIGHT, DARK, MODELS, MTL, glb, obj, ply
+from tests.meshes.coloured import BRIGHT, DARK, FACES, MODELS, MTL, PLATES, glb, obj, ply
 from tests.meshes.written import save
 
 
@@ -160,6 +160,34 @@ def test_ply_says_the_brightness_of_its_colours(of, kind, colours, tmp_path):
     (dark,), (bright,) = by_side(mesh)
     assert dark.colour[0] == pytest.approx(float(linear(np.array(100 / 255))), abs=1 / 64)
     assert bright.colour == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "dark", "bright"),
+    [
+        ("uchar", 0, 1),  # nearly black bytes, and not 0..1
+        ("uchar", 1, 255),
+        ("float", 0.5, 1),
+        ("float", 128, 255),
+        ("ushort", 128, 65535),
+        ("int", 128, 255),
+        ("int", 300, 65535),
+    ],
+)
+def test_text_has_the_colours_of_the_type_that_its_header_names(kind, dark, bright, tmp_path):
+    names = ("red", "green", "blue")
+    lines = ["ply", "format ascii 1.0", "element vertex 8"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += ["element face 4", "property list uchar int vertex_indices"]
+    lines += [*(f"property {kind} {name}" for name in names), "end_header"]
+    lines += [" ".join(map(str, point)) for point in PLATES]
+    for (a, b, c), value in zip(FACES, (dark, dark, bright, bright), strict=True):
+        lines.append(f"3 {a} {b} {c} {value} {value} {value}")
+    mesh = load_mesh(save(tmp_path, "a.ply", "\n".join(lines)), materials=True)
+    most = {"uchar": 255, "float": 1 if bright == 1 else 255, "int": bright}.get(kind, 65535)
+    for faces, value in zip(by_side(mesh), (dark, bright), strict=True):
+        (finish,) = faces
+        assert finish.colour[0] == pytest.approx(float(linear(np.array(value / most))), abs=1 / 64)
 
 
 def test_srgb_is_linear_below_its_knee_and_a_power_above():

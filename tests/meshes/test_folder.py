@@ -98,6 +98,26 @@ def test_the_folder_that_an_archive_unpacks_to_is_named(tmp_path):
         MeshFolder(tmp_path, classes=("chair",)).items()
 
 
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["a.stl"], r"chair: a\.stl lies right in it; put meshes into a folder named after their"),
+        (["train/chair/a.off", "test/chair/a.off"], "first; move test/chair to chair/test"),
+        (["notes.txt"], "has no folder of chair: expected class/train/name.off"),
+    ],
+)
+def test_layouts_that_are_not_read_say_what_to_do(names, said, tmp_path):
+    with pytest.raises(MissingDataError, match=said):
+        MeshFolder(make(tmp_path, *names), classes=("chair",)).items()
+
+
+def test_files_of_formats_that_are_not_read_are_named(tmp_path):
+    make(tmp_path, "chair/a.STEP", "chair/train/b.fbx", "chair/train/c.off", "chair/train/c.mtl")
+    make(tmp_path, "table/a.step")
+    folder = MeshFolder(tmp_path, classes=("chair",))
+    assert folder.unread() == ["chair/a.STEP", "chair/train/b.fbx"]
+
+
 @pytest.mark.parametrize("settings", [{}, {"classes": ("chair", "plant")}])
 def test_missing_classes_and_roots(tmp_path, settings):
     with pytest.raises(MissingDataError, match="no folder of meshes"):

@@ -1,12 +1,14 @@
 """glTF and GLB: scenes, buffers, and files that mean harm."""
 
 import json
+import struct
 
 import numpy as np
 import pytest
 import trimesh
 
 from qs3.meshes.formats import arrays
+from qs3.meshes.formats.gltf import buffer_files
 from qs3.meshes.io import load_mesh
 from tests.meshes.written import PYRAMID, corners, gltf, refused, save, z_up
 
@@ -48,6 +50,23 @@ def test_gltf_quantized_strided_and_without_scenes(tmp_path):
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 1]]
 
 
+def test_buffers_beside_a_file_are_found_and_those_within_it_are_not_looked_for(tmp_path):
+    tree, blob = gltf()
+    inside = tree["buffers"][0]
+    beside = {"byteLength": 76, "uri": "my%20points.bin"}
+    expected = save(tmp_path, "my points.bin", blob)
+    for name in ("a.gltf", "A.GLTF"):
+        path = save(tmp_path, name, json.dumps({**tree, "buffers": [inside, beside, beside]}))
+        assert buffer_files(path) == [expected]
+    assert buffer_files(save(tmp_path, "a.gltf", json.dumps(tree))) == []
+    text = json.dumps({**tree, "buffers": [{"byteLength": 76}, beside]}).encode()
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A)
+    assert buffer_files(save(tmp_path, "a.glb", head + text)) == [expected]
+    for damaged in (b"", b"glTF", head, head + text[:-1], b"[]", b'{"asset": 1, "buffers": 2}'):
+        assert buffer_files(save(tmp_path, "a.glb", damaged)) == []
+        assert buffer_files(save(tmp_path, "a.gltf", damaged)) == []
+
+
 @pytest.mark.parametrize(
     "uri", ["../secret.bin", "/etc/passwd", "link.bin", "sub/../../secret.bin"]
 )
@@ -59,6 +78,7 @@ def test_gltf_reads_nothing_outside_of_its_folder(tmp_path, uri):
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
     tree["buffers"] = [{"byteLength": 76, "uri": uri}]
     refused(folder, "a.gltf", json.dumps(tree), "outside of its folder")
+    assert buffer_files(folder / "a.gltf") == []
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,10 @@
                         object, every other number is one
     intrinsics   "fx,fy,cx,cy" in pixels, or a file .json, .yaml or .txt of
                  fx fy and cx cy (or ppx ppy, as librealsense calls them);
-                 K, k, camera_matrix or intrinsic_matrix: 9 numbers, by rows (ROS, OpenCV) or by
-                 columns (Open3D); perhaps width and height, which must be the picture's;
-                 or 4, 9 or 16 bare numbers (TUM, ScanNet)
+                 K, k, camera_matrix, intrinsic_matrix or cam_K: 9 numbers, by rows (ROS, OpenCV,
+                 BOP) or by columns (Open3D); perhaps width and height, which must be the picture's;
+                 or 4, 9 or 16 bare numbers (TUM, ScanNet); or these as an .npy.
+                 Of several YAML documents (rostopic echo) the first counts
 
 The centre of the top left pixel is (0, 0). Sizes are read and judged before a picture is unpacked.
 """
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +41,8 @@ MOST_OBJECTS = 1000
 _MOST_TEXT = 1 << 20  # bytes of a file with intrinsics
 _MOST_PNG = 1 << 26
 _PALETTE = 3
-_MATRICES = ("K", "k", "camera_matrix", "intrinsic_matrix", "intrinsics")
+_MATRICES = ("K", "k", "camera_matrix", "intrinsic_matrix", "intrinsics", "intrinsic", "cam_K")
+_DOCUMENT = re.compile(r"^---\s*$", re.MULTILINE)  # begins one, or ends the one before
 _SIZES = (("width", "height"), ("image_width", "image_height"))
 _CENTRES = (("cx", "cy"), ("ppx", "ppy"))
 _BENT = ("D", "d", "coeffs", "distortion_coefficients")
@@ -143,6 +146,9 @@ def read_intrinsics(words: str, folder: Path | None = None) -> Intrinsics:
     if numbers is not None:
         return Intrinsics(_camera(numbers, f"intrinsics={words}"))
     path = _there((folder or Path()) / Path(words).expanduser(), "intrinsics")
+    if path.suffix.lower() == ".npy":
+        matrix = read_npy(path, lambda shape, dtype: _check_matrix(path, shape, dtype))
+        return Intrinsics(_camera(matrix.ravel().tolist(), str(path)))
     data = _content(path, _MOST_TEXT)
     try:
         text = data.decode()
@@ -168,7 +174,8 @@ def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where
             f"{where}: the intrinsics are of pictures of {given.size[0]} x {given.size[1]} px, "
             f"this one has {width} x {height}"
         )
-    if not (-0.5 <= camera.cx_px <= width - 0.5 and -0.5 <= camera.cy_px <= height - 0.5):
+    # Strictly: at twice the size the middle is the corner of this picture.
+    if not (-0.5 < camera.cx_px < width - 0.5 and -0.5 < camera.cy_px < height - 0.5):
         raise DataError(
             f"{where}: the principal point ({camera.cx_px:g}, {camera.cy_px:g}) is outside of the "
             f"picture of {width} x {height} px; are the intrinsics those of another resolution, or "
@@ -213,6 +220,14 @@ def _check_image(where: Any, shape: tuple[int, ...], dtype: np.dtype, kinds: str
         )
     if dtype.kind not in kinds:
         raise DataError(f"{where}: the array holds {dtype}, expected " + _KINDS[kinds])
+
+
+def _check_matrix(where: Any, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    if shape not in ((4,), (3, 3), (4, 4)) or dtype.kind not in "fiu":
+        raise DataError(
+            f"{where}: the array is {dtype} {shape}; expected numbers fx fy cx cy, or a matrix "
+            "of 3 x 3 or 4 x 4"
+        )
 
 
 _KINDS = {"fiu": "numbers", "iub": "whole numbers, one an object, or bool"}
@@ -266,9 +281,10 @@ def _camera(values: list[float], where: str) -> Pinhole:
 
 
 def _parsed(text: str, where: str) -> Any:
-    """JSON or YAML; DataError if neither."""
+    """JSON or YAML, of which the first document counts; DataError if neither."""
     text = text.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
-    return load_yaml(text, where)
+    documents = (one for one in _DOCUMENT.split(text) if one.strip())
+    return load_yaml(next(documents, ""), where)
 
 
 def _of_mapping(given: Any, where: str) -> Intrinsics:

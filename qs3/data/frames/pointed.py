@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import label
 
 from qs3.data.frames.cutting import CLEAN, HARD, Fault, Piece, cut_out, faults
 from qs3.data.frames.given import checked_mask
@@ -48,6 +49,7 @@ _LEAST_SUPPORT = 0.15  # share of the points beside and below a box that a suppo
 _LEAST_PX = 60
 _OWN = 0.6  # share of a piece that must lie within the box for it not to be background
 _JOIN = 0.2  # of the size of a box's largest piece: what is so near is of the same object
+_PLACE = 0.05  # share of a mask that is more than a few stray pixels
 _TRIM = 3.0  # median absolute deviations
 _STEEPEST = np.cos(np.deg2rad(20.0))  # of a support
 
@@ -170,7 +172,24 @@ def _judged(
     if tier == CLEAN and any(caution.kind == BOX for caution in unsure):
         tier = HARD
     cautions = (*(Caution(fault.kind, fault.words) for fault in found), *unsure)
+    cautions += _several(mask, piece.kept)
     return Pointed(name, piece, mask, without, tier, cautions, how, turn)
+
+
+def _several(mask: Bool[np.ndarray, "h w"], kept: float) -> tuple[Caution, ...]:
+    """A caution where a number marks several things, of which one is taken."""
+    if kept > 1 - _PLACE:
+        return ()
+    numbers, _ = label(mask)
+    sizes = np.bincount(numbers[mask])
+    places = int((sizes >= max(_PLACE * sizes.sum(), _LEAST_PX)).sum())
+    if places < 2:
+        return ()
+    words = (
+        f"its number marks {places} separate places, of which one was taken, with {kept:.0%} of "
+        "what was measured: give each object a number of its own"
+    )
+    return (Caution("several", words),)
 
 
 def tier_of(found: Sequence[Fault]) -> str:
@@ -220,6 +239,11 @@ def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, i
         raise DataError(
             f"box={shown}: left,top,right,bottom in pixels must have left < right and top < "
             "bottom; width and height are not what is meant"
+        )
+    if max(right, bottom) <= 1:
+        raise DataError(
+            f"box={shown} is in fractions of the picture, or one pixel: give left,top,right,bottom "
+            f"in pixels of {width} x {height}"
         )
     rows = max(int(np.floor(top)), 0), min(int(np.ceil(bottom)), height)
     columns = max(int(np.floor(left)), 0), min(int(np.ceil(right)), width)

@@ -26,9 +26,11 @@ from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts
 from qs3.meshes.formats.by_trimesh import MAX_PARTS, assembled, loaded
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.formats.gltf_materials import finish_of
+from qs3.utils.memory import check_memory
 
 MAX_BUFFER_BYTES = 1 << 30
 
+_HEADER = struct.Struct("<4xIII4s")  # of GLB: version, length, and of the JSON length and kind
 _TRIANGLES, _STRIP = 4, 5  # below them: points and lines; above: fans
 _LARGEST = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}  # normalised, these mean 1
 _UNUSED = {"componentType": 5121, "type": "SCALAR", "count": 0}
@@ -42,12 +44,12 @@ def read_glb(
     data: bytes, folder: Path, colliders: Colliders, found: FoundFinishes | None = None
 ) -> Triangles:
     """Read GLB: a header, a JSON chunk and, in most files, a binary chunk."""
-    if len(data) < 20 or data[:4] != b"glTF":
+    if len(data) < _HEADER.size or data[:4] != b"glTF":
         raise MeshError("is not a GLB file, or cut within its header")
-    version, length, json_length, kind = struct.unpack_from("<4xIII4s", data)
+    version, length, json_length, kind = _HEADER.unpack_from(data)
     if version != 2:
         raise MeshError(f"is glTF {version}, but only version 2 is read")
-    end = 20 + json_length
+    end = _HEADER.size + json_length
     if length > len(data) or end > length or kind != b"JSON":
         raise MeshError(f"is truncated: {length} bytes were promised, {len(data)} are there")
     binary = None
@@ -55,7 +57,7 @@ def read_glb(
         binary_length, kind = struct.unpack_from("<I4s", data, end)
         if kind == b"BIN\0":
             binary = data[end + 8 : min(end + 8 + binary_length, length)]
-    return _triangles(data[20:end], binary, folder, colliders, found)
+    return _triangles(data[_HEADER.size : end], binary, folder, colliders, found)
 
 
 def read_gltf(
@@ -63,6 +65,26 @@ def read_gltf(
 ) -> Triangles:
     """Read the JSON form; its buffers lie within it, or in files of the same folder."""
     return _triangles(data, None, folder, colliders, found)
+
+
+def buffer_files(path: Path) -> list[Path]:
+    """The files beside a .gltf or .glb that hold its vertices, each once.
+
+    Empty of other formats, and of a file that is damaged or refers to what is not there.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".gltf", ".glb"):
+        return []
+    try:
+        check_memory(path.stat().st_size, "", MeshError)
+        with path.open("rb") as file:
+            length = _HEADER.unpack(file.read(_HEADER.size))[2] if suffix == ".glb" else -1
+            buffers = _parsed(file.read(length)).get("buffers", [])
+        uris = [buffer.get("uri") or "data:" for buffer in buffers]
+        folder = path.parent.resolve()
+        return list({_beside(uri, folder): None for uri in uris if not uri.startswith("data:")})
+    except Exception:  # what damaged bytes raise cannot be listed; reading the mesh will say it
+        return []
 
 
 def _triangles(
@@ -247,14 +269,20 @@ def _buffer(uri: str | None, binary: bytes | None, folder: Path, most: int) -> b
         return binary
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition("base64,")[2], validate=True)
+    path = _beside(uri, folder)
+    if path.stat().st_size > most:
+        raise MeshError(f"refers to more than {MAX_BUFFER_BYTES} bytes in other files")
+    return path.read_bytes()
+
+
+def _beside(uri: str, folder: Path) -> Path:
+    """The file that a buffer names, in the folder or below it."""
     path = (folder / unquote(uri)).resolve()
     if not path.is_relative_to(folder):
         raise MeshError(f"refers to {uri!r}, which lies outside of its folder")
     if not path.is_file():
         raise MeshError(f"refers to {uri!r}, which is not there: put it next to the mesh")
-    if path.stat().st_size > most:
-        raise MeshError(f"refers to more than {MAX_BUFFER_BYTES} bytes in other files")
-    return path.read_bytes()
+    return path
 
 
 def _transform(node: dict[str, Any]) -> np.ndarray:

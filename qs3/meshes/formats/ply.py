@@ -33,7 +33,8 @@ _MAX_HEADER_BYTES = 1 << 20
 @dataclass(frozen=True)
 class _Property:
     name: str
-    dtype: np.dtype
+    kind: np.dtype  # as the header says
+    dtype: np.dtype  # as it is read
     count_dtype: np.dtype | None  # of lists
 
 
@@ -51,9 +52,10 @@ def read(data: bytes, found: FoundFinishes | None = None) -> Triangles:
     """
     vertices = faces = None
     colours: dict[str, np.ndarray | None] = {}
-    for name, columns in _elements(data):
+    for element, columns in _elements(data):
+        name = element.name
         if found is not None and name in ("vertex", "face"):
-            colours[name] = colours_of(columns)
+            colours[name] = colours_of(columns, {p.name: p.kind for p in element.properties})
         if name == "vertex":
             vertices = _vertices(columns)
         elif name == "face":
@@ -74,21 +76,21 @@ def read(data: bytes, found: FoundFinishes | None = None) -> Triangles:
 
 def read_vertices(data: bytes) -> np.ndarray:
     """[V, 3] float64: the vertices alone, of a point cloud or of a mesh."""
-    for name, columns in _elements(data):
-        if name == "vertex":
+    for element, columns in _elements(data):
+        if element.name == "vertex":
             return _vertices(columns)
     raise MeshError("has no vertices")
 
 
-def _elements(data: bytes) -> Iterator[tuple[str, dict]]:
-    """Name and columns of each element."""
+def _elements(data: bytes) -> Iterator[tuple[_Element, dict]]:
+    """Each element with its columns."""
     elements, body = _parse_header(data)
     counts = {element.name: element.count for element in elements}
     check_counts(max(counts.values(), default=0), counts.get("face", 0))
     offset = 0
     for element in elements:
         columns, offset = _read_element(element, body, offset)
-        yield element.name, columns
+        yield element, columns
 
 
 def _vertices(columns: dict) -> np.ndarray:
@@ -118,10 +120,10 @@ def _parse_header(data: bytes) -> tuple[list[_Element], bytes]:
                 elements.append(_Element(name, int(count), []))
             case ["property", "list", count, kind, name] if elements and order:
                 elements[-1].properties.append(
-                    _Property(name, _dtype(kind, order, text), _dtype(count, order, text))
+                    _Property(name, *_dtypes(kind, order, text), _dtypes(count, order, text)[1])
                 )
             case ["property", kind, name] if elements and order:
-                elements[-1].properties.append(_Property(name, _dtype(kind, order, text), None))
+                elements[-1].properties.append(_Property(name, *_dtypes(kind, order, text), None))
             case _:
                 raise MeshError(f"has a header line that PLY does not know: {' '.join(words)!r}")
     if order is None:
@@ -130,10 +132,12 @@ def _parse_header(data: bytes) -> tuple[list[_Element], bytes]:
     return elements, numbers(body).astype("<f8").tobytes() if text else body
 
 
-def _dtype(kind: str, order: str, text: bool) -> np.dtype:
+def _dtypes(kind: str, order: str, text: bool) -> tuple[np.dtype, np.dtype]:
+    """The type that a word of the header means, and the one in which its numbers are read."""
     if kind not in _TYPES:
         raise MeshError(f"has a property of the unknown type {kind!r}")
-    return np.dtype("<f8") if text else np.dtype(order + _TYPES[kind])
+    meant = np.dtype(order + _TYPES[kind])
+    return meant, np.dtype("<f8") if text else meant
 
 
 def _read_element(element: _Element, body: bytes, offset: int) -> tuple[dict, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,13 @@ _LEVELS = 32
 """Steps of brightness that faces are sorted into: each is a material."""
 
 
-def colours_of(columns: dict[str, Any]) -> np.ndarray | None:
+def colours_of(columns: dict[str, Any], kinds: Mapping[str, np.dtype]) -> np.ndarray | None:
     """[N, 3] linear RGB of an element's rows; None where it has no colours.
 
-    Text does not keep whether numbers were bytes: where one is above 1, all are of 255.
+    Args:
+        columns: by name; of text all are floats.
+        kinds: by name as the header says. Whole numbers of one or two bytes fill their type; wider
+            ones, and floats above 1, are bytes by another name.
     """
     found = [columns[name] for name in _CHANNELS if isinstance(columns.get(name), np.ndarray)]
     if len(found) < len(_CHANNELS):
@@ -25,11 +29,16 @@ def colours_of(columns: dict[str, Any]) -> np.ndarray | None:
     colours = np.stack(found, axis=1)
     if not np.isfinite(colours).all():
         raise MeshError("has a colour that is not finite")
-    if colours.dtype.kind in "iu":
-        most = float(np.iinfo(colours.dtype).max)
-    else:
-        most = 255.0 if (colours > 1).any() else 1.0
-    return linear(colours / most)
+    return linear(colours / _most(colours, np.result_type(*(kinds[name] for name in _CHANNELS))))
+
+
+def _most(colours: np.ndarray, kind: np.dtype) -> float:
+    """What full brightness is."""
+    if kind.kind == "f":
+        return 255.0 if (colours > 1).any() else 1.0
+    if kind.itemsize <= 2:
+        return float(np.iinfo(kind).max)
+    return next((most for most in (255.0, 65535.0) if (colours <= most).all()), np.iinfo(kind).max)
 
 
 def add_colours(

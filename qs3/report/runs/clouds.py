@@ -10,7 +10,6 @@ import numpy as np
 
 from qs3.data.contact_sheets import class_sheet, contact_sheet, padded, scan_picture
 from qs3.data.store import PointSet
-from qs3.errors import Qs3Error
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.figures.class_balance import class_picture
 from qs3.report.runs.data import RunFiles
@@ -26,7 +25,9 @@ _SHEET, _ROW = 30, 6
 def cloud_pictures(
     run: RunFiles, data_dir: str | Path | None = None
 ) -> dict[str, Callable[[Path], object]]:
-    """What draws each of them into a PNG; it raises NothingToDrawError, which says why not.
+    """What draws each of them into a PNG.
+
+    It raises NothingToDrawError, which says why not, or a Qs3Error of a damaged dataset.
 
     `data_dir`: where the datasets lie; None: where the run's config says.
     """
@@ -42,14 +43,7 @@ def cloud_pictures(
         makers["mistakes"] = domains.mistakes
     else:
         makers["named"] = domains.named
-    return {name: partial(_or_say_why, make) for name, make in makers.items()}
-
-
-def _or_say_why(make: Callable[[Path], object], path: Path) -> None:
-    try:
-        make(path)
-    except Qs3Error as error:  # a damaged dataset: the run's other pictures are none the worse
-        raise NothingToDrawError(str(error)) from error
+    return makers
 
 
 class _Domains:

@@ -41,6 +41,7 @@ def draw_embedding(
 
     Raises:
         NothingToDrawError: data or weights are not there; says which.
+        DataError: a dataset is damaged.
     """
     sets = [open_domain(run, role, data_dir) for role in ("source", "target")]
     assert run.metrics is not None

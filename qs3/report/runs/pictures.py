@@ -88,7 +88,7 @@ def draw(
         try:
             make(path)
             pictures[name] = path
-        except NothingToDrawError as reason:
+        except (NothingToDrawError, Qs3Error) as reason:  # damaged data cost their pictures alone
             skipped[name] = str(reason)
             path.unlink(missing_ok=True)
     try:

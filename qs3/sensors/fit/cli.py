@@ -14,6 +14,8 @@ from qs3.utils.plural import counted
 if TYPE_CHECKING:
     from qs3.sensors.fit.preset import FittedPreset
 
+_LONGEST_M = 2.0  # baseline of a depth camera: a longer one is in another unit
+
 
 def _fit(
     words: Sequence[str],
@@ -23,15 +25,17 @@ def _fit(
     images: str | None,
     base: str | None,
     distance: float | None,
+    gain: float | None,
     **given: Any,
 ) -> None:
     if images is not None:
         if words or plot is not None:
             raise ConfigError("images= fits a stereo preset: leave frames and plot= out")
-        fit_images(Path(images), base, distance, given["unit"], Path(out).expanduser(), line)
+        file, unit = Path(out).expanduser(), given["unit"]
+        fit_images(Path(images), base, distance, unit, file, line, 1.0 if gain is None else gain)
         return
-    if base is not None or distance is not None:
-        raise ConfigError("base= and distance= belong to images=FOLDER")
+    if (base, distance, gain) != (None, None, None):
+        raise ConfigError("base=, distance= and gain= belong to images=FOLDER")
     preset = fit(words, **given)
     file = Path(out).expanduser()
     preset.save(file, line)
@@ -87,6 +91,12 @@ def fit(
         camera = Intrinsics.centred(width, height, focal)
     else:
         raise ConfigError("give the camera: intrinsics=fx,fy,cx,cy, or focal=PIXELS")
+    if baseline is not None and not 0 < abs(baseline) < _LONGEST_M:
+        hint = f"; if these are millimetres, give {baseline / 1000:g}"
+        raise ConfigError(
+            f"baseline={baseline:g}: metres from camera to projector, such as 0.075"
+            + hint * (abs(baseline) >= _LONGEST_M)
+        )
     if distances is not None and len(distances) != len(frames):
         values, of = counted(len(distances), "value"), counted(len(frames), "frame")
         raise ConfigError(f"distances= has {values} for {of}")
@@ -100,7 +110,13 @@ def fit(
 
 
 def fit_images(
-    folder: Path, base: str | None, distance_m: float | None, unit: str | None, out: Path, line: str
+    folder: Path,
+    base: str | None,
+    distance_m: float | None,
+    unit: str | None,
+    out: Path,
+    line: str,
+    gain: float = 1.0,
 ) -> None:
     """Fit a stereo preset's light, lens and noise to infrared pictures, and write it.
 
@@ -123,7 +139,7 @@ def fit_images(
     if not isinstance(sensor, SpeckleStereo):
         raise ConfigError(f"base={name} is no active stereo camera with two infrared pictures")
     scenes = read_pictures(folder, unit)
-    found = fit_pictures(scenes, sensor, distance_m)
+    found = fit_pictures(scenes, sensor, distance_m, gain)
     for said in report(found, sensor, len(scenes)):
         print(said)
     for pair in pair_fills(scenes, sensor):
@@ -160,6 +176,12 @@ FIT = Command(
         Option("images", text("FOLDER"), "of infrared pictures, in place of frames"),
         Option("base", text("NAME"), "stereo preset to begin with (default realsense_d415)"),
         Option("distance", NUMBER, "m to the scenes, where they have no depth image"),
+        Option(
+            "gain",
+            NUMBER,
+            "of the camera's amplifier in all pictures, times (default 1; a RealSense's setting "
+            "over 16)",
+        ),
     ),
     (
         "qs3 fit frames/*.png intrinsics=580,580,319.5,239.5 baseline=0.075 \\",
@@ -182,7 +204,9 @@ depth; see qs3.sensors.devices.fitted.FittedDepth. The plot shows data and model
 images=FOLDER holds rectified pictures of an active stereo camera: SCENE_left.png, and where there
 are any SCENE_right.png, SCENE_off.png (projector off, the same exposure) and SCENE_depth.png (the
 left camera's). Several frames of a still scene, SCENE_left_0.png and so on, tell noise from
-texture. Found, with their errors: ambient light, blur, exposure, noise and speckle, and f B. What
+texture. Found, with their errors: ambient light, blur, exposure, noise and speckle, and f B.
+Electrons at white are those without an amplifier; one that raised the pictures has to be said,
+gain=, for noise does not tell it from fewer electrons. Read-out noise is that at this gain. What
 the pictures do not tell is said, and left as it is in base=. Of each pair it is said how much of it
 the matcher of base= fills, and why the rest is lost.
 """,

@@ -17,6 +17,7 @@ from qs3.utils.pictures import png_bytes, read_png
 
 _MAX_PIXELS = 1 << 26
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
+_FAR_M = 100.0  # no wall that somebody measures
 _INVALID = 65535  # of 16 bits; 0 is the usual mark
 
 
@@ -38,10 +39,11 @@ class DepthImage:
 
 
 def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
-    """`fx,fy,cx,cy`, or a JSON file with fx, fy, cx, cy (also as K or intrinsic_matrix).
+    """`fx,fy,cx,cy`, or a JSON file with fx, fy, cx, cy (also ppx, ppy, K or intrinsic_matrix).
 
     Raises:
-        ConfigError: it is neither, or pixels are not square.
+        ConfigError: it is neither, pixels are not square, or the principal point lies outside of
+            the picture.
         MissingDataError: there is no such file.
         DataError: the file does not hold them.
     """
@@ -70,6 +72,12 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
         )
     if not 0.95 < fx / fy < 1.05:
         raise ConfigError(f"intrinsics=: fx {fx} and fy {fy} differ; pixels must be square")
+    # At twice the size the middle is the corner of these.
+    if not (-0.5 < cx < width_px - 0.5 and -0.5 < cy < height_px - 0.5):
+        raise ConfigError(
+            f"intrinsics=: the principal point ({cx:g}, {cy:g}) is outside of the frames of "
+            f"{width_px} x {height_px} px; are these of another resolution?"
+        )
     return Intrinsics(width_px, height_px, (fx + fy) / 2, cx, cy)
 
 
@@ -77,8 +85,9 @@ def _four(found: object) -> list[float] | None:
     if not isinstance(found, dict):
         return None
     try:
-        if all(key in found for key in ("fx", "fy", "cx", "cy")):
-            return [float(found[key]) for key in ("fx", "fy", "cx", "cy")]
+        for keys in (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy")):  # librealsense
+            if all(key in found for key in keys):
+                return [float(found[key]) for key in keys]
         for key in ("K", "intrinsic_matrix", "camera_matrix"):
             if key in found:
                 k = np.asarray(found[key], dtype=np.float64).reshape(-1)
@@ -135,7 +144,13 @@ def as_frame(name: str, raw: np.ndarray, unit: str | None = None) -> DepthImage:
     if not valid.any():
         raise DataError(f"{name} has no pixel with a depth")
     whole = raw.dtype.kind in "iu"
-    scale, words = _scale(name, float(np.median(values[valid])), whole, unit)
+    middle = float(np.median(values[valid]))
+    scale, words = _scale(name, middle, whole, unit)
+    if middle / scale > _FAR_M:
+        raise DataError(
+            f"{name}: with unit={unit} half of its depths are beyond {middle / scale:.4g} m: are "
+            "they in another unit?"
+        )
     depth = np.where(valid, values / scale, np.nan)
     resolution = 1 / scale if whole else _resolution(depth[valid])
     return DepthImage(name, depth, resolution, words)

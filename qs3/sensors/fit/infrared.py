@@ -15,6 +15,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from scipy.optimize import least_squares
 
+from qs3.config.checks import check_float
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.cameras import Window
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
@@ -74,6 +75,8 @@ class InfraredFit:
         dots_over_ambient: at `distance_m`, as `qs3 bench` has it.
         distance_m: median over the scenes.
         misfit: RMS of what is left, in standard errors; about 1 is good.
+        gain: of the pictures' amplifier, as it was given. Electrons at white are without it, and
+            read-out noise is what it was at it.
     """
 
     values: Mapping[str, float]
@@ -84,6 +87,7 @@ class InfraredFit:
     dots_over_ambient: float
     distance_m: float
     misfit: float
+    gain: float = 1.0
 
 
 @dataclass
@@ -102,7 +106,10 @@ class _Target:
 
 
 def fit_pictures(
-    scenes: Sequence[Pictures], base: SpeckleStereo, distance_m: float | None = None
+    scenes: Sequence[Pictures],
+    base: SpeckleStereo,
+    distance_m: float | None = None,
+    gain: float = 1.0,
 ) -> InfraredFit:
     """Fit ambient light, blur and noise of `base` to pictures; see `InfraredFit`.
 
@@ -110,14 +117,19 @@ def fit_pictures(
         scenes: at least one; matt things without much print on them show what dots do.
         base: the preset to begin with: pattern, projector and geometry stay.
         distance_m: of the scenes without a depth image.
+        gain: by how much the camera's amplifier raised all pictures, >= 1. Noise does not tell it
+            from fewer electrons at white, so it has to be said.
 
     Raises:
         DataError: pictures are too small, dark, or without dots.
-        ConfigError: the base has no linear camera, or a scene's distance is not known.
+        ConfigError: `gain` is below 1, the base has no linear camera, or a scene's distance is not
+            known.
     """
     _camera(base)
     targets = [_target(scene, base, distance_m) for scene in scenes]
+    check_float("gain", gain, ">= 1")
     start = {key: _first(key, base) for key in KEYS}
+    start["infrared.electrons_at_white"] /= gain  # of grey value 255 as it is in the pictures
 
     def residuals(logs: Sequence[torch.Tensor]) -> torch.Tensor:
         values = {key: start[key] * torch.exp(log) for key, log in zip(KEYS, logs, strict=True)}
@@ -156,6 +168,7 @@ def fit_pictures(
         key: start[key] if key in unknown else start[key] * math.exp(float(log))
         for key, log in zip(KEYS, found, strict=True)
     }
+    values["infrared.electrons_at_white"] *= gain
     values["infrared.white_level"] = float(np.median([target.white for target in targets]))
     middle = float(np.median([target.distance_m for target in targets]))
     return InfraredFit(
@@ -167,6 +180,7 @@ def fit_pictures(
         _dots_over_ambient(base, middle, values),
         middle,
         float(rest.square().mean().sqrt()),
+        gain,
     )
 
 

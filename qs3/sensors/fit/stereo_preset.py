@@ -13,7 +13,7 @@ _WORDS = {
     "ambient": "ambient light; a lit dot on white at 4 m has 1 at projector_strength 16",
     "infrared.psf_px": "blur of the lens, px",
     "infrared.speckle_contrast": "contrast of the laser's speckle",
-    "infrared.electrons_at_white": "electrons at grey value 255",
+    "infrared.electrons_at_white": "electrons at grey value 255 without an amplifier",
     "infrared.read_noise_e": "read-out noise, electrons",
     "infrared.white_level": "grey value that the exposure aims at",
 }
@@ -36,6 +36,16 @@ def report(found: InfraredFit, base: SpeckleStereo, scenes: int) -> list[str]:
         lines.append(
             f"{'f B':28} {found.focal_baseline:.4g} px m; with f = {base.focal_px:g} px a baseline "
             f"of {found.focal_baseline / base.focal_px:.5g} m: f and B alone cannot be told apart"
+        )
+    if found.gain == 1:
+        lines.append(
+            "the pictures are taken for unamplified: if the camera's gain was G, say gain=G, or "
+            "electrons_at_white is too low by it"
+        )
+    else:
+        lines.append(
+            f"at the pictures' gain of {found.gain:g} grey value 255 is as many electrons less by "
+            "it; read-out noise is what it is at this gain"
         )
     lines.append(
         "albedo, gain and projector_strength cannot be told apart: only their product is "

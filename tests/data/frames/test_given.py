@@ -173,6 +173,26 @@ MATRIX = [[525.0, 0, 319.5], [0, 526.0, 239.5], [0, 0, 1]]
             (640, 480),
             True,
         ),
+        (
+            "i.yaml",  # rostopic echo camera_info, and Ctrl-C in the second message
+            f"---\nheight: 480\nwidth: 640\nD: [0.0, 0.0]\nK: {np.ravel(MATRIX).tolist()}\n"
+            "---\nheight: 480\nwid",
+            (640, 480),
+            False,
+        ),
+        (
+            "j.json",  # Open3D's camera with its pose
+            {
+                "extrinsic": [1, 0, 0, 0],
+                "intrinsic": {
+                    **{"width": 640, "height": 480},
+                    "intrinsic_matrix": np.array(MATRIX).T.ravel().tolist(),
+                },
+            },
+            (640, 480),
+            False,
+        ),
+        ("k.json", {"cam_K": np.ravel(MATRIX).tolist(), "depth_scale": 1.0}, None, False),  # BOP
         ("f.txt", "525 0 319.5\n0 526 239.5\n0 0 1\n", None, False),
         ("g.txt", "525 0 319.5 0\n0 526 239.5 0\n0 0 1 0\n0 0 0 1\n", None, False),
     ],
@@ -185,6 +205,15 @@ def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, name, content,
     assert read_intrinsics("525,526,319.5,239.5").camera == found.camera
 
 
+def test_intrinsics_of_numpy(tmp_path):
+    for array in (MATRIX, [525, 526, 319.5, 239.5], np.pad(MATRIX, (0, 1)) + np.diag([0, 0, 0, 1])):
+        path = npy(tmp_path / "K.npy", np.array(array))
+        assert read_intrinsics(str(path)) == Intrinsics(Pinhole(525, 526, 319.5, 239.5))
+    for wrong in (np.ones((3, 4)), np.array(["a"] * 4), np.ones((2000, 2000))):
+        with pytest.raises(DataError, match=r"K\.npy.*fx fy cx cy, or a matrix of 3 x 3 or 4 x 4"):
+            read_intrinsics(str(npy(tmp_path / "K.npy", wrong)))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -194,6 +223,7 @@ def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, name, content,
         ("1 2 3 4 5 6 7 8 9", "is not a matrix fx 0 cx"),
         ("- 1\n- 2\n", "no fx, fy, cx, cy and no matrix K"),
         ("K: [[a, b]]", "not a readable file of intrinsics"),
+        ("---\n---\n", "no fx, fy, cx, cy and no matrix K"),
         ("{", r"camera\.yaml is not readable"),
         ("K: 2020-99-99", r"camera\.yaml is not readable"),
         (f"fx: 1\nfy: 1\ncx: 1\ncy: 1{'0' * 400}", "not a readable file of intrinsics"),
@@ -213,6 +243,7 @@ def test_what_is_no_intrinsics_is_told(tmp_path, text, message):
     [
         ((525, 525, 640, 240), None, "outside of the picture of 640 x 480"),
         ((525, 525, 320, -3), None, "another resolution"),
+        ((1050, 1050, 639.5, 479.5), None, "another resolution"),  # the middle, at twice the size
         ((0.9, 0.9, 320, 240), None, "focal lengths are in pixels"),
         ((90_000, 525, 320, 240), None, "field of view"),
         ((525, 525, 320, 240), (1280, 720), "of pictures of 1280 x 720 px, this one has 640 x 480"),

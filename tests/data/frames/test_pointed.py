@@ -101,6 +101,20 @@ def test_what_is_cut_off_covered_or_small_is_cautioned_and_still_there():
     assert one.cautions[0].words == f"{len(one.piece.points_m)} pixels with depth, fewer than 700"
 
 
+def test_two_things_with_one_number_are_cautioned_and_two_parts_of_one_are_not():
+    depth, mask = seen()
+    (both,) = point_out(depth, CAMERA, mask=mask > 0, up=ROOM.up_in_camera)
+    _, larger = point_out(depth, CAMERA, mask=mask, up=ROOM.up_in_camera)
+    np.testing.assert_array_equal(both.piece.points_m, larger.piece.points_m)
+    (said,) = [caution.words for caution in both.cautions if caution.kind == "several"]
+    assert said.startswith("its number marks 2 separate places, of which one was taken, with ")
+    parted = mask == 1
+    rows = np.flatnonzero(parted.any(axis=1))
+    parted[rows[len(rows) // 2]] = False  # a wire before it
+    (one,) = point_out(depth, CAMERA, mask=parted, up=ROOM.up_in_camera)
+    assert one.cautions == ()
+
+
 def test_an_object_without_depth_says_so_and_the_others_go_on():
     depth, mask = seen()
     depth[mask == 1] = 0
@@ -153,6 +167,7 @@ def test_a_fitted_vertical_is_right_or_not_sure(pitch_deg):
         ({"box": (5, 5, 5, 9)}, "left < right"),
         ({"box": (5, 5, 9)}, "not left,top,right,bottom"),
         ({"box": (700, 5, 900, 9)}, "outside the image of 640 x 480"),
+        ({"box": (0.3, 0.2, 0.6, 0.8)}, "in fractions of the picture.*pixels of 640 x 480"),
         ({"box": (5, 5, 90, 90), "up": (0, 0, 0)}, "not a direction"),
         ({"box": (5, 5, 90, 90), "up": (0, np.nan, 0)}, "not a direction"),
     ],

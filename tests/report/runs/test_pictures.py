@@ -287,6 +287,19 @@ def test_command_line(run, toy_data, tmp_path, capsys):
     assert not_blank(out / "embedding.png")
 
 
+def test_damaged_data_cost_their_pictures_and_not_the_page(run, toy_data, tmp_path, capsys):
+    use_real_net(run)
+    data_dir, out = tmp_path / "copy", tmp_path / "out"
+    shutil.copytree(toy_data, data_dir)
+    (data_dir / "kinectsim10" / "points.npy").write_bytes(b"no array")
+    assert main(["report", "page", f"run={run}", f"data_dir={data_dir}", f"out={out}"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    for name in ("embedding", "target_clouds"):
+        assert any(line.startswith(f"no {name}: ") and "points.npy" in line for line in said)
+    assert not_blank(out / "source_clouds.png")
+    assert "Features of both domains: " in (out / "index.html").read_text()
+
+
 def test_embedding_shows_both_domains_before_and_after(run):
     from qs3.report.runs.embedding import draw_embedding, sample
 

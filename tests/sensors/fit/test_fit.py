@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.sensors.bench.laws import nguyen_axial_m
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
@@ -318,6 +318,10 @@ def test_real_kinect_clouds_have_eighths_of_a_pixel(tmp_path):
         (np.random.default_rng(0).uniform(1, 4, (200, 300)), [], "no plane was found"),
         (np.full((200, 300), 60.0), [], "unit="),
         (np.full((200, 300), 2.0), ["distances=1,2"], "distances= has 2"),
+        (np.full((200, 300), 2000.0), ["unit=m"], "half of its depths are beyond 2000 m"),
+        (np.full((200, 300), 2.0), ["baseline=75"], "if these are millimetres, give 0.075"),
+        (np.full((200, 300), 2.0), ["baseline=0"], "metres from camera to projector"),
+        (np.full((200, 300), 2.0), ["baseline=nan"], "metres from camera to projector"),
         (np.full((200, 300), 2.0), ["intrinsics=1,2,3"], "fx,fy,cx,cy"),
         (np.zeros((5, 5, 3)), [], "not a depth image"),
     ],
@@ -340,6 +344,15 @@ def test_files_without_intrinsics_are_told(text, tmp_path):
     path.write_text(text)
     with pytest.raises(DataError, match=r"camera\.json (is not JSON|has neither)"):
         read_camera(str(path), 640, 480)
+
+
+def test_cameras_of_other_words_and_of_another_resolution(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text('{"fx": 580, "fy": 580, "ppx": 319.5, "ppy": 239.5}')
+    found = read_camera(str(path), 640, 480)
+    assert (found.focal_px, found.cx_px, found.cy_px) == (580, 319.5, 239.5)
+    with pytest.raises(ConfigError, match="outside of the frames of 320 x 240 px"):
+        read_camera(str(path), 320, 240)
 
 
 def test_damaged_and_large_arrays_are_refused_by_their_headers(tmp_path, capsys):

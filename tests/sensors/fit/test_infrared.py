@@ -14,7 +14,7 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.fit.infrared import Pictures, fit_pictures
+from qs3.sensors.fit.infrared import NOISE, Pictures, fit_pictures
 from qs3.sensors.fit.infrared_statistics import statistics
 from qs3.sensors.fit.pictures import read_pictures
 from qs3.sensors.fit.stereo_preset import report
@@ -47,6 +47,20 @@ def test_light_lens_and_noise_are_found_within_five_percent(scenes):
     assert found.misfit < 2
     assert "infrared.speckle_contrast" in found.unknown  # there is none
     assert found.distance_m == pytest.approx(1.1, abs=0.02)
+
+
+def test_an_amplifier_that_is_told_does_not_pass_for_fewer_electrons(scenes):
+    """Twice the grey values of as many electrons are what a gain of 2 gives."""
+    dim = scenes[2]
+    left, off = ([2.0 * image for image in images] for images in (dim.left, dim.off))
+    assert np.max(left) < 255
+    found = fit_pictures([replace(dim, left=left, off=off)], BASE, gain=2.0)
+    for key in NOISE[1:]:
+        assert found.values[key] == pytest.approx(HIDDEN[key], rel=0.1), key
+    assert any("at the pictures' gain of 2" in line for line in report(found, BASE, 1))
+    assert any("say gain=G" in line for line in report(replace(found, gain=1.0), BASE, 1))
+    with pytest.raises(ConfigError, match="gain must be >= 1"):
+        fit_pictures([dim], BASE, gain=0.5)
 
 
 def test_one_frame_does_not_tell_noise(scenes):
