@@ -184,8 +184,18 @@ def _wandb_forgotten() -> Iterator[None]:
             os.environ.pop("WANDB_MODE", None)  # set by Lightning's logger when offline
 
 
+_SEVERAL = {
+    "selection": "selection.student=last",
+    "evaluation": "evaluation.rotations=0",
+    "report": "report.pictures=false",
+}
+
+
 def _check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
+    for key, one in _SEVERAL.items():
+        if cfg[key] is None:
+            raise ConfigError(f"{key}=null: these are several settings; give one, as {one}")
     check_choice("selection.teacher", cfg.selection.teacher, TEACHERS)
     if cfg.selection.teacher == "given" and cfg.weights is None:
         raise ConfigError(

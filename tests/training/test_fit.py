@@ -219,6 +219,8 @@ def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
         ("selection.student=best", r"selection\.student must be one of .*'snd'.*'best'"),
         ("objective=accuracy", "objective=accuracy is refused"),
         ("report.pictures=perhaps", r"report\.pictures"),
+        ("evaluation=null", "evaluation=null: these are several .* as evaluation.rotations=0"),
+        ("report=null", "report=null: .* as report.pictures=false"),
         ("data.sampler=balanced method=supervised", r"=balanced draws source clouds only"),
         ("selection.student=snd", r"selection\.student=snd .*set selection\.student="),
     ],
