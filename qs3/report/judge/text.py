@@ -72,28 +72,36 @@ def _classes(verdict: Verdict) -> list[list[str]]:
 def csv_text(verdict: Verdict) -> str:
     """A row a family and tier, with a recall and a count for each class; shares in [0, 1].
 
-    At its end what the data are made of, and what trained and judged.
+    At its end how much more than the first family's its accuracies are (`less`: that family), what
+    the data are made of, and what trained and judged.
     """
     names = verdict.classes
+    none = [[None] * 9] * len(verdict.families[0].figures)  # of the first there is no difference
+    more = none + [
+        [d.base, *dataclasses.astuple(d.accuracy), *dataclasses.astuple(d.balanced)]
+        for d in verdict.differences
+    ]
     header = [
         "run", "seeds", "tier", "objects", "blocks", "accuracy", "accuracy_sem", "accuracy_low",
         "accuracy_high", "balanced", "balanced_sem", "balanced_low", "balanced_high", "majority",
         *(f"recall_{name}" for name in names), *(f"objects_{name}" for name in names),
+        "less", "accuracy_more", "accuracy_more_sem", "accuracy_more_low", "accuracy_more_high",
+        "balanced_more", "balanced_more_sem", "balanced_more_low", "balanced_more_high",
         "data", "trained_by", "judged_by",
     ]  # fmt: skip
     rows: list[list[Any]] = [header]
-    for family in verdict.families:
-        for f in family.figures:
-            a, b = f.accuracy, f.balanced
-            rows.append(
-                [
-                    family.name, " ".join(map(str, family.seeds)), f.tier, f.n, f.blocks,
-                    a.mean, a.sem, a.low, a.high, b.mean, b.sem, b.low, b.high, f.majority,
-                    *(f.recall.get(name) for name in names),
-                    *(f.counts.get(name, 0) for name in names),
-                    family.data, family.trained_by, verdict.judged_by,
-                ]
-            )  # fmt: skip
+    figures = [(family, f) for family in verdict.families for f in family.figures]
+    for (family, f), difference in zip(figures, more, strict=True):
+        a, b = f.accuracy, f.balanced
+        rows.append(
+            [
+                family.name, " ".join(map(str, family.seeds)), f.tier, f.n, f.blocks,
+                a.mean, a.sem, a.low, a.high, b.mean, b.sem, b.low, b.high, f.majority,
+                *(f.recall.get(name) for name in names),
+                *(f.counts.get(name, 0) for name in names), *difference,
+                family.data, family.trained_by, verdict.judged_by,
+            ]
+        )  # fmt: skip
     return csv_of(rows)
 
 

@@ -146,6 +146,7 @@ def test_command(archive, logs, tmp_path, capsys):
     rows = list(csv.DictReader((tmp_path / "judged.csv").read_text().splitlines()))
     assert [row["tier"] for row in rows] == ["all", "clean", "hard"] * 2
     assert rows[0]["objects_chair"] == "5"
+    assert [row["less"] for row in rows] == [""] * 3 + ["exp 0123abcd"] * 3
     made = "specklenet10 (published files), kinectsim10 (embedded catalogue, kinect_like, 4 views)"
     assert (rows[0]["data"], rows[0]["trained_by"]) == (made, "qs3 0.1.0; qs3 0.1.0, commit c0ffee")
     assert rows[0]["judged_by"] == in_words(VERSION, commit())
@@ -155,6 +156,10 @@ def test_command(archive, logs, tmp_path, capsys):
     assert QS3([*words, f"out={tmp_path}/judged.json"]) == 0
     found = json.loads((tmp_path / "judged.json").read_text())
     assert found["families"][0]["figures"][0]["accuracy"]["mean"] == float(rows[0]["accuracy"])
+    for row, difference in zip(rows[3:], found["differences"], strict=True):
+        assert (row["tier"], row["less"]) == (difference["tier"], difference["base"])
+        assert float(row["accuracy_more"]) == difference["accuracy"]["mean"]
+        assert float(row["balanced_more_low"]) == difference["balanced"]["low"]
     with pytest.raises(ConfigError, match=r"\.csv or \.json"):
         QS3([*words, "out=x.txt"])
 
