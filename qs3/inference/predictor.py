@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from qs3.clouds.finite import checked
 from qs3.config.checks import check_float
-from qs3.data.frames.given import Intrinsics, check_intrinsics
+from qs3.data.frames.given import Intrinsics, camera_of, check_intrinsics, check_metres
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import Pointed, point_out
 from qs3.data.importers.base import check_cloud
@@ -42,6 +42,7 @@ from qs3.inference.floor import check_camera_height
 from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.allocator import keep_freed_memory
+from qs3.utils.plural import counted
 
 BATCH = 32  # clouds: more are no faster on a CPU
 
@@ -213,7 +214,8 @@ class Predictor:
             batch_size: clouds that the net sees at a time.
 
         Raises:
-            DataError: no list of clouds; or names the cloud that is empty or not finite.
+            DataError: no list of clouds, or not as many names; or names the cloud that is empty or
+                not finite.
         """
         if clouds is None or isinstance(clouds, str | bytes) or not hasattr(clouds, "__iter__"):
             raise DataError(f"got {clouds!r:.60}; give a list of clouds, [n, 3] arrays")
@@ -224,6 +226,10 @@ class Predictor:
             )
         arrays = list(clouds)
         names = [f"cloud {i}" for i in range(len(arrays))] if names is None else names
+        if len(names) != len(arrays):
+            raise DataError(
+                f"names: {len(names)} of {counted(len(arrays), 'cloud')}; give each its own"
+            )
         if not arrays:
             return np.empty((0, len(self.classes)))
         pairs = zip(arrays, names, strict=True)
@@ -233,7 +239,7 @@ class Predictor:
     def predict_depth(
         self,
         depth_m: Float[np.ndarray, "h w"],
-        camera: Pinhole | Sequence[float],
+        camera: Pinhole | Sequence[float] | np.ndarray,
         *,
         mask: np.ndarray | None = None,
         box: Sequence[float] | None = None,
@@ -244,7 +250,8 @@ class Predictor:
 
         Args:
             depth_m: [h, w] floats, metres along the optical axis; 0 or not finite: not measured.
-            camera: fx, fy, cx, cy in pixels, the centre of the top left one at (0, 0).
+            camera: fx, fy, cx, cy in pixels, the centre of the top left one at (0, 0); or the
+                matrix [3, 3] of these.
             mask: [h, w] whole numbers or bool; 0 is background. Or:
             box: left, top, right, bottom in pixels.
             up: in the camera's frame (x right, y down, z forward), any length; None: by the planes
@@ -266,10 +273,9 @@ class Predictor:
             raise DataError(
                 f"the depth image is {depth.dtype} {depth.shape}, expected floats [h, w] in metres"
             )
+        check_metres(depth, "the depth image")
         if not isinstance(camera, Pinhole):
-            if len(values := [float(value) for value in camera]) != 4:
-                raise DataError(f"camera={values}: expected fx, fy, cx, cy")
-            camera = Pinhole(*values)
+            camera = camera_of([float(value) for value in np.ravel(camera)], "camera")
         check_intrinsics(Intrinsics(camera), depth, "the depth image")
         found = point_out(depth, camera, mask=mask, box=box, up=up)
         return [self._of_depth(one, floor) for one in found]

@@ -99,7 +99,13 @@ def test_each_object_of_a_mask_gets_what_the_net_says_of_its_cloud(run, frame, c
     assert [ball[1], rod[1]] == pytest.approx([0.7, 1.0], abs=0.06)
     with pytest.raises(ConfigError, match="camera_height=0 is not a height"):
         predictor.predict_depth(depth / 1000, SHOT.camera, mask=mask, camera_height=0)
-    in_python = predictor.predict_depth(depth / 1000, SHOT.camera, mask=mask, up=SHOT.up_in_camera)
+    with pytest.raises(DataError, match=r"beyond \d+ m; if these are millimetres, divide"):
+        predictor.predict_depth(depth.astype(float), SHOT.camera, mask=mask)
+    with pytest.raises(DataError, match="camera: 3 numbers; expected fx,fy,cx,cy or a 3 x 3"):
+        predictor.predict_depth(depth / 1000, SHOT.camera[:3], mask=mask)
+    fx, fy, cx, cy = SHOT.camera
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    in_python = predictor.predict_depth(depth / 1000, matrix, mask=mask, up=SHOT.up_in_camera)
     np.testing.assert_allclose([one.probabilities for one in in_python], expected, atol=1e-6)
     assert [one.cls for one in in_python] == [row["class"] for row in rows]
     with pytest.raises(DataError, match="expected floats"):

@@ -194,6 +194,8 @@ def test_what_is_no_list_of_clouds_is_told(predictor, test_clouds):
     for wrong in (None, 7, "scan.xyz"):
         with pytest.raises(DataError, match="give a list of clouds"):
             predictor(wrong)
+    with pytest.raises(DataError, match="names: 2 of 1 cloud;"):
+        predictor([cloud], names=["a", "b"])
     for wrong in (None, "scan.xyz", [[1, 2, 3], [4, 5]]):
         with pytest.raises(DataError, match=r"cloud 1: .*no .*numbers"):
             predictor([cloud, wrong])

@@ -20,7 +20,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -144,20 +144,45 @@ def read_intrinsics(words: str, folder: Path | None = None) -> Intrinsics:
     """
     numbers = _numbers(words)
     if numbers is not None:
-        return Intrinsics(_camera(numbers, f"intrinsics={words}"))
+        return Intrinsics(camera_of(numbers, f"intrinsics={words}"))
     path = _there((folder or Path()) / Path(words).expanduser(), "intrinsics")
     if path.suffix.lower() == ".npy":
         matrix = read_npy(path, lambda shape, dtype: _check_matrix(path, shape, dtype))
-        return Intrinsics(_camera(matrix.ravel().tolist(), str(path)))
+        return Intrinsics(camera_of(matrix.ravel().tolist(), str(path)))
     data = _content(path, _MOST_TEXT)
     try:
         text = data.decode()
         found = _numbers(text)
         if found is not None:
-            return Intrinsics(_camera(found, str(path)))
+            return Intrinsics(camera_of(found, str(path)))
         return _of_mapping(_parsed(text, str(path)), str(path))
     except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"{path}: not a readable file of intrinsics ({error})") from error
+
+
+def camera_of(values: Sequence[float], where: str) -> Pinhole:
+    """From fx fy cx cy, or the 9 or 16 numbers of a matrix.
+
+    Raises:
+        DataError: other numbers; begins with `where`.
+    """
+    values = list(values)
+    if len(values) == 16:
+        values = [*values[:3], *values[4:7], *values[8:11]]
+    if len(values) == 9:
+        if values[2] == values[5] == 0:  # by columns
+            values = [values[i] for i in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
+        fx, skew, cx, zero, fy, cy, *last = values
+        if skew or zero or last != [0, 0, 1]:
+            raise DataError(f"{where}: {values} is not a matrix fx 0 cx, 0 fy cy, 0 0 1")
+        values = [fx, fy, cx, cy]
+    if len(values) != 4:
+        found = counted(len(values), "number")
+        raise DataError(f"{where}: {found}; expected fx,fy,cx,cy or a 3 x 3 matrix")
+    try:
+        return Pinhole(*values)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
 
 
 def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where: str) -> Pinhole:
@@ -189,6 +214,16 @@ def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where
                 f"{field:.1f}°; focal lengths are in pixels"
             )
     return camera
+
+
+def check_metres(depth_m: Float[np.ndarray, "h w"], where: str) -> None:
+    """Raise DataError, which begins with `where`, if these are no metres but millimetres."""
+    measured = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
+    if measured.size and (middle := float(np.median(measured))) >= MOST_DEPTH_M:
+        raise DataError(
+            f"{where}: half of its depths are beyond {middle:.4g} m; if these are millimetres, "
+            "divide them by 1000"
+        )
 
 
 def _there(path: str | Path, what: str) -> Path:
@@ -260,26 +295,6 @@ def _numbers(text: str) -> list[float] | None:
         return None
 
 
-def _camera(values: list[float], where: str) -> Pinhole:
-    """From fx fy cx cy, or a matrix of 3 x 3 or 4 x 4."""
-    if len(values) == 16:
-        values = [*values[:3], *values[4:7], *values[8:11]]
-    if len(values) == 9:
-        if values[2] == values[5] == 0:  # by columns
-            values = [values[i] for i in (0, 3, 6, 1, 4, 7, 2, 5, 8)]
-        fx, skew, cx, zero, fy, cy, *last = values
-        if skew or zero or last != [0, 0, 1]:
-            raise DataError(f"{where}: {values} is not a matrix fx 0 cx, 0 fy cy, 0 0 1")
-        values = [fx, fy, cx, cy]
-    if len(values) != 4:
-        found = counted(len(values), "number")
-        raise DataError(f"{where}: {found}; expected fx,fy,cx,cy or a 3 x 3 matrix")
-    try:
-        return Pinhole(*values)
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
-
-
 def _parsed(text: str, where: str) -> Any:
     """JSON or YAML, of which the first document counts; DataError if neither."""
     text = text.removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
@@ -307,7 +322,7 @@ def _of_mapping(given: Any, where: str) -> Intrinsics:
     size = (int(given[sides[0]]), int(given[sides[1]])) if sides else None
     bent = next((given[key] for key in _BENT if key in given), None)
     bent = bent.get("data") if isinstance(bent, Mapping) else bent
-    return Intrinsics(_camera(values, where), size, bent is not None and any(_flat(bent)))
+    return Intrinsics(camera_of(values, where), size, bent is not None and any(_flat(bent)))
 
 
 def _flat(values: Any) -> list[float]:
