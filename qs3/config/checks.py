@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -24,10 +25,10 @@ def check_float(key: str, value: Any, allowed: str = "") -> float:
     """The value; ConfigError unless it is a finite number, `allowed` if given (`check_ranges`)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ConfigError(f"{key} must be a number, got {value!r}")
-    if not math.isfinite(value):
-        raise ConfigError(f"{key} must be a finite number, got {value}")
     if allowed:
         _check_range(key, value, allowed)
+    elif not math.isfinite(value):
+        raise ConfigError(f"{key} must be a finite number, got {value}")
     return value
 
 
@@ -45,6 +46,15 @@ def check_choice(key: str, value: Any, allowed: Sequence[str]) -> str:
     return value
 
 
+def check_keys(prefix: str, found: Iterable[str], known: Sequence[str]) -> None:
+    """Raise ConfigError for the first key after `prefix` that nothing would read: +KEY adds any."""
+    for key in found:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {prefix}{near[0]}?" if near else f"there are {', '.join(known)}"
+            raise ConfigError(f"{prefix}{key} is no setting, nothing reads it; {hint}")
+
+
 def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
     """Check numbers of an object, e.g. `check_ranges(self, "sensor.", fill_px=">= 0")`.
 
@@ -60,11 +70,11 @@ def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
 
 
 def _check_range(key: str, value: Any, allowed: str) -> None:
-    if isinstance(value, float) and math.isinf(value):
-        raise ConfigError(f"{key} must be a finite number, got {value}")
     if not _inside(value, allowed):
         word = "in " if allowed[0] in "[(" else ""
         raise ConfigError(f"{key} must be {word}{allowed}, got {value!r}")
+    if math.isinf(value):
+        raise ConfigError(f"{key} must be a finite number, got {value!r}")
 
 
 def _inside(value: Any, allowed: str) -> bool:

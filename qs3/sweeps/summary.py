@@ -104,7 +104,8 @@ class SummaryOfSeeds(Callback):
         jobs = last_words(self._read())
         self.journal.unlink(missing_ok=True)
         self.journal = None
-        folders = sorted({Path(job["folder"]) for job in jobs})
+        in_order = sorted(jobs, key=lambda job: job.get("job", 0))  # of the sweep, not of hashes
+        folders = list(dict.fromkeys(Path(job["folder"]) for job in in_order))
         if self.table and self.objective is not None:
             sys.stdout.write(objectives(jobs, self.objective) + "\n")
         elif self.table and any((folder / METRICS).is_file() for folder in folders):

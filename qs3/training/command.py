@@ -8,11 +8,12 @@ import math
 import os
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config import hashing
-from qs3.config.checks import check_bool, check_choice, check_float, check_int
+from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
 from qs3.config.hydra import build, component_names, in_multirun
 from qs3.data.ensure_source import check_or_make
 from qs3.data.store import is_finished
@@ -28,6 +29,21 @@ from qs3.training.run import Run
 from qs3.utils.locks import owned
 
 log = logging.getLogger(__name__)
+
+KEYS = {
+    "": (
+        *("data", "model", "method", "protocol", "selftraining", "selection", "evaluation"),
+        *("trainer", "callbacks", "logger", "paths", "report", "experiment_name", "seed"),
+        *("num_classes", "weights", "ckpt_path", "force", "compile", "objective"),
+    ),
+    "protocol.": (
+        *("epochs", "steps", "batch_size", "optimizer", "schedule", "smoothing", "regulariser"),
+        "augment",
+    ),
+    "selection.": ("teacher", "student"),
+    "evaluation.": ("norms", "rotations"),
+}
+"""The settings that this command reads itself; all others are arguments of what is built."""
 
 TEACHERS = ("source_val", "last", "given")
 SCHEDULES = ("cosine", "plateau")
@@ -196,6 +212,7 @@ def _check_settings(cfg: DictConfig) -> None:
     for key, one in _SEVERAL.items():
         if cfg[key] is None:
             raise ConfigError(f"{key}=null: these are several settings; give one, as {one}")
+    _check_keys(cfg)
     check_choice("selection.teacher", cfg.selection.teacher, TEACHERS)
     if cfg.selection.teacher == "given" and cfg.weights is None:
         raise ConfigError(
@@ -239,6 +256,15 @@ def _check_settings(cfg: DictConfig) -> None:
     check_float("protocol.regulariser", cfg.protocol.regulariser, ">= 0")
     if "lr" in cfg.protocol.optimizer:
         check_float("protocol.optimizer.lr", cfg.protocol.optimizer.lr)
+
+
+def _check_keys(cfg: DictConfig) -> None:
+    """Refuse keys that nothing reads; at the top those that no other value is made of."""
+    text = OmegaConf.to_yaml(cfg, resolve=False)
+    for prefix, known in KEYS.items():
+        found: Any = OmegaConf.select(cfg, prefix.rstrip(".")) if prefix else cfg
+        keys = [str(key) for key in found if prefix or f"${{{key}" not in text]
+        check_keys(prefix, keys, known)
 
 
 def _is_upper_bound(cfg: DictConfig) -> bool:

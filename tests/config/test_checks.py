@@ -24,11 +24,13 @@ def test_float(value):
 
 @pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])
 def test_what_is_not_finite_is_no_setting(value):
-    for allowed in ("", ">= 0"):
-        with pytest.raises(ConfigError, match=rf"a\.b must be a finite number, got {value}"):
+    with pytest.raises(ConfigError, match=rf"a\.b must be a finite number, got {value}"):
+        check_float("a.b", value)
+    for allowed in (">= 0", "> 0", "[0, 1]", "[0, inf)"):
+        with pytest.raises(ConfigError, match=rf"a\.b must be .*, got {value}"):
             check_float("a.b", value, allowed)
-    with pytest.raises(ConfigError, match=r"sensor\.a_m must be"):
-        check_ranges(SimpleNamespace(a_m=value), "sensor.", a_m=">= 0")
+        with pytest.raises(ConfigError, match=r"sensor\.a_m must be"):
+            check_ranges(SimpleNamespace(a_m=value), "sensor.", a_m=allowed)
 
 
 def test_choice():

@@ -54,8 +54,8 @@ def test_an_error_of_all_jobs_is_said_once(summary, tmp_path, caplog):
 def test_the_table_says_in_what_its_lines_differ(tmp_path, capsys):
     summary = SummaryOfSeeds()
     summary.on_multirun_start(config(tmp_path))
-    hashes = {"0.5": "aaaaaaaa", "0.45": "bbbbbbbb", "0.4": "cccccccc"}
-    for theta, sha in hashes.items():
+    hashes = {"0.5": "cccccccc", "0.45": "aaaaaaaa", "0.4": "bbbbbbbb"}
+    for num, (theta, sha) in reversed(list(enumerate(hashes.items()))):  # as workers take them
         for seed in (0, 1):
             words = ["experiment=quickstart", f"selftraining.theta={theta}", f"seed={seed}"]
             folder = tmp_path / "exp" / f"seed{seed}-{sha}"
@@ -63,14 +63,15 @@ def test_the_table_says_in_what_its_lines_differ(tmp_path, capsys):
                 write_run(tmp_path, seed=seed, hash=sha)
             else:
                 (folder / ".hydra").mkdir(parents=True)
-            summary.on_job_start(config(folder, *words))
-            summary.on_job_end(config(folder), SimpleNamespace(_return_value=None, overrides=words))
+            job = SimpleNamespace(_return_value=None, overrides=words)
+            summary.on_job_start(config(folder, *words, num=2 * num + seed))
+            summary.on_job_end(config(folder, num=2 * num + seed), job)
     summary.on_multirun_end(config(tmp_path))
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split()[:2] == ["experiment", "settings"]
-    assert sorted(line.split()[1] for line in lines[3:6]) == [
-        f"selftraining.theta={theta}" for theta in sorted(hashes)
-    ]  # also the one that is not finished
+    assert [line.split()[1] for line in lines[3:6]] == [
+        f"selftraining.theta={theta}" for theta in hashes
+    ]  # in the sweep's order, also the one that is not finished
     assert "experiment=quickstart" not in "".join(lines)  # what all have in common
 
 

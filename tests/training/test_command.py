@@ -11,6 +11,8 @@ from hydra import compose, initialize_config_dir
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
+from qs3.training.command import KEYS
+from qs3.training.command import _check_keys as check_keys_of
 from tests.commands import command
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
 from tests.training.toy import CONF, overrides
@@ -48,6 +50,17 @@ def test_every_experiment_composes(name):
         build(node)
     build(cfg.protocol.augment)
     build(cfg.protocol.optimizer)
+    check_keys_of(cfg)
+
+
+def test_keys_that_are_read_are_those_of_the_files():
+    """Also one of a user's own that other values are made of."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = compose("train", ["+short=3", "protocol.epochs=${short}", "debug=fast"])
+    check_keys_of(cfg)
+    assert set(cfg) - {"short"} == set(KEYS[""])
+    for key in ("protocol", "selection", "evaluation"):
+        assert set(cfg[key]) == set(KEYS[f"{key}."])
 
 
 def test_help_imports_nothing_heavy(tmp_path):

@@ -200,6 +200,8 @@ def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
         ("evaluation.rotations=-1", r"evaluation\.rotations .* >= 0, got -1"),
         ("num_classes=10", r"num_classes is 10.*set num_classes=3"),
         ("selection.teacher=best", r"selection\.teacher"),
+        ("+protocol.epoch=3", r"^protocol\.epoch is no setting.*did you mean protocol\.epochs\?"),
+        ("+warmup=3", r"^warmup is no setting, nothing reads it; there are data, model"),
         ("protocol.epochs=abc", r"protocol\.epochs .* got 'abc'"),
         ("protocol.batch_size=0", r"protocol\.batch_size .* got 0"),
         ("protocol.optimizer.lr=abc", r"protocol\.optimizer\.lr must be a number, got 'abc'"),

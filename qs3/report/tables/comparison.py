@@ -211,13 +211,15 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) -> C
     seeds = sorted(seed for seed in set.intersection(*map(set, finished)) if seed is not None)
     if len(seeds) < 2:
         if not all(finished):
-            return Compared(name, None, "not run")
+            return Compared(name, None, _not_run(pairs))
         return Compared(name, None, f"fewer than two seeds in common ({seeds})")
     for cell in cells:
         if cell.group and not cell.group.comparable:
             return Compared(name, None, f"{cell.row}, {cell.column}: not averaged, see the table")
     every = [runs[seed].metrics for runs in finished for seed in seeds]
     results = [result for result in every if result]
+    if all(_same(*pair) for pair in pairs):
+        return Compared(name, None, "the same runs: their settings do not differ")
     if not same_data(results, "target"):
         return Compared(name, None, data_differences(results, "target"))
     try:
@@ -238,6 +240,15 @@ def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) -> C
         clusters=_clusters(first.meshes, has_tiers),
         made_of=_made_of(cells),
     )
+
+
+def _not_run(pairs: Sequence[tuple[Cell, Cell]]) -> str:
+    """Whether it is the first ones that have no run, or which of those they are compared with."""
+    lacking = [[not (cell.group and cell.group.finished) for cell in pair] for pair in pairs]
+    if any(ours for ours, _ in lacking):
+        return "not run"
+    bases = [pair[1] for pair, (_, theirs) in zip(pairs, lacking, strict=True) if theirs]
+    return f"{'; '.join(f'{cell.row}, {cell.column}' for cell in bases)}: not run"
 
 
 def _pair_of(both: Sequence[tuple[Sequence[Predictions], Sequence[Predictions]]]) -> Pair:

@@ -156,10 +156,10 @@ def test_command(archive, logs, tmp_path, capsys):
     assert QS3([*words, f"out={tmp_path}/judged.json"]) == 0
     found = json.loads((tmp_path / "judged.json").read_text())
     assert found["families"][0]["figures"][0]["accuracy"]["mean"] == float(rows[0]["accuracy"])
-    for row, difference in zip(rows[3:], found["differences"], strict=True):
-        assert (row["tier"], row["less"]) == (difference["tier"], difference["base"])
-        assert float(row["accuracy_more"]) == difference["accuracy"]["mean"]
-        assert float(row["balanced_more_low"]) == difference["balanced"]["low"]
+    for row, less in zip(rows[3:], found["differences"], strict=True):
+        assert (row["tier"], row["less"]) == (less["tier"], less["base"])
+        assert float(row["accuracy_more"]) == less["accuracy"]["mean"]
+        assert float(row["balanced_more_low"]) == less["balanced"]["low"]
     with pytest.raises(ConfigError, match=r"\.csv or \.json"):
         QS3([*words, "out=x.txt"])
 

@@ -165,6 +165,20 @@ def test_compare_by_hand(tmp_path):
     assert (row["clouds"], row["clusters_are"]) == ("all", "meshes")
     with pytest.raises(ConfigError, match="no row 'x'"):
         against(table, "x")
+    why = {one.name: one.why for one in against(table, "GAST")}
+    assert why["PCM"] == "GAST, target test: not run"
+    assert why["DefRec"] == "not run"
+
+
+def test_runs_are_not_compared_with_themselves(tmp_path):
+    """Overrides may make two rows one."""
+    run = "target test: {run: experiment=dann_s2d}"
+    lines = ("title: t", "metrics: [accuracy]", "columns: [target test]", "rows:")
+    rows = (f"  - name: {name}\n    {run}" for name in "ab")
+    (tmp_path / "own.yaml").write_text("\n".join([*lines, *rows]))
+    table = fill(tmp_path, str(tmp_path / "own.yaml"), {("a", "target test"): 10})
+    (one,) = against(table, "a")
+    assert (one.name, one.why) == ("b", "the same runs: their settings do not differ")
 
 
 def test_what_a_table_does_not_average_is_not_compared(tmp_path):
