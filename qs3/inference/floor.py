@@ -14,7 +14,6 @@ No label takes part, nor the class that a net names.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -47,8 +46,6 @@ def check_camera_height(metres: float) -> float:
     said = f"camera_height={metres:g} is not a height above the floor in metres"
     if metres == 0:
         raise ConfigError(f"{said}: if it is not known, leave it out")
-    if not math.isfinite(metres):
-        raise ConfigError(said)
     if metres < 0:
         raise ConfigError(f"{said}: it is measured from the floor up; {-metres:g}?")
     per_metre, unit = (100, "centimetres") if metres < 10 * _HIGHEST_M else (1000, "millimetres")

@@ -40,8 +40,8 @@ def test_the_floor_is_where_many_end_and_none_goes_below():
         (-1.2, "measured from the floor up; 1.2?"),
         (1250, "if these are millimetres, give 1.25"),
         (125.0, "if these are centimetres, give 1.25"),
-        (np.nan, "camera_height=nan is not a height above the floor in metres"),
-        (np.inf, "camera_height=inf is not a height above the floor in metres"),
+        (np.nan, "camera_height must be a finite number, got nan"),
+        (np.inf, "camera_height must be a finite number, got inf"),
         ("1.2", "camera_height must be a number"),
     ],
 )

@@ -15,7 +15,7 @@ from tests.training.toy import MADE_OF, toy_config, write_toy
 from tests.training.watching import interrupt
 
 WORDS = (
-    *("method=twin", "method.target_weight=0", "selftraining=none", "protocol.epochs=2"),
+    *("method=twin", "method.target_weight=0.0", "selftraining=none", "protocol.epochs=2"),
     "model._target_=tests.training.nets.featured",
 )
 
