@@ -80,15 +80,16 @@ def notes(root: Path, version: str) -> str:
 
 
 def without_card(weights: Path) -> str:
-    """What a model of the package lacks: a card, or settings that name these very weights."""
+    """What a model of the package lacks: a card, or settings that name these very tensors."""
     card, config = weights.with_name("README.md"), weights.with_name("config.json")
     head = card.read_text("utf-8").split("---\n")[1:2] if card.is_file() else []
     about = yaml.safe_load(head[0]) if head else {}
     if missing := [key for key in CARD if not (about or {}).get(key)]:
         return f"{weights}: no model card beside it, {card.name}, with {', '.join(missing)}"
     said = json.loads(config.read_text("utf-8")) if config.is_file() else {}
-    if said.get("weights_sha256") != hashlib.sha256(weights.read_bytes()).hexdigest():
-        return f"{weights}: {config.name} beside it names other weights, or none"
+    key = "held_out_sha256" if weights.stem == "held_out" else "weights_sha256"
+    if said.get(key) != hashlib.sha256(weights.read_bytes()).hexdigest():
+        return f"{weights}: {config.name} beside it names other tensors, or none"
     return ""
 
 

@@ -121,7 +121,7 @@ def other_weights(root):
     (root / "model" / "README.md").write_text(CARD)
     (root / "model" / "config.json").write_text('{"weights_sha256": "0"}')
     commit(root)
-    return "names other weights"
+    return "names other tensors"
 
 
 @pytest.mark.parametrize("against", [dirty, tagged, silent, uncited, without_card, other_weights])
