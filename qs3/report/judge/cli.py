@@ -20,8 +20,11 @@ def _judge(out: Path | None, **given: Any) -> None:
     from qs3.utils.files import write_text
 
     runs: Sequence[str] = given.pop("runs")
+    keep: Path | None = given["keep"]
     verdict = judge(runs, given.pop("data"), **given)
     print(texts.text(verdict))
+    if keep:
+        print(f"kept in {keep}")
     if out:
         write = texts.csv_text if out.suffix.lower() == ".csv" else texts.json_text
         write_text(out, write(verdict))
@@ -44,10 +47,12 @@ JUDGE = Command(
         Option("floor", NUMBER, "its z in metres: minus the camera's height (default: each run's)"),
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
         Option("out", path("FILE"), ".csv or .json, with all digits"),
+        Option("keep", path("FOLDER"), "gets each net's answers, for runs= without its weights"),
     ),
     (
         "qs3 report judge runs=logs/qs3_s2d data=held_back.npz",
         "qs3 report judge runs=logs/source_only_s2d,logs/qs3_s2d data=held_back.npz out=judged.csv",
+        "qs3 report judge runs=logs/source_only_s2d data=held_back.npz keep=answers",
     ),
     about="""
 Accuracy, balanced accuracy over the classes that are there, and the majority rate, for all objects
@@ -58,6 +63,9 @@ paired object by object and seed by seed.
 Objects of one room are not independent: intervals take blocks of 30 frames in a row as clusters.
 Each cloud is thinned to the points that its run was trained with. The archive's arrays are in the
 reference of the data; domain=objects reads the same file.
+
+What keep= kept (a few kilobytes a run, laid out as below log_dir) can be given to runs= on another
+day or machine, beside runs trained there: of the same archive, part and settings alone.
 """,
     interrupted="nothing was saved",
 )  # fmt: skip

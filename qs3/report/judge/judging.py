@@ -1,13 +1,12 @@
 """Runs, objects, predictions, figures: what `qs3 report judge` finds out.
 
 The archive is read by `qs3.data.importers.object_archive`; its clouds go to each run as those of
-`qs3 predict` do, thinned to the points that the run was trained with. Nothing is trained, chosen or
-tuned by what comes out.
+`qs3 predict` do, thinned to the points that the run was trained with (`qs3.report.judge.answers`).
+Nothing is trained, chosen or tuned by what comes out.
 """
 
 from __future__ import annotations
 
-import glob
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,10 @@ from jaxtyping import Bool, Int
 
 from qs3.classes import known_as
 from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
-from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.inference.model_file import FILE, find_result
-from qs3.inference.predictor import Predictor, load
+from qs3.errors import ConfigError, DataError
+from qs3.report.judge.answers import Answers, answers_of, asked_of, find_runs, keep_answers
 from qs3.report.judge.intervals import Share, difference, share
 from qs3.runs.metrics import RunMetrics, read_metrics
-from qs3.utils.files import sha256_file
-from qs3.utils.progress import progress_bar
 from qs3.utils.version import VERSION, commit, in_words
 
 BLOCK = 30
@@ -137,11 +133,12 @@ def judge(
     inliers_only: bool = True,
     floor: float | None = None,
     device: str = "cpu",
+    keep: Path | None = None,
 ) -> Verdict:
     """Judge saved runs on an archive of objects.
 
     Args:
-        runs: folders of runs, folders of such folders, patterns, or result files.
+        runs: folders of runs, folders of such folders, patterns, result files, or what `keep` kept.
         data: the .npz.
         classes: only objects of these; none: of all that every run knows.
         part: of its `dev`; none: "judge", where it has one, else all.
@@ -149,31 +146,35 @@ def judge(
         floor: z of the floor in the archive, minus its camera's height, for nets that know heights;
             None: as in the target of each.
         device: of the nets.
+        keep: a folder that gets what each net called each object, for `runs` of another day.
 
     Raises:
         MissingDataError: a run or the archive is not there.
         DataError: one is damaged.
         ConfigError: nothing is left to judge on, or runs that cannot be judged so.
     """
-    files = find_runs(runs)
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
-    predictors = _loaded(files, floor, device)  # after it: no floor mends a wrong archive
-    common = _common([one.classes for one in predictors.values()], classes)
+    files = find_runs(runs, part)
+    asked = asked_of(archive, part, inliers_only, floor)
+    answers = answers_of(files, archive, chosen, asked, device)
+    if keep is not None:
+        keep_answers(answers, keep)
+    common = _common([one.classes for one in answers.values()], classes)
     names = [known_as(str(name), common) for name in archive.cls]
     kept = [i for i in chosen if names[i] is not None]
     if not kept:
         raise ConfigError(f"{data}: no object of {', '.join(common)} in what was asked for")
     truth = np.array([common.index(str(names[i])) for i in kept])
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
-    guesses = _guesses(predictors, archive, kept, inliers_only, floor, common)
+    guesses = {file: _called(one, common, kept, file) for file, one in answers.items()}
     every = np.ones(len(kept), dtype=bool)
     subsets = {"all": every, **{tier: tiers == tier for tier in TIERS if (tiers == tier).any()}}
     families, differences = [], []
     base: tuple[Family, np.ndarray] | None = None
-    for known in _families(list(predictors)):
+    for known in _families(files):
         picked = np.stack([guesses[file] for file in known.runs])
-        first = predictors[known.runs[0]]
+        first = answers[known.runs[0]]
         figures = tuple(
             _figures(tier, picked[:, of], truth[of], blocks[of], common)
             for tier, of in subsets.items()
@@ -183,7 +184,7 @@ def judge(
             known.runs,
             known.seeds,
             first.points,
-            first.result.target,
+            first.target,
             known.data,
             known.trained_by,
             figures,
@@ -196,7 +197,7 @@ def judge(
     left_out = len(chosen) - len(kept)
     return Verdict(
         data,
-        sha256_file(data),
+        asked.sha256,
         part,
         common,
         left_out,
@@ -241,64 +242,13 @@ def _differences(
     ]
 
 
-def _loaded(files: Sequence[Path], floor: float | None, device: str) -> dict[Path, Predictor]:
-    """The classifiers, all for clouds with z up; and a camera's, if they know heights."""
-    found = {file: load(file, device=device) for file in files}
-    for file, one in found.items():
-        if one.result.gravity != "z":
-            raise ConfigError(
-                f"{file} was trained on clouds in the frame of their camera; the archive's have z "
-                "up, so it cannot be judged on them"
-            )
-        if one.needs_floor and one.camera_height is None and floor is None:
-            raise ConfigError(
-                f"{file} knows heights above the floor, and its target's clouds stand at "
-                f"{one.result.floor_m:g}: the archive's have the camera at the origin; give "
-                "floor=-METRES, minus the camera's height"
-            )
-    return found
-
-
-def _guesses(
-    predictors: Mapping[Path, Predictor],
-    archive: Archive,
-    kept: Sequence[int],
-    inliers_only: bool,
-    floor: float | None,
-    common: Sequence[str],
-) -> dict[Path, np.ndarray]:
-    """What each run calls each object: a position in `common`, or -1 for another class."""
-    clouds = [archive.cloud(i, inliers_only) for i in kept]
-    said = [f"{archive.path.name}[{i}]" for i in kept]
-    found = {}
-    with progress_bar("judging runs", total=len(predictors)) as advance:
-        for file, one in predictors.items():
-            place = np.array([common.index(c) if c in common else -1 for c in one.classes])
-            found[file] = place[one(clouds, names=said, floor=floor).argmax(axis=1)]
-            advance()
-    return found
-
-
-def find_runs(runs: Sequence[str]) -> list[Path]:
-    """The result files that are meant, each once, in order.
-
-    Raises:
-        MissingDataError: one is not there, or a folder holds none.
-    """
-    found: dict[Path, None] = {}
-    for words in runs:
-        places = [Path(words).expanduser()]
-        if not places[0].exists() and glob.has_magic(words):
-            places = sorted(map(Path, glob.glob(str(places[0]))))
-            if not places:
-                raise MissingDataError(f"runs={words} matches nothing")
-        for place in places:
-            below = sorted(place.rglob(FILE)) if place.is_dir() else []
-            for file in below or [find_result(place)]:
-                found.setdefault(file)
-    if not found:
-        raise ConfigError("runs= names no run; give folders of finished runs")
-    return list(found)
+def _called(answers: Answers, common: Sequence[str], kept: Sequence[int], file: Path) -> np.ndarray:
+    """A position in `common` for each object, or -1 for another class."""
+    of = dict(zip(answers.objects, answers.called, strict=True))
+    if missing := [i for i in kept if i not in of]:
+        raise DataError(f"{file} has no answer to object {missing[0]} of the archive")
+    place = [common.index(name) if name in common else -1 for name in answers.classes]
+    return np.array([place[of[i]] for i in kept])
 
 
 class _Known(NamedTuple):

@@ -16,8 +16,9 @@ from qs3.inference.model_file import Result, write_result
 from qs3.inference.predictor import load
 from qs3.models.pointnet import pointnet
 from qs3.report.clustered import weights
+from qs3.report.judge.answers import find_runs
 from qs3.report.judge.intervals import difference, share
-from qs3.report.judge.judging import find_runs, judge
+from qs3.report.judge.judging import judge
 from qs3.report.judge.text import text
 from qs3.report.tables.paired import interval
 from qs3.utils.version import VERSION, commit, in_words

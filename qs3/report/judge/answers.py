@@ -1,0 +1,253 @@
+"""What nets call the objects of an archive: asked now, or kept of an earlier judgement.
+
+A net's weights are large and stay on the machine that trained it; what it called each object is a
+few kilobytes. `qs3 report judge keep=FOLDER` writes those, and `runs=` takes them up again, beside
+runs that were trained elsewhere.
+"""
+
+from __future__ import annotations
+
+import glob
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from qs3.classes import known_as
+from qs3.data.importers.object_archive import Archive
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.inference.model_file import FILE, find_result
+from qs3.inference.predictor import Predictor, load
+from qs3.runs.metrics import METRICS, read_metrics, write_metrics
+from qs3.utils.files import sha256_file, write_text
+from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.progress import progress_bar
+
+_Count = Annotated[int, Field(ge=0)]
+_Word = Annotated[str, Field(max_length=64)]
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(strict=True, extra="forbid"))
+class Asked:
+    """Of what a net was asked.
+
+    Attributes:
+        sha256: of the archive.
+        part: of it; "" for all.
+        inliers_only: whether stray points were left out.
+        floor: z of the floor, for nets that know heights; None: as in the run's target.
+    """
+
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    part: _Word
+    inliers_only: bool
+    floor: Annotated[float, Field(allow_inf_nan=False)] | None
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(strict=True, extra="forbid"))
+class Answers:
+    """What one net called the objects whose classes it knows.
+
+    Attributes:
+        asked: of what.
+        classes: that the net knows.
+        points: of a cloud as it sees them.
+        target: what it was adapted to.
+        objects: positions in the archive, ascending.
+        called: a position in `classes` for each.
+    """
+
+    asked: Asked
+    classes: Annotated[tuple[_Word, ...], Field(min_length=1, max_length=1000)]
+    points: _Count
+    target: Annotated[str, Field(max_length=1000)]
+    objects: tuple[_Count, ...]
+    called: tuple[_Count, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse what does not hang together."""
+        if len(self.objects) != len(self.called):
+            raise ValueError("objects and called should be of one length")
+        if list(self.objects) != sorted(set(self.objects)):
+            raise ValueError("objects should ascend")
+        if any(k >= len(self.classes) for k in self.called):
+            raise ValueError("called should be positions in classes")
+
+
+def asked_of(archive: Archive, part: str, inliers_only: bool, floor: float | None) -> Asked:
+    """What is asked now."""
+    floor = None if floor is None else float(floor)
+    return Asked(
+        sha256=sha256_file(archive.path), part=part, inliers_only=inliers_only, floor=floor
+    )
+
+
+def kept_name(part: str) -> str:
+    """The file's name, beside the run's `metrics.json`: such as "judged-adapt.json"."""
+    return f"judged-{part or 'all'}.json"
+
+
+def answers_of(
+    files: Sequence[Path], archive: Archive, chosen: Sequence[int], asked: Asked, device: str
+) -> dict[Path, Answers]:
+    """Of each run: its net's, or those that were kept.
+
+    Args:
+        files: from `find_runs`.
+        archive: of objects.
+        chosen: positions of the part that is asked.
+        asked: of what; kept answers must be to the same.
+        device: of the nets.
+
+    Raises:
+        DataError: a file is damaged.
+        ConfigError: a net cannot be judged so, or was asked something else.
+    """
+    kept = {file: read_answers(file, asked) for file in files if _is_kept(file)}
+    nets = _loaded([file for file in files if file not in kept], asked.floor, device)
+    found: dict[Path, Answers] = {}
+    if nets:
+        clouds = {i: archive.cloud(i, asked.inliers_only) for i in chosen}
+        with progress_bar("judging runs", total=len(nets)) as advance:
+            for file, net in nets.items():
+                found[file] = _ask(net, clouds, archive, asked)
+                advance()
+    return {file: kept[file] if file in kept else found[file] for file in files}
+
+
+def _ask(
+    net: Predictor, clouds: Mapping[int, np.ndarray], archive: Archive, asked: Asked
+) -> Answers:
+    objects = [i for i in clouds if known_as(str(archive.cls[i]), net.classes) is not None]
+    called = np.zeros(0, dtype=int)
+    if objects:
+        names = [f"{archive.path.name}[{i}]" for i in objects]
+        called = net([clouds[i] for i in objects], names=names, floor=asked.floor).argmax(axis=1)
+    return Answers(
+        asked=asked,
+        classes=tuple(net.classes),
+        points=net.points,
+        target=net.result.target,
+        objects=tuple(map(int, objects)),
+        called=tuple(map(int, called)),
+    )
+
+
+def _loaded(files: Sequence[Path], floor: float | None, device: str) -> dict[Path, Predictor]:
+    """The classifiers, all for clouds with z up; and a camera's, if they know heights."""
+    found = {file: load(file, device=device) for file in files}
+    for file, one in found.items():
+        if one.result.gravity != "z":
+            raise ConfigError(
+                f"{file} was trained on clouds in the frame of their camera; the archive's have z "
+                "up, so it cannot be judged on them"
+            )
+        if one.needs_floor and one.camera_height is None and floor is None:
+            raise ConfigError(
+                f"{file} knows heights above the floor, and its target's clouds stand at "
+                f"{one.result.floor_m:g}: the archive's have the camera at the origin; give "
+                "floor=-METRES, minus the camera's height"
+            )
+    return found
+
+
+def keep_answers(found: Mapping[Path, Answers], folder: Path) -> list[Path]:
+    """Write them below a folder; returns the files.
+
+    Layout: `<folder>/<experiment>/seed<seed>-<hash>/` with the run's `metrics.json`, as below
+    `paths.log_dir` and as `qs3 report keep` has it.
+
+    Raises:
+        ConfigError: a run has no `metrics.json`, so nothing says what it is.
+    """
+    written = []
+    for file, answers in found.items():
+        metrics = read_metrics(file.parent)
+        if metrics is None:
+            raise ConfigError(
+                f"keep= needs the {METRICS} of a run, which says what it is; none is beside {file}"
+            )
+        into = folder / metrics.experiment / f"seed{metrics.seed}-{metrics.hash}"
+        if into.resolve() == file.parent.resolve():
+            continue  # taken up from there
+        into.mkdir(parents=True, exist_ok=True)
+        write_metrics(into, metrics)
+        path = into / kept_name(answers.asked.part)
+        write_text(path, _text(answers))
+        written.append(path)
+    return written
+
+
+def _text(answers: Answers) -> str:
+    """JSON, a line a field."""
+    values: dict[str, Any] = asdict(answers)
+    lines = (f" {json.dumps(key)}: {json.dumps(value)}" for key, value in values.items())
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def read_answers(path: Path, asked: Asked) -> Answers:
+    """Kept ones.
+
+    Raises:
+        DataError: the file cannot be read, or is damaged.
+        ConfigError: they are to something else than `asked`.
+    """
+    try:
+        found = TypeAdapter(Answers).validate_json(read_whole(path, JSON_PEAK))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the file"
+        raise DataError(
+            f"{path} is damaged, or not of `qs3 report judge keep=`: {place}: {first['msg']}"
+        ) from error
+    was, now = asdict(found.asked), asdict(asked)
+    if other := [f"{key}={was[key]}, now {now[key]}" for key in now if was[key] != now[key]]:
+        raise ConfigError(f"{path} has answers to something else: {'; '.join(other)}")
+    return found
+
+
+def find_runs(runs: Sequence[str], part: str = "") -> list[Path]:
+    """The files that are meant, each once, in order: results of runs, or kept answers.
+
+    Args:
+        runs: folders of runs, folders of such folders, patterns, or files.
+        part: of the archive that is asked, which kept answers have in their name.
+
+    Raises:
+        MissingDataError: one is not there, or a folder holds none.
+    """
+    found: dict[Path, None] = {}
+    for words in runs:
+        places = [Path(words).expanduser()]
+        if not places[0].exists() and glob.has_magic(words):
+            places = sorted(map(Path, glob.glob(str(places[0]))))
+            if not places:
+                raise MissingDataError(f"runs={words} matches nothing")
+        for place in places:
+            for file in _below(place, part) if place.is_dir() else [place]:
+                found.setdefault(file if _is_kept(file) else find_result(file))
+    if not found:
+        raise ConfigError("runs= names no run; give folders of finished runs")
+    return list(found)
+
+
+def _below(folder: Path, part: str) -> list[Path]:
+    """Results, and kept answers where there is no result beside them; else the folder itself."""
+    results = list(folder.rglob(FILE))
+    there = {file.parent for file in results}
+    kept = [file for file in folder.rglob(kept_name(part)) if file.parent not in there]
+    found = sorted(results + kept)
+    if not found and (other := next(folder.rglob("judged-*.json"), None)):
+        raise MissingDataError(f"{folder} has no {FILE}, and {other} is of another part")
+    return found or [folder]
+
+
+def _is_kept(file: Path) -> bool:
+    return file.name.startswith("judged-") and file.suffix == ".json"

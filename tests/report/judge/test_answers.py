@@ -1,0 +1,124 @@
+"""Answers that were kept: the same verdict without weights, and nothing else is taken for them."""
+
+import dataclasses
+import json
+import shutil
+
+import pytest
+
+from qs3.__main__ import QS3
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.report.judge.answers import find_runs
+from qs3.report.judge.judging import judge
+from tests.fixtures.frame_files import write_archive
+from tests.report.judge.test_judge import add_net
+from tests.report.made_runs import write_run
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("answers") / "held_back.npz"
+    write_archive(path, {"train": 1, "test": 3}, points=150)
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    root = tmp_path_factory.mktemp("logs")
+    for seed in (0, 1):
+        add_net(write_run(root, seed=seed), seed)
+    add_net(write_run(root, experiment="other", hash="ffff0000"), 5)
+    return root
+
+
+@pytest.fixture
+def kept(archive, logs, tmp_path):
+    judge([str(logs)], archive, keep=tmp_path / "kept")
+    return tmp_path / "kept"
+
+
+def comparable(verdict):
+    """All of it but where the runs lie."""
+    families = tuple(dataclasses.replace(one, runs=()) for one in verdict.families)
+    return dataclasses.replace(verdict, families=families)
+
+
+def test_the_same_verdict_without_weights(archive, logs, kept):
+    names = [str(path.relative_to(kept)) for path in sorted(kept.rglob("*.json"))]
+    assert names[:2] == ["exp/seed0-0123abcd/judged-judge.json", "exp/seed0-0123abcd/metrics.json"]
+    assert len(names) == 6
+    asked_now = comparable(judge([str(logs)], archive))
+    assert comparable(judge([str(kept)], archive)) == asked_now
+    mixed = judge([str(kept / "exp"), str(logs / "other")], archive)
+    assert comparable(mixed) == asked_now
+    few = judge([str(kept)], archive, classes=["chair", "sofa"])
+    assert comparable(few) == comparable(judge([str(logs)], archive, classes=["chair", "sofa"]))
+
+
+def test_a_net_is_asked_where_both_are_there(archive, logs, tmp_path):
+    both = tmp_path / "both"
+    shutil.copytree(logs, both)
+    judge([str(both)], archive, keep=both)  # into the runs themselves: nothing is written there
+    assert not list(both.rglob("judged-*"))
+    judge([str(logs)], archive, keep=tmp_path / "kept")
+    shutil.copytree(tmp_path / "kept", both, dirs_exist_ok=True)
+    assert {file.name for file in find_runs([str(both)], "judge")} == {"result.pt"}
+
+
+def test_a_command_keeps_and_takes_up(archive, logs, tmp_path, capsys):
+    words = ["report", "judge", f"data={archive}", "part=adapt"]
+    assert QS3([*words, f"runs={logs}/exp", f"keep={tmp_path}/kept"]) == 0
+    before = capsys.readouterr().out
+    assert QS3([*words, f"runs={tmp_path}/kept"]) == 0
+    assert capsys.readouterr().out == before.replace(f"kept in {tmp_path}/kept\n", "")
+    with pytest.raises(MissingDataError, match=r"no result\.pt.*judged-adapt\.json is of another"):
+        QS3(["report", "judge", f"data={archive}", f"runs={tmp_path}/kept/exp/seed0-0123abcd"])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"inliers_only": False}, "inliers_only=True, now False"),
+        ({"floor": -1.0}, "floor=None, now -1.0"),
+    ],
+)
+def test_other_questions(archive, kept, change, said):
+    with pytest.raises(ConfigError, match=rf"judged-judge\.json has answers .* {said}"):
+        judge([str(kept)], archive, **change)
+
+
+def test_another_archive_and_part(archive, kept, tmp_path):
+    write_archive(tmp_path / "other.npz", {"train": 1, "test": 4}, points=150)
+    with pytest.raises(ConfigError, match=r"sha256=\w+, now \w+"):
+        judge([str(kept)], tmp_path / "other.npz")
+    file = kept / "other" / "seed0-ffff0000" / "judged-judge.json"
+    with pytest.raises(ConfigError, match="part=judge, now adapt"):
+        judge([str(file)], archive, part="adapt")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"called": [0]}, "one length"),
+        ({"called": [99] * 30}, "positions in classes"),
+        ({"objects": [3] * 30}, "should ascend"),
+        ({"classes": []}, "classes"),
+        ({"extra": 1}, "extra"),
+        ({"points": -1}, "points"),
+        ({"objects": list(range(1000, 1030))}, "no answer to object"),
+    ],
+)
+def test_damaged(archive, kept, change, said):
+    (file,) = (kept / "other").rglob("judged-judge.json")
+    values = json.loads(file.read_text())
+    assert len(values["objects"]) == 30
+    file.write_text(json.dumps({**values, **change}))
+    with pytest.raises(DataError, match=rf"judged-judge\.json.*{said}"):
+        judge([str(file)], archive)
+
+
+def test_a_run_that_nothing_describes(archive, tmp_path):
+    add_net(tmp_path, 3)
+    with pytest.raises(ConfigError, match=r"needs the metrics\.json of a run"):
+        judge([str(tmp_path)], archive, keep=tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
