@@ -191,6 +191,25 @@ def _read_judgement(path: Path) -> None:
     card(_result(), None, judgement=judgement)
 
 
+def _answers(folder: Path) -> list[bytes]:
+    from qs3.report.judge.answers import Answers, Asked, keep_answers, kept_name
+    from tests.report.made_runs import write_run
+
+    asked = Asked(sha256="0" * 64, part="judge", inliers_only=True, floor=-1.5)
+    said = Answers(
+        asked=asked, classes=TWO, points=64, target="kinectsim10", objects=(3, 5), called=(0, 1)
+    )
+    run = write_run(folder / "logs")
+    keep_answers({run / "result.pt": said}, folder / "kept")
+    return bytes_of(*(folder / "kept").rglob(kept_name("judge")))
+
+
+def _read_answers(path: Path) -> None:
+    from qs3.report.judge.answers import Asked, read_answers
+
+    read_answers(path, Asked(sha256="0" * 64, part="judge", inliers_only=True, floor=-1.5))
+
+
 def _calibrations(folder: Path) -> list[bytes]:
     from qs3.evaluation.trust_file import Calibration, write_calibration
 
@@ -258,6 +277,8 @@ READERS: tuple[Reader, ...] = (
            ("inference/model_folder.py", "inference/tensor_file.py")),
     Reader("judgement .json", _judgements, _read_judgement, "a.json", None,
            ("inference/judgement.py",)),
+    Reader("kept answers .json", _answers, _read_answers, "judged-judge.json", None,
+           ("report/judge/answers.py",)),
     Reader("search .json", _searches, _read_search, "a.json", None, ("tuning/state.py",)),
     Reader("calibration .json", _calibrations, _read_calibration, "a.json", None,
            ("evaluation/trust_file.py",)),
