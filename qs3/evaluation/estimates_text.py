@@ -35,7 +35,7 @@ MEANINGS: Mapping[str, str] = {
 def in_words(quality: AccuracyEstimates) -> str:
     """The estimates in short, for the end of a headline; "" without any."""
     if quality.trust is not None:
-        return trust_in_words(quality.trust)
+        return trust_in_words(quality.trust) + _of_whom(quality)
     if quality.calibrated is None:
         return ""
     before = f" (before self-training {_range(quality.teacher)})" if quality.teacher else ""
@@ -59,6 +59,11 @@ def trust_in_words(trust: Trust) -> str:
             f"labelled clouds{f', less{why}' if evidence else ''})"
         )
     return f"{DO_NOT_TRUST}: about {trust.expected:.0%} expected to be right{why}"
+
+
+def _of_whom(quality: AccuracyEstimates) -> str:
+    """A student was taught to be sure, so it is its teacher that was asked."""
+    return " (of the net before self-training)" if quality.teacher else ""
 
 
 def reasons(trust: Trust, most: int = 3) -> list[str]:
@@ -88,7 +93,7 @@ def table(quality: AccuracyEstimates) -> list[tuple[str, str, str]]:
     """Name, value and meaning of each figure that there is, for people."""
     rows = []
     if quality.trust is not None:
-        words = trust_in_words(quality.trust)
+        words = trust_in_words(quality.trust) + _of_whom(quality)
         rows.append(("expected accuracy", f"{quality.trust.expected:.1%}", f"{words}."))
     for key, meaning in MEANINGS.items():
         value = getattr(quality, key)

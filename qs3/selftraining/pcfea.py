@@ -35,7 +35,7 @@ class Pcfea(Method):
 
     z: logits of a source cloud of class y; w_j: rows of the head's last, linear layer, f its input
     [B, D]; λ = strength p, p the progress. The first term bounds from above the mean cross-entropy
-    of features f + N(a / λ (m_y - s_y), S_y) of weight λ: the source's in the target's style. A:
+    of features f + a (m_y - s_y) + N(0, λ S_y): the source's in the target's style. A:
     cross-entropy of cos(f, m_c) / 2 as logits of class c, A_s against the source's labels and A_t
     against the target's present predictions.
 

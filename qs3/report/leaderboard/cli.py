@@ -55,6 +55,7 @@ def _leaderboard(
         return build_table(table, log_dir, extra, kept=kept, rows=[row], columns=columns)
 
     before, name = built(), row["name"]
+    _check_rules(before, name)
     _check_class(before, name)
     todo = missing(before, seeds, [name], columns)
     print(f"{name}: {counted(len(todo), 'run')} to do", flush=True)
@@ -117,6 +118,21 @@ def beside(table: Table, name: str) -> Table:
     )
 
 
+def _check_rules(table: Table, name: str) -> None:
+    """Whether the other rows are trained by the rules that the row `name` is trained by.
+
+    Raises:
+        ConfigError: one is of another experiment, with other steps or points.
+    """
+    for row, cells in table.rows.items():
+        if row != name and any(c and c.runnable and ALONE not in c.overrides for c in cells):
+            raise ConfigError(
+                f"table={table.name}: its row {row!r} is not of {ALONE}, so it has other steps or "
+                "points than yours would have. By that table's own rules yours is trained by: "
+                "python train.py experiment=NAME method=own method.file=FILE"
+            )
+
+
 def _check_class(table: Table, name: str) -> None:
     """Build the method as each run will, before any has begun.
 
@@ -148,7 +164,10 @@ LEADERBOARD = Command(
         Option("name", text("NAME"), "of its row (default: the file's)"),
         Option("selftraining", text("NAME"), "of conf/selftraining, after the warm-up", "none"),
         Option(
-            "table", text("NAME"), "whose rows and columns: of conf/table, or a file", "leaderboard"
+            "table",
+            text("NAME"),
+            f"whose rows and columns, all of {ALONE}: of conf/table, or a file",
+            "leaderboard",
         ),
         Option("seeds", several(whole(0)), "default 0,1,2", ()),
         Option("columns", several(text("WORD")), "only columns with it in their name", ()),

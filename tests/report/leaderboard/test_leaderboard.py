@@ -92,7 +92,7 @@ def test_published_figures_are_those_of_the_benchmarks():
     seen = 0
     for column, name in zip(PUBLISHED, ("pointda10", "graspnetpc10"), strict=True):
         spec = yaml.safe_load((CONF / "table" / f"{name}.yaml").read_text("utf-8"))
-        there = {row["name"].removesuffix("-V").removesuffix("-B"): row for row in spec["rows"]}
+        there = {row["name"]: row for row in spec["rows"]}
         for row in SPEC["rows"]:
             if column not in row:
                 continue
@@ -210,6 +210,9 @@ def test_what_is_refused(toy, tmp_path, capsys):
     assert "two rows are called 'PCFEA'; give one another name" in said("name=PCFEA")
     assert "selftraining=x is not there; there are cbst, " in said("selftraining=x")
     assert "Turned: " in said("method.wieght=1")
+    other = [word for word in words(toy) if not word.startswith("table=")]
+    assert main([*other, "table=pointda10"]) == 1
+    assert "its row 'source only' is not of experiment=leaderboard" in capsys.readouterr().err
     (tmp_path / "two.py").write_text(METHOD.format(name="A") + METHOD.format(name="B"))
     for file, message in (("no.py", "no.py cannot be read"), ("two.py", "expected one class")):
         given = [word for word in words(toy) if not word.startswith("method=")]
