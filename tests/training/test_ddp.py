@@ -171,7 +171,10 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
     ids=lambda value: "" if isinstance(value, int) else " ".join(value[:2]) or "qbst",
 )
 def test_a_killed_run_goes_on(tmp_path: Path, settings: tuple[str, ...], epoch: int) -> None:
-    """Both processes killed; continued, they end as if they had not been, to the bit."""
+    """Both processes killed; continued, they end as if they had not been, to the bit.
+
+    And at the end of every epoch both hold the same: teachers, pools and heads of the method, too.
+    """
     write_domain(tmp_path / "data", "specklenet10", noise=0.05)
     write_domain(tmp_path / "data", "kinectsim10", noise=0.15, train=25)
 
@@ -184,8 +187,18 @@ def test_a_killed_run_goes_on(tmp_path: Path, settings: tuple[str, ...], epoch: 
         (found,) = (tmp_path / name / "quickstart").iterdir()
         return found
 
-    whole = run("whole")
+    watched = tmp_path / "watched"
+    whole = run(
+        "whole",
+        f"callbacks.progress={{_target_: tests.training.watching.WatchWeights, folder: {watched}}}",
+    )
     assert whole.returncode == 0, whole.stderr
+    epochs = len(list(watched.iterdir())) // 2
+    assert epochs > WARMUP
+    for seen in range(epochs):
+        one, two = (process["weights"] for process in seen_by(watched, seen))
+        different = [name for name in one if not torch.equal(one[name], two[name])]
+        assert different == [], (seen, different)
     kill = f"{{_target_: tests.training.watching.KillAt, epoch: {epoch}, batch: 0}}"
     killed = run("killed", f"callbacks.progress={kill}")
     assert killed.returncode == -signal.SIGKILL, killed.stderr

@@ -58,6 +58,19 @@ class Watch(Callback):
         )
 
 
+class WatchWeights(Callback):
+    """Writes all that a process holds at an epoch's end, the method's too, as `Watch` does."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def on_train_epoch_end(self, trainer: Any, pl_module: Any) -> None:
+        """Before the rounds' callback selects."""
+        file = self.folder / f"{trainer.current_epoch}-{trainer.global_rank}.pt"
+        save({"weights": copy_weights(pl_module)}, file)
+
+
 class Keep(Callback):
     """Copies each epoch's checkpoint to `<folder>/<epoch>.ckpt`, before the next one begins.
 
