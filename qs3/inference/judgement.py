@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field
 
-from qs3.errors import ConfigError, DataError
-from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.errors import ConfigError
+from qs3.utils.json_file import read_json
 
 _Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -108,16 +108,7 @@ def read_judgement(path: Path, run: Path) -> Judgement:
     """
     if path.suffix.lower() != ".json":
         raise ConfigError(f"judged={path}: give the .json of `qs3 report judge runs=... out=...`")
-    try:
-        found = TypeAdapter(_File).validate_json(read_whole(path, JSON_PEAK))
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
-        raise DataError(
-            f"{path} is damaged, or not of `qs3 report judge`: {place}: {first['msg']}"
-        ) from error
+    found = read_json(path, _File, "qs3 report judge")
     for family in found.families:
         if run.resolve() in [Path(name).resolve() for name in family.runs]:
             if len(family.runs) > 1:

@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qs3.classes import known_as
 from qs3.data.importers.object_archive import Archive
-from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.errors import ConfigError, MissingDataError
 from qs3.inference.model_file import FILE, find_result
 from qs3.inference.predictor import Predictor, load
 from qs3.runs.metrics import METRICS, read_metrics, write_metrics
 from qs3.utils.files import sha256_file, write_text
-from qs3.utils.memory import JSON_PEAK, read_whole
+from qs3.utils.json_file import read_json
 from qs3.utils.progress import progress_bar
 
 _Count = Annotated[int, Field(ge=0)]
@@ -156,31 +156,34 @@ def _loaded(files: Sequence[Path], floor: float | None, device: str) -> dict[Pat
     return found
 
 
-def keep_answers(found: Mapping[Path, Answers], folder: Path) -> list[Path]:
-    """Write them below a folder; returns the files.
-
-    Layout: `<folder>/<experiment>/seed<seed>-<hash>/` with the run's `metrics.json`, as below
-    `paths.log_dir` and as `qs3 report keep` has it.
+def check_keepable(files: Sequence[Path]) -> None:
+    """Before nets are asked: whether each run says what it is.
 
     Raises:
-        ConfigError: a run has no `metrics.json`, so nothing says what it is.
+        ConfigError: a run has no `metrics.json`.
     """
-    written = []
-    for file, answers in found.items():
-        metrics = read_metrics(file.parent)
-        if metrics is None:
+    for file in files:
+        if read_metrics(file.parent) is None:
             raise ConfigError(
                 f"keep= needs the {METRICS} of a run, which says what it is; none is beside {file}"
             )
+
+
+def keep_answers(found: Mapping[Path, Answers], folder: Path) -> None:
+    """Write them below a folder, of runs that `check_keepable` let pass.
+
+    Layout: `<folder>/<experiment>/seed<seed>-<hash>/` with the run's `metrics.json`, as below
+    `paths.log_dir` and as `qs3 report keep` has it.
+    """
+    for file, answers in found.items():
+        metrics = read_metrics(file.parent)
+        assert metrics is not None
         into = folder / metrics.experiment / f"seed{metrics.seed}-{metrics.hash}"
         if into.resolve() == file.parent.resolve():
             continue  # taken up from there
         into.mkdir(parents=True, exist_ok=True)
         write_metrics(into, metrics)
-        path = into / kept_name(answers.asked.part)
-        write_text(path, _text(answers))
-        written.append(path)
-    return written
+        write_text(into / kept_name(answers.asked.part), _text(answers))
 
 
 def _text(answers: Answers) -> str:
@@ -197,16 +200,7 @@ def read_answers(path: Path, asked: Asked) -> Answers:
         DataError: the file cannot be read, or is damaged.
         ConfigError: they are to something else than `asked`.
     """
-    try:
-        found = TypeAdapter(Answers).validate_json(read_whole(path, JSON_PEAK))
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "the file"
-        raise DataError(
-            f"{path} is damaged, or not of `qs3 report judge keep=`: {place}: {first['msg']}"
-        ) from error
+    found = read_json(path, Answers, "qs3 report judge keep=")
     was, now = asdict(found.asked), asdict(asked)
     if other := [f"{key}={was[key]}, now {now[key]}" for key in now if was[key] != now[key]]:
         raise ConfigError(f"{path} has answers to something else: {'; '.join(other)}")

@@ -18,7 +18,14 @@ from jaxtyping import Bool, Int
 from qs3.classes import known_as
 from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError
-from qs3.report.judge.answers import Answers, answers_of, asked_of, find_runs, keep_answers
+from qs3.report.judge.answers import (
+    Answers,
+    answers_of,
+    asked_of,
+    check_keepable,
+    find_runs,
+    keep_answers,
+)
 from qs3.report.judge.intervals import Share, difference, share
 from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.utils.version import VERSION, commit, in_words
@@ -156,6 +163,8 @@ def judge(
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
     files = find_runs(runs, part)
+    if keep is not None:
+        check_keepable(files)
     asked = asked_of(archive, part, inliers_only, floor)
     answers = answers_of(files, archive, chosen, asked, device)
     if keep is not None:
