@@ -68,8 +68,7 @@ def judge(result: SensorResult) -> list[Verdict]:
     if "d4" in name:
         out += _grazing(result)
     out += _own_law(result) + _fill(result) + _edge(result)
-    if name.startswith(_KINECTS):
-        out += _rooms(result)
+    out += _rooms(result)
     return [Verdict(name, *band) for band in out]
 
 
@@ -286,13 +285,23 @@ def _edge(result: SensorResult) -> list[_Band]:
 
 
 def _rooms(result: SensorResult) -> list[_Band]:
-    """Rooms with mixed materials: pixels lost within a factor of two of a real Kinect's."""
+    """Rooms with mixed materials: what is lost and what is mixed, within a factor of two of real.
+
+    What is lost is a real Kinect's, and asked of Kinects; D400s have other shadows and ranges.
+    """
     found = [m for m in result.rooms if m["condition"]["materials"] == "mixed"]
     if not found:  # a quick bench leaves them out
         return []
-    empty, real = found[0]["empty"], laws.REAL_ROOM_EMPTY
-    band = f"pixels of a room without depth within a factor of 2 of {real:.0%}"
-    return [(band, f"{empty:.1%}", real / 2, 2 * real, empty)]
+    out: list[_Band] = []
+    if result.subject.name.startswith(_KINECTS):
+        empty, real = found[0]["empty"], laws.REAL_ROOM_EMPTY
+        band = f"pixels of a room without depth within a factor of 2 of {real:.0%}"
+        out.append((band, f"{empty:.1%}", real / 2, 2 * real, empty))
+    mixed, real = found[0]["mixed"], laws.REAL_MIXED
+    band = f"steps of a room with a mixed pixel within a factor of 2 of {real:.0%}"
+    text = "no steps" if mixed is None else f"{mixed:.1%} of {found[0]['steps']}"
+    out.append((band, text, real / 2, 2 * real, mixed))
+    return out
 
 
 def drop(result: SensorResult, across: bool, below: float = 0.95) -> float | None:

@@ -113,7 +113,7 @@ class FringeProjection(TriangulatingSensor):
         seen = images[0]
         hit = np.isfinite(seen.depth_m)
         radiance = np.stack([image.radiance for image in images])
-        gain = self.infrared.gain(radiance.max(axis=0), hit)
+        gain = self.infrared.gain(radiance.max(axis=0), self.infrared.metered(seen, usual="image"))
         grey = np.stack([self.infrared.expose(image, gain, shot.rng) for image in radiance])
         exposures = grey.reshape(len(self.code.periods), self.code.steps, *grey.shape[1:])
 

@@ -17,6 +17,7 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Matcher, ReferenceMatcher
+from qs3.sensors.matching.texture import for_picture
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Slide, Speckle
 from qs3.sensors.renderers.base import Projector
@@ -121,10 +122,11 @@ class ReferenceSpeckle(TriangulatingSensor):
             dim = shot.scene(None, self.ambient)
             (other,) = shot.renderer.render(dim, camera, seed=seed, geometry=[False])
             ambient = other.radiance
-        gain = self.infrared.gain(image.radiance, np.isfinite(image.depth_m))
+        gain = self.infrared.gain(image.radiance, self.infrared.metered(image, usual="image"))
         grey = self.infrared.expose(image.radiance, gain, shot.rng, ambient)
         rows, columns = shot.window.slices
-        match = self.matcher.match(grey, self.reference[rows], shot.window.left)
+        matcher = for_picture(self.matcher, self.infrared.noise(gain))
+        match = matcher.match(grey, self.reference[rows], shot.window.left)
         depth, disparity, reason = self.depth_of(match)
         pictures = {"left": grey, "disparity": disparity, "clean": image.depth_m}
         if shot.explain:

@@ -11,7 +11,7 @@ after its down-sampling, by up to two), and StereoBM's bias of 0.029 px.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
 from qs3.sensors.matching import Match, Matcher, StereoBlockMatcher
+from qs3.sensors.matching.texture import for_picture
 from qs3.sensors.optics.blender_filmic import FilmicCamera
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.misalignment import Misalignment
@@ -73,6 +74,9 @@ class SpeckleStereo(TriangulatingSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if isinstance(self.misalignment, Mapping):
+            # `+sensor.misalignment.rows_px=0.2` on a preset whose file says nothing of it.
+            object.__setattr__(self, "misalignment", Misalignment.of(self.misalignment))
         check_ranges(
             self,
             "sensor.",
@@ -117,9 +121,9 @@ class SpeckleStereo(TriangulatingSensor):
         images = shot.renderer.render(scene, cameras, seed=seed, geometry=[True, False])
         windows = (shot.window, window)
         canvas = self._canvas(*windows)
-        whole = isinstance(self.infrared, InfraredCamera) and self.infrared.metering == "image"
-        metered = np.isfinite(images[0].depth_m) if whole else images[0].label > 0
-        gain = self.infrared.gain(images[0].radiance, metered)
+        gain = self.infrared.gain(
+            images[0].radiance, self.infrared.metered(images[0], usual="object")
+        )
         radiance = self._seen(images, windows, canvas)
         if isinstance(self.infrared, InfraredCamera) and self.infrared.needs_ambient:
             # The same seed: the same places in each pixel.
@@ -132,7 +136,8 @@ class SpeckleStereo(TriangulatingSensor):
             ]
         else:
             grey = [self.infrared.expose(total, gain, shot.rng) for total in radiance]
-        depth, disparity, reason = self.depth_of(self._match(grey[0], grey[1], canvas.left))
+        match = self._match(grey[0], grey[1], canvas.left, gain)
+        depth, disparity, reason = self.depth_of(match)
         inside = replace(
             shot.window, left=shot.window.left - canvas.left, top=shot.window.top - canvas.top
         ).slices
@@ -155,9 +160,12 @@ class SpeckleStereo(TriangulatingSensor):
         lens, k = self.misalignment, self.intrinsics
         return [lens.seen(one, canvas, k, right=i == 1) for i, one in enumerate(placed)]
 
-    def _match(self, left: np.ndarray, right: np.ndarray, first_column: int) -> Match:
+    def _match(self, left: np.ndarray, right: np.ndarray, first_column: int, gain: float) -> Match:
         """What the matcher finds; `first_column` is the canvas's first in the whole image."""
-        match = self.matcher.match(left, right)
+        matcher = self.matcher
+        if isinstance(self.infrared, InfraredCamera):
+            matcher = for_picture(matcher, self.infrared.noise(gain))
+        match = matcher.match(left, right)
         if self.blind_left_px:
             blind = slice(0, max(0, self.blind_left_px - first_column))
             match.reason[:, blind], match.disparity[:, blind] = Reason.OUTSIDE, np.nan

@@ -142,7 +142,7 @@ def fit_images(
     found = fit_pictures(scenes, sensor, distance_m, gain)
     for said in report(found, sensor, len(scenes)):
         print(said)
-    for pair in pair_fills(scenes, sensor):
+    for pair in pair_fills(scenes, sensor, found.noise):
         print(words_of(pair, name))
     save(out, found, name, sensor, line)
     print(f"wrote {out}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,7 +23,8 @@ from qs3.sensors.fit.infrared_noise import OverTime, Speckled, noise_residuals, 
 from qs3.sensors.fit.infrared_statistics import SMOOTH_PX, inner, smooth, statistics
 from qs3.sensors.gradients.twin import Twin, blurred, settings_of
 from qs3.sensors.gradients.views import Pair, View
-from qs3.sensors.optics.infrared import InfraredCamera
+from qs3.sensors.matching.texture import for_picture
+from qs3.sensors.optics.infrared import GreyNoise, InfraredCamera
 
 _SIDE_PX = 480  # of the plane that the twin shows
 _FAR = 5.0  # the search ends at factors of e to this power
@@ -88,6 +89,12 @@ class InfraredFit:
     distance_m: float
     misfit: float
     gain: float = 1.0
+
+    @property
+    def noise(self) -> GreyNoise:
+        """Of the pictures as they are, amplifier included."""
+        electrons = self.values["infrared.electrons_at_white"] / self.gain
+        return GreyNoise(electrons, self.values["infrared.read_noise_e"])
 
 
 @dataclass
@@ -171,17 +178,18 @@ def fit_pictures(
     values["infrared.electrons_at_white"] *= gain
     values["infrared.white_level"] = float(np.median([target.white for target in targets]))
     middle = float(np.median([target.distance_m for target in targets]))
-    return InfraredFit(
+    fit = InfraredFit(
         values,
         errors,
         unknown,
         tuple(key for key in KEYS if key not in unknown and 2 * errors[key] > WITHIN),
-        _focal_baseline(scenes, base),
+        None,
         _dots_over_ambient(base, middle, values),
         middle,
         float(rest.square().mean().sqrt()),
         gain,
     )
+    return replace(fit, focal_baseline=_focal_baseline(scenes, base, fit.noise))
 
 
 def facing(base: SpeckleStereo, distance_m: float, side_px: int) -> Pair:
@@ -320,8 +328,10 @@ def _unknown(
     return out
 
 
-def _focal_baseline(scenes: Sequence[Pictures], base: SpeckleStereo) -> float | None:
-    """Median of disparity times depth over the pixels that have both."""
+def _focal_baseline(
+    scenes: Sequence[Pictures], base: SpeckleStereo, noise: GreyNoise
+) -> float | None:
+    """Median of disparity times depth over the pixels that have both; `noise` of one frame."""
     found = []
     for scene in scenes:
         if scene.depth_m is None or not scene.right:
@@ -330,7 +340,9 @@ def _focal_baseline(scenes: Sequence[Pictures], base: SpeckleStereo) -> float | 
             np.clip(np.rint(np.mean(images, axis=0)), 0, 255).astype(np.uint8)
             for images in (scene.left, scene.right)
         ]
-        match = base.matcher.match(*pair)
+        count = len(scene.left)  # the mean of so many frames is as one of so many electrons more
+        of_mean = GreyNoise(noise.electrons_at_white * count, noise.read_noise_e * count**0.5)
+        match = for_picture(base.matcher, of_mean).match(*pair)
         product = match.disparity * scene.depth_m
         found.append(product[np.isfinite(product)])
     every = np.concatenate(found) if found else np.zeros(0)

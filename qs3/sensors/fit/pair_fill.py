@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.fit.infrared import Pictures
+from qs3.sensors.matching.texture import for_picture
+from qs3.sensors.optics.infrared import GreyNoise
 from qs3.sensors.pixel_status import Reason
 
 _MOST_COSTS = 400_000_000  # of a matcher at once: 1920 x 1080 pixels with 192 disparities
@@ -33,12 +35,16 @@ class PairFill:
     own: float | None
 
 
-def pair_fills(scenes: Sequence[Pictures], sensor: SpeckleStereo) -> list[PairFill]:
+def pair_fills(
+    scenes: Sequence[Pictures], sensor: SpeckleStereo, noise: GreyNoise
+) -> list[PairFill]:
     """The fill of each scene that has a right picture; of several frames the first.
 
-    Of pictures too large for the matcher's memory the middle rows are taken.
+    Of pictures too large for the matcher's memory the middle rows are taken. `noise` is that of
+    the pictures, for a matcher whose threshold goes by it.
     """
-    return [_fill(scene, sensor) for scene in scenes if scene.right]
+    matcher = for_picture(sensor.matcher, noise)
+    return [_fill(scene, replace(sensor, matcher=matcher)) for scene in scenes if scene.right]
 
 
 def words_of(found: PairFill, preset: str) -> str:

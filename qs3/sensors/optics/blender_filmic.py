@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from qs3.config.checks import check_ranges
+from qs3.sensors.renderers.base import Image
 
 # Logarithms to base 2 of the radiance where the curve begins and where it ends.
 _FIRST_STOP, _LAST_STOP = -12.473931188, 4.026068812
@@ -62,6 +63,10 @@ class FilmicCamera:
 
     def __post_init__(self) -> None:
         check_ranges(self, "infrared.", background=">= 0", faintest="> 0")
+
+    def metered(self, image: Image, usual: str) -> np.ndarray:
+        """The pixels [h, w] bool of the object; nothing depends on them."""
+        return image.label > 0
 
     def gain(self, radiance: np.ndarray, region: np.ndarray) -> float:
         """1: exposure 0, whatever is seen."""

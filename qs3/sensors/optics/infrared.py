@@ -10,6 +10,25 @@ import numpy as np
 
 from qs3.config.checks import check_bool, check_ranges
 from qs3.errors import ConfigError
+from qs3.sensors.renderers.base import Image
+
+
+@dataclass(frozen=True)
+class GreyNoise:
+    """Shot and read noise of a picture, in grey values.
+
+    Attributes:
+        electrons_at_white: electrons of grey value 255 in this picture, so fewer by the amplifier.
+        read_noise_e: standard deviation of the read-out noise in electrons.
+    """
+
+    electrons_at_white: float
+    read_noise_e: float
+
+    def variance(self, mean: np.ndarray) -> np.ndarray:
+        """Of whole grey values, at mean grey values of any shape; rounding has 1/12 of it."""
+        per_grey = self.electrons_at_white / 255.0
+        return np.maximum(mean, 0) / per_grey + (self.read_noise_e / per_grey) ** 2 + 1 / 12
 
 
 @dataclass(frozen=True)
@@ -36,8 +55,8 @@ class InfraredCamera:
         ambient_speckles: false: light that is not the projector's, and so no laser's, has no
             speckle; takes one more render a frame.
         metering: what the exposure goes by: "object", what bodies with a label show, or "image",
-            all surfaces in the part of the view that is rendered. Cameras that are matched
-            against a stored image go by all surfaces.
+            all surfaces in the part of the view that is rendered; null: what the sensor's kind
+            does, which is "object" for two cameras and "image" for one.
         max_exposure: grey values per unit of radiance at the longest exposure; null: as long as
             it takes.
         max_gain: by how much the amplifier makes up for what `max_exposure` lacks, at most.
@@ -52,7 +71,7 @@ class InfraredCamera:
     fixed_gain: float | None = None
     speckle_grain_px: int = 1
     ambient_speckles: bool = True
-    metering: Literal["object", "image"] = "object"
+    metering: Literal["object", "image"] | None = None
     max_exposure: float | None = None
     max_gain: float = 1.0
 
@@ -71,13 +90,19 @@ class InfraredCamera:
             max_gain=">= 1",
         )
         check_bool("ambient_speckles", self.ambient_speckles)
-        if self.metering not in ("object", "image"):
-            raise ConfigError(f"metering must be object or image, got {self.metering!r}")
+        if self.metering not in (None, "object", "image"):
+            raise ConfigError(f"metering must be object, image or null, got {self.metering!r}")
 
     @property
     def needs_ambient(self) -> bool:
         """Whether `expose` asks for the ambient light alone."""
         return self.speckle_contrast > 0 and not self.ambient_speckles
+
+    def metered(self, image: Image, usual: Literal["object", "image"]) -> np.ndarray:
+        """The pixels [h, w] bool that the exposure goes by; `usual` is the sensor's kind's."""
+        if (self.metering or usual) == "image":
+            return np.isfinite(image.depth_m)
+        return image.label > 0
 
     def gain(self, radiance: np.ndarray, region: np.ndarray) -> float:
         """Grey values per unit of radiance, from the pixels of `region` (bool, [h, w])."""
@@ -93,6 +118,10 @@ class InfraredCamera:
     def amplified(self, gain: float) -> float:
         """By how much the amplifier raises what the longest exposure gives; 1: not at all."""
         return 1.0 if self.max_exposure is None else max(1.0, gain / self.max_exposure)
+
+    def noise(self, gain: float) -> GreyNoise:
+        """Of pictures with `gain` grey values per unit of radiance, speckle aside."""
+        return GreyNoise(self.electrons_at_white / self.amplified(gain), self.read_noise_e)
 
     def expose(
         self,

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
 
 from qs3.config.checks import check_ranges
+from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics, Window
 from qs3.sensors.optics.smooth_field import smooth_field
 
@@ -44,6 +47,20 @@ class Misalignment:
         radial = dict.fromkeys(("k1", "k2"), "[-0.5, 0.5]")
         check_ranges(self, "misalignment.", cell_px="> 0", **shifts, **radial)
 
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> Misalignment:
+        """From a config without a class.
+
+        Raises:
+            ConfigError: a key that there is not, or a value out of its range.
+        """
+        keys = [each.name for each in fields(cls)]
+        if unknown := [str(key) for key in settings if key not in keys]:
+            raise ConfigError(
+                f"sensor.misalignment.{unknown[0]} is unknown; there are {', '.join(keys)}"
+            )
+        return cls(**settings)
+
     @property
     def distorts(self) -> bool:
         """Whether there is anything to do at all."""
@@ -66,8 +83,8 @@ class Misalignment:
         `canvas` is where its pixels lie in the whole image, whose intrinsics are `k`.
         """
         radial = bool(self.k1 or self.k2)
-        fields = right and bool(self.rows_px or self.columns_px)
-        if not radial and not fields:
+        shifted = right and bool(self.rows_px or self.columns_px)
+        if not radial and not shifted:
             return image
         u = np.arange(canvas.width, dtype=np.float64) + canvas.left
         v = np.arange(canvas.height, dtype=np.float64)[:, None] + canvas.top
@@ -79,7 +96,7 @@ class Misalignment:
             ideal_x, ideal_y = x / stretch, y / stretch
         at_u = ideal_x * k.focal_px + k.cx_px - canvas.left
         at_v = ideal_y * k.focal_px + k.cy_px - canvas.top
-        if fields:
+        if shifted:
             rng = np.random.default_rng([0x3EC7, self.seed])
             at_v = at_v - self.rows_px * smooth_field(canvas, self.cell_px, rng)
             at_u = at_u - self.columns_px * smooth_field(canvas, self.cell_px, rng)

@@ -67,7 +67,7 @@ def test_rooms_are_for_devices_that_look_at_them():
     assert "RoomCondition" not in {type(c).__name__ for c in runner.Plan.quick().conditions(SMALL)}
 
 
-def crafted(name, empty=0.08, fill=0.9, edge_on=0.0):
+def crafted(name, empty=0.08, fill=0.9, edge_on=0.0, mixed=0.2):
     subject, config = runner.load(name)
     result = runner.SensorResult(subject, config)
 
@@ -86,7 +86,7 @@ def crafted(name, empty=0.08, fill=0.9, edge_on=0.0):
         ]
     result.rooms = [
         {
-            "condition": {"materials": materials, "frames": 1}, "empty": empty, "mixed": 0.2,
+            "condition": {"materials": materials, "frames": 1}, "empty": empty, "mixed": mixed,
             "reasons": {"ok": 1 - empty, "shadow": empty}, "steps": 100, "flying": 0.01,
         }
         for materials in rooms.MATERIALS
@@ -99,6 +99,10 @@ def crafted(name, empty=0.08, fill=0.9, edge_on=0.0):
     [
         ("kinect_v1", {"empty": 0.08}, "of a room without depth", True),
         ("kinect_v1", {"empty": 0.005}, "of a room without depth", False),
+        ("kinect_v1", {"mixed": 0.1}, "with a mixed pixel", True),
+        ("kinect_v1", {"mixed": 0.3}, "with a mixed pixel", False),
+        ("realsense_d415", {"mixed": 0.01}, "with a mixed pixel", False),
+        ("realsense_d415", {"mixed": None}, "with a mixed pixel", False),
         ("realsense_d415", {"fill": 0.9}, "fill at 80 degrees", True),
         ("realsense_d415", {"fill": 0.1}, "fill at 80 degrees", False),
         ("realsense_d415", {"edge_on": 0.2}, "fill at 85 degrees", True),

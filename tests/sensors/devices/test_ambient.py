@@ -56,7 +56,7 @@ def test_a_bright_wall_darkens_the_object_where_the_whole_image_is_metered(rende
     wall = replace(square(2.5, 0.5, albedo=0.8), label=0)
     quiet = InfraredCamera(read_noise_e=0.0, electrons_at_white=1e9, white_quantile=1.0)
     grey = {}
-    for metering in ("object", "image"):
+    for metering in ("object", "image", None):
         sensor = SpeckleStereo(infrared=replace(quiet, metering=metering))
         frame = scan(sensor, [thing, wall], renderer, box=box_of(thing))
         clean = frame.images["clean"]
@@ -64,8 +64,22 @@ def test_a_bright_wall_darkens_the_object_where_the_whole_image_is_metered(rende
     # What is as bright as can be: ambient light and a dot on the wall, over the same on the object.
     brighter = 0.8 * (0.15 + 16 / 2.5**2) / (0.08 * (0.15 + 16 / 2.0**2))
     assert grey["object"] / grey["image"] == pytest.approx(brighter, rel=0.1)
+    assert grey[None] == grey["object"]
 
 
 def test_fringes_refuse_it():
     with pytest.raises(ConfigError, match=r"sensor\.infrared\.ambient_speckles=false"):
         FringeProjection(infrared=replace(SPECKLED, ambient_speckles=False))
+
+
+@pytest.mark.parametrize("kind", [ReferenceSpeckle, FringeProjection])
+def test_sensors_with_one_camera_go_by_the_image_unless_told_otherwise(kind, renderer):
+    thing = replace(square(2.0, 0.1, albedo=0.08), label=1)
+    wall = replace(square(2.5, 0.5, albedo=0.8), label=0)
+    grey = {}
+    for metering in ("object", "image", None):
+        camera = InfraredCamera(read_noise_e=0.0, electrons_at_white=1e9, metering=metering)
+        frame = scan(kind(infrared=camera), [thing, wall], renderer, box=box_of(thing))
+        grey[metering] = frame.images["left"][np.abs(frame.images["clean"] - 2.0) < 0.01].mean()
+    assert grey["object"] > 3 * grey["image"]
+    assert grey[None] == grey["image"]

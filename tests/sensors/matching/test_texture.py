@@ -5,8 +5,8 @@ import pytest
 
 from qs3.errors import ConfigError
 from qs3.sensors.matching import CensusMatcher
-from qs3.sensors.matching.texture import TextureOverNoise, window_moments
-from qs3.sensors.optics.infrared import InfraredCamera
+from qs3.sensors.matching.texture import TextureOverNoise, for_picture, window_moments
+from qs3.sensors.optics.infrared import GreyNoise, InfraredCamera
 from qs3.sensors.pixel_status import Reason
 
 CAMERA = InfraredCamera(electrons_at_white=3000.0, read_noise_e=25.0)
@@ -65,3 +65,26 @@ def test_a_dim_pair_with_dots_matches_and_a_bright_one_without_does_not():
 def test_settings_are_checked(key):
     with pytest.raises(ConfigError, match=f"texture.{key}"):
         TextureOverNoise(**{key: 0.0})
+
+
+def test_an_amplified_picture_is_judged_by_its_own_noise():
+    """A flat surface at a gain of 8: by the noise of an unamplified one 9 of 10 windows pass."""
+    camera = InfraredCamera(read_noise_e=10.0, max_exposure=10.0, max_gain=16.0)
+    flat = np.full((120, 160), 1.0, np.float32)
+    image = camera.expose(flat, 80.0, np.random.default_rng(0))
+    moments = window_moments(image, 9)
+    asked = TextureOverNoise(0.7)
+    assert asked.at(camera.noise(10.0)).enough(*moments).mean() > 0.9
+    assert asked.at(camera.noise(80.0)).enough(*moments).mean() < 0.02
+    of_preset = for_picture(CensusMatcher(texture=asked), camera.noise(80.0))
+    assert of_preset.texture == asked.at(GreyNoise(camera.electrons_at_white / 8, 10.0))
+
+
+def test_what_was_set_stays_and_what_was_not_has_to_be_said():
+    noise = GreyNoise(500.0, 5.0)
+    assert ASKED.at(noise) == ASKED
+    plain = CensusMatcher()
+    assert for_picture(plain, noise) is plain
+    blank = np.zeros((40, 60), np.uint8)
+    with pytest.raises(ConfigError, match=r"texture\.electrons_at_white"):
+        CensusMatcher(texture=TextureOverNoise(0.7)).match(blank, blank)

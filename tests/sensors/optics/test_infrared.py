@@ -136,7 +136,7 @@ def test_limits_that_are_not_reached_change_no_byte():
 
 
 def test_settings_of_the_exposure_are_checked():
-    with pytest.raises(ConfigError, match="metering must be object or image"):
+    with pytest.raises(ConfigError, match="metering must be object, image or null"):
         InfraredCamera(metering="centre")
     with pytest.raises(ConfigError, match="max_gain"):
         InfraredCamera(max_gain=0.5)

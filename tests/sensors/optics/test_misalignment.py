@@ -88,3 +88,11 @@ def test_columns_that_do_not_meet_are_a_bias_of_the_depth(renderer):
 def test_settings_are_checked(word):
     with pytest.raises(ConfigError, match=f"misalignment.{word}"):
         Misalignment(**{word: -1.0})
+
+
+def test_a_preset_without_it_takes_single_settings():
+    assert SpeckleStereo(misalignment={"rows_px": 0.2}).misalignment == Misalignment(rows_px=0.2)
+    with pytest.raises(ConfigError, match=r"misalignment\.row_px is unknown; there are k1"):
+        SpeckleStereo(misalignment={"row_px": 0.2})
+    with pytest.raises(ConfigError, match=r"misalignment\.k1"):
+        SpeckleStereo(misalignment={"k1": 3.0})
