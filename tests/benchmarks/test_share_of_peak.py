@@ -24,7 +24,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from qs3.geometry import compiled
 from qs3.geometry.matmul import matmul_t
-from tests.benchmarks.device import DEVICE, THREADS
 from tests.benchmarks.test_simpleview_speed import boxes
 from tests.benchmarks.test_throughput import _inference, _net, _training
 from tests.models.test_all_nets import NETS
@@ -126,15 +125,6 @@ def test_what_is_outside_of_torch_is_seen() -> None:
     found = shares(lambda: compiled.neighbour_max(x, index))
     assert found[OUTSIDE] > 0.5
     assert not [name for name in found if name.startswith("qs3")]
-
-
-def test_benchmarks_run_as_trainings_do(benchmark: BenchmarkFixture) -> None:
-    """With tensors left unfilled, and deterministic; `make test-all` leaves its process alone."""
-    benchmark.pedantic(lambda: None)
-    if benchmark.enabled:
-        assert not torch.utils.deterministic.fill_uninitialized_memory
-        assert torch.are_deterministic_algorithms_enabled() is (DEVICE.type == "cpu")
-        assert torch.get_num_threads() == THREADS
 
 
 def test_share_of_peak(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
