@@ -13,7 +13,7 @@ if "--benchmark-enable" in sys.argv:  # before torch is loaded
 import torch
 
 from qs3.engine.trainer import settle_process
-from tests.benchmarks.device import DEVICE, THREADS
+from tests.benchmarks.device import DEVICE, THREADS, deterministic
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -31,12 +31,11 @@ def as_trainings_do(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
         return
     filled = torch.utils.deterministic.fill_uninitialized_memory
-    before = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    threads = torch.get_num_threads()
     settle_process(THREADS)
-    torch.use_deterministic_algorithms(DEVICE.type == "cpu")
     try:
-        yield
+        with deterministic(DEVICE.type == "cpu"):
+            yield
     finally:
         torch.utils.deterministic.fill_uninitialized_memory = filled
-        torch.set_num_threads(before[0])
-        torch.use_deterministic_algorithms(before[1])
+        torch.set_num_threads(threads)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from statistics import median
+from typing import Literal
 
 import pytest
 import torch
@@ -16,13 +17,14 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from torch import nn
 from torch.nn import functional as F
 
-from tests.benchmarks.device import DEVICE, WHERE, finish
+from tests.benchmarks.device import DEVICE, WHERE, deterministic, finish
 from tests.benchmarks.test_kernels import STRAIGHT
 from tests.benchmarks.test_simpleview_speed import boxes
 from tests.models.test_all_nets import NETS, build
 
-ROUNDS, WARMUP, SECONDS = 30, 5, 4.0
+ROUNDS, WARMUP, SECONDS, TURNS = 30, 5, 4.0, 2
 SIZES = ((16, 256), (16, 1024), (64, 1024))
+DETERMINISTIC: dict[str, Literal["warn", False]] = {"warn": "warn", "off": False}
 
 
 def _or_nan(measured: Callable[[], float]) -> float:
@@ -98,5 +100,31 @@ def test_steps(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> No
             else:
                 shown += f" - | - | {memory:.2f} | - |"
             rows.append(shown)
+    with capsys.disabled():
+        print("\n".join(rows))  # noqa: T201
+
+
+def test_what_determinism_costs(benchmark: BenchmarkFixture, capsys: pytest.CaptureFixture) -> None:
+    """A step of DGCNN by `trainer.deterministic`; the benchmark's own time is of small clouds."""
+    net = build("dgcnn").float().train().to(DEVICE)
+    small = boxes(2, 64).to(DEVICE)
+    benchmark.pedantic(_milliseconds, (net, small), rounds=1)
+    sizes = ((2, 64),) if not benchmark.enabled else SIZES if DEVICE.type == "cuda" else SIZES[:1]
+    found: dict[str, dict[str, float]] = {word: {} for word in DETERMINISTIC}
+    for _ in range(TURNS):  # others on a busy machine take time from both
+        for word, setting in DETERMINISTIC.items():
+            for b, n in sizes:
+                with deterministic(setting):
+                    ms = _milliseconds(net, boxes(b, n).to(DEVICE))
+                found[word][f"{b} x {n}"] = min(ms, found[word].get(f"{b} x {n}", ms))
+    if not benchmark.enabled:
+        assert all(of_sizes["2 x 64"] > 0 for of_sizes in found.values())
+        return
+    benchmark.extra_info |= found
+    rows = [f"\n{WHERE}, torch {torch.__version__}: ms a step of DGCNN, forward and backward"]
+    rows += ["| `trainer.deterministic` |" + "".join(f" {size} |" for size in found["off"])]
+    rows += ["|---|" + "---|" * len(sizes)]
+    for word, of_sizes in found.items():
+        rows.append(f"| {word} |" + "".join(f" {ms:.2f} |" for ms in of_sizes.values()))
     with capsys.disabled():
         print("\n".join(rows))  # noqa: T201

@@ -9,12 +9,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
+from typing import Literal
 
 import pytest
 import torch
+from lightning.pytorch import Trainer
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from tests.benchmarks.device import DEVICE, THREADS
+from tests.benchmarks.device import DEVICE, THREADS, deterministic
 
 HERE = Path(__file__).parent
 MODULES = sorted(path.stem for path in HERE.glob("test_*.py"))
@@ -27,6 +29,23 @@ def test_benchmarks_run_as_trainings_do(benchmark: BenchmarkFixture) -> None:
         assert not torch.utils.deterministic.fill_uninitialized_memory
         assert torch.are_deterministic_algorithms_enabled() is (DEVICE.type == "cpu")
         assert torch.get_num_threads() == THREADS
+
+
+def _determinism() -> tuple[int, str | None]:
+    return torch.get_deterministic_debug_mode(), os.environ.get("CUBLAS_WORKSPACE_CONFIG")
+
+
+@pytest.mark.parametrize("setting", [False, "warn", True])
+def test_determinism_is_as_the_trainer_sets_it(setting: bool | Literal["warn"]) -> None:
+    before = _determinism()
+    with deterministic(setting):
+        ours = _determinism()
+    assert _determinism() == before
+    with deterministic(not setting):  # gives back what the trainer sets
+        os.environ.pop("CUBLAS_WORKSPACE_CONFIG", None)
+        Trainer(deterministic=setting, logger=False, enable_checkpointing=False)
+        assert _determinism() == ours
+    assert _determinism() == before
 
 
 def _names(code: CodeType) -> Iterator[str]:
