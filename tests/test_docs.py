@@ -8,8 +8,10 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 import yaml
 
 ROOT = Path(__file__).parents[1]
@@ -212,6 +214,19 @@ class MyClassifier(lightning.LightningModule):
         return torch.optim.Adam(self.parameters())
 """
     exec(compile(block.replace("\ndata =", f"\n{net}\ndata =", 1), "README.md", "exec"), {})
+
+
+def test_the_example_of_gradients_runs():
+    """As it stands on the page; the wall is a metre away, and more ambient light is seen."""
+    page = (ROOT / "docs/reference/gradients.md").read_text("utf-8")
+    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(compile(block, "gradients.md", "exec"), names)
+    seen = names["depth"][names["pair"].left.smooth]
+    assert seen.median().item() == pytest.approx(1.0, abs=0.002)
+    slope = names["settings"]["ambient"].grad
+    assert torch.isfinite(slope)
+    assert slope != 0
 
 
 def test_the_readme_is_short():
