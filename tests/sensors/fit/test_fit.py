@@ -1,6 +1,7 @@
 """`qs3 fit` must find what cameras hide."""
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.sensors.bench.laws import nguyen_axial_m
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
+from qs3.sensors.fit.cli import fit
 from qs3.sensors.fit.frames import read_camera
 from tests.commands import main
 from tests.sensors.scenery import plane, scan
@@ -213,16 +215,16 @@ def test_smooth_noise_below_a_step_is_found_to_be_smooth(size, tmp_path):
 SMALLER = FittedDepth(width_px=240, height_px=180, focal_px=220.0, noise_factor=0.0015)
 
 
-def kitchen(depth_m, relief, seed):
+def kitchen(depth_m, relief, seed, sensor=SMALLER):
     """A front of cupboards: 40 things that stand out from a plane, or are set back."""
-    rng, k = np.random.default_rng(seed), SMALLER.intrinsics
+    rng, k = np.random.default_rng(seed), sensor.intrinsics
     clean = np.full((k.height_px, k.width_px), depth_m, dtype=np.float32)
     clean /= 1 + 0.1 * (np.arange(k.width_px, dtype=np.float32) - k.cx_px) / k.focal_px
     for _ in range(40):
         width, height = rng.integers(12, 70, 2)
         row, col = rng.integers(0, k.height_px - 10), rng.integers(0, k.width_px - 10)
         clean[row : row + height, col : col + width] *= 1 + rng.uniform(-relief, relief)
-    return SMALLER.measure(clean, np.full_like(clean, 0.95), rng)[0]
+    return sensor.measure(clean, np.full_like(clean, 0.95), rng)[0]
 
 
 def told(folder, images, capsys):
@@ -234,6 +236,29 @@ def told(folder, images, capsys):
     status = main(["fit", *map(str, files), "focal=220", f"out={out}"])
     said = capsys.readouterr()
     return status, said.out + said.err, out
+
+
+TINY = replace(SMALLER, width_px=120, height_px=90, focal_px=110.0)
+
+
+@pytest.mark.parametrize("bad", [None, "middle", "far"])
+def test_one_bad_frame_among_good_walls_is_named_and_good_ones_are_not(bad, tmp_path):
+    """Frames so small that it takes a second; the command itself is tried below."""
+    for seed, (name, depth_m) in enumerate((("near", 1.0), ("middle", 1.6), ("far", 2.4))):
+        seen = kitchen(depth_m, 0.03, 1, TINY) if name == bad else wall(TINY, depth_m, 6, seed)
+        np.save(tmp_path / f"{name}.npy", seen)
+    files = [str(tmp_path / f"{name}.npy") for name in ("near", "middle", "far")]
+    given = dict.fromkeys(("intrinsics", "unit", "distances", "baseline", "power"))
+    if bad is None:
+        found = fit(files, focal=110.0, **given)
+        assert list(found.doubts) == []
+        assert not any("doubtful" in line for line in found.summary())
+        return
+    with pytest.raises(DataError, match="not of a flat wall") as error:
+        fit(files, focal=110.0, **given)
+    assert re.findall(r"(\w+)\.npy: [\d.]+ to [\d.]+ mm off", str(error.value)) == [bad]
+    assert str(error.value).count(".npy") == 1
+    assert "the law of all frames says" in str(error.value)
 
 
 @pytest.mark.slow
