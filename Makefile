@@ -10,6 +10,7 @@ PARALLEL ?= -n 2 --dist loadfile
 # Of `make bench`.
 DEVICE ?= cpu
 THREADS ?=
+POINTS ?=
 # Of `make release`.
 VERSION ?=
 GO ?= false
@@ -57,8 +58,8 @@ test: install ## all tests that are not slow, on 2 cores
 test-all: install ## the slow tests too, shapes in signatures checked, and the benchmarks once each
 	QS3_CHECK_SHAPES=1 $(RUN) -m pytest $(PARALLEL) -m ''
 
-bench: install ## speed, as ratios against named baselines; of nets and methods on DEVICE=cuda; THREADS=1
-	QS3_BENCH_DEVICE=$(DEVICE) QS3_BENCH_THREADS=$(THREADS) $(RUN) -m pytest tests/benchmarks --benchmark-enable -s
+bench: install ## speed, as ratios against named baselines; of nets and methods on DEVICE=cuda; THREADS=1; POINTS=512 in methods' clouds
+	QS3_BENCH_DEVICE=$(DEVICE) QS3_BENCH_THREADS=$(THREADS) QS3_BENCH_POINTS=$(POINTS) $(RUN) -m pytest tests/benchmarks --benchmark-enable -s
 
 mutants: install ## how many faults put into the core the tests notice; hours, goes on where it stopped
 	$(RUN) .ci/mutants.py .ci/mutants.toml docs/results/mutants.csv

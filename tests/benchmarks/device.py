@@ -1,4 +1,7 @@
-"""Where benchmarks run: `make bench DEVICE=cuda`, for nets and methods, or `THREADS=1`."""
+"""Where benchmarks run: `make bench DEVICE=cuda`, for nets and methods, or `THREADS=1`.
+
+And of how many points the clouds of the methods' steps are: `POINTS=512`.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ import torch
 from qs3.utils.threads import cores
 
 THREADS = int(os.environ.get("QS3_BENCH_THREADS") or len(cores()))  # as a training takes them
+POINTS = int(os.environ.get("QS3_BENCH_POINTS") or 1024)
 DEVICE = torch.device(os.environ.get("QS3_BENCH_DEVICE") or "cpu")
 WHERE = (
     f"{THREADS} threads"
