@@ -70,6 +70,7 @@ PATTERNS = (
     r"training/test_own_method\.py::test_on_a_target_without",
     # One or two of each family stay.
     r"methods/test_steps\.py::test_(operations_do|no_value).*\[(?!pcm\]|gast\]|student\]|dann\]|supervised\])",
+    r"methods/test_steps\.py::test_kernels_beside.*\[(?!pcm\]|pointdan\]|defrec\]|twin(_shared)?\]|student)",
     r"data/test_domain\.py::test_missing_data_is_explained\[(?!depthscannet10\]|modelnet10\]|specklenet10\]|own\])",
     r"data/test_domain\.py::test_every_domain_opens.*\[(?!depthscannet10|modelnet10\]|specklenet10\]|scannet10\]|own|nyuv2)",
     r"report/tables/test_tables\.py::test_(the_papers_numbers|cells_differ|quickstart_filled|extra_over)",

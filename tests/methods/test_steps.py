@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +24,7 @@ from qs3.evaluation.tent import minimise_entropy
 from qs3.methods.base import Method
 from qs3.methods.source_only import SourceOnly
 from qs3.models.dgcnn import dgcnn
+from qs3.models.pointdan import pointdan
 from qs3.selftraining.pcfea import Pcfea
 from qs3.selftraining.sd import GraphRefined
 from qs3.selftraining.selectors import Qbst, TeacherPredictions
@@ -76,31 +78,40 @@ def test_operations_do_not_grow_with_the_batch(name: str) -> None:
     assert _watched(name, b=4).counts == _watched(name, b=8).counts
 
 
-# Kernels that a step of DGCNN may take above those of its forward passes, 196 each. SD's and
-# Twin's have two passes of a teacher of its own among them, MLSP's the normals.
+@cache
+def _kernels(name: str, own_net: bool = False) -> int:
+    """Of a step of 16 x 1,024 points with DGCNN, or with PointDAN's own net."""
+    method, net = CASES[name].make(), pointdan(CLASSES) if own_net else dgcnn(CLASSES)
+    method.prepare(net)
+    net, method = net.to("meta"), method.to("meta")
+    batch = batch_of(CASES[name], method, 16, 1024, CLASSES, "meta")
+    with Watch() as watch:
+        total(method, net, batch, torch.Generator().manual_seed(0)).backward()
+    assert watch.carried == []
+    return watch.kernels.total()
+
+
+# Kernels that a step may take above those of its forward passes (196 each of DGCNN, 317 of
+# PointDAN's net) with their ways back. SD's and Twin's have two passes of a teacher among them,
+# which have none, MLSP's the normals.
 ABOVE = {
-    **{"pcm": 60, "dann": 60, "defrec_pcm": 200, "gast": 250, "student_source_pcm": 100},
-    **{"cpcm": 200, "mlsp": 400, "sd": 400, "pcfea_styled": 130},
-    **{"twin": 600, "twin_shared": 120, "twin_of_the_source": 340},
+    **{"source_only": 0, "supervised": 0, "pcm": 60, "dann": 60, "dann_apart": 60},
+    **{"pointdan": 200, "defrec": 130, "defrec_on_source": 260, "defrec_pcm": 200},
+    **{"gast": 250, "gast_no_rotation": 70, "gast_pcm": 250, "cpcm": 200, "mlsp": 400},
+    **{"sd": 400, "sd_cut_both": 400},
+    **{"twin": 500, "twin_shared": 70, "twin_of_the_source": 280},
+    **{"pcfea": 0, "pcfea_styled": 130, "pcfea_averaged": 150},
+    **{"student": 0, "student_pcm": 40, "student_source": 30, "student_source_pcm": 100},
+    **{"student_mrkld": 30, "student_lrent": 30},
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["pcm", *(pytest.param(n, marks=pytest.mark.slow) for n in ABOVE if n != "pcm")]
-)
+@parametrize
 def test_kernels_beside_the_passes(name: str) -> None:
-    kernels = {}
-    for case in ("source_only", name):
-        method = CASES[case].make()
-        net = dgcnn(CLASSES)
-        method.prepare(net)
-        net, method = net.to("meta"), method.to("meta")
-        batch = batch_of(CASES[case], method, 16, 1024, CLASSES, "meta")
-        with Watch() as watch:
-            total(method, net, batch, torch.Generator().manual_seed(0)).backward()
-        assert watch.carried == []
-        kernels[case] = watch.kernels.total()
-    assert kernels[name] <= CASES[name].passes * kernels["source_only"] + ABOVE[name]
+    own = name == "pointdan"
+    passes = CASES[name].passes * _kernels("source_only", own)
+    # Teachers' passes have no way back, so a step may be below; twice is the most for any method.
+    assert passes / 2 < _kernels(name, own) <= min(passes + ABOVE[name], 2 * passes)
 
 
 # Kernels of a step of DGCNN that no change may exceed, whatever its forward passes cost.
@@ -109,13 +120,7 @@ AT_MOST = {"source_only": 250, "pcm": 250 + 60, "gast": 2000}
 
 @pytest.mark.parametrize("name", AT_MOST)
 def test_kernels_of_a_step(name: str) -> None:
-    method, net = CASES[name].make(), dgcnn(CLASSES)
-    method.prepare(net)
-    net, method = net.to("meta"), method.to("meta")
-    batch = batch_of(CASES[name], method, 16, 1024, CLASSES, "meta")
-    with Watch() as watch:
-        total(method, net, batch, torch.Generator().manual_seed(0)).backward()
-    assert 100 < watch.kernels.total() <= AT_MOST[name]
+    assert 100 < _kernels(name) <= AT_MOST[name]
 
 
 @parametrize
