@@ -218,6 +218,7 @@ def test_augmentation_is_part_of_a_step(augment: Augment) -> None:
 FAULTS: dict[str, Callable[[Tensor], Tensor]] = {
     "item": lambda x: x * (1 + 0 * x.detach().sum().item()),
     "mask": lambda x: x[x[:, 0] > -1e9],
+    "assigned by a mask": lambda x: x.index_put((x[:, 0] > -1e9,), x),
     "cpu": lambda x: x + x.detach().cpu().to(x.device),
     "constant": lambda x: x + torch.tensor([0.0] * CLASSES, device=x.device),
     "loop": lambda x: torch.stack([row * 1.0 for row in x]),
