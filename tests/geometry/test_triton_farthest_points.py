@@ -26,7 +26,10 @@ for b, n, taken in ((3, 70, 70), (2, 64, 9), (1, 1, 1)):
 """
 
 
-@pytest.mark.skipif(find_spec("triton") is None, reason="comes with torch's builds for GPUs")
+@pytest.mark.skipif(
+    find_spec("triton") is None,
+    reason="Triton is missing: docs/reference/accelerators.md says how to bring it",
+)
 def test_the_kernel_takes_the_steps() -> None:
     found = subprocess.run(
         [sys.executable, "-c", COMPARE],
