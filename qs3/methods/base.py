@@ -22,6 +22,7 @@ from qs3.errors import ConfigError
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
+    from qs3.models.base import Features
 
 
 class Method(nn.Module):
@@ -106,6 +107,34 @@ def feature_dims(net: Any) -> tuple[int, int | None]:
     Raises:
         ConfigError: the model is not a backbone with a head.
     """
+    features = _of_two_clouds(net)
+    per_point = features.per_point
+    return features.global_.shape[1], None if per_point is None else per_point.shape[2]
+
+
+def check_taught(net: Any, key: str, instead: str) -> None:
+    """Refuse a loss of features that no gradient changes, such as those of `model=features`.
+
+    It would be minimised by nothing, and the run would be one without it under another name.
+
+    Args:
+        net: asked in eval mode, with two clouds: nothing in it changes.
+        key: what asks for the loss, as it is set.
+        instead: what to do about it.
+
+    Raises:
+        ConfigError: they do not change, or the model is not a backbone with a head.
+    """
+    with torch.enable_grad():
+        taught = _of_two_clouds(net).global_.requires_grad
+    if not taught:
+        raise ConfigError(
+            f"{key} trains a net's features, and this model's are frozen: it would teach nothing; "
+            f"{instead}"
+        )
+
+
+def _of_two_clouds(net: Any) -> Features:
     if not hasattr(net, "features"):
         raise ConfigError(
             f"this method puts heads on a model's features, but {type(net).__name__} has none; "
@@ -117,8 +146,6 @@ def feature_dims(net: Any) -> tuple[int, int | None]:
     training = net.training
     net.eval()
     try:
-        features = net.features(points)
+        return net.features(points)
     finally:
         net.train(training)
-    per_point = features.per_point
-    return features.global_.shape[1], None if per_point is None else per_point.shape[2]

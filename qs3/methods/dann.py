@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.config.checks import check_choice
-from qs3.methods.base import Method, class_loss, feature_dims, weight
+from qs3.methods.base import Method, check_taught, class_loss, feature_dims, weight
 from qs3.methods.reversal import dann_alpha, reverse_gradient
 from qs3.models.base import ClassHead
 from qs3.models.norms import use_domain
@@ -54,6 +54,8 @@ class Dann(Method):
 
     def prepare(self, net: nn.Module) -> None:
         """The domain head."""
+        if self.domain_weight:
+            check_taught(net, "method=dann", "choose method=pcfea, or a model that is trained")
         self.domain_head = ClassHead(feature_dims(net)[0], 2, dropout=0.0)
 
     def loss(

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_int
 from qs3.geometry.neighbours import farthest_point_sampling, gather
-from qs3.methods.base import Method, feature_dims, weight
+from qs3.methods.base import Method, check_taught, feature_dims, weight
 from qs3.methods.deform import VOXELS, cloud_size, deform
 from qs3.methods.mixup import join, source_loss
 from qs3.models.norms import use_domain
@@ -65,6 +65,8 @@ class Gast(Method):
 
     def prepare(self, net: nn.Module) -> None:
         """Linear heads: 27 voxels; four turns, twice. Only those of losses in use."""
+        if self.def_weight or self.rot_weight:
+            check_taught(net, "method=gast", "choose method=pcfea, or a model that is trained")
         width, _ = feature_dims(net)
         if self.def_weight:
             self.def_head = nn.Linear(width, VOXELS)

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
 from qs3.geometry.neighbours import gather
-from qs3.methods.base import class_loss, weight
+from qs3.methods.base import check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher
 from qs3.models.norms import use_domain
 
@@ -63,6 +63,12 @@ class Sd(MeanTeacher):
             student_temperature,
         )
         self.cut = check_choice("method.cut", cut, ("source", "both", "none"))
+
+    def prepare(self, net: Any) -> None:
+        """The teacher."""
+        if self.consistency_weight:
+            check_taught(net, "method=sd", "choose method=pcfea, or a model that is trained")
+        super().prepare(net)
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator

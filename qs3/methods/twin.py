@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
 from qs3.datamodules.twins import SOURCE_TWINS, Wants
-from qs3.methods.base import class_loss, weight
+from qs3.methods.base import check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher
 from qs3.models.norms import use_domain
 
@@ -98,6 +98,8 @@ class Twin(MeanTeacher):
     def prepare(self, net: Any) -> None:
         """A teacher of its own, unless it is shared or says nothing."""
         super().prepare(net)
+        if self.feature_weight:
+            check_taught(net, "method.feature_weight", "set method.feature_weight=0")
         if self.shared or not (self._distils or self.uses_target):
             self.teacher = None
 

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from qs3.config.checks import check_choice, check_float
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
-from qs3.methods.base import Method, class_loss, weight
+from qs3.methods.base import Method, check_taught, class_loss, weight
 from qs3.methods.mean_teacher import move_towards
 from qs3.models.norms import use_domain
 from qs3.selftraining.selectors import Selector, TeacherPredictions, most_confident
@@ -106,6 +106,12 @@ class Pcfea(Method):
             raise ConfigError(
                 "method=pcfea needs a class head whose last layer is linear; choose e.g. "
                 "model=dgcnn or model=pointnet"
+            )
+        if self.align_weight and len(head) == 1:  # what it is given is the net's vector
+            check_taught(
+                net,
+                "method.align_weight with a head of one layer",
+                "set method.align_weight=0, or give the head a hidden layer (model.hidden)",
             )
         classes, width = head[-1].weight.shape
         self.register_buffer("mean", torch.zeros(classes, width))

@@ -10,6 +10,7 @@ from qs3.config import hashing
 from qs3.errors import ConfigError
 from qs3.models.features import Encoder
 from qs3.runs.checkpoints import load
+from qs3.selftraining.pcfea import Pcfea
 from qs3.training.command import train
 from tests.models.onnx_files import write_encoder
 from tests.training.conftest import result_of
@@ -34,27 +35,45 @@ def frozen(toy_data, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "rounds",
-    ["selftraining=none", pytest.param("selftraining.epochs=2", marks=pytest.mark.slow)],
+    "words",
+    [
+        ("method=pcfea", "selftraining=none"),
+        *(
+            pytest.param((*both, "selftraining.epochs=2"), marks=pytest.mark.slow)
+            for both in (("method=source_only",), ("method=pcfea", "selftraining=spst"))
+        ),
+    ],
+    ids=" ".join,
 )
-def test_a_run_is_computed_once_goes_on_and_is_loaded(frozen, tmp_path, monkeypatch, rounds):
-    asked = []
-    real = Encoder.compute
+def test_a_run_is_computed_once_goes_on_and_is_loaded(frozen, tmp_path, monkeypatch, words):
+    asked, terms = [], set()
+    real, loss = Encoder.compute, Pcfea.loss
     monkeypatch.setattr(Encoder, "compute", lambda self, x: asked.append(len(x)) or real(self, x))
-    words = ("method=dann", "model.dropout=0.1", rounds)
+
+    def watched(self, *args):
+        found = loss(self, *args)
+        terms.update(found)
+        return found
+
+    monkeypatch.setattr(Pcfea, "loss", watched)
+    words = (*words, "model.dropout=0.1")
     cfg = frozen(*words, f"paths.log_dir={tmp_path / 'whole'}")
     metrics = train(cfg)
     assert metrics.warmup.last.scores.accuracy > 0.6  # 0.33 by chance
+    if "method=pcfea" in words:  # there was a pool
+        assert terms == {"ce", "align_source", "align_target"}
+    assert len(metrics.rounds) == (0 if "selftraining=none" in words else 2)
+    assert all(record.total_selected > 0 for record in metrics.rounds)
     assert len(list((tmp_path / "cache" / "features").iterdir())) == 3
-    # Two clouds for the width; 72 for training of source and target in four samples, and 24 for
-    # tests; nothing in all epochs; then the turned ones by which a run estimates its accuracy.
+    # 72 clouds for training of source and target in four samples, and 24 for tests; nothing in all
+    # epochs and pools; then the turned ones by which a run estimates its accuracy.
     pieces = [32, 32, 8] * 4
-    assert asked[:26] == [2, *pieces, *pieces, 24]
-    assert set(asked[26:]) <= {24}
+    assert asked[:25] == [*pieces, *pieces, 24]
+    assert set(asked[25:]) <= {24}
     asked.clear()
     broken = frozen(*words, f"paths.log_dir={tmp_path / 'broken'}")
     interrupt(broken, epoch=2)
-    assert asked == [2]  # features were there
+    assert asked == []  # features were there
     if metrics.rounds:
         interrupt(broken, epoch=6)
     train(broken)
@@ -74,3 +93,8 @@ def test_what_is_refused(frozen, tmp_path):
         train(frozen(file="no.onnx"))
     assert not (tmp_path / "logs").exists()
     assert (CONF / "protocol" / "frozen.yaml").is_file()
+
+
+def test_a_method_that_trains_features_is_refused(frozen):
+    with pytest.raises(ConfigError, match="method=dann trains a net's features, and this model's"):
+        train(frozen("method=dann", "selftraining=none"))

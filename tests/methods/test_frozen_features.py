@@ -1,0 +1,108 @@
+"""Losses on frozen features: each term teaches the head, or the method is refused."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from qs3.errors import ConfigError
+from qs3.methods.base import Method
+from qs3.methods.dann import Dann
+from qs3.methods.gast import Gast
+from qs3.methods.sd import Sd
+from qs3.methods.twin import Twin
+from qs3.models.base import PointClassifier
+from qs3.models.features import features
+from qs3.selftraining.pcfea import Pcfea
+from tests.methods.cases import CASES, Case, batch_of
+from tests.methods.shapes import CLASSES
+from tests.models.onnx_files import write_encoder
+
+FROZEN = "and this model's are frozen: it would teach nothing"
+NO_POINTS = "needs features of every point"
+REFUSED = {
+    "pointdan": "needs its own generator of nodes",
+    **dict.fromkeys(("defrec", "defrec_on_source", "defrec_pcm", "mlsp"), NO_POINTS),
+    **dict.fromkeys(("dann", "dann_apart", "sd", "sd_cut_both"), FROZEN),
+    **dict.fromkeys(("gast", "gast_no_rotation", "gast_pcm"), FROZEN),
+    **dict.fromkeys(("twin", "twin_shared", "twin_of_the_source"), FROZEN),
+}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_encoder(tmp_path_factory.mktemp("frozen") / "net.onnx", dim=16)
+
+
+def _net(file: Path, *hidden: int) -> PointClassifier:
+    torch.manual_seed(0)
+    return features(CLASSES, str(file), hashlib.sha256(file.read_bytes()).hexdigest(), hidden)
+
+
+def _taught(net: Any, method: Method, case: Case) -> dict[str, bool]:
+    """Whether each term's gradient reaches a weight of the net."""
+    batch = batch_of(case, method, 8, 64, CLASSES)
+    terms = method.loss(net, batch, torch.Generator().manual_seed(0))
+    weights = list(net.parameters())
+    return {
+        name: term.requires_grad and any(g is not None for g in _gradients(term, weights))
+        for name, term in terms.items()
+    }
+
+
+def _gradients(term: torch.Tensor, weights: list[Any]) -> tuple[torch.Tensor | None, ...]:
+    return torch.autograd.grad(term, weights, retain_graph=True, allow_unused=True)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_term_teaches_the_head_or_the_method_is_refused(name: str, file: Path) -> None:
+    net, method = _net(file, 8), CASES[name].make()
+    if name in REFUSED:
+        with pytest.raises(ConfigError, match=REFUSED[name]):
+            method.prepare(net)
+        return
+    method.prepare(net)
+    taught = _taught(net, method, CASES[name])
+    assert taught
+    assert all(taught.values()), taught
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *(Dann(domain_weight=0.0), Sd(consistency_weight=0.0)),
+        *(Gast(def_weight=0.0, rot_weight=0.0), Twin(feature_weight=0.0)),
+    ],
+    ids=lambda method: type(method).__name__,
+)
+def test_without_the_loss_of_features_it_is_not_refused(method: Method, file: Path) -> None:
+    net = _net(file, 8)
+    method.prepare(net)
+    taught = _taught(net, method, Case(lambda: method, 1))
+    assert taught.pop("ce")
+    if isinstance(method, Twin):
+        assert taught == dict.fromkeys(("twin", "logits", "views", "target"), True)
+
+
+def test_pcfea_aligns_what_the_head_s_last_layer_is_given(file: Path) -> None:
+    """Of a linear probe that is the frozen vector; styled it can still be."""
+    with pytest.raises(ConfigError, match=r"method\.align_weight with a head of one layer trains"):
+        Pcfea().prepare(_net(file))
+    net, method = _net(file), Pcfea(align_weight=0.0)
+    method.prepare(net)
+    method.styled = True
+    assert _taught(net, method, CASES["pcfea"]) == {"ce": True}
+
+
+def test_asking_changes_nothing(file: Path) -> None:
+    """The net stays in its mode, and its statistics as they were."""
+    net = _net(file, 8)
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    with torch.no_grad(), pytest.raises(ConfigError, match="method=sd trains"):
+        Sd().prepare(net)
+    assert net.training
+    assert all(torch.equal(before[name], value) for name, value in net.state_dict().items())
