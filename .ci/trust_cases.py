@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from trust_domain import last_inputs, told_apart
 from trust_known import SEEN_BY, Net, run_name, run_net, second, shipped_net, small_net, turned
 from trust_nets import POINTS
 from trust_targets import Target, View, targets, view
@@ -41,7 +42,7 @@ from qs3.runs.folder import METRICS
 FIRST = ("net", "source", "seed", "target", "left_out", "clouds", "held_out", "accuracy")
 CONFIDENCE = ("calibrated", "thresholded_confidence", "difference")
 SHIFTS = ("unsure", "thresholded", "answers", "shapes", "outside", "counts", "turns")
-COLUMNS = (*FIRST, *CONFIDENCE, *SHIFTS)
+COLUMNS = (*FIRST, *CONFIDENCE, *SHIFTS, "domain")
 AGREEMENT = ("net", "source", "seed", "target", "second", "seeds")
 
 
@@ -91,6 +92,7 @@ def case(net: Net, target: Target, seen_as: View) -> tuple[dict[str, Any], np.nd
         *(by_confidence[key] for key in ("calibrated", "thresholded", "difference")),
     )
     found = shifts(net.known, seen)
+    found["domain"] = told_apart(net.features, last_inputs(net.module, seen_as.points))
     return dict(zip(FIRST + CONFIDENCE, values, strict=True)) | found, answers
 
 

@@ -25,7 +25,8 @@ from qs3.utils.files import write_text
 ALONE = ("unsure", "thresholded", "answers", "shapes", "outside", "counts")
 """Shifts that take nothing but the clouds and the net's answers."""
 
-RULES = {"alone": ALONE, **{more: (*ALONE, more) for more in ("turns", "second", "seeds")}}
+MORE = ("turns", "second", "seeds", "domain")
+RULES = {"alone": ALONE, **{one: (*ALONE, one) for one in MORE}}
 SHIPPED = "alone"
 CONFIDENCES = {
     "calibrated confidence (AC)": "calibrated",

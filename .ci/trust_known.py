@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from trust_domain import last_inputs
 from trust_nets import MODELS, POINTS, SOURCES, labelled, parts
 from trust_targets import ROOMS, Target, of_size, view
 
@@ -53,6 +54,7 @@ class Net:
         points, scale: of a cloud as it sees it.
         known: what it says of held-out labelled clouds.
         held_out: these clouds as stored, for another net.
+        features: [v, D] what its last layer is given of them, for `trust_domain.told_apart`.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Net:
     scale: str
     known: Known
     held_out: Sequence[np.ndarray]
+    features: np.ndarray
 
 
 def turned(net: torch.nn.Module, points: torch.Tensor, said: np.ndarray) -> float:
@@ -87,10 +90,11 @@ def small_net(data: Path, path: Path) -> Net:
     module = MODELS[model](num_classes=10).eval()
     module.load_state_dict(torch.load(path, weights_only=True))
     clouds = labelled(data, source)
-    held_out = parts(clouds)[1]
-    known = known_of(module, held_out.clouds.all(), held_out.labels, compared(clouds.clouds, 200))
-    stored = stored_clouds(held_out)
-    return Net(model, source, int(seed), module, POINTS, SOURCES[source][2], known, stored)
+    held_out, scale = parts(clouds)[1], SOURCES[source][2]
+    points = held_out.clouds.all()
+    known = known_of(module, points, held_out.labels, compared(clouds.clouds, 200))
+    stored, features = stored_clouds(held_out), last_inputs(module, points)
+    return Net(model, source, int(seed), module, POINTS, scale, known, stored, features)
 
 
 def shipped_net(name: str, every: dict[str, Target]) -> Net:
@@ -105,7 +109,16 @@ def shipped_net(name: str, every: dict[str, Target]) -> Net:
             folder, {**values, "held_out": tensors_of(known)}, (folder / CARD).read_text("utf-8")
         )
     clouds = [of_size(cloud) for one in few for cloud in one.clouds]
-    return Net(name, "shipped", 0, predictor.net, result.points, result.scale, known, clouds)
+    features = last_inputs(predictor.net, views_of(predictor, few))
+    return Net(
+        name, "shipped", 0, predictor.net, result.points, result.scale, known, clouds, features
+    )
+
+
+def views_of(predictor: Predictor, few: list[Target]) -> torch.Tensor:
+    """Targets' clouds as its net sees them."""
+    scale = predictor.result.scale
+    return torch.cat([view(one, predictor.points, scale).points for one in few])
 
 
 def known_of_scans(predictor: Predictor, few: list[Target]) -> Known:
@@ -157,9 +170,10 @@ def run_net(folder: Path, cache_dir: Path | None = None, turns: bool = True) -> 
     whole = Labelled(clouds.clouds, clouds.ids, labels)
     index = RULES[about["val"]](whole.ids, labels.numpy())[1]
     held_out, measured = whole.at(index), compared(whole.clouds)
-    known = known_of(predictor.net, held_out.clouds.all(), held_out.labels, measured, turns)
-    stored = stored_clouds(held_out)
-    return Net(name, source, seed, predictor.net, predictor.points, scale, known, stored)
+    points = held_out.clouds.all()
+    known = known_of(predictor.net, points, held_out.labels, measured, turns)
+    stored, features = stored_clouds(held_out), last_inputs(predictor.net, points)
+    return Net(name, source, seed, predictor.net, predictor.points, scale, known, stored, features)
 
 
 def stored_clouds(labelled: Labelled) -> list[np.ndarray]:

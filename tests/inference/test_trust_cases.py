@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from qs3.errors import DataError
@@ -27,8 +28,10 @@ pytestmark = pytest.mark.skipif(not (ROOT / ".ci").is_dir(), reason="an sdist ha
 if (ROOT / ".ci").is_dir():
     sys.path.append(str(ROOT / ".ci"))
     import trust_cases
+    import trust_domain
     import trust_fit
     import trust_known
+    import trust_targets
 
 
 @pytest.fixture
@@ -59,6 +62,17 @@ def test_a_run_s_net_knows_what_its_own_file_says(whole):
     assert net.held_out[0].shape == (64, 3)
     assert (net.name, net.source, net.seed) == trust_known.run_name(whole) == ("dgcnn", "S", 0)
     assert (net.points, net.scale) == (32, "unit_ball")
+    assert net.features.shape == (len(held_out.labels), 256)
+
+
+def test_a_case_has_all_columns_and_its_domain_is_told_by_features(whole):
+    net = trust_known.run_net(whole, turns=False)
+    flat = torch.from_numpy(np.stack(net.held_out)[:, :32]) * torch.tensor([1.0, 1.0, 0.01])
+    target = trust_targets.Target("T", "T", [*flat.numpy()], np.zeros(len(flat), dtype=int))
+    row, _ = trust_cases.case(net, target, trust_targets.View(flat, net.known.measures))
+    assert [*row] == [name for name in trust_cases.COLUMNS if name != "turns"]
+    other = trust_domain.last_inputs(net.module, flat)
+    assert row["domain"] == trust_domain.told_apart(net.features, other)
 
 
 def test_names_tell_adapted_nets_and_nets_of_real_sizes_apart(whole, tmp_path):
