@@ -126,7 +126,7 @@ def fit_images(
     from qs3.config.compose import choices, composed
     from qs3.config.hydra import build
     from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-    from qs3.sensors.fit.infrared import fit_pictures
+    from qs3.sensors.fit.infrared import FOCAL_BASELINE, fit_pictures
     from qs3.sensors.fit.pair_fill import pair_fills, words_of
     from qs3.sensors.fit.pictures import read_pictures
     from qs3.sensors.fit.stereo_preset import report, save
@@ -142,6 +142,9 @@ def fit_images(
     found = fit_pictures(scenes, sensor, distance_m, gain)
     for said in report(found, sensor, len(scenes)):
         print(said)
+    if (why := found.unknown.get(FOCAL_BASELINE)) is not None:
+        stays = f"focal_px {sensor.focal_px:g} and baseline_m {sensor.baseline_m:g} stay"
+        print(f"{FOCAL_BASELINE:28} unknown: {why}; {stays}")
     for pair in pair_fills(scenes, sensor, found.noise):
         print(words_of(pair, name))
     save(out, found, name, sensor, line)
@@ -204,11 +207,11 @@ depth; see qs3.sensors.devices.fitted.FittedDepth. The plot shows data and model
 images=FOLDER holds rectified pictures of an active stereo camera: SCENE_left.png, and where there
 are any SCENE_right.png, SCENE_off.png (projector off, the same exposure) and SCENE_depth.png (the
 left camera's). Several frames of a still scene, SCENE_left_0.png and so on, tell noise from
-texture. Found, with their errors: ambient light, blur, exposure, noise and speckle, and f B.
-Electrons at white are those without an amplifier; one that raised the pictures has to be said,
-gain=, for noise does not tell it from fewer electrons. Read-out noise is that at this gain. What
-the pictures do not tell is said, and left as it is in base=. Of each pair it is said how much of it
-the matcher of base= fills, and why the rest is lost.
+texture. Found, with their errors: ambient light, blur, exposure, noise and speckle; with right
+pictures and a depth image, f B. Electrons at white are those without an amplifier; one that raised
+the pictures has to be said, gain=, for noise does not tell it from fewer electrons. Read-out noise
+is that at this gain. What the pictures do not tell is said, and left as it is in base=. Of each
+pair it is said how much of it the matcher of base= fills, and why the rest is lost.
 """,
     words="FRAMES",
     line=True,

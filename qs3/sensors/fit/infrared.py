@@ -40,6 +40,7 @@ KEYS = (
     "infrared.read_noise_e",
 )  # fmt: skip
 NOISE = KEYS[2:]
+FOCAL_BASELINE = "f B"
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +71,9 @@ class InfraredFit:
             at the quantile that the preset's exposure goes by; those that no picture tells are
             the base preset's.
         errors: standard error of each over its value, from the curvature of the fit.
-        unknown: keys that the pictures do not tell, with the reason.
+        unknown: keys that the pictures do not tell, with the reason; `FOCAL_BASELINE`, too.
         rough: keys that they tell, but not to within `WITHIN`.
-        focal_baseline: f B in px m by disparity and depth; None without both.
+        focal_baseline: f B in px m by disparity and depth; None: not known, `unknown` says why.
         dots_over_ambient: at `distance_m`, as `qs3 bench` has it.
         distance_m: median over the scenes.
         misfit: RMS of what is left, in standard errors; about 1 is good.
@@ -189,7 +190,10 @@ def fit_pictures(
         float(rest.square().mean().sqrt()),
         gain,
     )
-    return replace(fit, focal_baseline=_focal_baseline(scenes, base, fit.noise))
+    product = _focal_baseline(scenes, base, fit.noise)
+    if product is None:
+        unknown[FOCAL_BASELINE] = _why_no_product(scenes)
+    return replace(fit, focal_baseline=product)
 
 
 def facing(base: SpeckleStereo, distance_m: float, side_px: int) -> Pair:
@@ -227,10 +231,13 @@ def _target(scene: Pictures, base: SpeckleStereo, distance_m: float | None) -> _
         raise DataError(f"{scene.name}: {images[0].shape} is too small; 100 px are the least")
     if images[0].mean() < 3:
         raise DataError(f"{scene.name}: the picture is black")
-    depth = scene.depth_m
-    where = distance_m if depth is None else float(np.nanmedian(depth))
+    depths = _depths(scene)
+    where = float(np.median(depths)) if depths.size else distance_m
     if where is None or not where > 0:
-        raise ConfigError(f"{scene.name} has no depth image: say its distance with distance=METRES")
+        raise ConfigError(
+            f"{scene.name} has no depth image with depths in it: say its distance with "
+            "distance=METRES"
+        )
     tensors = [torch.from_numpy(image) for image in images]
     each = [statistics(tensor) for tensor in tensors]
     shared = torch.stack([one.shared for one in each]).mean(dim=0)
@@ -253,6 +260,12 @@ def _target(scene: Pictures, base: SpeckleStereo, distance_m: float | None) -> _
         where, shared, skewness, over_time(tensors), white, added, bool(ends > _CLIPPED),
         Speckled(projected, grain, _camera(base).ambient_speckles), smooth(projected),
     )  # fmt: skip
+
+
+def _depths(scene: Pictures) -> np.ndarray:
+    """[n] those that are known."""
+    depth = np.zeros(0) if scene.depth_m is None else scene.depth_m
+    return depth[np.isfinite(depth)]
 
 
 def _residuals(target: _Target, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -347,6 +360,17 @@ def _focal_baseline(
         found.append(product[np.isfinite(product)])
     every = np.concatenate(found) if found else np.zeros(0)
     return float(np.median(every)) if every.size else None
+
+
+def _why_no_product(scenes: Sequence[Pictures]) -> str:
+    """What is missing for f B."""
+    if not any(scene.right for scene in scenes):
+        return (
+            "one camera's pictures show no disparity: it needs SCENE_right.png, and a depth image"
+        )
+    if not any(_depths(scene).size for scene in scenes if scene.right):
+        return "a scene with right pictures needs a depth image, too, SCENE_depth.png"
+    return "no pixel has both a disparity by the base's matcher and a depth"
 
 
 def _dots_over_ambient(

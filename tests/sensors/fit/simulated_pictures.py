@@ -1,6 +1,7 @@
 """Infrared pictures of walls by a simulated camera whose numbers one knows, for `qs3 fit images=`.
 
 python -m tests.sensors.fit.simulated_pictures into=pictures speckle_contrast=0.3 read_noise_e=25
+python -m tests.sensors.fit.simulated_pictures into=pictures cameras=1 # no right pictures
 qs3 fit images=pictures base=realsense_d415 out=found.yaml
 """
 
@@ -39,13 +40,17 @@ def camera(hidden, fixed_gain):
         infrared=replace(BASE.infrared, fixed_gain=fixed_gain, **infrared),
         pattern=replace(BASE.pattern, seed=77),
         misalignment=Misalignment(),
-        matcher=StereoBlockMatcher(num_disparities=128),  # its depth is not looked at
+        matcher=StereoBlockMatcher(num_disparities=128),  # its disparity is not looked at
         filters=(),
     )
 
 
 def pictures(sensor, depth_m, name, renderer, frames=8, half_px=220):
-    """Frames of a wall that faces the camera, and one with the projector off."""
+    """Frames of a wall that faces both cameras, its depth, and one with the projector off.
+
+    The right camera's are the same columns as the left's, and dark where these show more than the
+    wall: no pixel of the left image lies there.
+    """
     half = half_px * depth_m / sensor.focal_px
     wall = square(depth_m, 2 * half)
     box = box_of(square(depth_m, half))
@@ -57,8 +62,9 @@ def pictures(sensor, depth_m, name, renderer, frames=8, half_px=220):
             still.rewind()
         rng = np.random.default_rng([i, round(100 * depth_m)])
         taken.append(one.scan((wall,), box, POSE, still if one is sensor else renderer, rng))
-    *left, dark = (frame.images["left"] for frame in taken)
-    return Pictures(name, left, (), [dark], taken[0].depth_m)
+    *lit, dark = (frame.images for frame in taken)
+    left, right = ([each[side] for each in lit] for side in ("left", "right"))
+    return Pictures(name, left, right, [dark["left"]], taken[0].clean_m)
 
 
 def three_walls(hidden, renderer):
@@ -85,10 +91,12 @@ def save(folder, scenes):
 def main(*words: str) -> None:
     """Write pictures by what is given, else by HIDDEN."""
     given = dict(word.partition("=")[::2] for word in words)
-    into = Path(given.pop("into"))
+    into, cameras = Path(given.pop("into")), given.pop("cameras", "2")
     hidden = {key: float(given.pop(key.split(".")[-1], value)) for key, value in HIDDEN.items()}
     assert not given, f"unknown: {', '.join(given)}"
-    save(into, three_walls(hidden, MitsubaRenderer(samples=16)))
+    assert cameras in ("1", "2"), f"cameras={cameras}: 1 or 2"
+    scenes = three_walls(hidden, MitsubaRenderer(samples=16))
+    save(into, [replace(scene, right=()) if cameras == "1" else scene for scene in scenes])
     sys.stdout.write(f"{into}: {', '.join(f'{key} {value:g}' for key, value in hidden.items())}\n")
 
 

@@ -14,7 +14,7 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.fit.infrared import NOISE, Pictures, fit_pictures
+from qs3.sensors.fit.infrared import FOCAL_BASELINE, NOISE, Pictures, fit_pictures
 from qs3.sensors.fit.infrared_statistics import statistics
 from qs3.sensors.fit.pictures import read_pictures
 from qs3.sensors.fit.stereo_preset import report
@@ -22,6 +22,7 @@ from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Speckle
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from tests.commands import main
+from tests.sensors.fit import simulated_pictures
 from tests.sensors.fit.simulated_pictures import BASE, HIDDEN, save, three_walls
 from tests.sensors.scenery import POSE, square
 
@@ -95,8 +96,7 @@ def test_statistics_of_shifted_noise():
 
 
 def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
-    shifted = np.roll(scenes[0].left[0], -61, axis=1)  # f B / Z
-    save(tmp_path / "pictures", [replace(scenes[0], right=[shifted]), *scenes[1:]])
+    save(tmp_path / "pictures", scenes)
     out = tmp_path / "sensor" / "mine.yaml"
     out.parent.mkdir()
     words = ["fit", f"images={tmp_path / 'pictures'}", f"out={out}"]
@@ -108,7 +108,11 @@ def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
     assert re.search(
         r"near: realsense_d415 fills \d+\.\d%.*; the camera's own depth: 100\.0%", said
     )
+    product = BASE.focal_px * BASE.baseline_m
+    (line,) = re.findall(r"^f B +(.*)", said, re.MULTILINE)
+    assert float(line.split(" px m")[0]) == pytest.approx(product, rel=1e-3)
     written = yaml.safe_load(out.read_text())
+    assert written["baseline_m"] == pytest.approx(BASE.baseline_m, rel=1e-3)
     assert written["defaults"][0] == "realsense_d415"
     assert written["ambient"] == pytest.approx(HIDDEN["ambient"], rel=0.07)
     assert written["infrared"]["psf_px"] == pytest.approx(HIDDEN["infrared.psf_px"], rel=0.07)
@@ -118,6 +122,67 @@ def test_the_command_writes_a_preset_that_composes(scenes, tmp_path, capsys):
     assert isinstance(found, SpeckleStereo)
     assert found.ambient == pytest.approx(written["ambient"])
     assert found.pattern.columns == BASE.pattern.columns
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_f_b_is_said_or_said_to_be_unknown(cameras, scenes, tmp_path, capsys):
+    one = replace(scenes[0], left=scenes[0].left[:1], right=scenes[0].right[: cameras - 1])
+    save(tmp_path / "pictures", [one])
+    out = tmp_path / "mine.yaml"
+    assert main(["fit", f"images={tmp_path / 'pictures'}", f"out={out}"]) == 0
+    (line,) = re.findall(r"^f B +(.*)", capsys.readouterr().out, re.MULTILINE)
+    baseline = yaml.safe_load(out.read_text()).get("baseline_m")
+    if cameras == 2:
+        assert line.startswith("55.2")
+        assert "f and B alone cannot be told apart" in line
+        assert baseline == pytest.approx(BASE.baseline_m, rel=1e-3)
+        assert "f B:" not in out.read_text()
+    else:
+        assert line.startswith("unknown: one camera's pictures show no disparity")
+        assert "SCENE_right.png" in line
+        assert line.endswith("baseline_m 0.055 stay")
+        assert "\n# not known: f B: one camera's pictures" in out.read_text()
+        assert baseline is None
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "grey", "why"),
+    [
+        (None, 1.0, "needs a depth image"),
+        (np.nan, 1.0, "needs a depth image"),  # an empty one
+        (0.9, 0.0, "no pixel has both a disparity"),
+    ],
+)
+def test_right_pictures_alone_do_not_tell_the_baseline(scenes, depth_m, grey, why):
+    left, right = scenes[0].left[:1], [grey * scenes[0].right[0]]
+    depth = None if depth_m is None else np.full(left[0].shape, depth_m)
+    found = fit_pictures([Pictures("near", left, right, (), depth)], BASE, distance_m=0.9)
+    assert found.distance_m == pytest.approx(0.9)
+    assert found.focal_baseline is None
+    assert why in found.unknown[FOCAL_BASELINE]
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_simulated_pictures_are_of_as_many_cameras_as_asked_for(cameras, tmp_path):
+    into = tmp_path / "pictures"
+    simulated_pictures.main(f"into={into}", f"cameras={cameras}")
+    found = read_pictures(into)
+    assert [scene.name for scene in found] == ["dim", "far", "near"]
+    for scene in found:
+        assert len(scene.left) == 8
+        assert len(scene.right) == 8 * (cameras - 1)
+        assert len(scene.off) == 1
+        assert np.isfinite(scene.depth_m).all()
+
+
+def test_simulated_right_pictures_are_the_left_ones_moved_by_the_disparity(scenes):
+    for scene in scenes:
+        left, right = (np.mean(images, axis=0) for images in (scene.left, scene.right))
+        moved = round(BASE.focal_px * BASE.baseline_m / float(np.median(scene.depth_m)))
+        same = left[30:-30, moved + 30 : -30], right[30:-30, 30 : -30 - moved]
+        assert np.corrcoef(same[0].ravel(), same[1].ravel())[0, 1] > 0.8
+        apart = left[30:-30, moved + 35 : -25], right[30:-30, 30 : -30 - moved]
+        assert abs(np.corrcoef(apart[0].ravel(), apart[1].ravel())[0, 1]) < 0.3
 
 
 def test_focal_length_times_baseline_by_disparity_and_depth(renderer):
@@ -135,6 +200,7 @@ def test_focal_length_times_baseline_by_disparity_and_depth(renderer):
     off_by_a_fifth = replace(sensor, baseline_m=0.05)
     scene = Pictures("wall", [left], [right], (), frame.clean_m)
     found = fit_pictures([scene], off_by_a_fifth)
+    assert FOCAL_BASELINE not in found.unknown
     assert found.focal_baseline == pytest.approx(300 * 0.061, rel=0.01)
 
 
