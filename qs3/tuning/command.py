@@ -25,6 +25,7 @@ from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer
 from qs3.tuning import parameters
 from qs3.tuning.features import ROUGHNESS, Descriptor, Distance, NetFeatures, roughness
+from qs3.tuning.remembered import Remembered
 from qs3.tuning.scenes import Still, check_recipe, sampled, still_of
 from qs3.tuning.search import search, settled
 from qs3.tuning.state import State, read_state
@@ -125,7 +126,7 @@ def tune(wanted: Wanted, overrides: Sequence[str]) -> Found:
     start = parameters.free(parameters.values_of(sensor, keys)).tolist()
     zeros = [0.0] * len(keys)
     state = read_state(at, settings) or State(settings, start, zeros, list(zeros))
-    renderer = build(cfg.renderer)
+    renderer = Remembered(build(cfg.renderer))
     if state.steps < wanted.steps:
         _go_on(state, keys, wanted, recipe, trained, cfg.seed, renderer, distance, at)
     found = parameters.as_floats(parameters.bounded(torch.tensor(settled(state)), keys))
