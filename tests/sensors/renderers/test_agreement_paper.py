@@ -158,16 +158,16 @@ def test_disparities_agree_on_bodies_of_several_materials(name, lit):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("more", "median_px"), [(1, 0.1), (16, 0.06)])
 @pytest.mark.parametrize("name", ["chair", "bookshelf"])
-def test_disparities_agree_on_clear_bodies(name):
-    """conf/materials/clear.yaml with as much glass as all the rest.
+def test_disparities_agree_on_clear_bodies(name, more, median_px):
+    """conf/materials/clear.yaml with as much glass as all the rest; looser than on other bodies.
 
     Whether a sample passes is drawn, and in Blender only what is behind depends on it, so that 16
-    of Mitsuba's are much noisier: it differs from itself with another seed by 0.10 px on the chair.
-    With 256 the two differ by 0.05 px there and by 0.035 px on the shelf, with 16 by 0.08.
+    of Mitsuba's are much noisier: it differs from itself with another seed by 0.11 px.
     """
     materials = materials_of("clear", glass=1.0)
-    compare(name, samples=16, window_px=140, materials=materials, median_px=0.06, more=16)
+    compare(name, samples=16, window_px=140, materials=materials, median_px=median_px, more=more)
 
 
 @pytest.mark.slow
