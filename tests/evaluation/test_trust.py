@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from qs3.evaluation.trust import (
     shifts,
 )
 from qs3.evaluation.trust_file import PATH, SHIFTS, Calibration, read_calibration, write_calibration
+from qs3.runs.metrics import Trust
 
 CALIBRATION = Calibration({"unsure": 0.5, "answers": 1.0, "shapes": 1.5}, 50, 8, 0.08, 0.16, 0.2)
 
@@ -247,3 +249,24 @@ def test_words_of_an_estimate_that_can_be_trusted():
     assert words.startswith(f"about {trust.expected:.0%} expected to be right, give or take 8 poi")
     assert DO_NOT_TRUST not in words
     assert reasons(trust) == [] or all("(0." in one for one in reasons(trust))
+
+
+def test_the_trial_of_the_docs_ends_as_a_run_with_its_figures_does():
+    """docs/how-to/adapt.md shows that run's output; other weights or words make another line."""
+    found = {
+        "unsure": 0.5096618, "thresholded": 0.4769241, "answers": 0.1481481,
+        "shapes": 0.2345679, "outside": 0.0555556, "counts": 0.1661760,
+    }  # fmt: skip
+    weights, held_out = read_calibration().weights, 0.7073171
+    trust = Trust(
+        expected=expected(held_out, found, weights),
+        trusted=False,
+        held_out=held_out,
+        shifts=found,
+        lost={name: weight * found[name] for name, weight in weights.items()},
+        error=read_calibration().mean_error,
+        error_90=read_calibration().error_90,
+    )
+    page = Path(__file__).parents[2] / "docs" / "how-to" / "adapt.md"
+    shown = " ".join(page.read_text("utf-8").split())
+    assert f"; {trust_in_words(trust)} (of the net before self-training); data: " in shown
