@@ -20,7 +20,8 @@ class Remembered:
     A search asks for the same view by sensors that differ in their camera or in `ambient`. A
     surface's radiance is what the projector's light leaves on it and `ambient` times what light of
     strength 1 does (`Scene.ambient`), so two renders serve all of them: the sum is that of one
-    render but for the last bit of a float32. The projector is taken for what it was.
+    render but for the last bit of a float32. Whatever else decides an image is part of what it is
+    known by. Scenes that are not plain, whose light bounces or shines, are rendered each time.
 
     Args:
         renderer: that renders what is not known.

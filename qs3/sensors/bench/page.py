@@ -55,9 +55,9 @@ _DIFFERENCES = """## Known differences from the devices
 - D400s ask for texture above their noise and lose planes that are nearly edge-on; how many pixels
   real ones keep at 80 and 85 degrees is not published, so those bands are wide and by geometry.
 - Kinects and D435 have mixed pixels at three to five times as many steps of a room as real frames,
-  so that band fails; the D415 is within it. What makes them is the blur of the lens (`psf_px`), in
-  which the windows of two surfaces run into each other: with 0.5 px in place of 0.8 `kinect_v1` has
-  14 % in place of 42 (three rooms), and its depths crowd at whole pixels, as real ones do not.
+  so that band fails; the D415 is within it. Of `kinect_v1` it is known what makes them, the blur of
+  the lens (`psf_px`): with 0.5 px in place of 0.8 it has 14 % in place of 42 (three rooms). Then
+  its depths crowd at whole pixels, as real ones do not.
 - `kinect_v1` and `structure_sensor` have laser speckle on their ambient light, too. It is faint
   behind their filter: `ambient_speckles: false` would be right and would move the bytes of R.
 - Light goes straight from projector to surface to camera: matt targets, no light from one surface

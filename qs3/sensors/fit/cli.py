@@ -126,7 +126,7 @@ def fit_images(
     from qs3.config.compose import choices, composed
     from qs3.config.hydra import build
     from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-    from qs3.sensors.fit.infrared import FOCAL_BASELINE, fit_pictures
+    from qs3.sensors.fit.infrared import fit_pictures
     from qs3.sensors.fit.pair_fill import pair_fills, words_of
     from qs3.sensors.fit.pictures import read_pictures
     from qs3.sensors.fit.stereo_preset import report, save
@@ -142,9 +142,6 @@ def fit_images(
     found = fit_pictures(scenes, sensor, distance_m, gain)
     for said in report(found, sensor, len(scenes)):
         print(said)
-    if (why := found.unknown.get(FOCAL_BASELINE)) is not None:
-        stays = f"focal_px {sensor.focal_px:g} and baseline_m {sensor.baseline_m:g} stay"
-        print(f"{FOCAL_BASELINE:28} unknown: {why}; {stays}")
     for pair in pair_fills(scenes, sensor, found.noise):
         print(words_of(pair, name))
     save(out, found, name, sensor, line)

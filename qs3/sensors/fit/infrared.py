@@ -353,7 +353,7 @@ def _focal_baseline(
             np.clip(np.rint(np.mean(images, axis=0)), 0, 255).astype(np.uint8)
             for images in (scene.left, scene.right)
         ]
-        count = len(scene.left)  # the mean of so many frames is as one of so many electrons more
+        count = len(scene.left)  # their mean has the noise of one with so many times the electrons
         of_mean = GreyNoise(noise.electrons_at_white * count, noise.read_noise_e * count**0.5)
         match = for_picture(base.matcher, of_mean).match(*pair)
         product = match.disparity * scene.depth_m

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.fit.infrared import WITHIN, InfraredFit
+from qs3.sensors.fit.infrared import FOCAL_BASELINE, WITHIN, InfraredFit
 from qs3.utils.files import write_text
 from qs3.utils.plural import counted
 
@@ -32,10 +32,14 @@ def report(found: InfraredFit, base: SpeckleStereo, scenes: int) -> list[str]:
         lines.append(f"{key:28} {found.values[key]:.4g}{error}   ({words})")
     dots = f"{found.dots_over_ambient:.3g} at {found.distance_m:.2f} m"
     lines.append(f"{'dots over ambient':28} {dots}")
-    if found.focal_baseline is not None:
+    if found.focal_baseline is None:
+        stay = f"focal_px {base.focal_px:g} and baseline_m {base.baseline_m:g} stay"
+        lines.append(f"{FOCAL_BASELINE:28} unknown: {found.unknown[FOCAL_BASELINE]}; {stay}")
+    else:
         lines.append(
-            f"{'f B':28} {found.focal_baseline:.4g} px m; with f = {base.focal_px:g} px a baseline "
-            f"of {found.focal_baseline / base.focal_px:.5g} m: f and B alone cannot be told apart"
+            f"{FOCAL_BASELINE:28} {found.focal_baseline:.4g} px m; with f = {base.focal_px:g} px a "
+            f"baseline of {found.focal_baseline / base.focal_px:.5g} m: f and B alone cannot be "
+            "told apart"
         )
     if found.gain == 1:
         lines.append(
