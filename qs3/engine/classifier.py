@@ -14,7 +14,7 @@ from qs3.datamodules.batches import generator_of
 from qs3.datamodules.phases import Phases
 from qs3.engine.schedules import Plateau, cosine
 from qs3.errors import ConfigError
-from qs3.methods.base import Method
+from qs3.methods.base import Method, total_loss
 from qs3.models.base import Backbone
 from qs3.utils.seeding import derive
 
@@ -173,7 +173,7 @@ class Classifier(LightningModule):
         generator = generator_of(batch, "method", self.seed, self.global_rank, self.device)
         self._regularisers.clear()
         terms = method.loss(self.net, {**batch, "progress": self._progress(batch_idx)}, generator)
-        total = torch.stack(list(terms.values())).sum()
+        total = total_loss(method, terms)
         if self._regularisers:
             total = total + self.regulariser_weight * torch.stack(self._regularisers).sum()
         if not warmup and self.trainer.world_size > 1:  # DDP waits for the gradient of all

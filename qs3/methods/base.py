@@ -76,6 +76,31 @@ class Method(nn.Module):
         raise NotImplementedError
 
 
+def total_loss(method: nn.Module, terms: dict[str, Tensor]) -> Float[Tensor, ""]:
+    """The sum of the terms of a method's loss.
+
+    Raises:
+        ConfigError: they are not scalar tensors by name (a loss of each cloud would be summed, not
+            averaged), or no gradient leads back from them.
+    """
+    rule = f"{type(method).__name__}.loss must return a dict of scalar tensors by name"
+    if not isinstance(terms, dict) or not terms:
+        raise ConfigError(f"{rule}, not {_what(terms)}")
+    for name, term in terms.items():
+        if not isinstance(term, Tensor) or term.ndim:
+            raise ConfigError(f"{rule}; {name!r} is {_what(term)}")
+    total = torch.stack(list(terms.values())).sum()
+    if not total.requires_grad:
+        raise ConfigError(f"{rule}; no gradient leads back from {', '.join(terms)}")
+    return total
+
+
+def _what(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"a tensor {list(value.shape)}"
+    return "an empty dict" if value == {} else f"of type {type(value).__name__}"
+
+
 def class_loss(
     logits: Float[Tensor, "b c"], labels: Tensor, smoothing: float = 0.0
 ) -> Float[Tensor, ""]:

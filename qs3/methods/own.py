@@ -30,7 +30,8 @@ def own(file: str, sha256: str, **settings: Any) -> Method:
     Raises:
         MissingDataError: there is no such file.
         ConfigError: its content is another one, it cannot be imported, it has no such class or
-            several, the settings are not its own, or it asks for labels of the target.
+            several, the settings are not its own, its `__init__` leaves out `Method`'s, or it
+            asks for labels of the target.
     """
     path = Path(file).expanduser()
     try:
@@ -47,6 +48,10 @@ def own(file: str, sha256: str, **settings: Any) -> Method:
         method = cls(**settings)
     except TypeError as error:  # of an unknown setting, above all
         raise ConfigError(f"method.file={file}: {cls.__name__}: {error}") from error
+    if "_modules" not in vars(method):  # torch's own words come later and name neither
+        raise ConfigError(
+            f"method.file={file}: {cls.__name__}.__init__ must begin with super().__init__()"
+        )
     if method.labels != "source":
         raise ConfigError(
             f"method.file={file}: {cls.__name__}.labels is {method.labels!r}: a method of one's "

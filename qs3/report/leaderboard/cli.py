@@ -6,6 +6,7 @@ the table's, so it is trained, evaluated and compared as all other rows are.
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -61,7 +62,10 @@ def _leaderboard(
     print(f"{name}: {counted(len(todo), 'run')} to do", flush=True)
     status = launch(todo, "joblib" if (jobs or 1) > 1 else "basic", jobs, log_dir)
     shown = beside(built(), name)
-    at = Path(out or Path(log_dir) / "tables") / f"{shown.name}-{method.stem}"
+    if overrides:
+        also = f"beside the rules all runs of this page have: {overrides}"
+        shown = replace(shown, notes=(*shown.notes, also))
+    at = Path(out or Path(log_dir) / "tables") / f"{shown.name}-{_file_name(name)}"
     page = markdown(shown) + _intervals(shown, name)
     write_text(f"{at}.md", page)
     for suffix, write in ((".csv", csv_text), (".tex", latex)):
@@ -118,6 +122,11 @@ def beside(table: Table, name: str) -> Table:
     )
 
 
+def _file_name(row: str) -> str:
+    """A row's name as a part of a file's: two rows of one method's file have files of their own."""
+    return re.sub(r"[^\w.]+", "-", row).strip("-.") or "row"
+
+
 def _check_rules(table: Table, name: str) -> None:
     """Whether the other rows are trained by the rules that the row `name` is trained by.
 
@@ -134,16 +143,19 @@ def _check_rules(table: Table, name: str) -> None:
 
 
 def _check_class(table: Table, name: str) -> None:
-    """Build the method as each run will, before any has begun.
+    """Build the method as each run will, and try its loss on random clouds, before any has begun.
 
     Raises:
-        ConfigError: the file is not a method (`qs3.methods.own`).
+        ConfigError: the file is not a method (`qs3.methods.own`), or its loss fails.
     """
     from qs3.config.compose import composed
     from qs3.config.hydra import build
+    from qs3.methods.trial import try_step
 
     cell = next(cell for cell in table.rows[name] if cell and cell.runnable)
-    build(composed("train", *cell.overrides).method)
+    cfg = composed("train", *cell.overrides)
+    method, net = build(cfg.method), build(cfg.model)
+    try_step(method, net, cfg.method.file, cfg.num_classes, cfg.data.points)
 
 
 def _intervals(table: Table, name: str) -> str:
@@ -152,7 +164,9 @@ def _intervals(table: Table, name: str) -> str:
     from qs3.report.tables.comparison import text as shown
 
     found = minus_each(table, name)
-    return f"\n{name} minus\n\n{shown(found, markdown=True)}" if found else ""
+    if any(one.differences for one in found):
+        return f"\n{name} minus\n\n{shown(found, markdown=True)}"
+    return "".join(f"\n{name} minus {one.name}: {one.why}\n" for one in found)
 
 
 LEADERBOARD = Command(
@@ -193,8 +207,10 @@ LEADERBOARD = Command(
         'qs3 leaderboard method=my_method.py columns="S -> K" seeds=0 selftraining=qbst',
     ),
     about="""
-The file is imported, which runs it: name one that you trust. An edited file is another row, whose
-runs begin anew; the same command goes on with interrupted runs and trains nothing twice.
+The file is imported, which runs it: name one that you trust. Its loss is tried on four random
+clouds before any run begins; the runs need the data of the chosen columns. An edited file is
+another row, whose runs begin anew; the same command goes on with interrupted runs and trains
+nothing twice.
 Rules and an example: docs/how-to/leaderboard.md. The other rows are trained by
 `qs3 report train table=leaderboard`.
 """,

@@ -15,7 +15,7 @@ from qs3.config.hashing import config_hash
 from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.errors import ConfigError
-from qs3.report.leaderboard.cli import ALONE, WITH_ROUNDS, own_row
+from qs3.report.leaderboard.cli import ALONE, WITH_ROUNDS, _file_name, _intervals, own_row
 from qs3.report.tables.formats import grid, markdown, to_run
 from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
@@ -191,6 +191,7 @@ def test_one_s_own_method_beside_the_others(toy, capsys):
     saved = toy / "logs" / "tables"
     assert (saved / "small-turned.md").read_text() in shown
     assert {p.suffix for p in saved.glob("small-turned.*")} == {".md", ".csv", ".tex"}
+    assert f"- beside the rules all runs of this page have: {TOY}\n" in shown
 
     def runs(text, settings=("method.weight=0.5",)):
         (toy / "elsewhere.py").write_text(text)
@@ -200,6 +201,26 @@ def test_one_s_own_method_beside_the_others(toy, capsys):
     assert runs(example()) == 0  # another place, the same content
     assert runs(example() + "# edited\n") == 2
     assert runs(example(), settings=()) == 2
+
+
+def test_rows_of_one_file_have_pages_of_their_own():
+    assert _file_name("my_method") == "my_method"
+    assert _file_name("Turned, w = 0.3") == "Turned-w-0.3"
+    assert _file_name("Mine (λ/2)") == "Mine-λ-2"
+    assert _file_name("../../x") == "x"
+    assert _file_name("?") == "row"
+
+
+def test_a_loss_that_fails_is_refused_before_any_run(toy, tmp_path, capsys):
+    file = tmp_path / "wrong.py"
+    text = example().replace('source["y_source"]', 'batch["target"]["y_target"]')
+    file.write_text(text)
+    (line,) = (i for i, one in enumerate(text.splitlines(), 1) if "y_target" in one)
+    given = [word for word in words(toy) if not word.startswith("method=")]
+    assert main([*given, f"method={file}"]) == 1
+    said = capsys.readouterr()
+    assert f"wrong.py, line {line}: KeyError: 'y_target'; a batch has " in said.err
+    assert "to do" not in said.out
 
 
 def test_what_is_refused(toy, tmp_path, capsys):
@@ -255,6 +276,22 @@ def test_what_is_shown(tmp_path):
     assert [job.name for job in missing(table, [7], columns=["K"])] == [
         "source only, S → K, seed 7"
     ]
+
+
+def test_without_two_seeds_in_common_there_is_a_reason_and_no_empty_table(tmp_path):
+    (tmp_path / "small.yaml").write_text(
+        SMALL + '  - {name: PCM, run: "experiment=leaderboard method=pcm"}\n'
+    )
+
+    def shown(*seeds):
+        for name in ("source only", "PCM"):
+            cell = build_table(str(tmp_path / "small.yaml"), tmp_path).rows[name][1]
+            run_cell(tmp_path, cell, seeds)
+        return _intervals(build_table(str(tmp_path / "small.yaml"), tmp_path), "PCM")
+
+    said = "PCM minus source only, S → K"
+    assert shown() == ""
+    assert shown(0) == f"\n{said}: fewer than two seeds in common ([0])\n"
 
 
 @pytest.mark.slow
