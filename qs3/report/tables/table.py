@@ -104,8 +104,9 @@ def build_table(
                 f"target={target}: the columns of table {name} have several targets; leave it out"
             )
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
+    place = override("paths.log_dir", log_dir)
     if str(log_dir) != "logs":
-        more.append(override("paths.log_dir", log_dir))
+        more.append(place)
     own = by_column(more, tuple(spec.columns))
     try:
         cells = [
@@ -124,7 +125,7 @@ def build_table(
         raise ConfigError(f"{path}: two rows are called {twice[0]!r}; give one another name")
     groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
     hint = f"; {ALONE}" if extra and len(shown) > 1 else ""
-    filled = {(c.row, c.column): c for c in _fill(cells, groups, target, hint)}
+    filled = {(c.row, c.column): c for c in _fill(cells, groups, target, hint, place)}
     named = tuple(_column(column, target) for column in shown)
     filled_rows = {
         row["name"]: tuple(filled.get((row["name"], column)) for column in named)
@@ -250,10 +251,12 @@ def _fill(
     groups: Mapping[tuple[str, str], Group],
     target: str | None,
     hint: str,
+    place: str,
 ) -> list[Cell]:
     """The cells with their runs, or with the reason why they cannot be run.
 
-    `hint` ends the message about an override that a cell's config does not take.
+    `hint` ends the message about an override that a cell's config does not take; `place` is the
+    override that says where runs lie, which changes nothing of what is looked up.
     """
     from hydra.errors import (
         ConfigCompositionException,
@@ -267,11 +270,11 @@ def _fill(
             filled.append(cell)
             continue
         try:
-            run = _composed(cell.overrides)
+            run = _composed(tuple(word for word in cell.overrides if word != place))
             if target and run.supervised:
                 # The upper bound has labels of its target: the other target is its source too.
                 cell = replace(cell, overrides=(*cell.overrides, f"domain@data.source={target}"))
-                run = _composed(cell.overrides)
+                run = _composed(tuple(word for word in cell.overrides if word != place))
         except MissingConfigException as error:
             filled.append(replace(cell, missing=first_line(error)))
             continue

@@ -72,7 +72,7 @@ def test_one_frame_does_not_tell_noise(scenes):
         assert found.values[key] == getattr(BASE.infrared, key.split(".")[1])
 
 
-@pytest.mark.parametrize("frames", [1, 2])
+@pytest.mark.parametrize("frames", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_clipped_pictures_are_said_to_be_clipped(scenes, frames):
     """Not that they hold too few dots, or too much noise: another exposure helps."""
     white = [np.clip(4.0 * image, 0, 255) for image in scenes[0].left[:frames]]
