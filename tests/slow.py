@@ -103,7 +103,6 @@ PATTERNS = (
     r"data/frames/test_real_kinect\.py::test_two_ways",
     r"data/scannet/test_extraction\.py::test_other_files",
     r"data/test_gravity_axis\.py::test_every_published",
-    r"models/test_simpleview\.py::test_windows_change",
     # Further members of families that the quick run knows by one or two.
     r"test_experiments\.py::test_experiment_runs\[supervised_d",
     r"test_composing\.py::test_it_is_what_hydra_composes\[(?!a toy run|another scheme|no command)",

@@ -7,6 +7,7 @@ from torch import nn
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models import pointnet2 as pointnet2_module
+from qs3.models.fast import grouped_mlp_max
 from qs3.models.pointnet2 import GroupedMLP, pointnet2
 from tests.models.by_formula import clouds, figures, fill
 from tests.models.reference_pointnet2 import StraightMLP, StraightPointNet2
@@ -64,6 +65,25 @@ def test_whole_net_equals_the_straight_one(variant: str, training: bool) -> None
     (a, da), (b, db) = _step(ours, points), _step(straight, points)
     torch.testing.assert_close(a, b, **TIGHT)
     torch.testing.assert_close(da, db, rtol=0.0, atol=1e-10 * max(1.0, float(db.abs().max())))
+
+
+@pytest.mark.usefixtures("few_centres")
+def test_threads_take_larger_parts_and_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grouped_mlp_max, "_AT_ONCE", 1 << 7)  # several parts of both
+    net, twin = pointnet2(10, "ssg").double(), pointnet2(10, "ssg").double()
+    twin.load_state_dict(net.state_dict())
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        alone = _step(net, _clouds())
+        parts = len(grouped_mlp_max._parts(1000, 16))
+        torch.set_num_threads(2)
+        two = _step(twin, _clouds())
+        assert len(grouped_mlp_max._parts(1000, 16)) == pytest.approx(parts / 8, abs=1)
+    finally:
+        torch.set_num_threads(before)
+    for mine, other in zip(two, alone, strict=True):
+        torch.testing.assert_close(mine, other, **TIGHT)
 
 
 @pytest.mark.usefixtures("few_centres")

@@ -2,14 +2,10 @@ import copy
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import nn
 from torch.nn import functional as F
 
 from qs3.models.base import PointClassifier
-from qs3.models.fast import active_windows as windows
-from qs3.models.fast import plain, resnet_cpu
 from qs3.models.projection import depth_images
 from qs3.models.resnet import ResNet18
 from qs3.models.simpleview import simpleview
@@ -29,15 +25,6 @@ def _small(**settings: object) -> PointClassifier:
         if p.ndim == 1:
             nn.init.normal_(p, 1.0, 0.3)
     return model.double()
-
-
-def _network(channels: int) -> ResNet18:
-    torch.manual_seed(0)
-    net = ResNet18(channels).double()
-    for p in net.parameters():
-        if p.ndim == 1:
-            nn.init.normal_(p, 1.0, 0.3)
-    return net
 
 
 def test_initial_weights() -> None:
@@ -114,10 +101,7 @@ def test_views_are_rows_of_the_table() -> None:
 
 @pytest.mark.parametrize("norm", ["batch", "instance"])
 @pytest.mark.parametrize("training", [True, False])
-def test_equals_straight_network(
-    training: bool, norm: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(resnet_cpu, "_AT_ONCE", 1 << 12)  # several parts
+def test_equals_straight_network(training: bool, norm: str) -> None:
     model = _small(norm=norm).train(training)
     twin = NaiveSimpleView(model).train(training)
     points, labels = _points(), torch.tensor([0, 1, 3])
@@ -133,58 +117,6 @@ def test_equals_straight_network(
         torch.testing.assert_close(mine, other, rtol=1e-10, atol=1e-10)
 
 
-@st.composite
-def sparse_images(draw: st.DrawFn) -> torch.Tensor:
-    """Images with a filled rectangle, at the border too, some with none: [i, 1, h, w].
-
-    The first two have one and maps stay larger than a pixel: else norms of channels with next to
-    no variance magnify rounding without bound, in the plain network too.
-    """
-    count, h, w = draw(st.integers(3, 6)), draw(st.integers(16, 45)), draw(st.integers(16, 45))
-    images = torch.zeros(count, 1, h, w, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(draw(st.integers(0, 10**6)))
-    for index, image in enumerate(images[:, 0]):
-        if index < 2 or draw(st.booleans()):
-            top, left = draw(st.integers(0, h - 1)), draw(st.integers(0, w - 1))
-            some = image[top : top + draw(st.integers(1, 5)), left : left + draw(st.integers(1, 5))]
-            some += torch.rand(some.shape, generator=generator, dtype=torch.float64) + 0.5
-    return images
-
-
-@settings(max_examples=25, deadline=None)
-@given(sparse_images(), st.sampled_from([1, 2, 4]), st.sampled_from([0.85, 1.0]))
-def test_windows_change_nothing(images: torch.Tensor, size: int, worth: float) -> None:
-    net = _network(4)
-    other = copy.deepcopy(net)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(windows, "ROUND", size)
-        patch.setattr(windows, "WORTH", worth)
-        patch.setattr(resnet_cpu, "_AT_ONCE", 1 << 11)  # several pieces
-        a = net(images)
-        g = torch.linspace(-1, 1, a.numel(), dtype=torch.float64).view(a.shape)
-        a.backward(g)
-    with plain():
-        b = other(images)
-    b.backward(g)
-    torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)
-    for p, q in zip(net.parameters(), other.parameters(), strict=True):
-        largest = q.grad.abs().max().clamp(min=1)  # a channel with no variance has huge ones
-        torch.testing.assert_close(p.grad / largest, q.grad / largest, rtol=1e-10, atol=1e-10)
-    for mine, theirs in zip(net.buffers(), other.buffers(), strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
-
-
-def test_two_stages_of_clouds_use_windows() -> None:
-    """As a trained net sees them: 128 pixels, clouds that fill the ball in one view only."""
-    points = _points(4, 1024) * torch.tensor([1.0, 0.4, 0.3])
-    images = depth_images(points).flatten(0, 1)
-    layouts = resnet_cpu._layouts(images != 0, ResNet18())
-    assert [layout.empty is not None for layout in layouts[:2]] == [True, True]
-    for layout in layouts:
-        seen = sorted(image for piece in layout.pieces for image in piece.images)
-        assert seen == list(range(24))
-
-
 @pytest.mark.parametrize("image_size", [16, 64])
 def test_float32_error_is_that_of_the_straight_network(image_size: int) -> None:
     # 16 channels: oneDNN's float32 gradient of a 1x1 convolution of stride 2 writes out of its
@@ -193,10 +125,6 @@ def test_float32_error_is_that_of_the_straight_network(image_size: int) -> None:
     model = copy.deepcopy(exact).float()
     twin = NaiveSimpleView(model)
     points, labels = _points(8), torch.arange(8) % 4
-    if image_size > 16:  # small in their images: windows
-        points = 0.3 * points
-        images = depth_images(points, image_size).flatten(0, 1)
-        assert resnet_cpu._layouts(images != 0, model.backbone.images)[0].empty is not None
     points = points.float().double()  # the same images
     nets = [(exact, points), (model, points.float()), (twin, points.float())]
     out = []
@@ -214,15 +142,6 @@ def test_float32_error_is_that_of_the_straight_network(image_size: int) -> None:
         for grads in (mine, other)
     ]
     assert total[0] <= 2 * total[1]
-
-
-def test_norms_of_another_kind_take_the_plain_way() -> None:
-    net = ResNet18(4)
-    images = torch.rand(2, 1, 16, 16)
-    assert resnet_cpu.can_step(net, images)
-    assert not resnet_cpu.can_step(ResNet18(4, "instance"), images)
-    assert not resnet_cpu.can_step(ResNet18(4).eval(), images)
-    assert resnet_cpu.can_step(ResNet18(4, "domain"), images)  # of one domain they are plain
 
 
 def test_copies_of_one_point() -> None:

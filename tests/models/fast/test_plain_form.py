@@ -17,11 +17,10 @@ from torch import Tensor, nn
 
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.dgcnn import DGCNN, EdgeConv
-from qs3.models.fast import grouped_mlp_max, plain, pointwise_max, resnet_cpu, rsconv, usable
+from qs3.models.fast import grouped_mlp_max, plain, pointwise_max, rsconv, usable
 from qs3.models.norms import KINDS, use_domain
 from qs3.models.pointnet import PointMLP
 from qs3.models.pointnet2 import GroupedMLP
-from qs3.models.resnet import ResNet18
 from qs3.models.rscnn import RSConv, group
 from tests.device import as_on_device
 
@@ -89,13 +88,7 @@ def rs_conv(draw: Draw, norm: str) -> Case:
     return layer, features, run
 
 
-def resnet(draw: Draw, norm: str) -> Case:
-    size = draw(16, 25)
-    images = torch.rand(draw(2, 6), 1, size, size, dtype=torch.float64)
-    return ResNet18(4, norm), [], lambda net, inputs: net(images)
-
-
-LAYERS = (edge_conv, pooled_conv5, point_mlp, grouped_mlp, rs_conv, resnet)
+LAYERS = (edge_conv, pooled_conv5, point_mlp, grouped_mlp, rs_conv)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -105,7 +98,6 @@ def _many_parts() -> Iterator[None]:
         patch.setattr("qs3.models.fast.edgeconv._GATHERED", 1)
         for module in (grouped_mlp_max, pointwise_max, rsconv):
             patch.setattr(module, "_AT_ONCE", 1 << 7)
-        patch.setattr(resnet_cpu, "_AT_ONCE", 1 << 11)
         yield
 
 
