@@ -29,7 +29,7 @@ class Twin(MeanTeacher):
     r"""A student of cut views that says what a teacher of whole objects says.
 
     L = CE(f(x), y) + a CE(f(w), y) + l T² KL(t(w) || f(x); T) + d (1 - cos(φ_t(w), φ_f(x)))
-    + v JS(f(x), f(x')) + u e^{-5 (1 - p)²} H(t(z); T_t, f(z')).
+    + b CE(f(x'), y) + v JS(f(x), f(x')) + u e^{-5 (1 - p)²} H(t(z); T_t, f(z')).
 
     x: a source cloud as the student sees it, noisy, hidden and cut; w: its twin (`sees`), turned
     alike; x': x drawn again, by another cut and, with `data.source.views=random`, another sensor
@@ -48,6 +48,7 @@ class Twin(MeanTeacher):
         twin_weight: a: the student learns twins, too, which is how its means come to know them.
         logit_weight: l.
         feature_weight: d.
+        again_weight: b: the student learns the second draw's class, too.
         view_weight: v.
         target_weight: u.
         sees: what the teacher sees of a source cloud: "whole", the object's whole surface; "clean",
@@ -64,6 +65,7 @@ class Twin(MeanTeacher):
         twin_weight: float = 1.0,
         logit_weight: float = 1.0,
         feature_weight: float = 1.0,
+        again_weight: float = 1.0,
         view_weight: float = 1.0,
         target_weight: float = 1.0,
         sees: str = "whole",
@@ -76,6 +78,7 @@ class Twin(MeanTeacher):
         self.twin_weight = weight("twin_weight", twin_weight)
         self.logit_weight = weight("logit_weight", logit_weight)
         self.feature_weight = weight("feature_weight", feature_weight)
+        self.again_weight = weight("again_weight", again_weight)
         self.view_weight = weight("view_weight", view_weight)
         self.target_weight = weight("target_weight", target_weight)
         self.sees = check_choice("method.sees", sees, sorted(SOURCE_TWINS))
@@ -87,7 +90,7 @@ class Twin(MeanTeacher):
         self.uses_target = self.target_weight > 0  # type: ignore[misc]
         self.wants = Wants(
             twin=self.sees if self.twin_weight or self._distils else None,
-            again=self.view_weight > 0,
+            again=self.again_weight > 0 or self.view_weight > 0,
             target_twin=self.uses_target,
         )
 
@@ -106,7 +109,7 @@ class Twin(MeanTeacher):
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """Terms "ce", "twin", "logits", "features", "views" and "target", each >= 0."""
+        """Terms "ce", "twin", "logits", "features", "again", "views" and "target", each >= 0."""
         if self.teacher is not None:
             self.follow(net)
         source = batch["source"]
@@ -115,8 +118,12 @@ class Twin(MeanTeacher):
         terms = {"ce": class_loss(logits, source["y_source"], self.smoothing)}
         if self.wants.twin:
             terms |= self._of_the_twin(net, source, features, logits)
-        if self.view_weight:
+        if self.wants.again:
             again = net(source["again"])
+        if self.again_weight:
+            ce = class_loss(again, source["y_source"], self.smoothing)
+            terms["again"] = self.again_weight * ce
+        if self.view_weight:
             terms["views"] = self.view_weight * jensen_shannon(logits, again)
         if self.target_weight:
             ramp = self.target_weight * math.exp(-5 * (1 - batch["progress"]) ** 2)

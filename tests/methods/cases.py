@@ -70,7 +70,9 @@ CASES = {
     "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
     "twin": Case(Twin, 4),
     "twin_shared": Case(lambda: Twin(teacher="shared"), 5),
-    "twin_of_the_source": Case(lambda: Twin(view_weight=0.0, target_weight=0.0), 2),
+    "twin_of_the_source": Case(
+        lambda: Twin(again_weight=0.0, view_weight=0.0, target_weight=0.0), 2
+    ),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),
     "pcfea_averaged": Case(lambda: _styled(momentum=0.99), 2),

@@ -107,6 +107,7 @@ WEIGHTS = {
         "twin_weight": {"twin"},
         "logit_weight": {"logits"},
         "feature_weight": {"features"},
+        "again_weight": {"again"},
         "view_weight": {"views"},
         "target_weight": {"target"},
     },

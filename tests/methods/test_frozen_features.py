@@ -85,7 +85,7 @@ def test_without_the_loss_of_features_it_is_not_refused(method: Method, file: Pa
     taught = _taught(net, method, Case(lambda: method, 1))
     assert taught.pop("ce")
     if isinstance(method, Twin):
-        assert taught == dict.fromkeys(("twin", "logits", "views", "target"), True)
+        assert taught == dict.fromkeys(("twin", "logits", "again", "views", "target"), True)
 
 
 def test_pcfea_aligns_what_the_head_s_last_layer_is_given(file: Path) -> None:

@@ -17,8 +17,8 @@ from qs3.methods.twin import Twin, distillation, jensen_shannon
 from tests.methods.parted import blobs
 from tests.methods.shapes import CLASSES, accuracy, tiny_net, train
 
-OFF = dict.fromkeys(("twin_weight", "logit_weight", "feature_weight", "view_weight"), 0.0)
-OFF["target_weight"] = 0.0
+OFF = dict.fromkeys(("twin_weight", "logit_weight", "feature_weight", "again_weight"), 0.0)
+OFF |= {"view_weight": 0.0, "target_weight": 0.0}
 
 
 def _batch(progress: float = 1.0) -> dict[str, Any]:
@@ -58,7 +58,12 @@ def _kl(q: list[float], p: list[float]) -> float:
 def test_every_term_by_loops(teacher: str) -> None:
     weights = {"twin_weight": 2.0, "logit_weight": 3.0, "feature_weight": 5.0, "view_weight": 7.0}
     net, method = _made(
-        **weights, target_weight=11.0, temperature=1.5, target_temperature=0.4, teacher=teacher
+        **weights,
+        again_weight=13.0,
+        target_weight=11.0,
+        temperature=1.5,
+        target_temperature=0.4,
+        teacher=teacher,
     )
     batch = _batch(progress=0.5)
     with torch.no_grad():
@@ -79,13 +84,14 @@ def test_every_term_by_loops(teacher: str) -> None:
         cosine = float(u @ v) / math.sqrt(float(u @ u) * float(v @ v))
         found["features"].append(5.0 * (1 - cosine))
         a, b = _softmax(student), _softmax(again)
+        found["again"].append(-13.0 * math.log(b[i]))
         mean = [(x + y) / 2 for x, y in zip(a, b, strict=True)]
         found["views"].append(7.0 * (_kl(a, mean) + _kl(b, mean)) / 2)
         q = _softmax(said(target["twin"][i : i + 1])[0], 0.4)
         p = _softmax(net(target["points"][i : i + 1])[0])
         ramp = 11.0 * math.exp(-5 * 0.25)
         found["target"].append(-ramp * sum(x * math.log(y) for x, y in zip(q, p, strict=True)))
-    assert set(terms) == {"ce", "twin", "logits", "features", "views", "target"}
+    assert set(terms) == {"ce", "twin", "logits", "features", "again", "views", "target"}
     for name, each in found.items():
         assert terms[name].item() == pytest.approx(sum(each) / 4, rel=1e-4), name
 
@@ -124,6 +130,7 @@ def test_divergences_are_none_for_equals_bounded_and_symmetric(
         ({"twin_weight": 1.0}, Wants("whole"), 2, False),
         ({"logit_weight": 1.0}, Wants("whole"), 1, True),
         ({"feature_weight": 1.0, "sees": "clean"}, Wants("clean"), 1, True),
+        ({"again_weight": 1.0}, Wants(again=True), 2, False),
         ({"view_weight": 1.0}, Wants(again=True), 2, False),
         ({"target_weight": 1.0}, Wants(target_twin=True), 2, True),
         ({"logit_weight": 1.0, "teacher": "shared"}, Wants("whole"), 2, False),
@@ -244,7 +251,8 @@ def test_a_teacher_of_wholes_sees_through_wrong_labels() -> None:
     assert (result[:, 0] - result[:, 1]).mean() > 0.05, result
 
 
-def test_two_draws_of_a_cloud_are_said_to_be_the_same() -> None:
+@pytest.mark.parametrize("key", ["view_weight", "again_weight"])
+def test_a_second_draw_teaches_what_the_first_hides(key: str) -> None:
     """The labelled draw shows an object's right side, the second draw its left, as test clouds do.
 
     A left corner is the right one of another class; so the copy without the term cannot know it.
@@ -258,7 +266,7 @@ def test_two_draws_of_a_cloud_are_said_to_be_the_same() -> None:
         right = mirrored * torch.tensor([-1.0, 1.0, 1.0])
         for i, v in enumerate((1.0, 0.0)):
             net = tiny_net(seed, norm=False)
-            method = Twin(**{**OFF, "view_weight": v})
+            method = Twin(**{**OFF, key: v})
             beside = ({"again": left}, {})
             train(method, net, (right, labels), right, steps=200, seed=seed, beside=beside)
             result[seed, i] = accuracy(net, held_out, labels)
