@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Sequence
 from functools import partial
@@ -43,8 +44,9 @@ def _built(
 
 
 def _saved_at(table: Table, out: str | None, given: dict[str, Any]) -> Path:
-    """Where a table's files go, without their suffix."""
-    name = "-".join(filter(None, (table.name, given["target"])))
+    """Where a table's files go, without suffix; a part of its columns has files of its own."""
+    part = (re.sub(r"\W+", "-", column).strip("-") for column in given["columns"])
+    name = "-".join(filter(None, (table.name, given["target"], *part)))
     return Path(out or Path(given["log_dir"] or "logs") / "tables") / name
 
 
@@ -210,6 +212,7 @@ _TABLE = (
         "overrides", text('"A=B ..."'), "more settings of all runs; COLUMN:A=B of a column's", ""
     ),
     Option("kept", text("FOLDER"), "results that `qs3 report keep` has kept: shown, not trained"),
+    Option("columns", several(text("WORD")), "only columns of this name, or with it in theirs", ()),
 )
 _OUT = Option("out", text("FOLDER"), "where the files go (default LOG_DIR/tables)")
 
@@ -220,6 +223,7 @@ TABLE = Command(
     (*_TABLE, _OUT),
     (
         "qs3 report table=uda",
+        'qs3 report table=leaderboard columns="S -> K"',
         'qs3 report table=uda target=kinectsim10 overrides="trainer=gpu data.points=512"',
     ),
 )
@@ -232,9 +236,6 @@ TRAIN = Command(
         *_TABLE,
         Option("seeds", several(whole(0)), "of each cell (default: the table's, mostly 0,1,2)", ()),
         Option("rows", several(text("WORD")), "only rows of this name, or with it in theirs", ()),
-        Option(
-            "columns", several(text("WORD")), "only columns of this name, or with it in theirs", ()
-        ),
         Option("jobs", whole(), "runs at the same time (default 1, or what the launcher does)"),
         Option("launcher", text("NAME"), "of Hydra: joblib, submitit_local, slurm or ray"),
     ),

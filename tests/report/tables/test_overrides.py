@@ -72,6 +72,11 @@ def test_a_key_that_one_column_s_target_lacks(tmp_path, capsys):
     words = [f"table={path}", f"log_dir={tmp_path}", "overrides=M->D:a=1"]
     assert main(["report", *words]) == 1
     assert "M->D:a=1: no column has 'M->D' in its name" in capsys.readouterr().err
+    assert main(["report", *words[:2], "columns=S -> K"]) == 0
+    shown = capsys.readouterr().out
+    assert "kinectsim10" in shown
+    assert "domain=objects" not in shown.replace("domain@data.target", "domain")
+    assert (tmp_path / "tables/several-S-K.csv").is_file()
 
 
 @pytest.mark.parametrize("seeds", ["0", "1.5", "[0]"])
