@@ -84,8 +84,8 @@ def build_table(
             each cell takes a fifth of a second.
 
     Raises:
-        ConfigError: no such table, its file or an override is wrong, or `target` is given for
-            a table whose columns have targets of their own.
+        ConfigError: no such table, its file or an override is wrong, no column is meant, or
+            `target` is given for a table whose columns have targets of their own.
     """
     path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
     if not path.is_file():
@@ -95,7 +95,12 @@ def build_table(
         )
     name, spec = path.stem, _read(path)
     spec.rows.extend(map(dict, rows))
-    wanted = chosen(spec.columns, columns) or set(spec.columns)
+    wanted = chosen(spec.columns, columns)
+    if not wanted and columns:
+        raise ConfigError(
+            f"no column of table {name} has {' or '.join(map(repr, columns))} in its name; "
+            f"columns are {', '.join(map(repr, spec.columns))}"
+        )
     shown = [column for column in spec.columns if column in wanted or _task(spec, column) is None]
     if target is not None:
         check_domain("target=", target)
@@ -270,11 +275,11 @@ def _fill(
             filled.append(cell)
             continue
         try:
-            run = _composed(tuple(word for word in cell.overrides if word != place))
+            run = _composed(_without(place, cell.overrides))
             if target and run.supervised:
                 # The upper bound has labels of its target: the other target is its source too.
                 cell = replace(cell, overrides=(*cell.overrides, f"domain@data.source={target}"))
-                run = _composed(tuple(word for word in cell.overrides if word != place))
+                run = _composed(_without(place, cell.overrides))
         except MissingConfigException as error:
             filled.append(replace(cell, missing=first_line(error)))
             continue
@@ -285,6 +290,10 @@ def _fill(
         found = groups.get((run.experiment, run.hash))
         filled.append(replace(cell, group=found, target=run.target, simulated=run.simulated))
     return filled
+
+
+def _without(word: str, words: Sequence[str]) -> tuple[str, ...]:
+    return tuple(one for one in words if one != word)
 
 
 class _Composed(NamedTuple):

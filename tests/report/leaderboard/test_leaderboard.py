@@ -232,9 +232,9 @@ def test_what_is_refused(toy, tmp_path, capsys):
     assert "selftraining=x is not there; there are cbst, " in said("selftraining=x")
     assert "Turned: " in said("method.wieght=1")
     other = [word for word in words(toy) if not word.startswith("table=")]
-    faster = toy / "faster.yaml"
-    faster.write_text(SMALL.replace("experiment=leaderboard", "experiment=quickstart"))
-    assert main([*other, f"table={faster}"]) == 1
+    quick = toy / "quick.yaml"
+    quick.write_text(SMALL.replace("experiment=leaderboard", "experiment=quickstart"))
+    assert main([*other, f"table={quick}"]) == 1
     assert "its row 'source only' is not of experiment=leaderboard" in capsys.readouterr().err
     (tmp_path / "two.py").write_text(METHOD.format(name="A") + METHOD.format(name="B"))
     for file, message in (("no.py", "no.py cannot be read"), ("two.py", "expected one class")):

@@ -75,8 +75,12 @@ def test_a_key_that_one_column_s_target_lacks(tmp_path, capsys):
     assert main(["report", *words[:2], "columns=S -> K"]) == 0
     shown = capsys.readouterr().out
     assert "kinectsim10" in shown
-    assert "domain=objects" not in shown.replace("domain@data.target", "domain")
+    assert "domain@data.target=objects" not in shown
     assert (tmp_path / "tables/several-S-K.csv").is_file()
+    assert main(["report", *words[:2], "columns=mars"]) == 1
+    said = capsys.readouterr().err
+    assert "no column of table several has 'mars' in its name; columns are 'R → A'" in said
+    assert not (tmp_path / "tables/several-mars.csv").exists()
 
 
 @pytest.mark.parametrize("seeds", ["0", "1.5", "[0]"])
