@@ -8,6 +8,7 @@ Here the information is what a simulation knows and a scan does not show.
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -18,11 +19,12 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
 from qs3.datamodules.twins import SOURCE_TWINS, Wants
+from qs3.errors import ConfigError
 from qs3.methods.base import check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher
 from qs3.models.norms import use_domain
 
-TEACHERS = ("mean", "shared")
+TEACHERS = ("mean", "shared", "own")
 
 
 class Twin(MeanTeacher):
@@ -44,8 +46,12 @@ class Twin(MeanTeacher):
     A weight of 0 leaves its term out, with its passes, and the clouds that nothing else needs are
     not loaded.
 
+    A teacher of its own is another net of the same kind: with it a CE(f(w), y) becomes
+    a CE(t(w), y), so that the student never sees a twin.
+
     Args:
-        twin_weight: a: the student learns twins, too, which is how its means come to know them.
+        twin_weight: a: the student learns twins, too, which is how its means come to know them; a
+            teacher of its own learns them instead.
         logit_weight: l.
         feature_weight: d.
         again_weight: b: the student learns the second draw's class, too.
@@ -54,10 +60,16 @@ class Twin(MeanTeacher):
         sees: what the teacher sees of a source cloud: "whole", the object's whole surface; "clean",
             what was seen, without error; "scan", the cloud itself, not cut. The first needs a store
             made with twins=[whole].
-        teacher: "mean", running means of the student in eval mode; "shared", the student itself.
+        teacher: "mean", running means of the student in eval mode; "shared", the student itself;
+            "own", of source clouds a net that learns twins beside it (dropped after training), of
+            target clouds the means.
         momentum: m of the means, see `MeanTeacher`.
         temperature: T > 0.
         target_temperature: T_t > 0.
+
+    Raises:
+        ConfigError: a value is out of its range, or a teacher of its own learns nothing
+            (twin_weight=0) or teaches nothing (logit_weight=0 and feature_weight=0).
     """
 
     def __init__(
@@ -75,6 +87,7 @@ class Twin(MeanTeacher):
         target_temperature: float = 0.5,
     ) -> None:
         super().__init__(momentum)
+        self.expert: Any = None  # a teacher of its own
         self.twin_weight = weight("twin_weight", twin_weight)
         self.logit_weight = weight("logit_weight", logit_weight)
         self.feature_weight = weight("feature_weight", feature_weight)
@@ -82,7 +95,13 @@ class Twin(MeanTeacher):
         self.view_weight = weight("view_weight", view_weight)
         self.target_weight = weight("target_weight", target_weight)
         self.sees = check_choice("method.sees", sees, sorted(SOURCE_TWINS))
-        self.shared = check_choice("method.teacher", teacher, TEACHERS) == "shared"
+        self.of = check_choice("method.teacher", teacher, TEACHERS)
+        if self.of == "own" and not (self.twin_weight and self._distils):
+            raise ConfigError(
+                "method.teacher=own learns by method.twin_weight and teaches by "
+                "method.logit_weight or method.feature_weight: set them above 0, or "
+                "method.teacher=mean"
+            )
         self.temperature = check_float("method.temperature", temperature, "> 0")
         self.target_temperature = check_float(
             "method.target_temperature", target_temperature, "> 0"
@@ -103,7 +122,10 @@ class Twin(MeanTeacher):
         super().prepare(net)
         if self.feature_weight:
             check_taught(net, "method.feature_weight", "set method.feature_weight=0")
-        if self.shared or not (self._distils or self.uses_target):
+        if self.of == "own":
+            self.expert = copy.deepcopy(net)
+        asked = self.uses_target or (self._distils and self.of == "mean")
+        if self.of == "shared" or not asked:
             self.teacher = None
 
     def loss(
@@ -139,15 +161,16 @@ class Twin(MeanTeacher):
         wait: nothing of theirs asks for a gradient, and what is detached keeps none.
         """
         terms, twin = {}, source["twin"]
-        if self.twin_weight or self.shared:
-            own = net.features(twin).global_
-            classes = net.head(own)
+        learner = self.expert if self.of == "own" else net
+        if self.twin_weight or self.of == "shared":
+            own = learner.features(twin).global_
+            classes = learner.head(own)
         if self.twin_weight:
             ce = class_loss(classes, source["y_source"], self.smoothing)
             terms["twin"] = self.twin_weight * ce
         if not self._distils:
             return terms
-        if not self.shared:
+        if self.of == "mean":
             own = self.teacher.features(twin).global_
             classes = self.teacher.head(own)
         if self.logit_weight:
@@ -160,7 +183,7 @@ class Twin(MeanTeacher):
 
     def _of_the_target(self, net: Any, target: dict[str, Tensor]) -> Float[Tensor, ""]:
         """Cross-entropy of cut target clouds with what the teacher says of them before the cut."""
-        teacher = net if self.shared else self.teacher
+        teacher = net if self.of == "shared" else self.teacher
         with use_domain(net, "target"), use_domain(teacher, "target"):
             said = teacher(target["twin"]).detach()
             student = net(target["points"])

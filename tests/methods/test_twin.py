@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.nn import functional as F
 
 from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
@@ -33,7 +34,7 @@ def _batch(progress: float = 1.0) -> dict[str, Any]:
 
 
 def _made(**settings: Any) -> tuple[Any, Twin]:
-    """A net whose teacher, but for a shared one, is another net by now."""
+    """A net whose teachers, but for a shared one, are other nets by now."""
     net, method = tiny_net(norm=False), Twin(**settings)
     method.prepare(net)
     if method.teacher is not None:
@@ -54,7 +55,7 @@ def _kl(q: list[float], p: list[float]) -> float:
     return sum(a * math.log(a / b) for a, b in zip(q, p, strict=True))
 
 
-@pytest.mark.parametrize("teacher", ["mean", "shared"])
+@pytest.mark.parametrize("teacher", ["mean", "shared", "own"])
 def test_every_term_by_loops(teacher: str) -> None:
     weights = {"twin_weight": 2.0, "logit_weight": 3.0, "feature_weight": 5.0, "view_weight": 7.0}
     net, method = _made(
@@ -70,14 +71,17 @@ def test_every_term_by_loops(teacher: str) -> None:
         terms = method.loss(net, batch, torch.Generator())
     source, target = batch["source"], batch["target"]
     net.requires_grad_(False)
-    said = net if teacher == "shared" else method.teacher
+    method.requires_grad_(False)
+    means = net if teacher == "shared" else method.teacher
+    said = method.expert if teacher == "own" else means
+    learner = said if teacher == "own" else net
     assert teacher == "shared" or not torch.equal(said(source["twin"]), net(source["twin"]))
     found: dict[str, list[float]] = {name: [] for name in terms}
     for i in range(4):
         one = {key: value[i : i + 1] for key, value in source.items()}
         student, again = net(one["points"])[0], net(one["again"])[0]
         found["ce"].append(-math.log(_softmax(student)[i]))
-        found["twin"].append(-2.0 * math.log(_softmax(net(one["twin"])[0])[i]))
+        found["twin"].append(-2.0 * math.log(_softmax(learner(one["twin"])[0])[i]))
         q, p = _softmax(said(one["twin"])[0], 1.5), _softmax(student, 1.5)
         found["logits"].append(3.0 * 1.5**2 * _kl(q, p))
         u, v = said.features(one["twin"]).global_[0], net.features(one["points"]).global_[0]
@@ -87,7 +91,7 @@ def test_every_term_by_loops(teacher: str) -> None:
         found["again"].append(-13.0 * math.log(b[i]))
         mean = [(x + y) / 2 for x, y in zip(a, b, strict=True)]
         found["views"].append(7.0 * (_kl(a, mean) + _kl(b, mean)) / 2)
-        q = _softmax(said(target["twin"][i : i + 1])[0], 0.4)
+        q = _softmax(means(target["twin"][i : i + 1])[0], 0.4)
         p = _softmax(net(target["points"][i : i + 1])[0])
         ramp = 11.0 * math.exp(-5 * 0.25)
         found["target"].append(-ramp * sum(x * math.log(y) for x, y in zip(q, p, strict=True)))
@@ -134,6 +138,7 @@ def test_divergences_are_none_for_equals_bounded_and_symmetric(
         ({"view_weight": 1.0}, Wants(again=True), 2, False),
         ({"target_weight": 1.0}, Wants(target_twin=True), 2, True),
         ({"logit_weight": 1.0, "teacher": "shared"}, Wants("whole"), 2, False),
+        ({"twin_weight": 1.0, "logit_weight": 1.0, "teacher": "own"}, Wants("whole"), 1, False),
     ],
 )
 def test_a_part_that_is_off_costs_nothing(
@@ -145,6 +150,7 @@ def test_a_part_that_is_off_costs_nothing(
     assert method.uses_target == wants.target_twin
     assert (method.teacher is not None) == teacher
     assert bool([name for name in method.state_dict() if name.startswith("teacher")]) == teacher
+    assert (method.expert is not None) == (on.get("teacher") == "own")
     batch, calls = _batch(), []
     for key, wanted in (("twin", wants.twin), ("again", wants.again)):
         if not wanted:
@@ -176,6 +182,26 @@ def test_no_gradient_reaches_the_teacher_or_its_clouds(teacher: str) -> None:
         assert not any(module.training for module in method.teacher.modules())
 
 
+def test_a_teacher_of_its_own_learns_twins_and_the_student_does_not() -> None:
+    """No other term moves it, and its own moves nothing else."""
+    on = {"twin_weight": 2.0, "logit_weight": 1.0, "feature_weight": 1.0}
+    net, method = _made(**{**OFF, **on, "teacher": "own"})
+    assert method.teacher is None  # no means are asked
+    assert {id(p) for p in method.parameters()} == {id(p) for p in method.expert.parameters()}
+    batch = _batch()
+    torch.stack(list(method.loss(net, batch, torch.Generator()).values())).sum().backward()
+    found = [p.grad.clone() for p in method.expert.parameters()]
+    method.expert.zero_grad()
+    classes = method.expert(batch["source"]["twin"])
+    (2 * F.cross_entropy(classes, batch["source"]["y_source"])).backward()
+    for alone, beside in zip(method.expert.parameters(), found, strict=True):
+        torch.testing.assert_close(alone.grad, beside)
+    assert any(gradient.any() for gradient in found)
+    net.zero_grad(set_to_none=True)
+    method.loss(net, batch, torch.Generator())["twin"].backward()
+    assert all(p.grad is None for p in net.parameters())
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -183,6 +209,8 @@ def test_no_gradient_reaches_the_teacher_or_its_clouds(teacher: str) -> None:
         ({"teacher": "none"}, "method.teacher must be one of"),
         ({"temperature": 0.0}, "method.temperature must be > 0"),
         ({"target_temperature": -1.0}, "method.target_temperature must be > 0"),
+        ({**OFF, "twin_weight": 1.0, "teacher": "own"}, "teacher=own learns by method.twin_weight"),
+        ({**OFF, "logit_weight": 1.0, "teacher": "own"}, "or method.teacher=mean"),
         ({"momentum": 2.0}, r"method.momentum must be in \[0, 1\]"),
         *(({key: -1.0}, f"method.{key} must be >= 0") for key in OFF),
     ],
@@ -229,11 +257,13 @@ def _parts(labels: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.slow
-def test_a_teacher_of_wholes_sees_through_wrong_labels() -> None:
+@pytest.mark.parametrize("teacher", ["mean", "own"])
+def test_a_teacher_of_wholes_sees_through_wrong_labels(teacher: str) -> None:
     """Four labels in ten are wrong. Wholes tell which: the teacher is not misled, and says so.
 
     Its copy learns the same few parts by the labels alone, and by heart.
     """
+    taught = {"twin_weight": 1.0, "logit_weight": 5.0, "teacher": teacher}
     result = torch.zeros(3, 2)
     for seed in range(3):
         generator = torch.Generator().manual_seed(seed)
@@ -242,9 +272,9 @@ def test_a_teacher_of_wholes_sees_through_wrong_labels() -> None:
         _, unseen = _parts(held_out, generator)
         wrong = torch.rand(64, generator=generator) < 0.4
         given = torch.where(wrong, (labels + 1) % CLASSES, labels)
-        for i, w in enumerate((5.0, 0.0)):
+        for i, on in enumerate((taught, {"twin_weight": 1.0})):
             net = tiny_net(seed, norm=False)
-            method = Twin(**{**OFF, "twin_weight": 1.0, "logit_weight": w}, momentum=0.9)
+            method = Twin(**{**OFF, **on}, momentum=0.9)
             beside = ({"twin": whole}, {})
             train(method, net, (part, given), part, steps=250, seed=seed, beside=beside)
             result[seed, i] = accuracy(net, unseen, held_out)

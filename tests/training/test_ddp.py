@@ -160,7 +160,16 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         (("method=sd", "selftraining=spst", FEATURED), 2),
         (("method=pcfea", "method.every=1.0", "selftraining=spst", FEATURED), 3),
         # twins, second draws and drawn sensors
-        (("method=twin", "selftraining=spst", "data.source.views=random", FEATURED), 2),
+        (
+            (
+                "method=twin",
+                "method.teacher=own",
+                "selftraining=spst",
+                "data.source.views=random",
+                FEATURED,
+            ),
+            2,
+        ),
         (("method=dann", "selftraining=crst_lrent", "selftraining.theta=0", FEATURED), 2),
         (("method=cpcm", "selftraining=spst", "evaluation.norms=tent"), 2),
         (("method=mlsp", "selftraining=spst", FEATURED), 2),
