@@ -106,6 +106,8 @@ def load(
     *,
     device: str | torch.device = "cpu",
     packages: Sequence[str] = ("qs3.models",),
+    prior: str | Mapping[str, float] | None = None,
+    prior_power: float = 0.5,
 ) -> Predictor:
     """The classifier that a finished run reports.
 
@@ -123,6 +125,9 @@ def load(
         device: where to run it: "cpu", "cuda", "cuda:1".
         packages: where the net of the file may be defined. For a net of your own add your
             package, if you trust it to be built with any arguments.
+        prior: how common classes are where the clouds come from: "rooms", as in ScanNet's, or
+            {"chair": 4, "bathtub": 0}, where those not named count as 1; None: as in training.
+        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.inference.prior`).
 
     Returns:
         See `qs3.inference.predictor.Predictor`.
@@ -131,11 +136,11 @@ def load(
         qs3.errors.MissingDataError: no finished run there.
         qs3.errors.DataError: the file is damaged, or asks for something else than a net of
             `packages`.
-        qs3.errors.ConfigError: no such device.
+        qs3.errors.ConfigError: no such device, or no such prior.
     """
     from qs3.inference.predictor import load as load_result
 
-    return load_result(run, device=device, packages=packages)
+    return load_result(run, device=device, packages=packages, prior=prior, prior_power=prior_power)
 
 
 @contextlib.contextmanager

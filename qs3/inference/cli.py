@@ -56,6 +56,8 @@ PREDICT = Command(
         Option("up", text("AXIS|X,Y,Z"), "clouds: x y z -x -y or -z; depth: see below", ""),
         Option("floor", NUMBER, "clouds: where the floor is on that axis, in metres"),
         Option("camera_height", NUMBER, "depth: of the camera above the floor, in metres"),
+        Option("prior", text("rooms|C:N,C:N"), "how common classes are there (see below)", ""),
+        Option("prior_power", NUMBER, "how much of that is believed, 0 to 1", 0.5),
         Option("part", text("NAME"), "of an archive of objects (default: adapt; or all)", ""),
         Option("sample", whole(), "only so many, drawn at random, always the same ones"),
         Option("out", text("FILE"), ".csv or .json", "predictions.csv"),
@@ -90,6 +92,11 @@ are relative to it, and what is empty holds as given here. up=x,y,z is up in the
 right, y down, z forward), at any length: what an accelerometer at rest reads, in these axes. -y is
 a level camera. Without it up is fitted to the planes of the picture, else the camera counts as
 level; the column up says which. camera_height= is for nets that know heights above the floor.
+
+Nets learn each class as often as any other, and in rooms two things in five are chairs: prior=rooms
+takes the ten classes as common as in ScanNet's, prior=chair:4,table:2,bathtub:0 says it of your own
+place: a chair is met four times as often as each class that is not named, a bathtub never. On real
+objects more answers are right with it, and fewer of rare classes.
 
 A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status, class,
 confidence, label, points, dropped, tier, caution, up, out_of_range, reason, and p_<class>, a

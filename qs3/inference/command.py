@@ -45,7 +45,7 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     """
     source = _depth_images(settings) if settings.depth else _clouds(settings)
     ckpt = settings.ckpt or pretrained.usual(source.floor_known)
-    predictor = load(ckpt, device=settings.device)
+    predictor = _loaded(ckpt, settings)
     found = _floor(source, settings, predictor)
     if found:
         settings = replace(settings, floor=found.z)
@@ -80,18 +80,20 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     records = [record(row, classes) for row in rows]
     trained_on, worth = _trained_on(ckpt), predictor.result.worth
     heights = any(one.needs_floor for one in (predictor, second) if one)
-    taken = found.words if found and heights else ""
+    taken = [found.words] if found and heights else []
+    taken += [predictor.prior.words] if predictor.prior else []
     trust, verdict = trust_of(rows, predictor)
     lines = [] if settings.ckpt else [chosen(ckpt, source)]
-    lines += [taken] * bool(taken)
+    lines += taken
     lines += told(rows, records, inputs, predictor, settings, seconds)
     if any(row.probabilities is not None for row in rows):  # else nothing was said to be judged
         lines.append(verdict)
         lines += [agreement(rows, classes)] if second else []
         lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
-        lines += [f"what it is worth: {worth}"] * bool(worth)
+        without = "; without prior=" if predictor.prior else ""
+        lines += [f"what it is worth: {worth}{without}"] * bool(worth)
     if out.suffix.lower() == ".json":
-        text = as_json(records, classes, predictor.result.target, trust)
+        text = as_json(records, classes, predictor.result.target, trust, predictor.prior)
     else:
         text = as_csv(records, classes)
     lines.append(_save(out, text))
@@ -101,6 +103,11 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         html = page(title, rows, gallery, classes, trained_on, worth, taken, verdict, where)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _loaded(name: str, settings: Settings) -> Predictor:
+    prior = settings.prior or None
+    return load(name, device=settings.device, prior=prior, prior_power=settings.prior_power)
 
 
 def _floor(source: Source, settings: Settings, predictor: Predictor) -> Floor | None:
@@ -135,7 +142,7 @@ def _second(settings: Settings, ckpt: str, first: Predictor) -> Predictor | None
     name = settings.second or ("none" if settings.ckpt else pretrained.other_than(ckpt))
     if name == "none":
         return None
-    second = load(name, device=settings.device)
+    second = _loaded(name, settings)
     if sorted(second.classes) != sorted(first.classes):
         raise ConfigError(
             f"second={name} tells {', '.join(second.classes)} apart, the first classifier "

@@ -101,7 +101,7 @@ def page(
     classes: Sequence[str],
     trained_on: str = "",
     worth: str = "",
-    floor: str = "",
+    notes: Sequence[str] = (),
     verdict: str = "",
     floor_m: float | None = None,
 ) -> str:
@@ -114,15 +114,15 @@ def page(
         classes: names in the order of the probabilities.
         trained_on: what the net's data are made of; "" if nobody knows.
         worth: what it was found to be worth on real objects; likewise.
-        floor: how it is known where that is, if the objects were asked.
+        notes: what was taken for granted: where the floor is, how common classes are.
         verdict: how many are expected to be right, without a look at labels; likewise.
         floor_m: z of the floor, if the net knows heights: cards say how high an object begins.
     """
     found = scores(rows, classes)
     failed = [row for row in rows if row.probabilities is None]
     parts = _head(found, rows, failed, classes)
-    if floor:
-        parts.append(f'<p class="note">{escape(floor[:1].upper() + floor[1:])}</p>')
+    for note in notes:
+        parts.append(f'<p class="note">{escape(note[:1].upper() + note[1:])}</p>')
     if verdict:
         without = "Without a look at labels: " if found else ""
         parts.append(f'<p class="note">{without}{escape(verdict)}</p>')

@@ -5,6 +5,7 @@
                                                    # in metres if predictor.in_metres, and with
                                                    # floor= if predictor.needs_floor
     objects = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
+    predictor = qs3.load(run, prior="rooms")  # or prior={"chair": 4, "bathtub": 0}
 
 A cloud goes the way of the target's clouds in the run: thinned to as many points as these were
 stored with (farthest points from the first one on), or filled up by repeating its points from the
@@ -15,8 +16,8 @@ probabilities of its predictions.csv.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +42,7 @@ from qs3.evaluation.trust import COMPARED, Known
 from qs3.inference.floor import check_camera_height
 from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
+from qs3.inference.prior import POWER, Prior, read_prior
 from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.plural import counted
 
@@ -99,11 +101,13 @@ class Predictor:
         net: [B, N, 3] to logits [B, C], in eval mode; it wants prepared clouds.
         result: where it comes from, and how its clouds are prepared.
         device: of the net.
+        prior: how common classes are where the clouds come from; None: as in training.
     """
 
     net: nn.Module
     result: Result
     device: torch.device
+    prior: Prior | None = None
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -186,7 +190,14 @@ class Predictor:
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
     ) -> Float[np.ndarray, "n c"]:
-        """Class probabilities of prepared clouds; n >= 1."""
+        """Class probabilities of prepared clouds, with `prior`; n >= 1."""
+        found = self.without_prior(points, batch_size)
+        return self.prior(found) if self.prior else found
+
+    def without_prior(
+        self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
+    ) -> Float[np.ndarray, "n c"]:
+        """The same as the net gives them."""
         found = predict(self.net, points, batch_size, self.device)
         if found.shape[1] != len(self.classes):
             raise DataError(
@@ -305,7 +316,12 @@ class Predictor:
 
 
 def load(
-    run: str | Path, *, device: str | torch.device = "cpu", packages: Sequence[str] = PACKAGES
+    run: str | Path,
+    *,
+    device: str | torch.device = "cpu",
+    packages: Sequence[str] = PACKAGES,
+    prior: str | Mapping[str, float] | None = None,
+    prior_power: float = POWER,
 ) -> Predictor:
     """The classifier that a finished run reports; also as `qs3.load`.
 
@@ -318,17 +334,25 @@ def load(
         device: where to run it: "cpu", "cuda", "cuda:1".
         packages: where the net of the file may be defined. For a net of your own add your
             package, if you trust it to be built with any arguments.
+        prior: how common classes are where the clouds come from, "rooms" or as {"chair": 4,
+            "bathtub": 0}, those not named counting as 1; None: as in training. See
+            `qs3.inference.prior`.
+        prior_power: how much of that is believed; 0 nothing, 1 all.
 
     Raises:
         MissingDataError: no finished run there.
         DataError: the file is damaged, or asks for something else than a net of `packages`.
-        ConfigError: no such device.
+        ConfigError: no such device, or no such prior.
     """
     result = read_result(run)
     place = device_of(device)
     if place.type == "cpu":
         keep_freed_memory()
-    return Predictor(build_net(result, packages).to(place), result, place)
+    found = Predictor(build_net(result, packages).to(place), result, place)
+    if prior is None:
+        return found
+    labels = found.held_out.labels if found.held_out else None
+    return replace(found, prior=read_prior(prior, found.classes, labels, prior_power))
 
 
 def _array(cloud: Any, name: str) -> np.ndarray:

@@ -37,6 +37,7 @@ class Scores:
 
     Attributes:
         all: right ones.
+        balanced: mean over the classes that are there of the share that is right, in [0, 1].
         majority: the commonest label, and how many have it.
         confidence: mean over all of them, in [0, 1].
         tiers: right ones of each tier, if there are any.
@@ -47,6 +48,7 @@ class Scores:
     """
 
     all: Count
+    balanced: float
     majority: tuple[str, int]
     confidence: float
     tiers: dict[str, Count]
@@ -87,11 +89,14 @@ def scores(rows: Iterable[Row], classes: Sequence[str]) -> Scores | None:
     for row, _ in judged:
         assert row.probabilities is not None
         confusion[classes.index(row.label), int(row.probabilities.argmax())] += 1
+    there = confusion.sum(axis=1) > 0
+    recalls = confusion.diagonal()[there] / confusion.sum(axis=1)[there]
     (label, times), *_ = Counter(row.label for row, _ in judged).most_common(1)
     tiers = sorted({row.tier for row, _ in judged} - {""})
     every = Counter(kind for row, _ in judged for kind in {*kinds(row, classes)})
     return Scores(
         _count(r for _, r in judged),
+        float(recalls.mean()),
         (label, times),
         float(np.mean([np.max(row.probabilities) for row, _ in judged])),  # type: ignore[arg-type]
         {tier: _count(r for row, r in judged if row.tier == tier) for tier in tiers},

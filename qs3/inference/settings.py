@@ -13,6 +13,7 @@ from qs3.errors import ConfigError
 from qs3.inference.floor import Floor, check_camera_height
 from qs3.inference.inputs import Unit
 from qs3.inference.predictor import Predictor
+from qs3.inference.prior import POWER
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Settings:
         up: the axis that points up in clouds (z if ""), or a direction in the depth camera's frame.
         floor: where the floor is in clouds along that axis, in metres; None: not known.
         camera_height: of the depth images' camera above the floor, in metres; likewise.
+        prior: how common classes are; "": as in training. See `qs3.inference.prior`.
+        prior_power: how much of that is believed.
         part: of an archive; "" for what one chooses on, "all" for all: see `archive_units`.
         sample: so many of the files, images or objects, drawn at random; None: all.
         out: .csv or .json.
@@ -51,6 +54,8 @@ class Settings:
     up: str = ""
     floor: float | None = None
     camera_height: float | None = None
+    prior: str = ""
+    prior_power: float = POWER
     part: str = ""
     sample: int | None = None
     out: str = "predictions.csv"

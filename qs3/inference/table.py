@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from qs3.data.frames.pointed import Caution
+from qs3.inference.prior import Prior
 from qs3.runs.metrics import Trust
 from qs3.utils.text_table import csv_text
 from qs3.utils.version import VERSION
@@ -38,6 +39,7 @@ class Row(NamedTuple):
         up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
         second: the class that another classifier names; "" if none was asked.
         measures: `qs3.evaluation.trust.COMPARED` of the cloud; () if it failed.
+        plain: `probabilities` before a prior; None if it failed.
     """
 
     file: str
@@ -51,6 +53,7 @@ class Row(NamedTuple):
     up: str = ""
     second: str = ""
     measures: tuple[float, ...] = ()
+    plain: Float[np.ndarray, " c"] | None = None
 
 
 def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:
@@ -93,7 +96,11 @@ def as_csv(records: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> str:
 
 
 def as_json(
-    records: Sequence[Mapping[str, Any]], classes: Sequence[str], target: str, trust: Trust | None
+    records: Sequence[Mapping[str, Any]],
+    classes: Sequence[str],
+    target: str,
+    trust: Trust | None,
+    prior: Prior | None,
 ) -> str:
     """One document.
 
@@ -102,12 +109,14 @@ def as_json(
         classes: names in the order of the probabilities.
         target: the domain that the net was adapted to.
         trust: how many answers are expected to be right; None: cannot be told.
+        prior: how common classes counted as; None: as in training.
     """
     document = {
         "qs3": VERSION,
         "target": target,
         "classes": list(classes),
         "trust": None if trust is None else dataclasses.asdict(trust),
+        "prior": None if prior is None else prior.told(classes),
         "clouds": records,
     }
     return json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -17,9 +17,10 @@ from qs3.runs.metrics import Trust
 def trust_of(rows: Sequence[Row], predictor: Predictor) -> tuple[Trust | None, str]:
     """The verdict, and it in words; None with the reason where nothing can be told.
 
-    Labels that somebody gave play no part.
+    Labels that somebody gave play no part. Of answers with a prior it tells what is known of those
+    without it: its weights were fitted to such.
     """
-    said = [row for row in rows if row.probabilities is not None]
+    said = [row for row in rows if row.plain is not None]
     known = predictor.held_out
     if known is None:
         return None, (
@@ -29,9 +30,8 @@ def trust_of(rows: Sequence[Row], predictor: Predictor) -> tuple[Trust | None, s
         )
     if len(said) < FEWEST:
         return None, f"how many are right cannot be told of fewer than {FEWEST} clouds"
-    seen = Seen(
-        np.array([row.probabilities for row in said]), np.array([row.measures for row in said])
-    )
+    seen = Seen(np.array([row.plain for row in said]), np.array([row.measures for row in said]))
     trust = judge(known, seen, read_calibration())
     assert trust is not None
-    return trust, trust_in_words(trust)
+    words = trust_in_words(trust)
+    return trust, f"{words}; told of the answers without prior=" if predictor.prior else words

@@ -91,13 +91,14 @@ def _judged(
             rows[i] = item.row(reason_of(error, item.name), None), None
     if prepared:
         points = torch.stack([each.points for _, each in prepared.values()])
-        found = predictor.probabilities(points, len(points))
+        plain = predictor.without_prior(points, len(points))
+        found = predictor.prior(plain) if predictor.prior else plain
         others = _said(second, [item for item, _ in prepared.values()], floor)
-        for (i, (item, each)), probabilities, other in zip(
-            prepared.items(), found, others, strict=True
+        for (i, (item, each)), probabilities, before, other in zip(
+            prepared.items(), found, plain, others, strict=True
         ):
             row = item.row("; ".join(each.strange), probabilities)
-            rows[i] = row._replace(second=other, measures=each.measures), item
+            rows[i] = row._replace(second=other, measures=each.measures, plain=before), item
     return [rows[i] for i in range(len(batch))]
 
 

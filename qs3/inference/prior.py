@@ -1,0 +1,141 @@
+"""How common classes are where clouds come from, and what that makes of a net's probabilities.
+
+A net has learnt how common classes were in its training, which is as likely as not every class
+alike; in rooms two things in five are chairs. With p the net's probabilities, u the classes' shares
+in training and q those where the clouds come from,
+
+    p'_k ~ p_k (q_k / u_k)^t.
+
+t = 1 is Bayes' rule for classes that look the same in both places (Saerens, Latinne, Decaestecker,
+"Adjusting the Outputs of a Classifier to New a Priori Probabilities", Neural Computation 14, 2002);
+t as a choice is Menon et al., "Long-tail learning via logit adjustment", ICLR 2021. Nothing is
+estimated from the clouds or from their labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from qs3.classes import CLASSES, known_as
+from qs3.config.checks import check_float
+from qs3.errors import ConfigError
+
+POWER = 0.5
+"""t: on real objects half of it is right more often than all of it (docs/how-to/predict.md)."""
+
+ROOMS: dict[str, int] = dict(
+    zip(CLASSES, (98, 329, 464, 650, 2578, 161, 210, 88, 495, 1037), strict=True)
+)
+"""Objects of each class in the rooms of ScanNet10's training part (PointDA-10, Qin et al. 2019)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """How much commoner classes are than in training.
+
+    Attributes:
+        shares: [C] q >= 0, of sum 1.
+        power: t.
+        factors: [C] >= 0, one of them above 0: (q_k / u_k)^t, the largest of them 1.
+        words: the shares, for people.
+    """
+
+    shares: Float[np.ndarray, " c"]
+    power: float
+    factors: Float[np.ndarray, " c"]
+    words: str
+
+    def __call__(self, probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+        """The same with these classes as common; a cloud of impossible ones keeps the likeliest."""
+        weighed = probabilities * self.factors
+        total = weighed.sum(axis=1, keepdims=True)
+        possible = (self.factors > 0) / np.count_nonzero(self.factors)
+        return np.where(total > 0, weighed / np.where(total > 0, total, 1), possible)
+
+    def told(self, classes: Sequence[str]) -> dict[str, Any]:
+        """For a table in JSON."""
+        return {
+            "power": self.power,
+            "shares": dict(zip(classes, self.shares.tolist(), strict=True)),
+        }
+
+
+def read_prior(
+    given: str | Mapping[str, float],
+    classes: Sequence[str],
+    labels: Int[np.ndarray, " v"] | None = None,
+    power: float = POWER,
+) -> Prior:
+    """A prior as it is given.
+
+    Args:
+        given: "rooms", as in `ROOMS`; or classes and how common they are, in any unit, as
+            "chair:4,table:2,bathtub:0" or as a mapping: those that are not named count as 1, and
+            0 is never.
+        classes: that the net knows.
+        labels: positions in `classes` of labelled clouds as in its training; None: each class was
+            as common as every other one.
+        power: t >= 0.
+
+    Raises:
+        ConfigError: what is given is no such thing, or names a class that the net does not know.
+    """
+    power = check_float("prior_power", power, ">= 0")
+    if given == "rooms":
+        given = _of_rooms(classes)
+    pairs = _pairs(given) if isinstance(given, str) else list(given.items())
+    common: dict[str, float] = {}
+    for word, value in pairs:
+        name = known_as(str(word), classes)
+        if name is None:
+            raise ConfigError(f"prior={word}: the classifier's classes are {', '.join(classes)}")
+        if name in common:
+            raise ConfigError(f"prior= names {name} twice")
+        common[name] = check_float(f"prior={word}", value, ">= 0")
+    here = np.array([common.get(name, 1.0) for name in classes])
+    if not here.any():
+        raise ConfigError("prior= leaves no class that there could be")
+    counts = np.bincount([] if labels is None else labels, minlength=len(classes)) + 1.0
+    shares = here / here.sum()
+    ratio = shares / (counts / counts.sum())
+    factors = np.where(ratio > 0, ratio**power, 0.0)  # 0 stays 0 at power 0, too
+    factors /= factors.max()
+    return Prior(shares, power, factors, _in_words(shares, classes, power))
+
+
+def _of_rooms(classes: Sequence[str]) -> dict[str, float]:
+    if unknown := [name for name in classes if name not in ROOMS]:
+        raise ConfigError(
+            f"prior=rooms knows {', '.join(ROOMS)}; the classifier also tells "
+            f"{', '.join(unknown)}: say how common they are, prior=chair:4,table:2"
+        )
+    return {name: ROOMS[name] for name in classes}
+
+
+def _pairs(words: str) -> list[tuple[str, float]]:
+    pairs: list[tuple[str, float]] = []
+    for part in words.split(","):
+        name, colon, value = part.rpartition(":")
+        if not colon or not name.strip():
+            raise ConfigError(
+                f"prior={words}: {part.strip()!r} should be CLASS:NUMBER, as in chair:4,table:2; "
+                "or say prior=rooms"
+            )
+        try:
+            pairs.append((name.strip(), float(value)))
+        except ValueError:
+            raise ConfigError(
+                f"prior={words}: {value.strip()!r} after {name.strip()} should be a number"
+            ) from None
+    return pairs
+
+
+def _in_words(shares: Float[np.ndarray, " c"], classes: Sequence[str], power: float) -> str:
+    order = np.argsort(-shares, kind="stable")
+    said = ", ".join(f"{classes[k]} {shares[k]:.1%}" for k in order)
+    return f"classes count as this common, at power {power:g} (prior=): {said}"

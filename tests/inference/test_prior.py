@@ -1,0 +1,147 @@
+"""prior=: Bayes' rule by hand, what a choice of it cannot do, and where it shows."""
+
+from __future__ import annotations
+
+import inspect
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import qs3
+from qs3.classes import CLASSES
+from qs3.errors import ConfigError
+from qs3.inference.cli import PREDICT
+from qs3.inference.prior import POWER, ROOMS, read_prior
+from tests.commands import main
+
+AB = ("a", "b")
+THREE = ("chair", "table", "lamp")
+shares = st.lists(st.floats(0.01, 1), min_size=3, max_size=3)
+
+
+def test_bayes_rule_by_hand() -> None:
+    """Trained on three a to each b, met as often as each other."""
+    labels = np.array([0] * 2 + [1] * 0)  # (2 + 1) : (0 + 1), none of v is not never
+    prior = read_prior({"a": 1, "b": 1}, AB, labels, power=1)
+    np.testing.assert_allclose(prior.factors, [1 / 3, 1])
+    # 0.6 : 0.4 becomes 0.2 : 0.4
+    np.testing.assert_allclose(prior(np.array([[0.6, 0.4]])), [[1 / 3, 2 / 3]])
+
+
+def test_half_of_it_by_hand() -> None:
+    """The four times commoner class counts twice."""
+    prior = read_prior("chair:4", THREE, power=0.5)
+    np.testing.assert_allclose(prior.shares, [4 / 6, 1 / 6, 1 / 6])
+    said = prior(np.array([[0.25, 0.25, 0.5], [0.0, 0.5, 0.5]]))
+    np.testing.assert_allclose(said, [[0.4, 0.2, 0.4], [0.0, 0.5, 0.5]])
+    assert "at power 0.5" in prior.words
+    assert prior.words.endswith("chair 66.7%, table 16.7%, lamp 16.7%")
+
+
+def test_rooms_are_those_of_the_published_training_part() -> None:
+    assert sum(ROOMS.values()) == 6110
+    prior = read_prior("rooms", CLASSES)
+    assert prior.shares[CLASSES.index("chair")] == pytest.approx(2578 / 6110)
+    order = np.argsort(prior.factors)
+    assert CLASSES[order[-1]] == "chair"
+    assert CLASSES[order[0]] == "plant"
+
+
+def test_what_never_comes_is_never_said() -> None:
+    prior = read_prior("table:0", THREE, power=0.0)  # even at power 0
+    said = prior(np.array([[0.2, 0.7, 0.1], [0.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(said, [[2 / 3, 0, 1 / 3], [0.5, 0, 0.5]])
+
+
+def test_names_are_those_that_folders_may_have() -> None:
+    given = read_prior("Night_Stand:2,couch:3", CLASSES)
+    plain = read_prior({"cabinet": 2, "sofa": 3}, CLASSES)
+    np.testing.assert_array_equal(given.factors, plain.factors)
+
+
+@settings(max_examples=50, deadline=None)
+@given(shares, shares, st.floats(0.1, 10), st.floats(0, 2))
+def test_shares_whatever_the_unit_and_no_more(
+    common: list[float], said: list[float], unit: float, power: float
+) -> None:
+    names = dict(zip(THREE, common, strict=True))
+    p = np.array([said]) / np.sum(said)
+    prior = read_prior(names, THREE, power=power)
+    after = prior(p)
+    np.testing.assert_allclose(after.sum(axis=1), 1)
+    scaled = read_prior({k: unit * v for k, v in names.items()}, THREE, power=power)
+    np.testing.assert_allclose(scaled(p), after, rtol=1e-6)
+    # Two classes' odds change by their own ratio alone.
+    odds = (after[0, 0] / after[0, 1]) / (p[0, 0] / p[0, 1])
+    assert odds == pytest.approx((common[0] / common[1]) ** power, rel=1e-6)
+    alike = read_prior(dict.fromkeys(THREE, unit), THREE, np.array([0, 1, 2]), power)
+    np.testing.assert_allclose(alike(p), p)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("chairs:4", "prior=chairs: the classifier's classes are chair, table, lamp"),
+        ("chair", "'chair' should be CLASS:NUMBER"),
+        ("", "'' should be CLASS:NUMBER"),
+        ("chair:4;table:2", "'4;table' after chair|CLASS:NUMBER|classes are"),
+        ("chair:many", "'many' after chair should be a number"),
+        ("chair:-1", "prior=chair must be >= 0"),
+        ("chair:inf", "prior=chair must be"),
+        ("chair:nan", "prior=chair must be"),
+        ("chair:1,Chair:2", "names chair twice"),
+        ("chair:0,table:0,lamp:0", "leaves no class"),
+        ({"chair": True}, "prior=chair must be a number"),
+    ],
+)
+def test_what_is_no_prior_says_so(given, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read_prior(given, THREE)
+
+
+def test_rooms_know_ten_classes() -> None:
+    with pytest.raises(ConfigError, match="the classifier also tells shelf_unit: say how common"):
+        read_prior("rooms", ("chair", "shelf_unit"))
+    assert read_prior("rooms", ("chair", "lamp")).shares[0] == pytest.approx(2578 / 2739)
+    with pytest.raises(ConfigError, match="prior_power must be >= 0"):
+        read_prior("rooms", CLASSES, power=-1)
+
+
+def test_the_three_ways_to_it_have_one_power() -> None:
+    (option,) = (option for option in PREDICT.options if option.key == "prior_power")
+    given = inspect.signature(qs3.load).parameters["prior_power"].default
+    assert option.default == given == POWER
+
+
+def test_in_python_and_on_the_command_line(run, tmp_path, capsys) -> None:
+    """The same probabilities; what can be expected is told of the answers without it."""
+    clouds = np.random.default_rng(0).normal(size=(32, 64, 3))
+    np.save(tmp_path / "clouds.npy", clouds)
+    plain = qs3.load(run)
+    kind = plain.classes[-1]
+    weighed = qs3.load(run, prior={kind: 9}, prior_power=1)
+    expected = weighed.prior(plain(clouds))
+    np.testing.assert_allclose(weighed(clouds), expected)
+    before, after = plain(clouds)[:, -1], expected[:, -1]
+    assert (after > before).all()
+    found = {}
+    for name, words in {"plain": [], "prior": [f"prior={kind}:9", "prior_power=1"]}.items():
+        out = tmp_path / f"{name}.json"
+        ask = ["predict", f"ckpt={run}", f"input={tmp_path / 'clouds.npy'}", f"out={out}"]
+        assert main([*ask, *words]) == 0
+        text, page = capsys.readouterr().out, out.with_suffix(".html").read_text()
+        found[name] = json.loads(out.read_text())
+        for shown in (text, page):
+            assert ("lasses count as this common, at power 1" in shown) == (name == "prior")
+            assert ("told of the answers without prior=" in shown) == (name == "prior")
+    assert found["plain"]["prior"] is None
+    assert found["prior"]["prior"]["power"] == 1
+    assert found["prior"]["prior"]["shares"][kind] == pytest.approx(9 / (8 + len(plain.classes)))
+    assert found["prior"]["trust"] == found["plain"]["trust"]
+    said = [list(one["probabilities"].values()) for one in found["prior"]["clouds"]]
+    np.testing.assert_allclose(said, expected, rtol=1e-5)
+    with pytest.raises(ConfigError, match="prior=unicorn"):
+        qs3.load(run, prior="unicorn:1")
