@@ -74,12 +74,12 @@ class Twin(MeanTeacher):
 
     def __init__(
         self,
-        twin_weight: float = 1.0,
-        logit_weight: float = 1.0,
-        feature_weight: float = 1.0,
+        twin_weight: float = 0.0,
+        logit_weight: float = 0.0,
+        feature_weight: float = 0.0,
         again_weight: float = 1.0,
-        view_weight: float = 1.0,
-        target_weight: float = 1.0,
+        view_weight: float = 0.0,
+        target_weight: float = 0.0,
         sees: str = "whole",
         teacher: str = "mean",
         momentum: float = 0.99,
