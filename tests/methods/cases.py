@@ -50,6 +50,10 @@ def _styled(**settings: Any) -> Pcfea:
     return method
 
 
+OF_WHOLES = {"twin_weight": 1.0, "logit_weight": 1.0, "feature_weight": 1.0}
+EVERYTHING = {**OF_WHOLES, "again_weight": 1.0, "view_weight": 1.0, "target_weight": 1.0}
+"""All parts of `Twin`."""
+
 # A voxel of a toy cloud holds few points.
 CASES = {
     "source_only": Case(SourceOnly, 1),
@@ -68,11 +72,10 @@ CASES = {
     "mlsp": Case(lambda: Mlsp(min_points=2), 2),
     "sd": Case(Sd, 2),
     "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
-    "twin": Case(Twin, 4),
-    "twin_shared": Case(lambda: Twin(teacher="shared"), 5),
-    "twin_of_the_source": Case(
-        lambda: Twin(again_weight=0.0, view_weight=0.0, target_weight=0.0), 2
-    ),
+    "twin": Case(Twin, 2),
+    "twin_everything": Case(lambda: Twin(**EVERYTHING), 4),
+    "twin_shared": Case(lambda: Twin(**EVERYTHING, teacher="shared"), 5),
+    "twin_of_the_source": Case(lambda: Twin(**OF_WHOLES, again_weight=0.0), 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),
     "pcfea_averaged": Case(lambda: _styled(momentum=0.99), 2),

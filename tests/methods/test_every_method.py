@@ -15,6 +15,7 @@ from torch import nn
 
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, feature_dims
+from qs3.methods.twin import Twin
 from qs3.models.base import ClassHead, PointClassifier
 from qs3.models.dgcnn import DGCNN
 from qs3.models.pointdan import pointdan
@@ -24,9 +25,14 @@ from tests.methods.cases import Case, batch_of, total
 
 NAMES = [
     *("source_only", "pcm", "dann", "defrec_on_source", "defrec_pcm", "gast", "gast_pcm"),
-    *("pointdan", "cpcm", "mlsp", "sd", "twin", "twin_shared", "pcfea_styled", "student_all"),
+    *("pointdan", "cpcm", "mlsp", "sd", "twin_everything", "twin_shared", "twin_own"),
+    *("pcfea_styled", "student_all"),
 ]
-CASES = {**cases.CASES, "student_all": Case(lambda: Student(True, 0.01, 0.1, 1), 2, pseudo="soft")}
+CASES = {
+    **cases.CASES,
+    "student_all": Case(lambda: Student(True, 0.01, 0.1, 1), 2, pseudo="soft"),
+    "twin_own": Case(lambda: Twin(**cases.OF_WHOLES, teacher="own"), 1),
+}
 parametrize = pytest.mark.parametrize("name", NAMES)
 
 
@@ -75,8 +81,9 @@ def test_a_step_is_a_function_of_the_generator(name: str) -> None:
         "dann",
         "pointdan",
         "pcfea_styled",
-        "twin",
+        "twin_everything",
         "twin_shared",
+        "twin_own",
     ):  # these draw nothing of their own
         assert not torch.equal(values[0], values[2])
     torch.set_rng_state(state)
@@ -103,7 +110,7 @@ WEIGHTS = {
         "discrepancy_weight": {"discrepancy"},
         "node_weight": {"nodes"},
     },
-    "twin": {
+    "twin_everything": {
         "twin_weight": {"twin"},
         "logit_weight": {"logits"},
         "feature_weight": {"features"},
@@ -130,7 +137,7 @@ def test_a_weight_multiplies_its_terms_and_no_others(name: str) -> None:
 
 def test_who_sees_the_target() -> None:
     seen = {name for name, case in CASES.items() if case.make().uses_target}
-    without = {"source_only", "supervised", "pcm", "twin_of_the_source"}
+    without = {"source_only", "supervised", "pcm", "twin", "twin_of_the_source", "twin_own"}
     students = {name for name in CASES if name.startswith("student")}  # theirs are pseudo-labelled
     assert seen == set(CASES) - without - students
 

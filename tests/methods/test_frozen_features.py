@@ -18,7 +18,7 @@ from qs3.methods.twin import Twin
 from qs3.models.base import PointClassifier
 from qs3.models.features import features
 from qs3.selftraining.pcfea import Pcfea
-from tests.methods.cases import CASES, Case, batch_of
+from tests.methods.cases import CASES, EVERYTHING, Case, batch_of
 from tests.methods.shapes import CLASSES
 from tests.models.onnx_files import write_encoder
 
@@ -29,7 +29,7 @@ REFUSED = {
     **dict.fromkeys(("defrec", "defrec_on_source", "defrec_pcm", "mlsp"), NO_POINTS),
     **dict.fromkeys(("dann", "dann_apart", "sd", "sd_cut_both"), FROZEN),
     **dict.fromkeys(("gast", "gast_no_rotation", "gast_pcm"), FROZEN),
-    **dict.fromkeys(("twin", "twin_shared", "twin_of_the_source"), FROZEN),
+    **dict.fromkeys(("twin_everything", "twin_shared", "twin_of_the_source"), FROZEN),
 }
 
 
@@ -75,7 +75,7 @@ def test_each_term_teaches_the_head_or_the_method_is_refused(name: str, file: Pa
     "method",
     [
         *(Dann(domain_weight=0.0), Sd(consistency_weight=0.0)),
-        *(Gast(def_weight=0.0, rot_weight=0.0), Twin(feature_weight=0.0)),
+        *(Gast(def_weight=0.0, rot_weight=0.0), Twin(**{**EVERYTHING, "feature_weight": 0.0})),
     ],
     ids=lambda method: type(method).__name__,
 )

@@ -99,7 +99,7 @@ ABOVE = {
     **{"pointdan": 200, "defrec": 130, "defrec_on_source": 260, "defrec_pcm": 200},
     **{"gast": 250, "gast_no_rotation": 70, "gast_pcm": 250, "cpcm": 200, "mlsp": 400},
     **{"sd": 400, "sd_cut_both": 400},
-    **{"twin": 506, "twin_shared": 76, "twin_of_the_source": 280},
+    **{"twin": 30, "twin_everything": 506, "twin_shared": 76, "twin_of_the_source": 280},
     **{"pcfea": 0, "pcfea_styled": 130, "pcfea_averaged": 150},
     **{"student": 0, "student_pcm": 40, "student_source": 30, "student_source_pcm": 100},
     **{"student_mrkld": 30, "student_lrent": 30},

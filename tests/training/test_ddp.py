@@ -27,7 +27,7 @@ from qs3.training.command import train
 from qs3.utils.seeding import derive
 from tests.commands import command
 from tests.training.conftest import result_of
-from tests.training.toy import CLASSES, TinyNet, overrides, toy_config, write_domain
+from tests.training.toy import CLASSES, TWIN, TinyNet, overrides, toy_config, write_domain
 from tests.training.watching import interrupt, seen_by
 
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
@@ -162,7 +162,7 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
         # twins, second draws and drawn sensors
         (
             (
-                "method=twin",
+                *TWIN,
                 "method.teacher=own",
                 "selftraining=spst",
                 "data.source.views=random",

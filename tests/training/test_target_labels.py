@@ -19,7 +19,7 @@ from qs3.evaluation.metrics import Evaluation
 from qs3.evaluation.selection_rules import STUDENT_RULES
 from qs3.training.command import train
 from tests.training.search import Truth, search
-from tests.training.toy import _SHAPES, CLASSES, write_domain
+from tests.training.toy import _SHAPES, CLASSES, TWIN, write_domain
 
 TRAIN, TEST = 90, 45
 
@@ -114,7 +114,7 @@ CASES = [
     (("selftraining=none",), True),
     (("selftraining.use_source=true",), True),
     *(((f"selection.student={rule}",), False) for rule in STUDENT_RULES),
-    (("method=twin", "selftraining=none", "model._target_=tests.training.nets.featured"), False),
+    ((*TWIN, "selftraining=none", "model._target_=tests.training.nets.featured"), False),
 ]
 SLOW = ("twin", "last", "entropy", "infomax")  # rules; like the others
 

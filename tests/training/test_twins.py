@@ -11,11 +11,11 @@ from qs3.errors import DataError
 from qs3.runs.folder import read_started
 from qs3.training.command import train
 from qs3.training.shared_warmup import warmup_sha256
-from tests.training.toy import MADE_OF, toy_config, write_toy
+from tests.training.toy import MADE_OF, TWIN, toy_config, write_toy
 from tests.training.watching import interrupt
 
 WORDS = (
-    *("method=twin", "method.target_weight=0.0", "selftraining=none", "protocol.epochs=2"),
+    *(*TWIN, "method.target_weight=0.0", "selftraining=none", "protocol.epochs=2"),
     "model._target_=tests.training.nets.featured",
 )
 

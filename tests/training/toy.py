@@ -25,6 +25,11 @@ MADE_OF = {
     ),
 }
 CONF = Path(__file__).parents[2] / "conf"
+TWIN = (
+    "method=twin",
+    *(f"method.{part}_weight=1.0" for part in ("twin", "logit", "feature", "view", "target")),
+)
+"""With all parts."""
 
 
 class TinyNet(nn.Module):
