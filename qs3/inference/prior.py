@@ -34,6 +34,9 @@ ROOMS: dict[str, int] = dict(
 """Objects of each class in the rooms of ScanNet10's training part (PointDA-10, Qin et al. 2019)."""
 
 
+_SHOWN = 12  # classes in words
+
+
 @dataclass(frozen=True, eq=False)
 class Prior:
     """How much commoner classes are than in training.
@@ -88,6 +91,8 @@ def read_prior(
     power = check_float("prior_power", power, ">= 0")
     if given == "rooms":
         given = _of_rooms(classes)
+    if not isinstance(given, str | Mapping):
+        raise ConfigError(f"prior={given!r:.60} should be words or a mapping, {{'chair': 4}}")
     pairs = _pairs(given) if isinstance(given, str) else list(given.items())
     common: dict[str, float] = {}
     for word, value in pairs:
@@ -97,14 +102,16 @@ def read_prior(
         if name in common:
             raise ConfigError(f"prior= names {name} twice")
         common[name] = check_float(f"prior={word}", value, ">= 0")
-    here = np.array([common.get(name, 1.0) for name in classes])
+    here = np.array([common.get(name, 1.0) for name in classes], dtype=np.float64)
     if not here.any():
         raise ConfigError("prior= leaves no class that there could be")
-    counts = np.bincount([] if labels is None else labels, minlength=len(classes)) + 1.0
+    here /= here.max()  # sums of huge numbers are none
     shares = here / here.sum()
-    ratio = shares / (counts / counts.sum())
-    factors = np.where(ratio > 0, ratio**power, 0.0)  # 0 stays 0 at power 0, too
-    factors /= factors.max()
+    counts = np.bincount([] if labels is None else labels, minlength=len(classes)) + 1.0
+    there = shares > 0  # 0 stays 0 at power 0, too
+    log = np.log(np.where(there, shares, 1.0)) - np.log(counts / counts.sum())
+    log -= log[there].max()
+    factors = np.where(there, np.exp(power * np.minimum(log, 0.0)), 0.0)
     return Prior(shares, power, factors, _in_words(shares, classes, power))
 
 
@@ -137,5 +144,7 @@ def _pairs(words: str) -> list[tuple[str, float]]:
 
 def _in_words(shares: Float[np.ndarray, " c"], classes: Sequence[str], power: float) -> str:
     order = np.argsort(-shares, kind="stable")
-    said = ", ".join(f"{classes[k]} {shares[k]:.1%}" for k in order)
+    said = ", ".join(f"{classes[k]} {shares[k]:.1%}" for k in order[:_SHOWN])
+    if len(order) > _SHOWN:
+        said += f", and {len(order) - _SHOWN} more"
     return f"classes count as this common, at power {power:g} (prior=): {said}"

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import qs3
-from qs3.classes import CLASSES
+from qs3.classes import CLASSES, MODELNET40
 from qs3.errors import ConfigError
 from qs3.inference.cli import PREDICT
 from qs3.inference.prior import POWER, ROOMS, read_prior
@@ -56,6 +56,17 @@ def test_what_never_comes_is_never_said() -> None:
     np.testing.assert_allclose(said, [[2 / 3, 0, 1 / 3], [0.5, 0, 0.5]])
 
 
+def test_huge_numbers_and_powers_are_finite() -> None:
+    """The largest floats, and a power by which the commonest class alone is left."""
+    prior = read_prior(dict.fromkeys(THREE, 1.7e308), THREE, power=1.0)
+    np.testing.assert_allclose(prior.shares, 1 / 3)
+    alone = read_prior("chair:2", THREE, power=1e300)
+    np.testing.assert_array_equal(alone(np.array([[0.01, 0.5, 0.49], [0, 0.5, 0.5]]))[0], [1, 0, 0])
+    assert np.isfinite(alone(np.array([[0, 0.5, 0.5]]))).all()
+    many = read_prior("chair:9", MODELNET40)
+    assert many.words.endswith(", and 28 more")
+
+
 def test_names_are_those_that_folders_may_have() -> None:
     given = read_prior("Night_Stand:2,couch:3", CLASSES)
     plain = read_prior({"cabinet": 2, "sofa": 3}, CLASSES)
@@ -95,6 +106,7 @@ def test_shares_whatever_the_unit_and_no_more(
         ("chair:1,Chair:2", "names chair twice"),
         ("chair:0,table:0,lamp:0", "leaves no class"),
         ({"chair": True}, "prior=chair must be a number"),
+        (["chair"], "should be words or a mapping"),
     ],
 )
 def test_what_is_no_prior_says_so(given, message: str) -> None:
@@ -145,3 +157,5 @@ def test_in_python_and_on_the_command_line(run, tmp_path, capsys) -> None:
     np.testing.assert_allclose(said, expected, rtol=1e-5)
     with pytest.raises(ConfigError, match="prior=unicorn"):
         qs3.load(run, prior="unicorn:1")
+    assert main([*ask, "prior_power=0.7"]) == 1
+    assert "prior_power= is for prior=" in capsys.readouterr().err
