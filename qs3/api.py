@@ -127,7 +127,7 @@ def load(
             package, if you trust it to be built with any arguments.
         prior: how common classes are where the clouds come from: "rooms", as in ScanNet's, or
             {"chair": 4, "bathtub": 0}, where those not named count as 1; None: as in training.
-        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.inference.prior`).
+        prior_power: how much of that is believed: 0 nothing, 1 all (`qs3.evaluation.prior`).
 
     Returns:
         See `qs3.inference.predictor.Predictor`.

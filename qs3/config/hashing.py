@@ -41,6 +41,7 @@ _UNHASHED = (
 )
 # Left out where they are null, as they were before there were such keys: kept results stay valid.
 _NEW = ("weights",)
+_PRIOR = ("evaluation.prior", "evaluation.prior_power")  # of runs without a prior, likewise
 _FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
@@ -60,6 +61,9 @@ def config_sha256(cfg: DictConfig) -> str:
         _leave_out(plain, key)
     for key in _NEW:
         if plain.get(key) is None:
+            _leave_out(plain, key)
+    if (plain.get("evaluation") or {}).get("prior") is None:
+        for key in _PRIOR:
             _leave_out(plain, key)
     if (plain.get("data") or {}).get("scale") != "above_floor":
         for key in _FLOORS:

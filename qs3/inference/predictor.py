@@ -11,7 +11,7 @@ A cloud goes the way of the target's clouds in the run: thinned to as many point
 stored with (farthest points from the first one on), or filled up by repeating its points from the
 first on; put into the unit ball, or of a net that sees metres only centred, or of one that sees
 heights put over the floor; and of it the farthest `points` points. The test clouds of a run get the
-probabilities of its predictions.csv.
+probabilities of its predictions.csv; with `evaluation.prior` if `load` is told the same.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from qs3.datamodules.fps_samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
+from qs3.evaluation.prior import POWER, Prior, read_prior
 from qs3.evaluation.trust import COMPARED, Known
 from qs3.inference.floor import check_camera_height
 from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
-from qs3.inference.prior import POWER, Prior, read_prior
 from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.plural import counted
 
@@ -336,7 +336,7 @@ def load(
             package, if you trust it to be built with any arguments.
         prior: how common classes are where the clouds come from, "rooms" or as {"chair": 4,
             "bathtub": 0}, those not named counting as 1; None: as in training. See
-            `qs3.inference.prior`.
+            `qs3.evaluation.prior`.
         prior_power: how much of that is believed; 0 nothing, 1 all.
 
     Raises:

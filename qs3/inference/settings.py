@@ -10,10 +10,10 @@ from typing import NamedTuple
 from qs3.config.checks import check_choice
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError
+from qs3.evaluation.prior import POWER
 from qs3.inference.floor import Floor, check_camera_height
 from qs3.inference.inputs import Unit
 from qs3.inference.predictor import Predictor
-from qs3.inference.prior import POWER
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Settings:
         up: the axis that points up in clouds (z if ""), or a direction in the depth camera's frame.
         floor: where the floor is in clouds along that axis, in metres; None: not known.
         camera_height: of the depth images' camera above the floor, in metres; likewise.
-        prior: how common classes are; "": as in training. See `qs3.inference.prior`.
+        prior: how common classes are; "": as in training. See `qs3.evaluation.prior`.
         prior_power: how much of that is believed.
         part: of an archive; "" for what one chooses on, "all" for all: see `archive_units`.
         sample: so many of the files, images or objects, drawn at random; None: all.

@@ -91,6 +91,7 @@ class Evaluated:
         labels: whether anybody knows the clouds' classes.
         rotations: rotations about the up axis over which the further scores average; 0: none.
         norms: "trained", "adabn" or "tent".
+        prior: how common classes counted as, in words; "": as in training.
         final_over_rotations, warmup_over_rotations: those scores.
         tiers: the final scores of the clouds of each tier, for datasets that have tiers ("clean",
             "hard": how much of the object is seen) and labels.
@@ -100,6 +101,7 @@ class Evaluated:
     labels: bool
     rotations: int
     norms: str
+    prior: str = ""
     final_over_rotations: Scores | None = None
     warmup_over_rotations: Scores | None = None
     tiers: dict[str, Scores] | None = None

@@ -41,7 +41,7 @@ KEYS = {
         "augment",
     ),
     "selection.": ("teacher", "student"),
-    "evaluation.": ("norms", "rotations"),
+    "evaluation.": ("norms", "prior", "prior_power", "rotations"),
 }
 """The settings that this command reads itself; all others are arguments of what is built."""
 

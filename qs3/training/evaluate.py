@@ -40,7 +40,8 @@ class Outcome:
 
     Attributes:
         net: the reported one.
-        predictions: its, for each evaluated cloud.
+        predictions: its, for each evaluated cloud; these and all scores are with
+            `evaluation.prior`, estimates and validators without.
         choice: how its epoch was chosen; None: the last one's, or the warm-up's.
         final: its scores.
         scores: of "selected" and "last", the warm-up's epochs, and "student", the last round's.
@@ -136,10 +137,15 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     names = {"selected": WARMUP_SELECTED, "last": WARMUP_LAST, "student": STUDENT}
     files = {name: run.folder / file for name, file in names.items()}
     choice = None if built.student.rule == LAST else built.student.choice()
-    reported = "student" if run.scheme.rounds else "selected"
-    file = choice.file if choice else files[reported]
+    last = "student" if run.scheme.rounds else "selected"
+    file = choice.file if choice else files[last]
     net, device = nets(file), nets.device
-    predictions = evaluation.predictions_of(nets.of_test(file))
+
+    def reported(weights: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
+        found = nets.of_test(weights, turn)
+        return loaded.prior(found) if loaded.prior else found
+
+    predictions = evaluation.predictions_of(reported(file))
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
     quality, held_out = _quality(run, loaded, nets, file)
     return Outcome(
@@ -147,10 +153,10 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         predictions=predictions,
         choice=choice,
         final=evaluation.scores_of(predictions.probabilities),
-        scores={name: evaluation.scores_of(nets.of_test(path)) for name, path in files.items()},
+        scores={name: evaluation.scores_of(reported(path)) for name, path in files.items()},
         rotated=(
-            evaluation.rotation_averaged(partial(nets.of_test, file)),
-            evaluation.rotation_averaged(partial(nets.of_test, files["selected"])),
+            evaluation.rotation_averaged(partial(reported, file)),
+            evaluation.rotation_averaged(partial(reported, files["selected"])),
         ),
         validators=without_labels(net, data.target, choice, batch_size, device),
         quality=quality,

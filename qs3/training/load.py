@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
 
 from qs3.config.hydra import build
 from qs3.data.domain import Domain
@@ -14,6 +18,7 @@ from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.splits import labels_of, load_clouds, subsample_splits
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
+from qs3.evaluation.prior import Prior, read_prior
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf
 from qs3.training.given import Given
@@ -34,6 +39,7 @@ class Loaded:
         stored_points: of a cloud on disk.
         started: what `started.json` says: hashes of data and config, versions.
         made_of: what the labelled dataset and the target are made of.
+        prior: how common classes are in the target, if `evaluation.prior` says so.
     """
 
     data: AdaptationData
@@ -42,6 +48,7 @@ class Loaded:
     stored_points: int
     started: dict[str, Any]
     made_of: DataMadeOf
+    prior: Prior | None
 
 
 def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
@@ -73,6 +80,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
+    prior = _prior(cfg.evaluation, target.classes, data.labelled.labels.numpy())
     if (few := cfg.data.clouds_a_split) is not None:
         target = subsample_splits(target, few)
     split = _evaluated_split(target)
@@ -92,7 +100,15 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         _tiers_by_id(target, run.target),
     )
     made_of = DataMadeOf(source=labelled, target=of_target)
-    return Loaded(data, evaluation, split, target.points.shape[1], started, made_of)
+    return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, prior)
+
+
+def _prior(settings: Any, classes: Sequence[str], labels: np.ndarray) -> Prior | None:
+    given: Any = settings.prior
+    if given is None:
+        return None
+    given = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
+    return read_prior(given, classes, labels, settings.prior_power)
 
 
 def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:

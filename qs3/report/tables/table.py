@@ -207,12 +207,18 @@ def _cell(
 ) -> Cell | None:
     """The cell of an entry `<column>: {run:, paper:, ...}`, or of what the row has for all columns.
 
-    A row's `run` is followed by the overrides of its columns; a column without any has published
-    numbers alone. Its `paper` has a number a column; `seeds` is how many it should have.
+    A row's `run` is followed by the overrides of its columns, of those that its `columns` names if
+    it has that; a column without any has published numbers alone. Its `paper` has a number a
+    column; `seeds` is how many it should have.
     """
     own = row.get(column, {})
     line = own.get("run")
-    if line is None and "run" in row and (task := _task(spec, column)) is not None:
+    if (
+        line is None
+        and "run" in row
+        and column in _meant(spec, row)
+        and (task := _task(spec, column)) is not None
+    ):
         line = f"{row['run']} {task}"
     numbers = row.get("paper")
     if numbers is not None and len(numbers) != len(spec.columns):
@@ -240,6 +246,18 @@ def _cell(
         seeds = seeds[: of_all.seeds]
     first = bool(own.get("first", row.get("first", False)))
     return Cell(row["name"], column, overrides, paper, take, seeds=seeds, first=first)
+
+
+def _meant(spec: _Spec, row: Mapping[str, Any]) -> Sequence[str]:
+    """The columns that a row's `run` is for: all, or those that it names."""
+    meant = row.get("columns", [*spec.columns])
+    wrong = [x for x in meant if x not in spec.columns] if isinstance(meant, list) else [meant]
+    if wrong:
+        raise ConfigError(
+            f"table row {row['name']!r}: columns: {wrong[0]!r} is none of the table's, which are "
+            f"{', '.join(map(repr, spec.columns))}"
+        )
+    return meant
 
 
 def check_domain(key: str, name: str) -> None:

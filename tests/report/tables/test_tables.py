@@ -186,6 +186,8 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
         ("HEAD\nrows: [{name: [a], a: {paper: 1}}]", "x.yaml: missing or wrong entry 'name'"),
         ("title: x\nmetrics: []\ncolumns: []\nrows: [{}]", "x.yaml: missing or wrong entry 'name'"),
         ("HEAD\nrows:\n- {name: r, a: {run: nonsense}}", "table cell 'r', 'a': .*nonsense"),
+        ("HEAD\nrows:\n- {name: r, run: x, columns: [a, c]}", "row 'r': columns: 'c' is none of"),
+        ("HEAD\nrows:\n- {name: r, run: x, columns: a}", "row 'r': columns: 'a' is none of"),
     ],
 )
 def test_wrong_tables(tmp_path, text, message):
@@ -195,6 +197,21 @@ def test_wrong_tables(tmp_path, text, message):
     path.write_text(text.replace("HEAD", "title: x\nmetrics: [accuracy]\ncolumns: [a, b]"))
     with pytest.raises(ConfigError, match=message):
         build_table(str(path))
+
+
+def test_a_row_may_be_for_some_columns_alone(tmp_path):
+    path = tmp_path / "x.yaml"
+    run = "experiment=source_only_s2d"
+    path.write_text(
+        "title: x\nmetrics: [accuracy]\n"
+        "columns: {a: domain@data.target=kinectsim10, b: domain@data.target=scannet10}\n"
+        f"rows:\n- {{name: all, run: {run}}}\n- {{name: one, run: {run} seed=5, columns: [b]}}\n"
+    )
+    table = build_table(str(path), tmp_path)
+    assert [cell.target for cell in table.rows["all"]] == ["kinectsim10", "scannet10"]
+    first, second = table.rows["one"]
+    assert first is None
+    assert second.target == "scannet10"
 
 
 def test_command_line(tmp_path, capsys):
