@@ -21,6 +21,7 @@ from pydantic.dataclasses import dataclass
 from qs3.classes import known_as
 from qs3.data.importers.object_archive import Archive
 from qs3.errors import ConfigError, MissingDataError
+from qs3.evaluation.prior import POWER
 from qs3.inference.model_file import FILE, find_result
 from qs3.inference.predictor import Predictor, load
 from qs3.runs.metrics import METRICS, read_metrics, write_metrics
@@ -41,12 +42,16 @@ class Asked:
         part: of it; "" for all.
         inliers_only: whether stray points were left out.
         floor: z of the floor, for nets that know heights; None: as in the run's target.
+        prior, prior_power: how common classes counted as; "": as in training. See
+            `qs3.evaluation.prior`.
     """
 
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     part: _Word
     inliers_only: bool
     floor: Annotated[float, Field(allow_inf_nan=False)] | None
+    prior: Annotated[str, Field(max_length=4096)] = ""
+    prior_power: Annotated[float, Field(allow_inf_nan=False, ge=0)] = POWER
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(strict=True, extra="forbid"))
@@ -79,17 +84,31 @@ class Answers:
             raise ValueError("called should be positions in classes")
 
 
-def asked_of(archive: Archive, part: str, inliers_only: bool, floor: float | None) -> Asked:
+def asked_of(
+    archive: Archive,
+    part: str,
+    inliers_only: bool,
+    floor: float | None,
+    prior: str = "",
+    prior_power: float = POWER,
+) -> Asked:
     """What is asked now."""
-    floor = None if floor is None else float(floor)
     return Asked(
-        sha256=sha256_file(archive.path), part=part, inliers_only=inliers_only, floor=floor
+        sha256=sha256_file(archive.path),
+        part=part,
+        inliers_only=inliers_only,
+        floor=None if floor is None else float(floor),
+        prior=prior,
+        prior_power=float(prior_power),
     )
 
 
-def kept_name(part: str) -> str:
-    """The file's name, beside the run's `metrics.json`: such as "judged-adapt.json"."""
-    return f"judged-{part or 'all'}.json"
+def kept_name(part: str, prior: str = "") -> str:
+    """The file's name, beside the run's `metrics.json`: such as "judged-adapt.json".
+
+    Answers with a prior, of which one is kept, are in "judged-adapt-prior.json".
+    """
+    return f"judged-{part or 'all'}{'-prior' * bool(prior)}.json"
 
 
 def answers_of(
@@ -109,7 +128,7 @@ def answers_of(
         ConfigError: a net cannot be judged so, or was asked something else.
     """
     kept = {file: read_answers(file, asked) for file in files if _is_kept(file)}
-    nets = _loaded([file for file in files if file not in kept], asked.floor, device)
+    nets = _loaded([file for file in files if file not in kept], asked, device)
     found: dict[Path, Answers] = {}
     if nets:
         clouds = {i: archive.cloud(i, asked.inliers_only) for i in chosen}
@@ -138,16 +157,17 @@ def _ask(
     )
 
 
-def _loaded(files: Sequence[Path], floor: float | None, device: str) -> dict[Path, Predictor]:
+def _loaded(files: Sequence[Path], asked: Asked, device: str) -> dict[Path, Predictor]:
     """The classifiers, all for clouds with z up; and a camera's, if they know heights."""
-    found = {file: load(file, device=device) for file in files}
+    told: dict[str, Any] = {"prior": asked.prior or None, "prior_power": asked.prior_power}
+    found = {file: load(file, device=device, **told) for file in files}
     for file, one in found.items():
         if one.result.gravity != "z":
             raise ConfigError(
                 f"{file} was trained on clouds in the frame of their camera; the archive's have z "
                 "up, so it cannot be judged on them"
             )
-        if one.needs_floor and one.camera_height is None and floor is None:
+        if one.needs_floor and one.camera_height is None and asked.floor is None:
             raise ConfigError(
                 f"{file} knows heights above the floor, and its target's clouds stand at "
                 f"{one.result.floor_m:g}: the archive's have the camera at the origin; give "
@@ -183,7 +203,7 @@ def keep_answers(found: Mapping[Path, Answers], folder: Path) -> None:
             continue  # taken up from there
         into.mkdir(parents=True, exist_ok=True)
         write_metrics(into, metrics)
-        write_text(into / kept_name(answers.asked.part), _text(answers))
+        write_text(into / kept_name(answers.asked.part, answers.asked.prior), _text(answers))
 
 
 def _text(answers: Answers) -> str:
@@ -207,12 +227,13 @@ def read_answers(path: Path, asked: Asked) -> Answers:
     return found
 
 
-def find_runs(runs: Sequence[str], part: str = "") -> list[Path]:
+def find_runs(runs: Sequence[str], part: str = "", prior: str = "") -> list[Path]:
     """The files that are meant, each once, in order: results of runs, or kept answers.
 
     Args:
         runs: folders of runs, folders of such folders, patterns, or files.
         part: of the archive that is asked, which kept answers have in their name.
+        prior: likewise, whether there is one.
 
     Raises:
         MissingDataError: one is not there, or a folder holds none.
@@ -225,21 +246,23 @@ def find_runs(runs: Sequence[str], part: str = "") -> list[Path]:
             if not places:
                 raise MissingDataError(f"runs={words} matches nothing")
         for place in places:
-            for file in _below(place, part) if place.is_dir() else [place]:
+            for file in _below(place, kept_name(part, prior)) if place.is_dir() else [place]:
                 found.setdefault(file if _is_kept(file) else find_result(file))
     if not found:
         raise ConfigError("runs= names no run; give folders of finished runs")
     return list(found)
 
 
-def _below(folder: Path, part: str) -> list[Path]:
+def _below(folder: Path, name: str) -> list[Path]:
     """Results, and kept answers where there is no result beside them; else the folder itself."""
     results = list(folder.rglob(FILE))
     there = {file.parent for file in results}
-    kept = [file for file in folder.rglob(kept_name(part)) if file.parent not in there]
+    kept = [file for file in folder.rglob(name) if file.parent not in there]
     found = sorted(results + kept)
     if not found and (other := next(folder.rglob("judged-*.json"), None)):
-        raise MissingDataError(f"{folder} has no {FILE}, and {other} is of another part")
+        raise MissingDataError(
+            f"{folder} has no {FILE}, and {other} answers something else than {name}"
+        )
     return found or [folder]
 
 

@@ -45,6 +45,8 @@ JUDGE = Command(
         Option("part", text("NAME"), "part of the archive (default: judge, if it has one)", ""),
         Option("inliers_only", FLAG, "leave out points that the archive marks as stray", True),
         Option("floor", NUMBER, "its z in metres: minus the camera's height (default: each run's)"),
+        Option("prior", text("rooms|C:N,C:N"), "how common classes are, as in qs3 predict", ""),
+        Option("prior_power", NUMBER, "how much of that is believed, 0 to 1", 0.5),
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
         Option("out", path("FILE"), ".csv or .json, with all digits"),
         Option("keep", path("FOLDER"), "gets each net's answers, for runs= without its weights"),
@@ -53,6 +55,7 @@ JUDGE = Command(
         "qs3 report judge runs=logs/qs3_s2d data=held_back.npz",
         "qs3 report judge runs=logs/source_only_s2d,logs/qs3_s2d data=held_back.npz out=judged.csv",
         "qs3 report judge runs=logs/source_only_s2d data=held_back.npz keep=answers",
+        "qs3 report judge runs=dgcnn-rooms data=held_back.npz floor=-1.2 prior=rooms",
     ),
     about="""
 Accuracy, balanced accuracy over the classes that are there, and the majority rate, for all objects

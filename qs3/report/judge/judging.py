@@ -18,6 +18,7 @@ from jaxtyping import Bool, Int
 from qs3.classes import known_as
 from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError
+from qs3.evaluation.prior import POWER
 from qs3.report.judge.answers import (
     Answers,
     answers_of,
@@ -114,6 +115,7 @@ class Verdict:
         left_out: objects of other classes.
         inliers_only: whether stray points were left out.
         floor: z of the floor, for nets that know heights; None: as in the target of each.
+        prior, prior_power: how common classes counted as; "": as in training.
         families: in the order of the runs given.
         differences: of the others to the first of them.
         judged_by: version of qs3, and the commit of a checkout.
@@ -126,6 +128,8 @@ class Verdict:
     left_out: int
     inliers_only: bool
     floor: float | None
+    prior: str
+    prior_power: float
     families: tuple[Family, ...]
     differences: tuple[Difference, ...]
     judged_by: str
@@ -141,6 +145,8 @@ def judge(
     floor: float | None = None,
     device: str = "cpu",
     keep: Path | None = None,
+    prior: str = "",
+    prior_power: float = POWER,
 ) -> Verdict:
     """Judge saved runs on an archive of objects.
 
@@ -154,6 +160,9 @@ def judge(
             None: as in the target of each.
         device: of the nets.
         keep: a folder that gets what each net called each object, for `runs` of another day.
+        prior, prior_power: how common classes are in the archive's place, and how much of that is
+            believed (`qs3.evaluation.prior`); "": as in training, also of runs that were evaluated
+            with a prior.
 
     Raises:
         MissingDataError: a run or the archive is not there.
@@ -162,10 +171,10 @@ def judge(
     """
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
-    files = find_runs(runs, part)
+    files = find_runs(runs, part, prior)
     if keep is not None:
         check_keepable(files)
-    asked = asked_of(archive, part, inliers_only, floor)
+    asked = asked_of(archive, part, inliers_only, floor, prior, prior_power)
     answers = answers_of(files, archive, chosen, asked, device)
     if keep is not None:
         keep_answers(answers, keep)
@@ -212,6 +221,8 @@ def judge(
         left_out,
         inliers_only,
         floor,
+        prior,
+        prior_power,
         tuple(families),
         tuple(differences),
         in_words(VERSION, commit()),

@@ -29,8 +29,9 @@ def text(verdict: Verdict) -> str:
     part = f", part {v.part}" if v.part else ""
     stray = "left out" if v.inliers_only else "kept"
     floor = "" if v.floor is None else f"; the floor lies at {v.floor:g} m"
+    prior = f"; classes as common as prior={v.prior}, power {v.prior_power:g}" if v.prior else ""
     lines = [
-        f"{v.data}{part}: real objects; stray points {stray}{floor}",
+        f"{v.data}{part}: real objects; stray points {stray}{floor}{prior}",
         *aligned(rows),
         "Mean ± SEM over seeds; in brackets the interval at 95 %, with blocks of frames as clusters"
         " and, of several runs, seeds.",

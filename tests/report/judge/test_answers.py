@@ -71,8 +71,28 @@ def test_a_command_keeps_and_takes_up(archive, logs, tmp_path, capsys):
     before = capsys.readouterr().out
     assert QS3([*words, f"runs={tmp_path}/kept"]) == 0
     assert capsys.readouterr().out == before.replace(f"kept in {tmp_path}/kept\n", "")
-    with pytest.raises(MissingDataError, match=r"no result\.pt.*judged-adapt\.json is of another"):
+    with pytest.raises(MissingDataError, match=r"no result\.pt.*judged-adapt\.json answers"):
         QS3(["report", "judge", f"data={archive}", f"runs={tmp_path}/kept/exp/seed0-0123abcd"])
+
+
+def test_answers_with_a_prior_are_others_and_kept_apart(archive, logs, tmp_path, capsys):
+    words = ["report", "judge", f"data={archive}", f"runs={logs}/exp"]
+    verdicts = {}
+    for prior in ("", "chair:1000000", "chair:0"):
+        told = judge(
+            [str(logs / "exp")], archive, keep=tmp_path / "kept", prior=prior, prior_power=1
+        )
+        verdicts[prior] = told.families[0].figures[0].predicted
+    assert verdicts["chair:1000000"]["chair"] == pytest.approx(sum(verdicts[""].values()))
+    assert verdicts["chair:0"]["chair"] == 0
+    names = {file.name for file in (tmp_path / "kept").rglob("judged-*")}
+    assert names == {"judged-judge.json", "judged-judge-prior.json"}
+    again = judge([str(tmp_path / "kept")], archive, prior="chair:0", prior_power=1)
+    assert again.families[0].figures[0].predicted == verdicts["chair:0"]
+    with pytest.raises(ConfigError, match=r"prior=chair:0, now sofa:2"):
+        judge([str(tmp_path / "kept")], archive, prior="sofa:2", prior_power=1)
+    assert QS3([*words, "prior=rooms"]) == 0
+    assert "classes as common as prior=rooms, power 0.5" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
