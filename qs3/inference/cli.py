@@ -74,16 +74,14 @@ PREDICT = Command(
         "qs3 predict ckpt=result.pt depth=objects.csv intrinsics=camera.json out=said.json",
     ),
     about="""
-Without ckpt= a classifier of the ten classes that comes with qs3 is taken, and what it is worth on
-real objects is said: dgcnn-speckle, for clouds in any unit; dgcnn-rooms, which knows sizes and
-heights and is right more often, where floor= or camera_height= is given, or where the objects of an
-archive say by their lowest points where the floor is; pointnet-speckle is another net for any unit.
+Without ckpt= a classifier of ten classes that comes with qs3 is taken, and what it is worth on real
+objects is said: dgcnn-rooms, which knows sizes and heights and is right more often, where floor= or
+camera_height= is given or an archive's lowest points tell; else dgcnn-speckle, for any unit.
 
 CLOUDS are .xyz .txt .npy .npz .ply .pcd .h5 .hdf5, in any depth of folders: any number of points,
 any unit, any place. A net that knows sizes takes them as metres; one that knows heights wants
-floor=, which is 0 if objects stand on z = 0. Other files are passed over. Which way is up is not
-guessed (default z), and the wrong axis costs most of the accuracy. Labels: the file's own, or a
-folder called as a class.
+floor=, which is 0 if objects stand on z = 0. Which way is up is not guessed (default z), and the
+wrong axis costs most of the accuracy. Labels: the file's own, or a folder called as a class.
 
 DEPTH IMAGES are .png of 16 bits, in millimetres, or .npy; 0 is not measured. A mask has 0 where no
 object is and a number for each object. A list is .csv, .json or .yaml with a row an object or a
@@ -93,21 +91,16 @@ right, y down, z forward), at any length: what an accelerometer at rest reads, i
 a level camera. Without it up is fitted to the planes of the picture, else the camera counts as
 level; the column up says which. camera_height= is for nets that know heights above the floor.
 
-Nets learn each class as often as any other, and in rooms two things in five are chairs: prior=rooms
-takes the ten classes as common as in ScanNet's, prior=chair:4,table:2,bathtub:0 says it of your own
-place: a chair is met four times as often as each class that is not named, a bathtub never. On real
-objects more answers are right with it, and fewer of rare classes.
+prior=rooms takes classes as common as in ScanNet's rooms (42 % chairs), prior=chair:4,bathtub:0 as
+in your place: others count as 1, 0 is never. More answers are right then, fewer of rare classes.
 
 A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status, class,
-confidence, label, points, dropped, tier, caution, up, out_of_range, reason, and p_<class>, a
-probability for each class. dropped counts points that are NaN or infinite, and pixels of an object
-without depth. tier is clean, hard, or poor (what datasets leave out), and caution says why: cut off
-by the picture, covered, few pixels.
+confidence, label, points, dropped (NaN or infinite, or pixels without depth), tier (clean, hard, or
+poor, what datasets leave out), caution, up, out_of_range, reason, and a p_<class> for each class.
 
 out_of_range=yes: a cloud unlike all those of training (fewer points than the net samples and than
-training had; spacing, flatness, height or stray points outside what 99.8 % of them had); the reason
-says in what. It guarantees nothing: an object of no known class also gets a class, often with high
-confidence.
+training had; spacing, flatness, height or stray points outside what 99.8 % of them had). It
+guarantees nothing: an object of no known class also gets a class, often with high confidence.
 
 The page shows the objects: with labels the errors first, the most confident before the others.
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.

@@ -75,12 +75,16 @@ def test_rows_say_nothing_beyond_the_rules():
         assert named <= {
             *("method", "selftraining", "selftraining.share", "evaluation.norms", "model"),
             *("selftraining.selector.graph", "selftraining.selector.growth"),
-            *("protocol.epochs", "protocol.steps"),
+            *("protocol.epochs", "protocol.steps", "evaluation.prior"),
         }, row
         assert ("selftraining" in named) == (rounds <= set(words)), row
         assert {"protocol.epochs", "protocol.steps"} & named == (
             {"protocol.epochs", "protocol.steps"} if rounds <= set(words) else set()
         )
+    for row in SPEC["rows"]:  # where it is not the target's own, by the counts of another dataset
+        prior = [word for word in row.get("run", "").split() if "evaluation.prior" in word]
+        assert prior in ([], ["evaluation.prior=rooms"])
+        assert row.get("columns") == (["R → N", "R → A", "R → A0"] if prior else None)
     five = {row["name"] for row in SPEC["rows"] if row.get("seeds") == 5}
     assert five == {"source only", "QS3 (PCM+QBST)", "Twins (ours)"}
     assert {row.get("seeds", 3) for row in SPEC["rows"]} == {3, 5}
