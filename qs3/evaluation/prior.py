@@ -115,6 +115,16 @@ def read_prior(
     return Prior(shares, power, factors, _in_words(shares, classes, power))
 
 
+def check_told(prior: object, power: float) -> None:
+    """Refuse a power that nothing reads.
+
+    Raises:
+        ConfigError: it is not `POWER`, and there is no prior.
+    """
+    if not prior and power != POWER:
+        raise ConfigError("prior_power= is for prior=; give prior=rooms or prior=chair:4,...")
+
+
 def _of_rooms(classes: Sequence[str]) -> dict[str, float]:
     if unknown := [name for name in classes if name not in ROOMS]:
         raise ConfigError(

@@ -38,7 +38,7 @@ from qs3.datamodules.fps_samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
-from qs3.evaluation.prior import POWER, Prior, read_prior
+from qs3.evaluation.prior import POWER, Prior, check_told, read_prior
 from qs3.evaluation.trust import COMPARED, Known
 from qs3.inference.floor import check_camera_height
 from qs3.inference.held_out import known_of
@@ -348,6 +348,7 @@ def load(
     place = device_of(device)
     if place.type == "cpu":
         keep_freed_memory()
+    check_told(prior, prior_power)
     found = Predictor(build_net(result, packages).to(place), result, place)
     if prior is None:
         return found

@@ -75,8 +75,6 @@ class Settings:
             raise ConfigError(f"depth_scale={self.depth_scale:g}: metres a unit, in (0, 1]")
         if self.depth and self.floor is not None:
             raise ConfigError("floor= is for clouds; of depth images give camera_height=METRES")
-        if self.prior_power != POWER and not self.prior:
-            raise ConfigError("prior_power= is for prior=; give prior=rooms or prior=chair:4,...")
         if self.camera_height is not None:
             check_camera_height(self.camera_height)
         if self.input:

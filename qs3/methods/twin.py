@@ -1,4 +1,6 @@
-"""Twins: a student of one noisy, hidden, cut view follows a teacher who sees the whole object.
+"""Twins: two draws of each source cloud, and what else a simulation knows of it.
+
+A student of one noisy, hidden, cut view can follow a teacher who sees the whole object.
 
 Ours. Learning with information that only the teacher has is of Vapnik, Vashist, "A new learning
 paradigm: Learning using privileged information", Neural Networks 22 (2009), as distillation of
@@ -43,6 +45,8 @@ class Twin(MeanTeacher):
 
     The normalised squared distance |û - v̂|² is 2 (1 - cos), so it is no further choice.
 
+    By default b = 1 and the others are 0: none of them helped on real objects
+    (docs/results/twin.md).
     A weight of 0 leaves its term out, with its passes, and the clouds that nothing else needs are
     not loaded.
 
@@ -95,8 +99,8 @@ class Twin(MeanTeacher):
         self.view_weight = weight("view_weight", view_weight)
         self.target_weight = weight("target_weight", target_weight)
         self.sees = check_choice("method.sees", sees, sorted(SOURCE_TWINS))
-        self.of = check_choice("method.teacher", teacher, TEACHERS)
-        if self.of == "own" and not (self.twin_weight and self._distils):
+        self.taught_by = check_choice("method.teacher", teacher, TEACHERS)
+        if self.taught_by == "own" and not (self.twin_weight and self._distils):
             raise ConfigError(
                 "method.teacher=own learns by method.twin_weight and teaches by "
                 "method.logit_weight or method.feature_weight: set them above 0, or "
@@ -122,10 +126,10 @@ class Twin(MeanTeacher):
         super().prepare(net)
         if self.feature_weight:
             check_taught(net, "method.feature_weight", "set method.feature_weight=0")
-        if self.of == "own":
+        if self.taught_by == "own":
             self.expert = copy.deepcopy(net)
-        asked = self.uses_target or (self._distils and self.of == "mean")
-        if self.of == "shared" or not asked:
+        asked = self.uses_target or (self._distils and self.taught_by == "mean")
+        if self.taught_by == "shared" or not asked:
             self.teacher = None
 
     def loss(
@@ -161,8 +165,8 @@ class Twin(MeanTeacher):
         wait: nothing of theirs asks for a gradient, and what is detached keeps none.
         """
         terms, twin = {}, source["twin"]
-        learner = self.expert if self.of == "own" else net
-        if self.twin_weight or self.of == "shared":
+        learner = self.expert if self.taught_by == "own" else net
+        if self.twin_weight or self.taught_by == "shared":
             own = learner.features(twin).global_
             classes = learner.head(own)
         if self.twin_weight:
@@ -170,7 +174,7 @@ class Twin(MeanTeacher):
             terms["twin"] = self.twin_weight * ce
         if not self._distils:
             return terms
-        if self.of == "mean":
+        if self.taught_by == "mean":
             own = self.teacher.features(twin).global_
             classes = self.teacher.head(own)
         if self.logit_weight:
@@ -183,7 +187,7 @@ class Twin(MeanTeacher):
 
     def _of_the_target(self, net: Any, target: dict[str, Tensor]) -> Float[Tensor, ""]:
         """Cross-entropy of cut target clouds with what the teacher says of them before the cut."""
-        teacher = net if self.of == "shared" else self.teacher
+        teacher = net if self.taught_by == "shared" else self.teacher
         with use_domain(net, "target"), use_domain(teacher, "target"):
             said = teacher(target["twin"]).detach()
             student = net(target["points"])

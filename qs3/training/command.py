@@ -164,9 +164,15 @@ def headline(metrics: RunMetrics) -> str:
         )
     return (
         f"{run}accuracy {final.accuracy:.1%}, balanced {final.balanced_accuracy:.1%} "
-        f"on {target}, majority rate {final.majority_rate:.1%}; data: {metrics.data_text}"
+        f"on {target}, majority rate {final.majority_rate:.1%}{_told(metrics)}; "
+        f"data: {metrics.data_text}"
         f"{_chosen(metrics)}"
     )
+
+
+def _told(metrics: RunMetrics) -> str:
+    """That predictions were told how common classes are."""
+    return "; with evaluation.prior" if metrics.evaluation.prior else ""
 
 
 def _chosen(metrics: RunMetrics) -> str:

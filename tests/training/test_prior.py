@@ -9,7 +9,7 @@ from qs3.config import hashing
 from qs3.errors import ConfigError
 from qs3.evaluation.prior import read_prior
 from qs3.runs.predictions import read_predictions
-from qs3.training.command import train
+from qs3.training.command import headline, train
 from tests.training.toy import CLASSES
 
 WORDS = ("method=source_only", "selftraining=none", "protocol.epochs=2", "evaluation.rotations=2")
@@ -32,6 +32,8 @@ def test_the_reported_probabilities_are_weighed_and_estimates_are_not(toy) -> No
     assert after.evaluation.final_over_rotations != before.evaluation.final_over_rotations
     assert after.evaluation.prior == prior.words
     assert before.evaluation.prior == ""
+    assert "; with evaluation.prior; data: " in headline(after)
+    assert "evaluation.prior" not in headline(before)
     assert after.quality == before.quality
     assert after.validators == before.validators
 

@@ -45,7 +45,7 @@ JUDGE = Command(
         Option("part", text("NAME"), "part of the archive (default: judge, if it has one)", ""),
         Option("inliers_only", FLAG, "leave out points that the archive marks as stray", True),
         Option("floor", NUMBER, "its z in metres: minus the camera's height (default: each run's)"),
-        Option("prior", text("rooms|C:N,C:N"), "how common classes are, as in qs3 predict", ""),
+        Option("prior", text("rooms|C:N,C:N"), "also with classes as common: see qs3 predict", ""),
         Option("prior_power", NUMBER, "how much of that is believed, 0 to 1", 0.5),
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
         Option("out", path("FILE"), ".csv or .json, with all digits"),

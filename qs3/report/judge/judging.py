@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int
 from qs3.classes import known_as
 from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError
-from qs3.evaluation.prior import POWER
+from qs3.evaluation.prior import POWER, check_told
 from qs3.report.judge.answers import (
     Answers,
     answers_of,
@@ -115,7 +115,8 @@ class Verdict:
         left_out: objects of other classes.
         inliers_only: whether stray points were left out.
         floor: z of the floor, for nets that know heights; None: as in the target of each.
-        prior, prior_power: how common classes counted as; "": as in training.
+        prior, prior_power: how common classes counted as in the second half of the families; "":
+            there is no such half.
         families: in the order of the runs given.
         differences: of the others to the first of them.
         judged_by: version of qs3, and the commit of a checkout.
@@ -161,61 +162,68 @@ def judge(
         device: of the nets.
         keep: a folder that gets what each net called each object, for `runs` of another day.
         prior, prior_power: how common classes are in the archive's place, and how much of that is
-            believed (`qs3.evaluation.prior`); "": as in training, also of runs that were evaluated
-            with a prior.
+            believed (`qs3.evaluation.prior`): each family is judged without it and with it. "":
+            only without, also of runs that were evaluated with a prior.
 
     Raises:
         MissingDataError: a run or the archive is not there.
         DataError: one is damaged.
         ConfigError: nothing is left to judge on, or runs that cannot be judged so.
     """
+    check_told(prior, prior_power)
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
-    files = find_runs(runs, part, prior)
+    asks = [
+        asked_of(archive, part, inliers_only, floor, *told)
+        for told in [("", POWER), (prior, prior_power)][: 1 + bool(prior)]
+    ]
+    found = []
+    for asked in asks:
+        files = find_runs(runs, part, asked.prior)
+        if keep is not None:
+            check_keepable(files)
+        found.append(answers_of(files, archive, chosen, asked, device))
     if keep is not None:
-        check_keepable(files)
-    asked = asked_of(archive, part, inliers_only, floor, prior, prior_power)
-    answers = answers_of(files, archive, chosen, asked, device)
-    if keep is not None:
-        keep_answers(answers, keep)
-    common = _common([one.classes for one in answers.values()], classes)
+        for answers in found:
+            keep_answers(answers, keep)
+    common = _common([one.classes for answers in found for one in answers.values()], classes)
     names = [known_as(str(name), common) for name in archive.cls]
     kept = [i for i in chosen if names[i] is not None]
     if not kept:
         raise ConfigError(f"{data}: no object of {', '.join(common)} in what was asked for")
     truth = np.array([common.index(str(names[i])) for i in kept])
     blocks, tiers = archive.frame[kept] // BLOCK, archive.tier[kept]
-    guesses = {file: _called(one, common, kept, file) for file, one in answers.items()}
     every = np.ones(len(kept), dtype=bool)
     subsets = {"all": every, **{tier: tiers == tier for tier in TIERS if (tiers == tier).any()}}
     families, differences = [], []
     base: tuple[Family, np.ndarray] | None = None
-    for known in _families(files):
-        picked = np.stack([guesses[file] for file in known.runs])
-        first = answers[known.runs[0]]
-        figures = tuple(
-            _figures(tier, picked[:, of], truth[of], blocks[of], common)
-            for tier, of in subsets.items()
-        )
-        family = Family(
-            known.name,
-            known.runs,
-            known.seeds,
-            first.points,
-            first.target,
-            known.data,
-            known.trained_by,
-            figures,
-        )
-        families.append(family)
-        right = picked == truth
-        base = base or (families[0], right)
-        if len(families) > 1:
-            differences += _differences(families[-1], right, *base, truth, blocks, subsets)
+    for asked, answers in zip(asks, found, strict=True):
+        for known in _families(list(answers)):
+            picked = np.stack([_called(answers[file], common, kept, file) for file in known.runs])
+            first = answers[known.runs[0]]
+            figures = tuple(
+                _figures(tier, picked[:, of], truth[of], blocks[of], common)
+                for tier, of in subsets.items()
+            )
+            family = Family(
+                known.name + f", prior={asked.prior}" * bool(asked.prior),
+                known.runs,
+                known.seeds,
+                first.points,
+                first.target,
+                known.data,
+                known.trained_by,
+                figures,
+            )
+            families.append(family)
+            right = picked == truth
+            base = base or (families[0], right)
+            if len(families) > 1:
+                differences += _differences(families[-1], right, *base, truth, blocks, subsets)
     left_out = len(chosen) - len(kept)
     return Verdict(
         data,
-        asked.sha256,
+        asks[0].sha256,
         part,
         common,
         left_out,

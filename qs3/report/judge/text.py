@@ -29,7 +29,7 @@ def text(verdict: Verdict) -> str:
     part = f", part {v.part}" if v.part else ""
     stray = "left out" if v.inliers_only else "kept"
     floor = "" if v.floor is None else f"; the floor lies at {v.floor:g} m"
-    prior = f"; classes as common as prior={v.prior}, power {v.prior_power:g}" if v.prior else ""
+    prior = f"; beside each run with prior={v.prior}, power {v.prior_power:g}" if v.prior else ""
     lines = [
         f"{v.data}{part}: real objects; stray points {stray}{floor}{prior}",
         *aligned(rows),

@@ -79,20 +79,25 @@ def test_answers_with_a_prior_are_others_and_kept_apart(archive, logs, tmp_path,
     words = ["report", "judge", f"data={archive}", f"runs={logs}/exp"]
     verdicts = {}
     for prior in ("", "chair:1000000", "chair:0"):
-        told = judge(
-            [str(logs / "exp")], archive, keep=tmp_path / "kept", prior=prior, prior_power=1
-        )
-        verdicts[prior] = told.families[0].figures[0].predicted
+        more = {"prior": prior, "prior_power": 1} if prior else {}
+        told = judge([str(logs / "exp")], archive, keep=tmp_path / "kept", **more)
+        verdicts[prior] = told.families[-1].figures[0].predicted
+        assert len(told.families) == 1 + bool(prior)
+        assert told.families[0].figures[0].predicted == verdicts[""]
     assert verdicts["chair:1000000"]["chair"] == pytest.approx(sum(verdicts[""].values()))
     assert verdicts["chair:0"]["chair"] == 0
     names = {file.name for file in (tmp_path / "kept").rglob("judged-*")}
     assert names == {"judged-judge.json", "judged-judge-prior.json"}
     again = judge([str(tmp_path / "kept")], archive, prior="chair:0", prior_power=1)
-    assert again.families[0].figures[0].predicted == verdicts["chair:0"]
+    assert again.families[1].name == again.families[0].name + ", prior=chair:0"
+    assert again.families[1].figures[0].predicted == verdicts["chair:0"]
+    assert again.differences == told.differences  # the same seeds, object by object
+    with pytest.raises(ConfigError, match="prior_power= is for prior="):
+        judge([str(logs / "exp")], archive, prior_power=1)
     with pytest.raises(ConfigError, match=r"prior=chair:0, now sofa:2"):
         judge([str(tmp_path / "kept")], archive, prior="sofa:2", prior_power=1)
     assert QS3([*words, "prior=rooms"]) == 0
-    assert "classes as common as prior=rooms, power 0.5" in capsys.readouterr().out
+    assert "beside each run with prior=rooms, power 0.5" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
