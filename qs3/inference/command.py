@@ -79,6 +79,8 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     seconds = time.monotonic() - began
     records = [record(row, classes) for row in rows]
     trained_on, worth = _trained_on(ckpt), predictor.result.worth
+    if worth and predictor.prior:
+        worth += "; without prior="
     heights = any(one.needs_floor for one in (predictor, second) if one)
     taken = [found.words] if found and heights else []
     taken += [predictor.prior.words] if predictor.prior else []
@@ -90,8 +92,7 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         lines.append(verdict)
         lines += [agreement(rows, classes)] if second else []
         lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
-        without = "; without prior=" if predictor.prior else ""
-        lines += [f"what it is worth: {worth}{without}"] * bool(worth)
+        lines += [f"what it is worth: {worth}"] * bool(worth)
     if out.suffix.lower() == ".json":
         text = as_json(records, classes, predictor.result.target, trust, predictor.prior)
     else:

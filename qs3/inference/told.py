@@ -81,7 +81,7 @@ def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
 
     tiers = "".join(f"; {tier} {of(count)}" for tier, count in found.tiers.items())
     label, times = found.majority
-    balanced = f", classes alike {found.balanced:.1%}"
+    balanced = f", balanced {found.balanced:.1%}"
     return [f"right {of(found.all)}{balanced}{tiers}; always {label}: {times / found.all.of:.1%}"]
 
 
