@@ -78,7 +78,9 @@ class SavedNets:
 
     def __init__(self, run: Run, loaded: Loaded, built: Built) -> None:
         self.run, self.data, self.test = run, loaded.data, loaded.evaluation.test
-        self.classifier, self.device = built.classifier, built.classifier.device
+        self.classifier = built.classifier
+        # After `fit` Lightning moves the classifier to the CPU; the accelerator is still there.
+        self.device = built.trainer.strategy.root_device
         self._weights: dict[Path, str] = {}
         self._nets: dict[tuple[str, str], nn.Module] = {}
         self._predicted: dict[tuple[str, str, float], np.ndarray] = {}

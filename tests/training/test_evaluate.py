@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -74,3 +75,27 @@ def test_weights_are_equal_by_their_values_not_by_their_file(tmp_path):
         assert weights_sha256(net.state_dict()) == sha
     assert weights_sha256({"w": torch.zeros(2, 3)}) != weights_sha256({"w": torch.zeros(3, 2)})
     assert weights_sha256({"w": torch.zeros(1)}) != weights_sha256({"v": torch.zeros(1)})
+
+
+def test_nets_predict_where_they_were_trained():
+    """After `fit` Lightning has moved the classifier to the CPU; the accelerator is asked."""
+    trainer = SimpleNamespace(strategy=SimpleNamespace(root_device=torch.device("meta")))
+    classifier = SimpleNamespace(device=torch.device("cpu"), fresh_net=lambda phase: TinyNet(3))
+    run = SimpleNamespace(cfg=SimpleNamespace(data=SimpleNamespace(eval_batch_size=2)))
+    loaded = SimpleNamespace(data=None, evaluation=SimpleNamespace(test=None))
+    built = SimpleNamespace(trainer=trainer, classifier=classifier)
+    nets = stage.SavedNets(run, loaded, built)
+    assert nets.device == torch.device("meta")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_evaluation_of_a_gpus_training_is_on_the_gpu(toy, monkeypatch):
+    devices = set()
+
+    def spied(net, points, batch_size, device="cpu", **named):
+        devices.add(torch.device(device).type)
+        return predict(net, points, batch_size, device, **named)
+
+    monkeypatch.setattr(stage, "predict", spied)
+    train(toy("force=true", "trainer=gpu"))
+    assert devices == {"cuda"}
