@@ -69,7 +69,8 @@ def config_sha256(cfg: DictConfig) -> str:
         for key in _FLOORS:
             _leave_out(plain, key)
     for domain in ("source", "target"):
-        if ((plain.get("data") or {}).get(domain) or {}).get("views") == "stored":
+        node = (plain.get("data") or {}).get(domain)
+        if isinstance(node, dict) and node.get("views") == "stored":
             _leave_out(plain, f"data.{domain}.views")
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None

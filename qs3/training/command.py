@@ -218,6 +218,11 @@ def _check_settings(cfg: DictConfig) -> None:
     for key, one in _SEVERAL.items():
         if cfg[key] is None:
             raise ConfigError(f"{key}=null: these are several settings; give one, as {one}")
+    for key in ("data.source", "data.target"):
+        if not isinstance(domain := OmegaConf.select(cfg, key), DictConfig):
+            raise ConfigError(
+                f"{key} must be a domain of conf/domain, got {domain!r}; give domain@{key}=NAME"
+            )
     _check_keys(cfg)
     check_choice("selection.teacher", cfg.selection.teacher, TEACHERS)
     if cfg.selection.teacher == "given" and cfg.weights is None:

@@ -304,7 +304,7 @@ def run(command: Command | Group, argv: Sequence[str]) -> int:
 
 
 def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
-    """`main` of Hydra with the same manners: `help`, Ctrl-C, SIGTERM, and `--help | head`."""
+    """`main` of Hydra with the same manners: `help`, hints, Ctrl-C, SIGTERM, `--help | head`."""
 
     @functools.wraps(main)
     def command() -> None:
@@ -327,6 +327,8 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
             ):
                 what, status = "interrupted", INTERRUPTED
             else:
+                if hint := _hint(error.__context__):  # Hydra's own error, told
+                    print(hint, file=sys.stderr)
                 raise
             print(f"\n{what}; run the same command again and it continues", file=sys.stderr)
             sys.exit(status)
@@ -342,6 +344,25 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 def _near(word: str, known: Iterable[str]) -> str:
     return next(iter(difflib.get_close_matches(word, list(known), n=1)), "")
+
+
+def _hint(error: BaseException | None) -> str:
+    """What to type instead, below Hydra's message that a choice or a key is not there."""
+    asked, there = getattr(error, "missing_cfg_file", None), getattr(error, "options", None)
+    if asked and there:  # MissingConfigException
+        group, _, name = asked.rpartition("/")
+        keys = [word.removesuffix(f"={name}") for word in sys.argv if word.endswith(f"={name}")]
+        key = keys[0] if keys else group  # as it was typed: domain@data.target
+        return f"did you mean {key}={near}?" if (near := _near(name, there)) else ""
+    cause = error and error.__cause__  # of ConfigCompositionException, by OmegaConf
+    key, node = getattr(cause, "key", None), getattr(cause, "parent_node", None)
+    if not isinstance(key, str) or not isinstance(node, Mapping):
+        return ""
+    place = str(getattr(cause, "full_key", key)).removesuffix(key)
+    if near := _near(key, keys := [str(known) for known in node]):
+        return f"did you mean {place}{near}=?"
+    keys = [known for known in keys if not known.startswith("_")]
+    return f"keys of {place.rstrip('.') or 'the config'} are {', '.join(keys)}" if keys else ""
 
 
 def _page(

@@ -81,6 +81,11 @@ def test_help_imports_nothing_heavy(tmp_path):
     [
         ((), ("specklenet10", "meta.yaml", "generate.py")),
         (("method=supervised",), ("ConfigError", "set selftraining=none")),
+        (("data.source=modelnet10",), ("ConfigError: data.source must", "domain@data.source=NAME")),
+        (("method=pmc",), ("did you mean method=pcm?",)),
+        (("domain@data.target=objcts",), ("did you mean domain@data.target=objects?",)),
+        (("method.wieght=1", "method=twin"), ("did you mean method.twin_weight=?",)),
+        (("selection.best=1",), ("keys of selection are teacher, student",)),
         (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),
         (
             (
