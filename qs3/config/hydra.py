@@ -7,6 +7,8 @@ Importing this module registers the resolvers `${qs3.run_name:}`, `${qs3.wandb_i
 
 from __future__ import annotations
 
+import functools
+import inspect
 import itertools
 import re
 import textwrap
@@ -17,10 +19,11 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException, InstantiationException
 from hydra.types import RunMode
-from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config import hashing
+from qs3.config.checks import check_bool
 from qs3.config.location import CONF, typed
 from qs3.errors import ConfigError, Qs3Error
 
@@ -134,8 +137,9 @@ def build(node: Any, **more: Any) -> Any:
 
     Raises:
         ConfigError: the target does not take what stands in the config (a TypeError or ValueError
-            of its own); names the place in the config.
+            of its own), or a switch is neither true nor false; names the place in the config.
     """
+    _check_switches(node)
     try:
         return instantiate(node, _convert_="all", **more)
     except InstantiationException as error:
@@ -149,6 +153,34 @@ def build(node: Any, **more: Any) -> Any:
             where = place[1] if place else str(error).splitlines()[0]
             raise ConfigError(f"{where}: {error.__cause__}") from error
         raise
+
+
+def _check_switches(node: Any) -> None:
+    """Raise ConfigError for a text where a target takes a bool: Hydra reads `no` as one, and true.
+
+    Goes down as far as `instantiate` does.
+    """
+    if isinstance(node, ListConfig):
+        for item in node:
+            _check_switches(item)
+    if not isinstance(node, DictConfig) or node._is_none() or node._is_missing():
+        return
+    taken = _bools(str(node["_target_"])) if "_target_" in node else frozenset()
+    for key in node:
+        value = None if OmegaConf.is_missing(node, key) else node[key]
+        if key in taken and isinstance(value, str):
+            check_bool(node._get_full_key(key), value)
+        if node.get("_recursive_", True):
+            _check_switches(value)
+
+
+@functools.cache
+def _bools(target: str) -> frozenset[str]:
+    """The parameters of a class or function of ours that are annotated as bool."""
+    if not target.startswith("qs3."):
+        return frozenset()
+    taken = inspect.signature(get_object(target)).parameters.items()
+    return frozenset(key for key, one in taken if one.annotation in ("bool", bool))
 
 
 def cli_errors(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:

@@ -243,7 +243,10 @@ def _check_settings(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, key)
         if value is not None and (key, value) != ("trainer.threads", "auto"):
             check_int(key, value, 1)
-    check_bool("data.make_source", cfg.data.make_source)
+    for key in ("data.make_source", "force", "compile"):
+        check_bool(key, OmegaConf.select(cfg, key))
+    if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
+        check_bool("trainer.deterministic", exactly)
     if cfg.report.pictures != "auto":
         check_bool("report.pictures", cfg.report.pictures)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):

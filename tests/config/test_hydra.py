@@ -16,6 +16,10 @@ def refuses(value: int) -> int:
     raise ValueError(f"{value} is too small")
 
 
+def kept(value: dict) -> dict:
+    return value
+
+
 def fails() -> None:
     raise RuntimeError("a defect")
 
@@ -37,6 +41,35 @@ def test_what_a_target_does_not_take_is_an_error_of_the_config():
 def test_our_own_errors_are_raised_as_they_were():
     with pytest.raises(ConfigError, match=r"^selftraining\.selector\.mu must be one of"):
         build(node(_target_="qs3.selftraining.selectors.Qbst", mu="two"))
+
+
+@pytest.mark.parametrize(
+    ("target", "key"),
+    [
+        ("qs3.methods.defrec.DefRec", "on_source"),
+        ("qs3.methods.gast.Gast", "pcm"),
+        ("qs3.datamodules.augment.Augment", "rotate_z"),
+        ("qs3.datamodules.phases.SelfTrainingConfig", "use_source"),
+        ("qs3.selftraining.sd.GraphRefined", "graph"),
+    ],
+)
+@pytest.mark.parametrize("word", ["no", "off", "flase", "yes"])
+def test_a_switch_that_is_a_word_is_refused(target, key, word):
+    """To Hydra these are texts, and any text is true."""
+    said = f"^a\\.b\\.{key} must be true or false, got '{word}'$"
+    with pytest.raises(ConfigError, match=said):
+        build(node(_target_=target, **{key: word}))
+    inner = {"_target_": target, key: word}
+    with pytest.raises(ConfigError, match=r"^a\.b\.value\."):
+        build(node(_target_="tests.config.test_hydra.refuses", value=inner))
+
+
+def test_switches_below_what_is_built_later_are_left_alone():
+    found = build(
+        node(_target_="tests.config.test_hydra.kept", _recursive_=False,
+             value={"_target_": "qs3.datamodules.augment.Augment", "rotate_z": "no"})
+    )  # fmt: skip
+    assert found["rotate_z"] == "no"
 
 
 def test_other_errors_keep_their_traceback():

@@ -85,6 +85,9 @@ def test_help_imports_nothing_heavy(tmp_path):
         (("method=pmc",), ("did you mean method=pcm?",)),
         (("domain@data.target=objcts",), ("did you mean domain@data.target=objects?",)),
         (("method.wieght=1", "method=twin"), ("did you mean method.twin_weight=?",)),
+        (("force=no",), ("ConfigError: force must be true or false, got 'no'",)),
+        (("compile=off",), ("ConfigError: compile must be true or false, got 'off'",)),
+        (("trainer.deterministic=no",), ("trainer.deterministic must be true or false",)),
         (("selection.best=1",), ("keys of selection are teacher, student",)),
         (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),
         (
