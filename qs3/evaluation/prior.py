@@ -54,11 +54,16 @@ class Prior:
     words: str
 
     def __call__(self, probabilities: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-        """The same with these classes as common; a cloud of impossible ones keeps the likeliest."""
+        """The same with these classes as common.
+
+        Of a cloud of impossible classes all possible ones are alike; NaN, of a net that diverged,
+        stays NaN.
+        """
         weighed = probabilities * self.factors
         total = weighed.sum(axis=1, keepdims=True)
         possible = (self.factors > 0) / np.count_nonzero(self.factors)
-        return np.where(total > 0, weighed / np.where(total > 0, total, 1), possible)
+        known = np.where(total > 0, weighed / np.where(total > 0, total, 1), possible)
+        return np.where(np.isnan(total), np.nan, known)
 
     def told(self, classes: Sequence[str]) -> dict[str, Any]:
         """For a table in JSON."""

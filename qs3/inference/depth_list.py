@@ -201,6 +201,8 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
         box = numbers(given["box"], 4, "box") if "box" in given else None
         _one_of(str(given.get("mask", "")), box)
         only = given.get("object")
+        if isinstance(only, bool) or (isinstance(only, float) and not only.is_integer()):
+            raise ConfigError(f"object={only}: expected the whole number of an object of the mask")
         scale = given.get("depth_scale")
         shown = replace(
             common,

@@ -53,9 +53,11 @@ def checked_tensors(found: dict[str, Tensor]) -> dict[str, Tensor]:
     kinds = [said.dtype, labels.dtype, measures.dtype, turns.dtype]
     if kinds != [torch.float32, torch.int64, torch.float32, torch.float32]:
         raise ValueError("should be float32, and int64 labels")
-    v, columns = len(labels), len(COMPARED)
-    whole = labels.ndim == 1 and said.ndim == 2 and len(said) == v
-    if not whole or measures.ndim != 2 or measures.shape[1] != columns or turns.shape != (1,):
+    plain = all(one.layout == torch.strided for one in (said, labels, measures, turns))
+    columns = len(COMPARED)
+    whole = labels.ndim == 1 and said.ndim == 2 and said.shape[0] == (v := labels.shape[0])
+    shapes = whole and measures.ndim == 2 and measures.shape[1] == columns and turns.shape == (1,)
+    if not (plain and shapes):
         raise ValueError(f"should be [v, C], [v], [m, {columns}] and [1]")
     if not (0 < v <= MOST and 0 < len(measures) <= MOST):
         raise ValueError(f"should be 1 to {MOST} clouds")

@@ -23,6 +23,7 @@ from qs3.utils.files import write_bytes
 
 MAX_BYTES = 2 << 30
 _MAX_HEADER = 16 << 20
+_MOST = 1 << 62  # numbers as torch holds them, of strides too
 _MAX_DIMENSIONS = 16
 _TYPES = {
     "F64": torch.float64,
@@ -125,6 +126,8 @@ def _entry(about: Any, name: str, path: Path) -> tuple[torch.dtype, list[int], i
         numbers = [*shape, begin, end]
         if len(shape) > _MAX_DIMENSIONS or {*map(type, numbers)} - {int} or min(numbers) < 0:
             raise ValueError
+        if 0 in shape and math.prod(max(size, 1) for size in shape) > _MOST:
+            raise ValueError  # no byte belongs to it, so nothing else bounds it
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(
             f"{path} is damaged: {name!r} should have a dtype of {', '.join(_TYPES)}, a shape, "

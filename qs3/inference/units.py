@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
+import numpy as np
 import torch
 
 from qs3.errors import DataError
@@ -19,6 +20,8 @@ from qs3.inference.predictor import Predictor, Prepared
 from qs3.inference.settings import Settings
 from qs3.inference.table import Row
 from qs3.models.norms import norms_for, use_domain
+
+_DIVERGED = "the classifier's answer is no number: its training has diverged"
 
 
 def predict_units(
@@ -97,6 +100,9 @@ def _judged(
         for (i, (item, each)), probabilities, before, other in zip(
             prepared.items(), found, plain, others, strict=True
         ):
+            if np.isnan(probabilities).any():
+                rows[i] = item.row(_DIVERGED, None), None
+                continue
             row = item.row("; ".join(each.strange), probabilities)
             rows[i] = row._replace(second=other, measures=each.measures, plain=before), item
     return [rows[i] for i in range(len(batch))]

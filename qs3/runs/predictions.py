@@ -26,6 +26,7 @@ FILE = "predictions.csv"
 OF_FILES = "predictions_of_files.csv"
 _FIRST = ("id", "mesh", "label", "predicted")
 _TIER = "tier"
+_ONE = 1.001  # sums in float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,11 @@ def read_predictions(path: Path) -> Predictions:
         classes = tuple(name.removeprefix("p_") for name in header[first:])
         if tuple(header[: len(_FIRST)]) != _FIRST or not classes or not rows:
             raise ValueError("it has other columns, or no rows")
-        return Predictions(
+        if len(set(classes)) < len(classes) or len({row[0] for row in rows}) < len(rows):
+            raise ValueError("a class or an id occurs twice")
+        if {len(row) for row in rows} != {len(header)}:
+            raise ValueError("a row has more or fewer cells than columns")
+        found = Predictions(
             classes,
             tuple(row[0] for row in rows),
             tuple(row[1] for row in rows),
@@ -118,6 +123,13 @@ def read_predictions(path: Path) -> Predictions:
             np.array([[float(cell) for cell in row[first:]] for row in rows]),
             tuple(row[len(_FIRST)] for row in rows) if first > len(_FIRST) else (),
         )
+        unknown = np.isnan(found.probabilities)  # of a net that diverged, whole rows
+        shares = (found.probabilities >= 0) & (found.probabilities <= _ONE)
+        if not (shares | unknown.all(axis=1, keepdims=True)).all():
+            raise ValueError("a probability is not in [0, 1]")
+        if [classes.index(row[3]) for row in rows] != found.predicted.tolist():
+            raise ValueError("what is predicted is not the most probable class")
+        return found
     except (OSError, ValueError, IndexError, csv.Error) as error:
         raise DataError(f"{path} cannot be read ({error}); repeat the run with force=true") from (
             error

@@ -50,6 +50,11 @@ def test_what_never_comes_is_never_said() -> None:
     np.testing.assert_allclose(said, [[2 / 3, 0, 1 / 3], [0.5, 0, 0.5]])
 
 
+def test_what_is_no_number_stays_none() -> None:
+    said = read_prior("table:0", THREE)(np.array([[np.nan] * 3, [1.0, 0.0, 0.0]]))
+    np.testing.assert_array_equal(np.isnan(said).all(axis=1), [True, False])
+
+
 def test_huge_numbers_and_powers_are_finite() -> None:
     """The largest floats, and a power by which the commonest class alone is left."""
     prior = read_prior(dict.fromkeys(THREE, 1.7e308), THREE, power=1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -13,6 +14,7 @@ import torch
 
 import qs3
 from qs3.data.store import open_pointset
+from qs3.inference.model_file import read_result, write_result
 from qs3.runs.predictions import read_predictions
 from tests.commands import main
 from tests.data.importers.own_clouds import write_odd
@@ -197,6 +199,20 @@ def test_points_that_are_not_finite_are_left_out_and_counted(run, clouds, tmp_pa
     assert json.loads((tmp_path / "said.json").read_text())["clouds"][0]["dropped"] == 3
     told = capsys.readouterr().out
     assert "left out of 1 cloud: 3 points, NaN or infinite (column dropped)" in told
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_a_net_that_diverged_says_so_of_each_cloud(run, clouds, tmp_path, suffix):
+    result = read_result(run)
+    weights = {name: tensor * torch.nan for name, tensor in result.weights.items()}
+    write_result(tmp_path / "nan.pt", replace(result, weights=weights))
+    np.save(tmp_path / "a.npy", clouds[:2])
+    out = tmp_path / f"said{suffix}"
+    words = [f"ckpt={tmp_path / 'nan.pt'}", f"input={tmp_path / 'a.npy'}", f"out={out}"]
+    assert main(["predict", *words]) == 1
+    rows = table(out) if suffix == ".csv" else json.loads(out.read_text())["clouds"]
+    assert [row["status"] for row in rows] == ["failed"] * 2
+    assert all("its training has diverged" in row["reason"] for row in rows)
 
 
 def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):

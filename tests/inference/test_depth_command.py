@@ -217,12 +217,20 @@ def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys):
     assert "broken off" in page
 
 
+@pytest.mark.parametrize("number", ["3.7", "true", "1.0000001"])
+def test_an_object_of_a_list_is_a_whole_number(tmp_path, number):
+    (tmp_path / "a.yaml").write_text(f"- {{depth: a.png, mask: m.png, object: {number}}}\n")
+    found, _ = find_shown(str(tmp_path / "a.yaml"), "", Shown("", intrinsics=CAMERA))
+    assert "expected the whole number of an object" in found[0].wrong
+
+
 def test_rows_of_a_list_with_numbers_without_end_are_told(tmp_path):
     rows = "- {depth: a.png, mask: m.png, object: .inf}\n"
     rows += f"- {{depth: a.png, box: [1, 2, 3, 1{'0' * 400}]}}\n"
     (tmp_path / "a.yaml").write_text(rows)
     found, _ = find_shown(str(tmp_path / "a.yaml"), "", Shown("", intrinsics=CAMERA))
-    assert ["infinity" in found[0].wrong, "box=" in found[1].wrong] == [True, True]
+    assert "object=inf: expected the whole number" in found[0].wrong
+    assert "box=" in found[1].wrong
     (tmp_path / "a.yaml").write_text("- depth: 2020-99-99\n")
     with pytest.raises(DataError, match=r"a\.yaml is not readable: month must be"):
         find_shown(str(tmp_path / "a.yaml"), "", Shown(""))

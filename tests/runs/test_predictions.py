@@ -41,6 +41,7 @@ def test_tiers_are_a_column_where_there_are_some(tmp_path):
 
 
 HEADER = "id,mesh,label,predicted,p_a\n"
+TWO = "id,mesh,label,predicted,p_a,p_b\n"
 
 
 @pytest.mark.parametrize(
@@ -54,6 +55,14 @@ HEADER = "id,mesh,label,predicted,p_a\n"
         HEADER + "x" * 200_000,
         HEADER.replace("p_a", "tier,p_a") + "1,2,a,a\n",
         HEADER.replace("p_a", "tier") + "1,2,,a,b\n",
+        HEADER + "1,2,a,a,1,0\n",
+        HEADER + "1,2,a,a,1\n1,2,a,a,1\n",
+        HEADER + "1,2,a,a,7\n",
+        HEADER + "1,2,a,a,-0.1\n",
+        TWO + "1,2,a,a,1\n",
+        TWO + "1,2,a,b,1,0\n",
+        TWO + "1,2,a,a,nan,1\n",
+        TWO.replace("p_b", "p_a") + "1,2,a,a,1,0\n",
     ],
 )
 def test_damage_is_an_error_that_names_the_file(tmp_path, text):
@@ -61,6 +70,12 @@ def test_damage_is_an_error_that_names_the_file(tmp_path, text):
     path.write_text(text)
     with pytest.raises(DataError, match=r"p\.csv cannot be read"):
         read_predictions(path)
+
+
+def test_a_net_that_diverged_has_rows_of_nan(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text(TWO + "1,2,a,a,nan,nan\n")
+    assert np.isnan(read_predictions(path).probabilities).all()
 
 
 def test_a_missing_file_is_an_error_that_names_it(tmp_path):
