@@ -76,7 +76,7 @@ class Prior:
 def read_prior(
     given: str | Mapping[str, float],
     classes: Sequence[str],
-    labels: Int[np.ndarray, " v"] | None = None,
+    learnt: Float[np.ndarray, " c"] | None = None,
     power: float = POWER,
 ) -> Prior:
     """A prior as it is given.
@@ -86,8 +86,7 @@ def read_prior(
             "chair:4,table:2,bathtub:0" or as a mapping: those that are not named count as 1, and
             0 is never.
         classes: that the net knows.
-        labels: positions in `classes` of labelled clouds as in its training; None: each class was
-            as common as every other one.
+        learnt: u, shares of the classes in its training, each above 0; None: all alike.
         power: t >= 0.
 
     Raises:
@@ -112,12 +111,19 @@ def read_prior(
         raise ConfigError("prior= leaves no class that there could be")
     here /= here.max()  # sums of huge numbers are none
     shares = here / here.sum()
-    counts = np.bincount([] if labels is None else labels, minlength=len(classes)) + 1.0
+    if learnt is None:
+        learnt = shares_of([], len(classes))
     there = shares > 0  # 0 stays 0 at power 0, too
-    log = np.log(np.where(there, shares, 1.0)) - np.log(counts / counts.sum())
+    log = np.log(np.where(there, shares, 1.0)) - np.log(learnt)
     log -= log[there].max()
     factors = np.where(there, np.exp(power * np.minimum(log, 0.0)), 0.0)
     return Prior(shares, power, factors, _in_words(shares, classes, power))
+
+
+def shares_of(labels: Int[np.ndarray, " n"] | Sequence[int], classes: int) -> np.ndarray:
+    """Shares [C] of the classes among labels, one more of each so that none is 0."""
+    counts = np.bincount(np.asarray(labels, dtype=np.int64), minlength=classes) + 1.0
+    return counts / counts.sum()
 
 
 def check_told(prior: object, power: float) -> None:

@@ -89,6 +89,7 @@ def _printable(value: str) -> str:
 
 _LONGEST = 1000  # characters of a sentence
 _Points = Annotated[int, Field(strict=True, ge=1, le=1 << 20)]  # more is a damaged number
+_Share = Annotated[float, Field(strict=True, gt=0, le=1)]
 _Ends = Annotated[list[Annotated[float, Field(strict=True)]], Field(min_length=2, max_length=2)]
 
 
@@ -111,6 +112,8 @@ class Result:
         worth: what it was found to be worth on real objects, in a sentence; "" if nobody looked.
         held_out: what the net says of held-out labelled clouds, by which its answers to others are
             judged; see `qs3.inference.held_out`. None in files of older versions.
+        learnt: shares of the classes in its training, by which a prior is weighed; see
+            `qs3.evaluation.prior`. None in files of older versions.
     """
 
     model: Annotated[dict[str, Any], AfterValidator(_model)]
@@ -125,6 +128,7 @@ class Result:
     floor_m: Annotated[float, Field(strict=True, allow_inf_nan=False)] | None = None
     worth: Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable)] = ""
     held_out: Annotated[dict[str, Tensor], AfterValidator(checked_tensors)] | None = None
+    learnt: tuple[_Share, ...] | None = None
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
 
@@ -262,6 +266,8 @@ def _checked(file: Path, found: Any) -> Result:
             place, why = "floor_m", "should be a number for scale above_floor, and for no other"
         elif result.held_out and result.held_out["probabilities"].shape[1] != len(result.classes):
             place, why = "held_out", "should have a probability for each class"
+        elif result.learnt is not None and len(result.learnt) != len(result.classes):
+            place, why = "learnt", "should have a share for each class"
         else:
             return result
     raise DataError(f"{file} is not a result that qs3 wrote, or damaged: {place}: {why}")

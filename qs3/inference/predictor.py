@@ -38,7 +38,7 @@ from qs3.datamodules.fps_samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
-from qs3.evaluation.prior import POWER, Prior, check_told, read_prior
+from qs3.evaluation.prior import POWER, Prior, check_told, read_prior, shares_of
 from qs3.evaluation.trust import COMPARED, Known
 from qs3.inference.floor import check_camera_height
 from qs3.inference.held_out import known_of
@@ -352,8 +352,10 @@ def load(
     found = Predictor(build_net(result, packages).to(place), result, place)
     if prior is None:
         return found
-    labels = found.held_out.labels if found.held_out else None
-    return replace(found, prior=read_prior(prior, found.classes, labels, prior_power))
+    learnt = None if result.learnt is None else np.array(result.learnt)
+    if learnt is None and found.held_out:  # a file of an older version
+        learnt = shares_of(found.held_out.labels, len(found.classes))
+    return replace(found, prior=read_prior(prior, found.classes, learnt, prior_power))
 
 
 def _array(cloud: Any, name: str) -> np.ndarray:

@@ -69,7 +69,7 @@ def _imported(path: Path, source: bytes, sha256: str) -> ModuleType:
     module.__file__ = str(path)
     sys.modules[name] = module
     try:
-        exec(compile(source, str(path), "exec"), module.__dict__)
+        exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         del sys.modules[name]
         frames = traceback.extract_tb(error.__traceback__)

@@ -155,13 +155,18 @@ def use_domain(net: nn.Module, domain: str) -> Iterator[None]:
 
 
 def norms_for(net: nn.Module, domain: str) -> str:
-    """The domain whose norms clouds of `domain` should use: "source" if `domain` was never trained.
+    """The domain whose norms clouds of `domain` should use: the other one if it was never trained.
 
-    So a net with domain-specific norms that has only seen the source serves the target with those.
+    So a net with domain-specific norms that has only seen the source serves the target with those,
+    and a student that has only seen the target the source. The source's if neither was trained.
     """
     norms = [m for m in net.modules() if isinstance(m, DomainNorm)]
-    seen = all(int(getattr(norm, domain).num_batches_tracked) > 0 for norm in norms)
-    return domain if seen else "source"
+
+    def seen(one: str) -> bool:
+        return all(int(getattr(norm, one).num_batches_tracked) > 0 for norm in norms)
+
+    other = "target" if domain == "source" else "source"
+    return domain if seen(domain) else other if seen(other) else "source"
 
 
 def begin_target_norms(net: nn.Module) -> None:

@@ -23,7 +23,7 @@ from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, check_taught, class_loss, weight
 from qs3.methods.mean_teacher import move_towards
-from qs3.models.norms import use_domain
+from qs3.models.norms import begin_target_norms, use_domain
 from qs3.selftraining.selectors import Selector, TeacherPredictions, most_confident
 
 if TYPE_CHECKING:
@@ -156,6 +156,8 @@ class Pcfea(Method):
         self.styled = epoch >= first
         if not self.styled or (epoch - first) % max(1, round(self.every * epochs)):
             return
+        if epoch == first:
+            begin_target_norms(net)
         size, classes = data.eval_batch_size, len(self.mean)
         labels, asked = data.labelled.labels.numpy(), self.teacher or net
         f, p = _features(asked, data.labelled.clouds.all(), size, "source", self.mean.device)

@@ -152,12 +152,17 @@ class StudentSelection(Callback):
         """Move a part of the set that the last round would train on aside."""
         assert data.pseudo is not None
         index, labels = data.pseudo
-        hard = labels.argmax(dim=1) if labels.is_floating_point() else labels
+        hard, named = labels, torch.ones(len(labels), dtype=torch.bool)
+        if labels.is_floating_point():  # a label of weight 0 names no class
+            hard, named = labels.argmax(dim=1), labels.sum(dim=1) > 0
         round_ = self.phases.rounds - 1
-        ids = [data.target.ids[i] for i in index.tolist()]
-        held = hold_out(hard.numpy(), ids, derive(data.seed, PSEUDO_VAL, round_))
+        ids = [data.target.ids[i] for i in index[named].tolist()]
+        held = np.zeros(len(labels), dtype=bool)
+        held[named.numpy()] = hold_out(
+            hard[named].numpy(), ids, derive(data.seed, PSEUDO_VAL, round_)
+        )
         if not held.any():
-            counts = np.bincount(hard.numpy(), minlength=len(self.classes))
+            counts = np.bincount(hard[named].numpy(), minlength=len(self.classes))
             found = ", ".join(f"{n} {c}" for n, c in zip(self.classes, counts, strict=True))
             raise SelectionError(
                 f"round {round_}: selection.student={PSEUDO_VAL} holds out a fifth of each class's "

@@ -247,6 +247,11 @@ def _check_settings(cfg: DictConfig) -> None:
         check_bool(key, OmegaConf.select(cfg, key))
     if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
         check_bool("trainer.deterministic", exactly)
+    if cfg.trainer.get("limit_val_batches") == 0:
+        raise ConfigError(
+            "trainer.limit_val_batches must leave a batch: held-out labelled clouds say what the "
+            "net is worth; null takes all of them"
+        )
     if cfg.report.pictures != "auto":
         check_bool("report.pictures", cfg.report.pictures)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):

@@ -26,6 +26,7 @@ from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
 from qs3.selftraining.student_selection import Choice
+from qs3.training import class_shares
 from qs3.training.build import Built
 from qs3.training.load import Loaded
 from qs3.training.run import STUDENT, Run
@@ -49,6 +50,7 @@ class Outcome:
         validators: its label-free scores.
         quality: estimates of its accuracy.
         held_out: what it says of held-out labelled clouds; None of one that has diverged.
+        learnt: shares of the classes in what it learnt from.
         training: its accuracy on training clouds, with `data.clouds_a_class` alone.
     """
 
@@ -61,6 +63,7 @@ class Outcome:
     validators: dict[str, float | None]
     quality: AccuracyEstimates
     held_out: Known | None
+    learnt: class_shares.Shares
     training: TrainingAccuracy | None
 
 
@@ -143,9 +146,15 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     file = choice.file if choice else files[last]
     net, device = nets(file), nets.device
 
+    learnt, prior = loaded.learnt, loaded.prior
+    if run.scheme.rounds:
+        learnt = class_shares.of_student(run.scheme, loaded.learnt, built.rounds.records[-1])
+        prior = class_shares.prior_of(run.cfg.evaluation, evaluation.classes, learnt)
+    of_teacher = (files["selected"], files["last"])
+
     def reported(weights: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
-        found = nets.of_test(weights, turn)
-        return loaded.prior(found) if loaded.prior else found
+        found, its = nets.of_test(weights, turn), loaded.prior if weights in of_teacher else prior
+        return its(found) if its else found
 
     predictions = evaluation.predictions_of(reported(file))
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
@@ -163,6 +172,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         validators=without_labels(net, data.target, choice, batch_size, device),
         quality=quality,
         held_out=held_out,
+        learnt=learnt,
         training=(
             training_accuracy(net, data.labelled, data.owner, batch_size, device)
             if run.cfg.data.clouds_a_class is not None

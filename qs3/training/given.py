@@ -25,12 +25,14 @@ class Given:
         classes: in the order of its logits.
         weights: of its net, float32 where they are floats.
         sha256: of them.
+        learnt: shares of the classes in its training; None: nobody knows.
     """
 
     name: str
     classes: tuple[str, ...]
     weights: dict[str, Tensor]
     sha256: str
+    learnt: tuple[float, ...] | None = None
 
     def check_classes(self, classes: Sequence[str]) -> None:
         """Raise DataError if the run's are others."""
@@ -71,7 +73,7 @@ def read_given(cfg: DictConfig) -> Given | None:
         key: value.float() if value.is_floating_point() else value
         for key, value in result.weights.items()
     }
-    return Given(name, result.classes, weights, _sha256(weights))
+    return Given(name, result.classes, weights, _sha256(weights), result.learnt)
 
 
 def _sha256(weights: Mapping[str, Tensor]) -> str:

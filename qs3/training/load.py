@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
 
 from qs3.config.hydra import build
 from qs3.data.domain import Domain
@@ -18,9 +16,10 @@ from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.splits import labels_of, load_clouds, subsample_splits
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
-from qs3.evaluation.prior import Prior, read_prior
+from qs3.evaluation.prior import Prior
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf
+from qs3.training import class_shares
 from qs3.training.given import Given
 from qs3.training.provenance import note_start
 from qs3.training.run import Run
@@ -39,7 +38,8 @@ class Loaded:
         stored_points: of a cloud on disk.
         started: what `started.json` says: hashes of data and config, versions.
         made_of: what the labelled dataset and the target are made of.
-        prior: how common classes are in the target, if `evaluation.prior` says so.
+        learnt: shares of the classes in what the warm-up's net learns from.
+        prior: how common classes are in the target, for that net, if `evaluation.prior` says so.
     """
 
     data: AdaptationData
@@ -48,6 +48,7 @@ class Loaded:
     stored_points: int
     started: dict[str, Any]
     made_of: DataMadeOf
+    learnt: class_shares.Shares
     prior: Prior | None
 
 
@@ -80,7 +81,10 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
-    prior = _prior(cfg.evaluation, target.classes, data.labelled.labels.numpy())
+    learnt = class_shares.of_warmup(data, len(target.classes))
+    if given and run.cfg.selection.teacher == "given" and given.learnt:
+        learnt = np.array(given.learnt)
+    prior = class_shares.prior_of(cfg.evaluation, target.classes, learnt)
     if (few := cfg.data.clouds_a_split) is not None:
         target = subsample_splits(target, few)
     split = _evaluated_split(target)
@@ -100,15 +104,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         _tiers_by_id(target, run.target),
     )
     made_of = DataMadeOf(source=labelled, target=of_target)
-    return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, prior)
-
-
-def _prior(settings: Any, classes: Sequence[str], labels: np.ndarray) -> Prior | None:
-    given: Any = settings.prior
-    if given is None:
-        return None
-    given = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
-    return read_prior(given, classes, labels, settings.prior_power)
+    return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, learnt, prior)
 
 
 def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:

@@ -31,7 +31,7 @@ from qs3.config import hashing
 from qs3.errors import DataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
-from qs3.utils.files import copy_file, sha256_file, write_json
+from qs3.utils.files import copy_file, remove_leftovers, sha256_file, write_json
 from qs3.utils.locks import locked
 
 log = logging.getLogger(__name__)
@@ -49,6 +49,7 @@ def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
     for key in _AFTERWARDS:
         OmegaConf.update(before, key, None)
     parts = [hashing.config_sha256(before), started["data"], started["versions"]]
+    parts.append(started.get("threads"))  # sums are ordered by them
     if "beside" in started:
         parts.append(started["beside"])
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
@@ -104,6 +105,7 @@ class SharedWarmup(Checkpoint):
         if self._is_there():
             return
         (self.shared / runs.STARTED).unlink(missing_ok=True)
+        remove_leftovers(self.shared)  # of a copy that was killed
         for name in _FILES:
             copy_file(self.folder / name, self.shared / name)
         write_json(self.shared / runs.STARTED, _mark(self.sha256, self.folder))

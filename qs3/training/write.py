@@ -149,6 +149,7 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         weights=copy_weights(outcome.net),
         floor_m=_floor(run),
         held_out=tensors_of(outcome.held_out) if outcome.held_out else None,
+        learnt=tuple(outcome.learnt.tolist()),
     )
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from qs3.classes import CLASSES, MODELNET40
 from qs3.errors import ConfigError
-from qs3.evaluation.prior import ROOMS, read_prior
+from qs3.evaluation.prior import ROOMS, read_prior, shares_of
 
 AB = ("a", "b")
 THREE = ("chair", "table", "lamp")
@@ -19,7 +19,7 @@ shares = st.lists(st.floats(0.01, 1), min_size=3, max_size=3)
 def test_bayes_rule_by_hand() -> None:
     """Trained on three a to each b, met as often as each other."""
     labels = np.array([0] * 2 + [1] * 0)  # (2 + 1) : (0 + 1), none of v is not never
-    prior = read_prior({"a": 1, "b": 1}, AB, labels, power=1)
+    prior = read_prior({"a": 1, "b": 1}, AB, shares_of(labels, 2), power=1)
     np.testing.assert_allclose(prior.factors, [1 / 3, 1])
     # 0.6 : 0.4 becomes 0.2 : 0.4
     np.testing.assert_allclose(prior(np.array([[0.6, 0.4]])), [[1 / 3, 2 / 3]])
@@ -87,7 +87,7 @@ def test_shares_whatever_the_unit_and_no_more(
     # Two classes' odds change by their own ratio alone.
     odds = (after[0, 0] / after[0, 1]) / (p[0, 0] / p[0, 1])
     assert odds == pytest.approx((common[0] / common[1]) ** power, rel=1e-6)
-    alike = read_prior(dict.fromkeys(THREE, unit), THREE, np.array([0, 1, 2]), power)
+    alike = read_prior(dict.fromkeys(THREE, unit), THREE, shares_of([0, 1, 2], 3), power)
     np.testing.assert_allclose(alike(p), p)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -116,6 +117,13 @@ class Settings:
 {METHOD.format(name="A")}
 """
     assert type(of(tmp_path, text)).__name__ == "A"
+
+
+def test_annotations_are_what_they_are_in_the_file(tmp_path):
+    """Not texts, as in files that ask for it: somebody's own code may look at them."""
+    text = METHOD.format(name="A") + "def size(n: int): ...\n"
+    module = sys.modules[type(of(tmp_path, text)).__module__]
+    assert module.size.__annotations__ == {"n": int}
 
 
 def test_a_run_is_named_by_the_content_not_by_the_place(tmp_path):

@@ -137,3 +137,15 @@ def test_predictions_of_the_target_use_its_norms_once_it_was_trained_on() -> Non
         np.testing.assert_allclose(as_target, net(points).double().softmax(1).numpy(), atol=1e-6)
     plain = pointnet(3)
     assert norms_for(plain, "target") == "target"  # nothing to choose
+    assert norms_for(plain, "source") == "source"
+
+
+def test_a_student_of_the_target_alone_says_of_the_source_what_its_norms_say() -> None:
+    net = pointnet(3, norm="domain")
+    assert norms_for(net, "target") == norms_for(net, "source") == "source"  # neither is trained
+    points = torch.randn(4, 20, 3)
+    with use_domain(net, "target"):
+        net(points * 3 + 1)
+    assert norms_for(net, "source") == "target"
+    of_target = predict(net, points, 4)
+    np.testing.assert_array_equal(predict(net, points, 4, domain="source"), of_target)

@@ -88,6 +88,7 @@ def test_help_imports_nothing_heavy(tmp_path):
         (("force=no",), ("ConfigError: force must be true or false, got 'no'",)),
         (("compile=off",), ("ConfigError: compile must be true or false, got 'off'",)),
         (("trainer.deterministic=no",), ("trainer.deterministic must be true or false",)),
+        (("trainer.limit_val_batches=0",), ("ConfigError: trainer.limit_val_batches must",)),
         (("selection.best=1",), ("keys of selection are teacher, student",)),
         (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),
         (

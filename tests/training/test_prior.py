@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import qs3
 from qs3.config import hashing
+from qs3.data.store import open_pointset
 from qs3.errors import ConfigError
 from qs3.evaluation.prior import read_prior
+from qs3.inference.model_file import read_result
+from qs3.runs.metrics import read_metrics
 from qs3.runs.predictions import read_predictions
 from qs3.training.command import headline, train
-from tests.training.toy import CLASSES
+from tests.training.toy import CLASSES, write_domain
+
+PACKAGES = ("qs3.models", "tests")
 
 WORDS = ("method=source_only", "selftraining=none", "protocol.epochs=2", "evaluation.rotations=2")
 
@@ -36,6 +44,59 @@ def test_the_reported_probabilities_are_weighed_and_estimates_are_not(toy) -> No
     assert "evaluation.prior" not in headline(before)
     assert after.quality == before.quality
     assert after.validators == before.validators
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A source of 40 balls, 20 rods and 10 slabs, of which a fifth is held out."""
+    data = tmp_path_factory.mktemp("uneven")
+    write_domain(data, "specklenet10", noise=0.3, train=(40, 20, 10))
+    write_domain(data, "kinectsim10", noise=0.6)
+    return data
+
+
+def factors_of(toy, uneven: Path, *words: str) -> tuple[np.ndarray, Path]:
+    """By what the reported probabilities are weighed, and the run that is told."""
+    runs = []
+    for more in ((), ("evaluation.prior={ball: 1}", "evaluation.prior_power=1.0")):
+        cfg = toy(f"paths.data_dir={uneven}", *words, *more)
+        train(cfg)
+        runs.append(hashing.run_folder(cfg))
+    plain, told = (read_predictions(run / "predictions.csv").probabilities for run in runs)
+    ratio = told / plain
+    return (ratio / ratio.max(axis=1, keepdims=True))[0], runs[1]
+
+
+def test_classes_count_as_the_net_met_them_and_load_does_the_same(toy, uneven: Path) -> None:
+    """All alike there: by (n + 1) of the 32, 16 and 8 clouds that it learnt from."""
+    factors, run = factors_of(toy, uneven, *WORDS)
+    np.testing.assert_allclose(factors, [9 / 33, 9 / 17, 1], rtol=1e-5)
+    net = qs3.load(run, packages=PACKAGES, prior={"ball": 1}, prior_power=1.0)
+    np.testing.assert_allclose(net.prior.factors, [9 / 33, 9 / 17, 1])
+    clouds = open_pointset(uneven / "kinectsim10").split("test").points
+    found = read_predictions(run / "predictions.csv")
+    np.testing.assert_allclose(net(list(np.array(clouds))), found.probabilities, atol=1e-6)
+
+
+def test_a_balanced_sampler_shows_all_classes_alike(toy, uneven: Path) -> None:
+    factors, run = factors_of(toy, uneven, *WORDS, "data.sampler=balanced")
+    np.testing.assert_allclose(factors, 1, rtol=1e-5)
+    assert read_result(run).learnt == pytest.approx([1 / 3] * 3)
+
+
+def test_a_student_has_met_its_pseudo_labels(toy, uneven: Path) -> None:
+    """From scratch and without the source; beside it, the mean of both."""
+    rounds = ("method=source_only", "protocol.epochs=2", "evaluation.rotations=0")
+    factors, run = factors_of(toy, uneven, *rounds)
+    selected = read_metrics(run).rounds[-1].selected
+    counts = np.array([selected[name] for name in CLASSES]) + 1.0
+    np.testing.assert_allclose(factors, counts.min() / counts, rtol=1e-5)
+    assert read_result(run).learnt == pytest.approx(counts / counts.sum())
+    cfg = toy(f"paths.data_dir={uneven}", *rounds, "selftraining.use_source=true")
+    metrics = train(cfg)
+    counts = np.array([metrics.rounds[-1].selected[name] for name in CLASSES]) + 1.0
+    both = (counts / counts.sum() + np.array([33, 17, 9]) / 59) / 2
+    assert read_result(hashing.run_folder(cfg)).learnt == pytest.approx(both)
 
 
 def test_runs_without_it_have_the_hash_that_they_had(toy) -> None:

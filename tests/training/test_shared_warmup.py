@@ -114,6 +114,14 @@ def test_it_is_shared_one_epoch_before_its_end_and_once(tmp_path, warmup, caplog
     assert (where.stat().st_mtime_ns, (where / "last.ckpt").stat().st_mtime_ns) == changed
 
 
+def test_what_a_copy_that_was_killed_left_is_cleared(tmp_path):
+    where = tmp_path / "warmups" / "01234567-seed7"
+    where.mkdir(parents=True)
+    (where / ".last.ckpt.abc.tmp.ckpt").write_text("half")
+    trained(tmp_path / "a", SharedWarmup(tmp_path / "a", where.parent, SHA256, 7, 3))
+    assert sorted(path.name for path in where.glob("*.ckpt")) == ["last.ckpt"]
+
+
 @pytest.mark.parametrize("different", ["sha256", "seed", "nothing is shared"])
 def test_nobody_elses_is_taken(tmp_path, different, caplog):
     (tmp_path / "b").mkdir()
@@ -247,10 +255,11 @@ def test_the_hash_covers_what_comes_before():
     others = [
         of("model.k", 10),
         of("selection.teacher", "best"),
+        of(started={**started, "threads": 2}),
         of(started={**started, "versions": {"a": 1, "b": 3}}),
         of(started={**started, "data": {"source": {"sha256": "b"}, "target": 1}}),
     ]
-    assert len({of(), *others}) == 5
+    assert len({of(), *others}) == 6
 
 
 def shared_folders(folder: Path) -> list[Path]:

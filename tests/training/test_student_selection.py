@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import qs3.selftraining.student_selection
 from qs3.config import hashing
 from qs3.config.hydra import build
 from qs3.data.store import ManifestRow, open_pointset, write_pointset
+from qs3.datamodules.phases import Phases
 from qs3.datamodules.splits import load_clouds
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
@@ -260,6 +262,26 @@ def test_soft_pseudo_labels_are_held_out_by_their_most_probable_class(toy):
     metrics = train(toy(*soft, "selection.student=pseudo_val"))
     assert metrics.student.held_out > 0
     assert 0 <= metrics.student.score <= 1
+
+
+def test_a_label_of_no_weight_is_not_held_out(tmp_path):
+    """It names no class: all of it being 0, its first place is not its most probable one."""
+    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val", CLASSES)
+    soft = torch.zeros(40, 3)
+    soft[:20] = torch.eye(3)[torch.arange(20) % 2 + 1]  # rods and slabs, no ball
+    kept = {}
+    data = SimpleNamespace(
+        pseudo=(torch.arange(40), soft),
+        seed=0,
+        target=SimpleNamespace(ids=[str(i) for i in range(40)]),
+        set_pseudo_labels=lambda index, labels: kept.update(index=index, labels=labels),
+    )
+    callback._hold_out(data)
+    index, labels = callback.held_out
+    assert len(index) >= 2
+    assert (index < 20).all()
+    assert torch.equal(labels, index % 2 + 1)
+    assert sorted([*index.tolist(), *kept["index"].tolist()]) == list(range(40))
 
 
 def test_too_few_to_hold_out(toy, monkeypatch):

@@ -48,14 +48,21 @@ class TinyNet(nn.Module):
 
 
 def write_domain(
-    folder: Path, name: str, *, noise: float, train: int = 24, test: int = 8, points: int = 64
+    folder: Path,
+    name: str,
+    *,
+    noise: float,
+    train: int | tuple[int, ...] = 24,
+    test: int = 8,
+    points: int = 64,
 ) -> None:
-    """A store of `train` and `test` clouds a class; their twins lack the noise."""
+    """A store of `train` and `test` clouds a class, or each class; their twins lack the noise."""
     rng = np.random.default_rng(len(name))
     clouds, exact, rows = [], [], []
     for split, count in (("train", train), ("test", test)):
-        for cls in CLASSES:
-            for i in range(count):
+        each = count if isinstance(count, tuple) else (count,) * len(CLASSES)
+        for cls, n in zip(CLASSES, each, strict=True):
+            for i in range(n):
                 cloud = rng.normal(size=(points, 3)) * _SHAPES[cls]
                 exact.append(cloud)
                 clouds.append(cloud + noise * rng.normal(size=(points, 3)))
