@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ _UNHASHED = (
 _NEW = ("weights",)
 _PRIOR = ("evaluation.prior", "evaluation.prior_power")  # of runs without a prior, likewise
 _FLOORS = ("data.source.floor_m", "data.target.floor_m")  # matter to data.scale=above_floor alone
+_FROM_OUTSIDE = re.compile(r"\$\{\s*oc\.")
 _NO_ROUNDS = "qs3.datamodules.phases.no_rounds"
 
 
@@ -51,7 +53,7 @@ def config_sha256(cfg: DictConfig) -> str:
 
     Interpolations are hashed as they are written: what they point to is hashed at its own place,
     or does not matter (`${paths.data_dir}/...`). But a method's or a model's file is hashed by its
-    content.
+    content, and what comes from outside of the config (`${oc.env:NAME}`) by its value.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
     for group in ("method", "model"):
@@ -59,6 +61,7 @@ def config_sha256(cfg: DictConfig) -> str:
             plain[group]["sha256"] = cfg[group].sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
+    plain = _with_values(plain, cfg, "")
     for key in _NEW:
         if plain.get(key) is None:
             _leave_out(plain, key)
@@ -97,6 +100,19 @@ def _leave_out(plain: Any, key: str) -> None:
         plain = plain.get(parent) if isinstance(plain, dict) else None
     if isinstance(plain, dict):
         plain.pop(leaf, None)
+
+
+def _with_values(node: Any, cfg: DictConfig, place: str) -> Any:
+    """The same, with values in place of what OmegaConf's own resolvers bring in."""
+    if isinstance(node, dict):
+        begin = f"{place}." if place else ""
+        return {key: _with_values(value, cfg, f"{begin}{key}") for key, value in node.items()}
+    if isinstance(node, list):
+        return [_with_values(value, cfg, f"{place}[{i}]") for i, value in enumerate(node)]
+    if isinstance(node, str) and _FROM_OUTSIDE.search(node):
+        found = OmegaConf.select(cfg, place)
+        return OmegaConf.to_container(found, resolve=True) if OmegaConf.is_config(found) else found
+    return node
 
 
 def config_hash(cfg: DictConfig) -> str:

@@ -237,10 +237,16 @@ class TrainingAccuracy:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class DataHashes:
-    """`PointSet.sha256` of both datasets."""
+    """`PointSet.sha256` of both datasets.
+
+    Attributes:
+        source: of the labelled clouds, so the target's for `method=supervised`.
+        beside: of twins or views that were trained on, too; "" without, and in older files.
+    """
 
     source: str
     target: str
+    beside: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -315,6 +321,20 @@ class RunMetrics:
     def diverged(self) -> bool:
         """Whether the reported net's predictions are no numbers: every cloud is of class 0 then."""
         return self.validators.get("entropy", 0.0) is None
+
+    @property
+    def seen(self) -> dict[str, str]:
+        """SHA-256 of all that it was trained on: "source", "target", "beside" and "weights".
+
+        "" of what it had none of. The source's is the target's for `method=supervised`: older files
+        name one there that nobody used.
+        """
+        return {
+            "source": self.data.target if self.source == self.target else self.data.source,
+            "target": self.data.target,
+            "beside": self.data.beside,
+            "weights": self.versions.get("weights", "").rpartition(" ")[2],
+        }
 
     @property
     def target_text(self) -> str:

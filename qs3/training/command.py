@@ -7,7 +7,7 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -18,7 +18,7 @@ from qs3.config.hydra import build, component_names, in_multirun
 from qs3.data.ensure_source import check_or_make
 from qs3.data.store import is_finished
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, Qs3Error
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
 from qs3.inference import pretrained
@@ -116,6 +116,7 @@ def train(cfg: DictConfig) -> RunMetrics:
         else:
             runs.check_config(run.folder, metrics.config_sha256, hashing.config_sha256(cfg))
             _refuse_other_data(run, metrics.data)
+            _refuse_other_weights(run, metrics.versions)
             log.info("already finished (force=true repeats it)")
     log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
     if (run.folder / OF_FILES).is_file():
@@ -348,11 +349,29 @@ def _warn_of_one_domain(run: Run) -> None:
 
 def _refuse_other_data(run: Run, hashes: DataHashes) -> None:
     """Raise if a dataset is there and is not the one that the finished run used."""
-    for role, domain in (("source", run.source), ("target", run.target)):
+    used = {"source": run.source, "target": run.target}
+    if _is_upper_bound(run.cfg):
+        del used["source"]
+    for role, domain in used.items():
         if is_finished(domain.folder):  # else it was put away since, and the result stands
             runs.check_data(
                 run.folder, domain.name, getattr(hashes, role), domain.open(verify=False).sha256
             )
+
+
+def _refuse_other_weights(run: Run, versions: Mapping[str, str]) -> None:
+    """Raise if the classifier that `weights` names is there and is another than it was."""
+    if run.cfg.weights is None:
+        return
+    from qs3.training.given import read_given  # and torch with it
+
+    name, _, sha256 = versions.get("weights", "").rpartition(" ")
+    try:
+        given = read_given(run.cfg)
+    except Qs3Error:  # it was put away since, and the result stands
+        return
+    if given is not None:
+        runs.check_data(run.folder, f"the classifier {name}", sha256, given.sha256)
 
 
 def _refuse_ddp_in_multirun(cfg: DictConfig) -> None:

@@ -77,7 +77,8 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     _check_classes(source, target, cfg.num_classes)
     if given:
         given.check_classes(target.classes)
-    started = note_start(run, source, target, given, data.labelled_domain.beside_sha256)
+    used = source if data.owner == "source" else target
+    started = note_start(run, used, target, given, data.labelled_domain.beside_sha256)
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")

@@ -7,6 +7,7 @@ from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from qs3.config.compose import choices, composed
+from qs3.config.hashing import config_hash
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from tests.training.toy import toy_config
@@ -70,6 +71,16 @@ def test_switches_below_what_is_built_later_are_left_alone():
              value={"_target_": "qs3.datamodules.augment.Augment", "rotate_z": "no"})
     )  # fmt: skip
     assert found["rotate_z"] == "no"
+
+
+def test_a_value_from_outside_is_hashed_as_it_is(tmp_path, monkeypatch):
+    """And not as the text that asks for it."""
+    hashes = []
+    for rule in ("last", "source_val"):
+        monkeypatch.setenv("RULE", rule)
+        hashes.append(config_hash(toy_config(tmp_path, "selection.teacher=${oc.env:RULE}")))
+        assert hashes[-1] == config_hash(toy_config(tmp_path, f"selection.teacher={rule}"))
+    assert hashes[0] != hashes[1]
 
 
 def test_other_errors_keep_their_traceback():

@@ -6,6 +6,7 @@ import csv
 import importlib
 import json
 import logging
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from qs3.training.command import CENTRED_ONLY, UNIT_BALL_ONLY, train
 from qs3.utils.locks import owned
 from qs3.utils.version import VERSION, commit
 from tests.training.conftest import result_of
-from tests.training.toy import toy_config
+from tests.training.toy import toy_config, write_domain
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -142,6 +143,20 @@ def test_the_upper_bound_over_the_floor_asks_only_its_own_domain(toy):
     assert read_result(hashing.run_folder(cfg)).floor_m == -1.0
     other = toy(*words, "data.scale=above_floor", "data.target.floor_m=0")
     assert hashing.config_hash(other) != hashing.config_hash(cfg)
+
+
+def test_the_upper_bound_does_not_ask_for_the_same_source(toy, toy_data, tmp_path):
+    data = tmp_path / "data"
+    shutil.copytree(toy_data, data)
+    words = ("method=supervised", "selftraining=none", "protocol.epochs=1")
+    cfg = toy(*words, f"paths.data_dir={data}")
+    first = train(cfg)
+    assert first.data.source == first.data.target
+    shutil.rmtree(data / "specklenet10")
+    write_domain(data, "specklenet10", noise=0.06)
+    assert train(cfg) == first
+    (hashing.run_folder(cfg) / "metrics.json").unlink()
+    assert train(cfg).final == first.final
 
 
 def test_parts_that_cannot_see_metres_are_parts():

@@ -48,6 +48,21 @@ def test_weights_alone_are_trained_on(toy, finished):
     assert first_loss(given) < 0.9 * first_loss(fresh)
 
 
+def test_another_classifier_under_its_name_is_refused(toy, finished, tmp_path):
+    teacher = tmp_path / "teacher.pt"
+    result = read_result(finished)
+    write_result(teacher, result)
+    cfg = toy(*ONLY_ROUNDS, f"weights={teacher}")
+    before = train(cfg)
+    assert train(cfg).final == before.final  # it is there, and the same
+    changed = {name: value + 1 for name, value in result.weights.items()}
+    write_result(teacher, replace(result, weights=changed))
+    with pytest.raises(DataError, match=r"another version of the classifier teacher\.pt"):
+        train(cfg)
+    teacher.unlink()
+    assert train(cfg).final == before.final  # put away: the result stands
+
+
 def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
     words = (*ONLY_ROUNDS, f"weights={finished}")
     whole = toy(*words)

@@ -302,7 +302,7 @@ def _families(files: Sequence[Path]) -> list[_Known]:
         if metrics is None:
             found[(str(file),)] = _Known(str(file), (file,))
             continue
-        key = (metrics.experiment, metrics.hash, metrics.data.source, metrics.data.target)
+        key = (metrics.experiment, metrics.hash, *metrics.seen.values())
         of = members.setdefault(key, {})
         if metrics.seed in of:
             other = of[metrics.seed][0].parent

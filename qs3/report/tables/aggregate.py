@@ -203,21 +203,29 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
         problems.append(
             f"seeds {_list(diverged)}: the net has diverged and calls every cloud alike: averaged"
         )
-    for role in ("source", "target"):
+    for role, what in _ROLES.items():
         hashes = defaultdict(list)
         for run in finished:
-            hashes[getattr(run.metrics.data, role) if run.metrics else ""].append(run.seed)
+            hashes[run.metrics.seen[role] if run.metrics else ""].append(run.seed)
         if len(hashes) > 1:
             seen = "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in hashes.items())
-            if same_data((run.metrics for run in finished), role):
+            if role in _DATASETS and same_data((run.metrics for run in finished), role):
                 problems.append(
                     f"the {role} was made by one recipe on several machines, whose bytes differ by "
                     f"rounding ({seen}): averaged"
                 )
                 continue
             comparable = False
-            problems.append(f"the {role} dataset differs ({seen}): not averaged")
+            problems.append(f"{what} ({seen}): not averaged")
     return Group(*key, tuple(finished), tuple(problems), comparable)
+
+
+_DATASETS = ("source", "target")
+_ROLES = {
+    **{role: f"the {role} dataset differs" for role in _DATASETS},
+    "beside": "twins or views of the source differ",
+    "weights": "the classifier that they began with differs",
+}
 
 
 def same_data(results: Iterable[RunMetrics | None], role: str) -> bool:

@@ -110,6 +110,31 @@ def test_other_data_are_not_averaged(tmp_path, role):
     assert "seeds 0 occur more than once" in found.problems[0]
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"data": DataHashes(source="a" * 64, target="b" * 64, beside="c" * 64)}, "twins or views"),
+        ({"versions": {"qs3": "0.1.0", "weights": "teacher " + "d" * 64}}, "the classifier that"),
+    ],
+)
+def test_other_twins_and_other_teachers_are_not_averaged(tmp_path, changes, said):
+    write_run(tmp_path, seed=0)
+    write_run(tmp_path, seed=1, **changes)
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("accuracy") is None
+    assert said in found.problems[0]
+
+
+def test_a_source_that_nobody_used_tells_no_runs_apart(tmp_path):
+    """The upper bound's, which older files name."""
+    for seed, source in enumerate("ac"):
+        data = DataHashes(source=source * 64, target="b" * 64)
+        write_run(tmp_path, seed=seed, source="kinectsim10", target="kinectsim10", data=data)
+    (found,) = group(load_runs(tmp_path))
+    assert found.stat("accuracy").n == 2
+    assert found.problems == ()
+
+
 @pytest.mark.parametrize("role", ["source", "target"])
 def test_one_recipe_on_two_machines_is_averaged_and_said(tmp_path, role):
     """Bytes of renderings differ by processor; recipes do not."""
