@@ -205,8 +205,9 @@ class Domain:
         if published is not None:
             return
         unfinished = is_begun(self.folder)
+        why = self._absent(importer)
         lines = [
-            f"domain {self.name}: {self.label} is not there. Looked for:",
+            f"domain {self.name}: {why}{self.label} is not there. Looked for:",
             f"  {self.folder / 'meta.yaml'}{'   (begun but not finished)' * unfinished}",
             *([f"  {Path(self.twin_of).absolute() / self.variant}.npy"] if self.twin_of else []),
             *(f"  {pattern}" for pattern in (importer.looks_for() if importer else [])),
@@ -216,9 +217,17 @@ class Domain:
         if self.make:
             verb = "Continue making it" if unfinished else "Make it"
             lines.append(f"{verb}:\n  {self.make}")
-        if self.stand_in:
+        if self.stand_in and not why:  # who named a folder mistyped it, and has clouds
             lines.append(f"Or make a stand-in and use that one:\n  {self.stand_in}")
         raise MissingDataError(typed("\n".join(lines)))
+
+    def _absent(self, importer: Importer | None) -> str:
+        """What is wrong with the place that somebody named; "" if it is the config's own."""
+        if importer is None:
+            return ""
+        data_dir = Path(self.path).absolute().parent
+        usual = importer.place == data_dir or importer.place.is_relative_to(data_dir / "published")
+        return "" if usual else f"{importer.absent()}; "
 
     def open(self, verify: bool = True) -> PointSet:
         """Open the dataset; the first time, bring the published files into the store.

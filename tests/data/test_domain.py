@@ -58,6 +58,7 @@ def test_missing_data_is_explained(tmp_path, name):
     with pytest.raises(MissingDataError) as caught:
         found.check()
     message = str(caught.value)
+    assert message.startswith(f"domain {name}: {found.label} is not there. Looked for:\n")
     assert str(found.folder / "meta.yaml") in message
     assert "Where to get it: " in message
     if found.make or found.stand_in:
@@ -203,6 +204,25 @@ def test_unfinished_generation_names_the_command_to_continue(tmp_path):
     (tmp_path / "kinectsim10" / "part").write_text("")
     with pytest.raises(MissingDataError, match=r"(?s)begun but not finished.*Continue making it"):
         domain("kinectsim10", tmp_path).check()
+
+
+def test_a_place_that_was_named_is_told_first_and_has_no_stand_in(tmp_path):
+    def said(name, key, place):
+        with pytest.raises(MissingDataError) as caught:
+            domain(name, tmp_path / "data", f"published.{key}={place}").check()
+        assert "python generate.py" not in str(caught.value)
+        return str(caught.value).splitlines()[0].removeprefix(f"domain {name}: ")
+
+    (empty := tmp_path / "empty").mkdir()
+    (cloud := tmp_path / "a.xyz").write_text("0 0 0\n")
+    (tmp_path / "empty" / "notes.md").write_text("")
+    nowhere = tmp_path / "nope"
+    assert said("own", "folder", nowhere).startswith(f"there is no folder {nowhere}; own clouds")
+    assert said("own", "folder", empty).startswith(f"{empty} holds no cloud of .xyz .txt .npy")
+    assert said("own", "folder", cloud).startswith(f"{cloud} is a file; give the folder that")
+    assert said("objects", "file", nowhere).startswith(f"there is no file {nowhere}; archive of")
+    assert said("scannet10", "folder", nowhere).startswith(f"there is no folder {nowhere}; Scan")
+    assert said("scannet10", "folder", empty).startswith(f"{empty} holds nothing of what")
 
 
 def test_all_that_is_missing_is_told_at_once(tmp_path):

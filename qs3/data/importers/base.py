@@ -97,6 +97,16 @@ class Importer(abc.ABC):
     def is_there(self) -> bool:
         """Whether there is anything to read; must be fast."""
 
+    def absent(self) -> str:
+        """Why there is nothing to read, for a message about a folder or file that was named."""
+        if self.place != self.root:
+            return f"there is no file {self.place}"
+        if self.root.is_file():
+            return f"{self.root} is a file; give the folder that it lies in"
+        if not self.root.is_dir():
+            return f"there is no folder {self.root}"
+        return f"{self.root} holds nothing of what is looked for"
+
     @abc.abstractmethod
     def items(self, classes: Sequence[str]) -> list[Item]:
         """Everything there is, in the dataset's order.

@@ -99,6 +99,12 @@ class CloudFolder(Importer):
         """See `Importer`: whether there is any file of a known format."""
         return self.root.is_dir() and next(_files(self.root, self.root), None) is not None
 
+    def absent(self) -> str:
+        """See `Importer`."""
+        if self.root.is_dir():
+            return f"{self.root} holds no cloud of {' '.join(SUFFIXES)}"
+        return super().absent()
+
     def items(self, classes: Sequence[str]) -> list[Item]:
         """See `Importer`. Sorted by split, class and name.
 
