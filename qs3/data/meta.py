@@ -11,6 +11,7 @@ import yaml  # type: ignore[import-untyped,unused-ignore]
 
 from qs3.data.array_files import shards_fit
 from qs3.data.manifest import AGAIN
+from qs3.data.place import instead_of_dataset
 from qs3.errors import DataError, MissingDataError
 from qs3.utils.files import write_text
 from qs3.utils.memory import read_whole
@@ -42,19 +43,15 @@ def write_meta(folder: Path, facts: Mapping[str, Any], others: Mapping[str, Any]
 
 
 def meta_of_finished(folder: Path) -> dict[str, Any]:
-    """As `read_meta`, and says what is missing where there is none.
+    """As `read_meta`, and says what lies there instead where there is none.
 
     Raises:
-        MissingDataError: there is no such folder, or its dataset was not finished.
+        MissingDataError: there is no such folder, its dataset was not finished, or it is
+            something else.
         DataError: as `read_meta`.
     """
-    if not folder.is_dir():
-        raise MissingDataError(f"there is no dataset folder {folder}")
     if not is_finished(folder):
-        raise MissingDataError(
-            f"{folder} has no {META}: the generation or import was not finished; "
-            "run the same command again and it continues"
-        )
+        raise MissingDataError(instead_of_dataset(folder, META))
     return read_meta(folder)
 
 

@@ -27,6 +27,7 @@ OWN = {
     "config/hydra.py": "comments of our own configs",
     "data/download/catalogue.py": "a file of the package",
     "data/inspection/gravity.py": "a file of the package",
+    "data/place.py": "the names in a zip; what is damaged is called no archive",
     "data/viewer/page.py": "files of the package",
     "methods/own.py": "Python that the user names, to be run",
     "models/features.py": "a net that the user names, parsed and run by onnxruntime",

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from qs3.config.compose import choices
 from qs3.data.domain import Domain, compose_domain
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow, read_manifest
@@ -55,7 +56,7 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
         MissingDataError: the domain's files are not there.
         DataError: they are damaged.
     """
-    if is_finished(name) or "/" in name or name.startswith((".", "~")):
+    if _is_path(name):
         if unknown := sorted(set(overrides) - {"variant", "paths.data_dir"}):
             raise ConfigError(f"{', '.join(unknown)}: a folder of a dataset takes variant= only")
         folder, variant = Path(name).expanduser(), overrides.get("variant", "points")
@@ -67,6 +68,13 @@ def open_named(name: str, overrides: Mapping[str, str]) -> Opened:
     domain = compose_domain(name, overrides)
     domain.tell_of_judging()
     return opened_domain(domain, domain.open())
+
+
+def _is_path(name: str) -> bool:
+    """Whether a place is meant; a domain's name stays one beside a file or folder called so."""
+    if is_finished(name) or "/" in name or name.startswith((".", "~")):
+        return True
+    return name not in choices("domain") and Path(name).exists()
 
 
 def opened_domain(domain: Domain, data: PointSet) -> Opened:
