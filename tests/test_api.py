@@ -57,6 +57,37 @@ def test_wrong_words_are_errors_for_people(word):
         composed("train", word)
 
 
+@pytest.mark.parametrize(
+    ("call", "words", "advice"),
+    [
+        (train, ["experiment=quickstart", "sead=1"], "did you mean seed=?"),
+        (train, ["method=pmc"], "did you mean method=pcm?"),
+        (train, ["method=nothing"], "there are cpcm, dann, "),
+        (train, ["data.nothing=1"], "keys of data are source, target, "),
+        (train, ["seed"], "'seed' cannot be read: words are key=value"),
+        (
+            train,
+            ["experiment=quickstart seed=1"],
+            "one key=value each: 'experiment=quickstart', 'seed=1'",
+        ),
+        (train, ["-m", "seed=1"], "one run at a time: call it once for each seed"),
+        (train, ["seed=0,1"], "one run at a time: call it once for each seed"),
+        (train, ["seed=[1"], "'seed=[1' cannot be read: no viable alternative"),
+        (
+            generate,
+            ["chairs/a.off", "domain=specklenet10"],
+            "'chairs/a.off' cannot be read: words are key=value; a mesh is given as "
+            "trimesh.load(path)",
+        ),
+    ],
+)
+def test_wrong_words_have_the_hints_of_the_commands(call, words, advice):
+    with pytest.raises(ConfigError) as caught:
+        call(*words)
+    assert advice in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 def test_generate(tmp_path):
     few = ["classes=[chair]", "catalogue.train=1", "catalogue.test=1", "workers=0"]
     made = generate("domain=modelnet10", *few, f"paths.data_dir={tmp_path}")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from qs3.config.location import CONF
 from qs3.errors import ConfigError
+from qs3.utils.cli import hint_of
+
+_ONE_RUN = "one run at a time: call it once for each seed"
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -48,7 +51,7 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
         try:
             return compose(command, list(overrides), **more)
         except HydraException as error:
-            raise ConfigError(f"{place}{first_line(error)}{_there(error)}") from error
+            raise ConfigError(f"{place}{_explained(error, command, overrides)}") from error
 
 
 def choices(group: str) -> list[str]:
@@ -56,10 +59,31 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
-def _there(error: BaseException) -> str:
-    """The choices that there are, if a group has not the one that was asked for."""
-    options = getattr(error, "options", None)  # of Hydra's MissingConfigException
-    return f"; there are {', '.join(options)}" if options else ""
+def _explained(error: BaseException, command: str | None, words: Sequence[str]) -> str:
+    """Hydra's message in one line, and what to write instead where that is known."""
+    line = first_line(error)
+    word = getattr(error, "override", None)  # of Hydra's OverrideParseException
+    if isinstance(word, str):
+        advice = _of_word(word, command)
+        return f"{word!r} cannot be read: {advice or line}"
+    if line.startswith("Ambiguous value"):  # seed=0,1
+        return f"{line}: a list is written key=[a,b]; {_ONE_RUN}"
+    hint = hint_of(error, words)
+    if options := getattr(error, "options", None):  # of Hydra's MissingConfigException
+        hint = hint or f"there are {', '.join(options)}"
+    return f"{line.rstrip('.')}; {hint}" if hint else line
+
+
+def _of_word(word: str, command: str | None) -> str:
+    """What is wrong with a word that Hydra cannot parse; "" if its own message has to do."""
+    if word.startswith("-"):
+        return f"flags are for the command line; {_ONE_RUN}"
+    if "=" not in word:
+        mesh = "; a mesh is given as trimesh.load(path)" if command == "generate" else ""
+        return f"words are key=value{mesh}"
+    if len(parts := word.split()) > 1 and all("=" in part for part in parts):
+        return f"one key=value each: {', '.join(map(repr, parts))}"
+    return ""
 
 
 def first_line(error: BaseException) -> str:

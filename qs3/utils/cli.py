@@ -327,7 +327,7 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
             ):
                 what, status = "interrupted", INTERRUPTED
             else:
-                if hint := _hint(error.__context__):  # Hydra's own error, told
+                if hint := hint_of(error.__context__, sys.argv):  # Hydra's own error, told
                     print(hint, file=sys.stderr)
                 raise
             print(f"\n{what}; run the same command again and it continues", file=sys.stderr)
@@ -346,12 +346,15 @@ def _near(word: str, known: Iterable[str]) -> str:
     return next(iter(difflib.get_close_matches(word, list(known), n=1)), "")
 
 
-def _hint(error: BaseException | None) -> str:
-    """What to type instead, below Hydra's message that a choice or a key is not there."""
+def hint_of(error: BaseException | None, words: Sequence[str]) -> str:
+    """What to type instead of one of `words`, of Hydra's error of a choice or key there is not.
+
+    It goes below Hydra's own message, or behind it; "" of other errors.
+    """
     asked, there = getattr(error, "missing_cfg_file", None), getattr(error, "options", None)
     if asked and there:  # MissingConfigException
         group, _, name = asked.rpartition("/")
-        keys = [word.removesuffix(f"={name}") for word in sys.argv if word.endswith(f"={name}")]
+        keys = [word.removesuffix(f"={name}") for word in words if word.endswith(f"={name}")]
         key = keys[0] if keys else group  # as it was typed: domain@data.target
         return f"did you mean {key}={near}?" if (near := _near(name, there)) else ""
     cause = error and error.__cause__  # of ConfigCompositionException, by OmegaConf
