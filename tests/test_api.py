@@ -62,6 +62,8 @@ def test_wrong_words_are_errors_for_people(word):
     [
         (train, ["experiment=quickstart", "sead=1"], "did you mean seed=?"),
         (train, ["method=pmc"], "did you mean method=pcm?"),
+        (generate, ["domain=specklenet"], "did you mean domain=specklenet10?"),
+        (train, ["experiment=own"], "did you mean experiment=own_meshes?"),
         (train, ["method=nothing"], "there are cpcm, dann, "),
         (train, ["data.nothing=1"], "keys of data are source, target, "),
         (train, ["seed"], "'seed' cannot be read: words are key=value"),

@@ -28,6 +28,7 @@ INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help")
 _WIDTH = 100
+_BEGINS = 3  # letters that tell which word they begin
 # Flags of Hydra that show something and end.
 _SHOWS = (*_HELP, "--hydra-help", "--version", "--cfg", "-c", "--info", "-i", "-sc")
 
@@ -343,7 +344,11 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _near(word: str, known: Iterable[str]) -> str:
-    return next(iter(difflib.get_close_matches(word, list(known), n=1)), "")
+    """The choice that is meant: the first that the word begins, else the one most like it."""
+    known = list(known)
+    if len(word) >= _BEGINS and (longer := [one for one in known if one.startswith(word)]):
+        return longer[0]
+    return next(iter(difflib.get_close_matches(word, known, n=1)), "")
 
 
 def hint_of(error: BaseException | None, words: Sequence[str]) -> str:

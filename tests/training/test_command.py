@@ -84,6 +84,7 @@ def test_help_imports_nothing_heavy(tmp_path):
         (("data.source=modelnet10",), ("ConfigError: data.source must", "domain@data.source=NAME")),
         (("method=pmc",), ("did you mean method=pcm?",)),
         (("domain@data.target=objcts",), ("did you mean domain@data.target=objects?",)),
+        (("domain@data.source=specklenet",), ("did you mean domain@data.source=specklenet10?",)),
         (("method.wieght=1", "method=twin"), ("did you mean method.twin_weight=?",)),
         (("force=no",), ("ConfigError: force must be true or false, got 'no'",)),
         (("compile=off",), ("ConfigError: compile must be true or false, got 'off'",)),
