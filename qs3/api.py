@@ -38,12 +38,14 @@ def train(*overrides: str) -> Path:
     from omegaconf import OmegaConf
 
     from qs3.config.hashing import run_folder
+    from qs3.runs.unbegun import removed_if_unbegun
     from qs3.training.command import train as run_of
     from qs3.utils.files import write_text
 
     with _as_hydra("train", overrides) as cfg:
         folder = run_folder(cfg)
-        run_of(cfg)
+        with removed_if_unbegun(folder):
+            run_of(cfg)
     # What Hydra leaves in a run's folder, which pictures and `qs3.report` read.
     write_text(folder / ".hydra" / "config.yaml", OmegaConf.to_yaml(cfg))
     write_text(folder / ".hydra" / "overrides.yaml", OmegaConf.to_yaml(list(overrides)))

@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 import qs3
 from qs3.api import generate, train
 from qs3.config.compose import composed
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.report.runs.data import read_run
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import read_metrics
@@ -88,6 +88,13 @@ def test_wrong_words_have_the_hints_of_the_commands(call, words, advice):
         call(*words)
     assert advice in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_start_that_fails_leaves_no_folder(tmp_path):
+    dirs = (f"paths.data_dir={tmp_path / 'data'}", f"paths.log_dir={tmp_path / 'logs'}")
+    with pytest.raises(MissingDataError):
+        train("experiment=quickstart", *dirs, "data.make_source=false")
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
 def test_generate(tmp_path):

@@ -13,6 +13,7 @@ import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
 from qs3.training.command import KEYS
 from qs3.training.command import _check_keys as check_keys_of
+from qs3.utils.locks import owned
 from tests.commands import command
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
 from tests.training.toy import CONF, overrides
@@ -109,6 +110,29 @@ def test_what_is_missing_or_wrong_is_said_before_anything_heavy_is_imported(tmp_
     assert result.returncode == 1
     assert all(word in result.stderr for word in told)
     assert "Traceback" not in result.stderr
+
+
+def test_a_start_that_fails_leaves_no_folder_and_touches_no_other(tmp_path):
+    words = "experiment=qs3_s2d", "method=supervised"
+    assert command(tmp_path, *words).returncode == 1
+    logs = tmp_path / "logs"
+    assert list(logs.iterdir()) == []
+    (folder,) = _failed(tmp_path, *words)
+    (folder / "notes.txt").write_text("mine")
+    assert command(tmp_path, *words).returncode == 1
+    assert {path.name for path in folder.iterdir()} >= {"notes.txt", "train.log", ".hydra"}
+    (folder / "notes.txt").unlink()
+    with owned(folder):  # another process that has only just begun
+        assert command(tmp_path, *words).returncode == 1
+    assert (folder / "train.log").is_file()
+    assert command(tmp_path, *words).returncode == 1
+    assert not folder.parent.exists()
+
+
+def _failed(tmp_path, *words):
+    """The folder of a job of a sweep, which stays: the summary names it."""
+    assert command(tmp_path, *words, "-m").returncode == 1
+    return [path.parent for path in (tmp_path / "logs").glob("*/*/train.log")]
 
 
 def test_missing_data_in_a_multirun_are_said_once(tmp_path):

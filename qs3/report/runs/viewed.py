@@ -82,7 +82,10 @@ def part_of_run(
 
 def _said(run: RunFiles) -> Predictions:
     if run.predictions is None:
-        raise MissingDataError(f"{run.folder} has no predictions: the run is not finished")
+        why = "it is a run that did not finish; repeat its command"
+        if run.metrics is not None:
+            why = "its predictions.csv is gone; repeat its command with force=true"
+        raise MissingDataError(f"{run.folder} has no predictions: {why}")
     return run.predictions
 
 

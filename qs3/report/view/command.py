@@ -29,6 +29,7 @@ from qs3.meshes.io import DECLARE_UP, load_mesh
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.runs.data import is_run, read_run
 from qs3.report.runs.viewed import part_of_run, worst_first
+from qs3.runs.unbegun import is_unbegun
 from qs3.utils.files import write_text
 from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar
@@ -101,6 +102,8 @@ def _part(path: str, most: int, settings: Settings) -> Part:
         )
     if is_archive(place):
         return _archive(place, most, settings)
+    if place.is_dir() and is_unbegun(place):
+        raise MissingDataError(f"{place} is a run that did not finish; repeat its command")
     return _files(place, most, settings)
 
 

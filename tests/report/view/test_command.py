@@ -192,9 +192,15 @@ def test_runs_that_cannot_be_shown(view, run, tmp_path):
     assert "its target, kinectsim10, is not at" in said
     (run / "predictions.csv").unlink()
     assert "MissingDataError" in (said := view(run)[1])
-    assert "no predictions" in said
+    assert "no predictions: its predictions.csv is gone" in said
     (run / "metrics.json").write_text(json.dumps({}))
     assert "DataError" in view(run)[1]
+    (run / "metrics.json").unlink()
+    assert "no predictions: it is a run that did not finish; repeat its command" in view(run)[1]
+    (failed := tmp_path / "failed" / ".hydra").mkdir(parents=True)
+    (failed / "config.yaml").write_text("")
+    (failed.parent / "train.log").write_text("")
+    assert view(failed.parent)[1].endswith("is a run that did not finish; repeat its command\n")
 
 
 @pytest.mark.parametrize(
