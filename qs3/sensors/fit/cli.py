@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 from qs3.config.location import CONF, typed
 from qs3.errors import ConfigError
-from qs3.utils.cli import NUMBER, Command, Option, one_of, several, text
+from qs3.utils.cli import FLAG, NUMBER, Command, Option, one_of, several, text
 from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
+    from qs3.sensors.fit.frames import DepthImage
     from qs3.sensors.fit.preset import FittedPreset
 
+_LEAST_DISTANCES = 3  # of walls: two tell no law from chance
+_APART = 1.05  # times as far is another distance
 _LONGEST_M = 2.0  # baseline of a depth camera: a longer one is in another unit
 
 
@@ -62,8 +65,9 @@ def fit(
     distances: Sequence[float] | None,
     baseline: float | None,
     power: str | None,
+    few: bool = False,
 ) -> FittedPreset:
-    """All steps, from files to the preset.
+    """All steps, from files to the preset; `few` allows less than three distances.
 
     Raises:
         ConfigError, DataError: say which argument or file is to blame.
@@ -100,13 +104,44 @@ def fit(
     if distances is not None and len(distances) != len(frames):
         values, of = counted(len(distances), "value"), counted(len(frames), "frame")
         raise ConfigError(f"distances= has {values} for {of}")
+    kept = [i for i, frame in enumerate(frames) if not _copied(frame, frames[:i])]
+    frames = [frames[i] for i in kept]
+    distances = None if distances is None else [distances[i] for i in kept]
     steps = find_steps(frames)
     walls = [find_wall(frame.name, frame.depth_m, camera) for frame in frames]
     noise = find_noise(walls, steps, float(power) if power else None)
     doubts = check_walls(walls, noise, steps)
+    if not few:
+        _check_distances([wall.centre_m for wall in walls])
     return FittedPreset(
         camera, noise, steps, find_fill(walls), find_bias(walls, distances), baseline, walls, doubts
     )
+
+
+def _copied(frame: DepthImage, before: Sequence[DepthImage]) -> bool:
+    """Whether an earlier frame has the same depths; says so."""
+    import numpy as np
+
+    for other in before:
+        if np.array_equal(frame.depth_m, other.depth_m, equal_nan=True):
+            print(f"{frame.name}: the same depths as {other.name}, so they count once")
+            return True
+    return False
+
+
+def _check_distances(centres_m: Sequence[float]) -> None:
+    """Raise ConfigError if the walls are at too few distances to tell how noise grows."""
+    apart: list[float] = []
+    for centre in sorted(centres_m):
+        if not apart or centre > apart[-1] * _APART:
+            apart.append(centre)
+    if len(apart) < _LEAST_DISTANCES:
+        seen = ", ".join(f"{centre:.2f}" for centre in apart)
+        raise ConfigError(
+            f"the frames show walls at {counted(len(apart), 'distance')} ({seen} m), and how noise "
+            f"grows takes {_LEAST_DISTANCES} that differ by {100 * (_APART - 1):.0f} % or more: "
+            "add frames from others (say 1, 1.5, 2 and 3 m), or fit what there is with few=true"
+        )
 
 
 def fit_images(
@@ -173,6 +208,7 @@ FIT = Command(
             one_of("1", "2"),
             "noise grows with Z to this power (default: whichever fits better)",
         ),
+        Option("few", FLAG, "fit frames from fewer than three distances, too", False),
         Option("images", text("FOLDER"), "of infrared pictures, in place of frames"),
         Option("base", text("NAME"), "stereo preset to begin with (default realsense_d415)"),
         Option("distance", NUMBER, "m to the scenes, where they have no depth image"),
@@ -193,8 +229,8 @@ FIT = Command(
 FRAMES are .png (16 bits), .npy [h, w] or .pcd: three or more of a flat, matt wall, from distances
 that differ (say 1, 1.5, 2 and 3 m), turned by a few degrees so that several steps of depth are
 seen; and some at a slant (20 to 70 degrees) for the fill rate. Other things may be in view; the
-plane that covers most is the wall. Frames whose errors do not look like a camera's noise on a wall
-are refused or, where that is not sure, named.
+plane that covers most is the wall. Fewer distances take few=true. Frames whose errors do not look
+like a camera's noise on a wall are refused or, where that is not sure, named.
 
 What is found: noise against distance (before the quantiser; growing with Z^2 as for cameras that
 triangulate, or with Z, whichever fits better), its smoothness, steps of 1/Z or of Z, fill rate

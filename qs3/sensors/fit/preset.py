@@ -58,7 +58,8 @@ focal_px: {k.focal_px:.8g}
 cx_px: {k.cx_px:.8g}
 cy_px: {k.cy_px:.8g}
 step_px: 1
-# The frames show walls from {nearest:.2f} to {farthest:.2f} m.
+# The frames show walls from {nearest:.2f} to {farthest:.2f} m; beyond that noise, steps and bias
+# are extrapolated.
 min_depth_m: 0.3
 max_depth_m: 8.0
 noise_floor_m: {noise.floor_m:.6g}
@@ -77,9 +78,11 @@ baseline_m: {baseline}
 
     def summary(self) -> list[str]:
         """What was found, a line each."""
-        noise, steps = self.noise, self.steps
+        noise, steps, (nearest, farthest) = self.noise, self.steps, self._range()
         floor = f"{1e3 * noise.floor_m:.2f} mm + " if noise.floor_m else ""
         lines = [
+            f"walls     seen from {nearest:.2f} to {farthest:.2f} m; beyond that the preset "
+            "extrapolates",
             f"noise     sigma(Z) = {floor}{1e3 * noise.factor:.3f} mm (Z / m)^{noise.power:g}"
             + ("" if noise.power_known else "; the power is assumed, walls are equally far"),
             f"          smooth over {noise.correlation_px:.2f} px",

@@ -60,7 +60,7 @@ def camera_of(sensor):
 
 def fitted(folder, files, *arguments):
     out = folder / "found.yaml"
-    assert main(["fit", *map(str, files), f"out={out}", *arguments]) == 0
+    assert main(["fit", *map(str, files), f"out={out}", "few=true", *arguments]) == 0
     assert out.with_suffix(".png").stat().st_size > 20_000
     text = out.read_text()
     settings = yaml.safe_load(text)
@@ -120,6 +120,34 @@ def test_one_distance_cannot_tell_the_law(tmp_path):
     assert found.noise_power == 2
     assert found.noise_factor == pytest.approx(0.003, rel=0.05)
     assert "assumed: all walls are equally far" in text
+
+
+def test_three_distances_are_asked_for_and_said(tmp_path, capsys):
+    for name, depth_m, seed in (("a", 1.0, 0), ("b", 1.02, 1), ("c", 1.6, 2), ("d", 2.4, 3)):
+        np.save(tmp_path / f"{name}.npy", wall(TINY, depth_m, 6, seed))
+    (tmp_path / "copy.npy").write_bytes((tmp_path / "d.npy").read_bytes())
+    out = tmp_path / "found.yaml"
+
+    def run(names, *more):
+        files = [str(tmp_path / f"{name}.npy") for name in names]
+        status = main(["fit", *files, "focal=110", f"out={out}", *more])
+        return status, *capsys.readouterr()
+
+    for names in (["a"], ["a", "b", "c"], ["d", "copy", "c"]):
+        status, _, error = run(names)
+        assert status == 1
+        assert f"the frames show walls at {1 if names == ['a'] else 2} distance" in error
+        assert "few=true" in error
+        assert not out.exists()
+    status, said, _ = run(["a", "c", "d", "copy"], "distances=1,1.6,2.4,2.4")
+    assert status == 0
+    assert "copy.npy: the same depths as d.npy, so they count once" in said
+    low, high = re.search(r"walls +seen from ([\d.]+) to ([\d.]+) m; beyond", said).groups()
+    assert float(low) < 1 < 2.4 < float(high)
+    assert f"walls from {low} to {high} m; beyond that noise, steps and bias\n# are extrap" in (
+        out.read_text()
+    )
+    assert run(["a", "b"], "few=true")[0] == 0
 
 
 def test_the_steps_of_a_simulated_kinect_are_found(tmp_path, renderer):
@@ -233,7 +261,7 @@ def told(folder, images, capsys):
     for file, image in zip(files, images.values(), strict=True):
         np.save(file, image)
     out = folder / "found.yaml"
-    status = main(["fit", *map(str, files), "focal=220", f"out={out}"])
+    status = main(["fit", *map(str, files), "focal=220", f"out={out}", "few=true"])
     said = capsys.readouterr()
     return status, said.out + said.err, out
 
