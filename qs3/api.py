@@ -87,11 +87,11 @@ def generate(*arguments: Any) -> Any:
         RenderError: the renderer cannot be used here.
     """
     if not arguments or isinstance(arguments[0], str):
-        from qs3.config.compose import composed
         from qs3.generation.command import generate as made
         from qs3.generation.materials_file import with_materials
 
-        return made(composed("generate", *with_materials(arguments)))
+        with _as_hydra("generate", with_materials(arguments)) as cfg:
+            return made(cfg)
     from qs3.generation.scan import scan_meshes
 
     solids, *overrides = arguments
@@ -147,7 +147,7 @@ def load(
 
 @contextlib.contextmanager
 def _as_hydra(command: str, overrides: Sequence[str]) -> Iterator[DictConfig]:
-    """A command's config; in the block Hydra's choices are known, which name a run's parts."""
+    """A command's config; in the block Hydra's choices are known, which name parts."""
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import open_dict
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.compose import choices, composed
@@ -69,7 +70,7 @@ def _sensor(cfg: DictConfig) -> str:
     if not cfg.sensor:
         holes = " with holes" if cfg.recipe.get("dropout") else ""
         return f"surface samples{holes}"
-    words = [_named("sensor", cfg.sensor)]
+    words = [_own_preset() or _named("sensor", cfg.sensor)]
     if kinds := cfg.get("materials"):
         words.append(_named("materials", kinds, _MATERIALS))
     if light := cfg.get("light"):
@@ -79,6 +80,19 @@ def _sensor(cfg: DictConfig) -> str:
     if errors := cfg.get("depth_errors"):
         words += ["no holes"] * (not errors.holes) + ["no mixed pixels"] * (not errors.mixed_pixels)
     return ", ".join(words)
+
+
+def _own_preset() -> str:
+    """The name of a sensor's file that lies beside conf, and what was changed; "" if in conf."""
+    if not HydraConfig.initialized():
+        return ""
+    hydra = HydraConfig.get()
+    name = str(hydra.runtime.choices.get("sensor") or "")
+    if not name or name in choices("sensor"):
+        return ""
+    words = [word.lstrip("+~") for word in hydra.overrides.task]
+    changed = [word.removeprefix("sensor.") for word in words if word.startswith("sensor.")]
+    return _with(name, changed)
 
 
 _MATERIALS = {
@@ -114,12 +128,15 @@ def _named(
             found.append((len(changed), name, changed))
     if not found:  # of one's own
         return str(plain["_target_"].rsplit(".", 1)[-1])
-    count, name, changed = min(found)
+    _, name, changed = min(found)
     said = (words or {}).get(name, name)
-    if not count:
-        return said
-    more = f" and {count - _MOST} more" if count > _MOST else ""
-    return f"{said} with {' '.join(changed[:_MOST])}{more}"
+    return _with(said, changed)
+
+
+def _with(name: str, changed: Sequence[str]) -> str:
+    """A name and its changed settings, some of many."""
+    more = f" and {len(changed) - _MOST} more" if len(changed) > _MOST else ""
+    return f"{name} with {' '.join(changed[:_MOST])}{more}" if changed else name
 
 
 def _differences(

@@ -6,6 +6,7 @@ import shutil
 
 import pytest
 
+import qs3
 from qs3.classes import CLASSES, MODELNET40
 from qs3.config.hydra import build
 from qs3.data.store import is_finished
@@ -101,6 +102,18 @@ def test_many_changes_are_counted_and_a_class_of_ones_own_is_named():
     assert made.sensor == "speckle_stereo with width_px=900 step_px=1 max_depth_m=4 and 1 more"
     own = composed("domain=specklenet10", "sensor._target_=my.lab.Camera")
     assert made_of(own, CLASSES, ["a"], "").sensor == "Camera"
+
+
+def test_a_preset_beside_conf_has_the_name_of_its_file(tmp_path):
+    (tmp_path / "sensor").mkdir()
+    target = "_target_: qs3.sensors.devices.fitted.FittedDepth\n"
+    (tmp_path / "sensor" / "my_camera.yaml").write_text(target + "noise_power: 2\n")
+    words = ["domain=specklenet10", f"hydra.searchpath=[file://{tmp_path}]", "sensor=my_camera"]
+    words += ["renderer=mitsuba", "classes=[chair]", "limit=1", *FAST]
+    words += [f"paths.data_dir={tmp_path}", "sensor.noise_power=1"]
+    words.remove("sensor=speckle_stereo_small")
+    made = qs3.generate(*words).made_of
+    assert made.sensor == "my_camera with noise_power=1"
 
 
 def test_all_of_modelnet40_serves_as_it_is(tmp_path, caplog):
