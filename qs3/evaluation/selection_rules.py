@@ -12,6 +12,7 @@ The earliest epoch wins a tie.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from qs3.errors import ConfigError
@@ -21,6 +22,14 @@ PSEUDO_VAL = "pseudo_val"
 STUDENT_RULES = (LAST, PSEUDO_VAL, "entropy", "infomax", "snd")
 OBJECTIVES = ("entropy", "infomax", "snd")
 """What a search may ask for: none looks at a label of the target, all judge on the same clouds."""
+
+
+def chosen_in_words(chosen: str) -> str:
+    """`selection.teacher` or `.student` of metrics.json for people, who count epochs from 1.
+
+    "source_val, epoch 7" is "source_val, epoch 8", as the progress of a run counts.
+    """
+    return re.sub(r"(?<=, epoch )\d+", lambda epoch: str(int(epoch[0]) + 1), chosen)
 
 
 def check_objective(objective: Any) -> None:

@@ -20,7 +20,7 @@ from qs3.data.store import is_finished
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.errors import ConfigError, Qs3Error
 from qs3.evaluation.estimates_text import in_words
-from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective
+from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective, chosen_in_words
 from qs3.inference import pretrained
 from qs3.runs import folder as runs
 from qs3.runs.metrics import METRICS, DataHashes, RunMetrics, read_metrics, write_metrics
@@ -178,7 +178,7 @@ def _told(metrics: RunMetrics) -> str:
 
 def _chosen(metrics: RunMetrics) -> str:
     """How teacher and student were selected, for the end of the headline."""
-    teacher, student = metrics.selection.teacher, metrics.selection.student
+    teacher, student = map(chosen_in_words, (metrics.selection.teacher, metrics.selection.student))
     if teacher == student:  # no rounds
         return f"; selected by {teacher}"
     return f"; teacher selected by {teacher}; student by {student}"

@@ -120,7 +120,8 @@ def test_last_is_the_default_and_leaves_nothing_behind(finished):
     assert not (finished / "student_selected.pt").exists()
     assert "StudentSelection" not in load(finished / "last.ckpt")["callbacks"]
     assert headline(metrics).endswith(
-        f"; teacher selected by {metrics.selection.teacher}; student by last"
+        f"; teacher selected by source_val, epoch {metrics.warmup.selected.epoch + 1}; "
+        "student by last"
     )
 
 
@@ -148,7 +149,9 @@ def test_metrics_name_rule_epoch_and_score(by_rule, finished, rule):
     assert student.epoch == min(epoch for epoch in scores if scores[epoch] == best)
     said = f"{rule}, epoch {student.epoch}, score {best:.6g}"
     assert metrics.selection.student == said
-    assert headline(metrics).endswith(f"; student by {said}")
+    assert headline(metrics).endswith(
+        f"; student by {rule}, epoch {student.epoch + 1}, score {best:.6g}"
+    )
     assert student.rule == rule
     assert student.last.epoch == 9
     if rule != "pseudo_val":  # there the last round was trained on fewer clouds

@@ -37,11 +37,12 @@ def curves(run: RunFiles) -> Figure:
         raise NothingToDrawError("no epoch is done yet")
     figure, axes = new_figure(8.5, 7.2, 3, 1, sharex=True, heights=(1.0, 1.0, 0.6))
     colours = (BLUE, ORANGE, GREEN, RED)
+    epochs = history.epoch + 1  # people count from 1
     for i, (name, values) in enumerate(history.loss.items()):
-        curve(axes[0], history.epoch, values, colours[i % 4], name)
+        curve(axes[0], epochs, values, colours[i % 4], name)
     for i, (name, values) in enumerate(history.accuracy.items()):
-        curve(axes[1], history.epoch, 100 * values, colours[i % 4], name)
-    curve(axes[2], history.epoch, history.learning_rate, SOFT, "lr")
+        curve(axes[1], epochs, 100 * values, colours[i % 4], name)
+    curve(axes[2], epochs, history.learning_rate, SOFT, "lr")
     axes[0].set_ylabel("training loss")
     axes[1].set_ylabel("held-out accuracy in %")
     axes[2].set_ylabel("learning rate")
@@ -54,17 +55,18 @@ def curves(run: RunFiles) -> Figure:
     for phase, first, last in spans:
         for ax in axes:
             if phase % 2 == 0:
-                ax.axvspan(first - 0.5, last + 0.5, color="#f0f3f7", zorder=0, linewidth=0)
+                ax.axvspan(first + 0.5, last + 1.5, color="#f0f3f7", zorder=0, linewidth=0)
         if phase <= 1 or (phase - 1) % every == 0:
             words = (
                 "warm-up" if phase == 0 else f"round {phase - 1}" if len(spans) < 7 else phase - 1
             )
-            axes[0].text((first + last) / 2, 1.02, words, transform=axes[0].get_xaxis_transform(),
+            middle, of_axes = (first + last) / 2 + 1, axes[0].get_xaxis_transform()
+            axes[0].text(middle, 1.02, words, transform=of_axes,
                          ha="center", va="bottom", fontsize=8.5, color=SOFT)  # fmt: skip
     for epoch, words, colour in _marks(run):
         for ax in axes:
             ax.axvline(epoch, color=colour, linestyle="--", linewidth=1.1, label=words)
-    axes[2].set_xlim(history.epoch.min() - 0.5, history.epoch.max() + 0.5)
+    axes[2].set_xlim(epochs.min() - 0.5, epochs.max() + 0.5)
     axes[2].xaxis.get_major_locator().set_params(integer=True)
     for ax in axes[:2]:
         ax.legend(fontsize=8.5, frameon=False, loc="best")
@@ -73,15 +75,15 @@ def curves(run: RunFiles) -> Figure:
 
 
 def _marks(run: RunFiles) -> list[tuple[int, str, str]]:
-    """Epochs whose weights were chosen."""
+    """Epochs whose weights were chosen, counted from 1."""
     if run.metrics is None:
         return []
     found = []
-    teacher, student = run.metrics.warmup.selected.epoch, run.metrics.student
-    if teacher >= 0:
+    teacher, student = run.metrics.warmup.selected.epoch + 1, run.metrics.student
+    if teacher > 0:
         found.append((teacher, f"teacher: epoch {teacher}", RED))
     if student is not None:
-        found.append((student.epoch, f"student: epoch {student.epoch}", GREEN))
+        found.append((student.epoch + 1, f"student: epoch {student.epoch + 1}", GREEN))
     return found
 
 

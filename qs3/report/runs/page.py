@@ -7,6 +7,7 @@ from html import escape
 from pathlib import Path
 
 from qs3.evaluation.estimates_text import table as quality_table
+from qs3.evaluation.selection_rules import chosen_in_words
 from qs3.report.runs.data import RunFiles, settings_of
 from qs3.report.runs.figures import EVALUATION_ONLY
 from qs3.utils import html
@@ -106,9 +107,9 @@ def key_figures(run: RunFiles) -> dict[str, str]:
     before = m.warmup.selected.scores.accuracy
     if run.rounds and before is not None:
         found["accuracy before self-training"] = f"{before:.1%}"
-    found["teacher selected by"] = m.selection.teacher
+    found["teacher selected by"] = chosen_in_words(m.selection.teacher)
     if run.rounds:
-        found["student selected by"] = m.selection.student
+        found["student selected by"] = chosen_in_words(m.selection.student)
     found["time"] = f"{m.times.seconds:.0f} s"
     found["hash of the settings"] = m.hash
     found["versions"] = ", ".join(f"{k} {v}" for k, v in m.versions.items())

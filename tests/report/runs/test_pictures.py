@@ -84,6 +84,8 @@ def check_page(run, drawn):
     assert "kinectsim10 (simulated)" in page
     assert "python train.py experiment=quickstart" in page
     assert "  epochs: 4" in page
+    chosen = read_metrics(run).warmup.selected.epoch
+    assert f"source_val, epoch {chosen + 1}<" in page
     assert "<script" not in page
 
 
@@ -91,13 +93,14 @@ def test_curves_are_the_history(run):
     rows, axes = table(run / "history.csv"), run_figures.curves(read_run(run)).axes
     epochs = [int(row["epoch"]) for row in rows]
     loss, accuracy = line(axes[0], "train/loss"), line(axes[1], "source_val/acc")
-    np.testing.assert_array_equal(loss, [epochs, [float(row["train/loss"]) for row in rows]])
+    from_1 = [epoch + 1 for epoch in epochs]
+    np.testing.assert_array_equal(loss, [from_1, [float(row["train/loss"]) for row in rows]])
     np.testing.assert_allclose(accuracy[1], [100 * float(r["source_val/acc"]) for r in rows])
     np.testing.assert_array_equal(line(axes[2], "lr")[1], [float(row["lr"]) for row in rows])
     assert texts(axes[0]) == ["warm-up", "round 0", "round 1"]
-    assert [p.get_x() for p in axes[0].patches] == [-0.5, 6.5]  # warm-up and every other round
+    assert [p.get_x() for p in axes[0].patches] == [0.5, 7.5]  # warm-up and every other round
     teacher = read_metrics(run).warmup.selected.epoch
-    assert line(axes[0], f"teacher: epoch {teacher}")[0].tolist() == [teacher, teacher]
+    assert line(axes[0], f"teacher: epoch {teacher + 1}")[0].tolist() == [teacher + 1] * 2
 
 
 def test_chosen_student_is_marked(run):
@@ -106,7 +109,7 @@ def test_chosen_student_is_marked(run):
     student = StudentChoice(rule="snd", epoch=8, score=0.3, scores=scores, held_out=0, last=last)
     change(run, student=student)
     axes = run_figures.curves(read_run(run)).axes
-    assert line(axes[1], "student: epoch 8")[0].tolist() == [8, 8]
+    assert line(axes[1], "student: epoch 9")[0].tolist() == [9, 9]
 
 
 def test_confusion_is_that_of_the_predictions(run):
