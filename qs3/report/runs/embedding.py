@@ -75,13 +75,20 @@ def draw_embedding(
         places[title] = tsne(np.concatenate(features))
     return run_figures.embedding(
         f"{run.title}, on {run.target}: features of clouds (t-SNE)\n"
-        "colours are true classes, evaluation only",
+        f"{meaning(np.concatenate(labels), domain)}",
         places,
         np.concatenate(labels),
         domain,
         run.classes,
         names,
     )
+
+
+def meaning(labels: np.ndarray, domain: np.ndarray) -> str:
+    """What the colours are: [n] labels with -1 unknown, [n] domain 0 source and 1 target."""
+    if (labels[domain == 1] >= 0).any():
+        return "colours are true classes, evaluation only"
+    return "colours are the source's classes; those of the target are not known"
 
 
 def sample(n: int, most: int, seed: int) -> np.ndarray:

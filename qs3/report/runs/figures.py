@@ -297,7 +297,7 @@ def embedding(
     """Both domains' clouds on a plane: a panel for each of `places` (by its title, [n, 2]).
 
     Args:
-        labels: [n] class; -1 unknown, drawn grey.
+        labels: [n] class; -1 unknown, drawn nearly black: one of the classes is grey.
         domain: [n] 0 source, 1 target.
         names, domains: of the classes and of the two domains.
     """
@@ -312,7 +312,7 @@ def embedding(
         for d in (0, 1):
             for k in range(-1, len(names)):
                 of = (domain == d) & (labels == k)
-                colour = SOFT if k < 0 else picked[k]
+                colour = INK if k < 0 else picked[k]
                 style: dict[str, Any] = {"facecolors": "none"} if d == 0 else {"facecolors": colour}
                 ax.scatter(*xy[of].T, s=15, marker=markers[d], edgecolors=[colour],
                            linewidths=0.7, alpha=0.85, **style)  # fmt: skip
@@ -328,7 +328,7 @@ def embedding(
         for name, colour in zip(names, picked, strict=True)
     ]
     if (labels < 0).any():
-        handles.append(Line2D([], [], linestyle="", marker="s", color=SOFT, label="unknown class"))
+        handles.append(Line2D([], [], linestyle="", marker="s", color=INK, label="unknown class"))
     figure.legend(handles=handles, loc="outside right center", fontsize=8.5, frameon=False)
     figure.suptitle(title, fontsize=12)
     return figure

@@ -52,7 +52,9 @@ def page(
         skipped: why a picture is not there, by name.
         clouds: the page beside it with clouds that can be turned, if there is one.
     """
-    link = f'<p><a href="{escape(clouds)}">Clouds to turn</a>, the most confident errors first.</p>'
+    judged = run.final is not None and run.final.accuracy is not None
+    order = "the most confident errors first" if judged else "in doubt first"
+    link = f'<p><a href="{escape(clouds)}">Clouds to turn</a>, {order}.</p>'
     parts = [
         *(f'<p class="note">Note: {escape(note)}.</p>' for note in run.notes),
         html.table(key_figures(run).items(), head="column"),

@@ -198,7 +198,8 @@ def test_unlabelled_target(run):
     assert {name for name, why in drawn.skipped.items() if why == reason} == {
         "confusion", "calibration",
     }  # fmt: skip
-    assert reason in drawn.page.read_text()
+    assert reason in (page := drawn.page.read_text())
+    assert "Clouds to turn</a>, in doubt first." in page
     axes = run_figures.pseudo_labels(read_run(run)).axes
     assert not any("precision" in str(each.get_label()) for each in axes[3].lines)
     assert len(run_figures.classes(read_run(run)).axes[1].containers) == 1
@@ -319,6 +320,25 @@ def test_embedding_shows_both_domains_before_and_after(run):
     assert sample(5, 9, seed=0).tolist() == [0, 1, 2, 3, 4]
     assert len(set(sample(100, 9, seed=0))) == 9
     assert sample(100, 9, seed=0).tolist() != sample(100, 9, seed=1).tolist()
+
+
+def test_an_embedding_says_whose_classes_it_knows_and_unknown_ones_are_none_of_them():
+    from matplotlib.colors import to_rgb
+
+    from qs3.classes import CLASSES as TEN
+    from qs3.report.runs.embedding import meaning
+
+    domain = np.repeat([0, 1], 10)
+    known, unknown = np.arange(10), np.full(10, -1)
+    said = meaning(np.concatenate([known, unknown]), domain)
+    assert said == "colours are the source's classes; those of the target are not known"
+    assert meaning(np.concatenate([known, known]), domain).startswith("colours are true classes")
+    labels, xy = np.concatenate([known, unknown]), np.zeros((20, 2))
+    figure = run_figures.embedding("t", {"a": xy}, labels, domain, TEN, ("s", "t"))
+    handles = {h.get_label(): to_rgb(h.get_color()) for h in figure.legends[0].legend_handles}
+    plain = np.array(handles["unknown class"])
+    for name in TEN:
+        assert np.abs(plain - handles[name]).max() > 0.25, name
 
 
 def test_training_draws_and_its_hash_does_not_know(toy):
