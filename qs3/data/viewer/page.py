@@ -32,6 +32,7 @@ _USUAL = 50 * 2048  # points of a page, if nobody says how many
 _USUAL_CLOUD = 50_000  # and of one cloud
 _NAMED = 10  # failures
 _NONE, _VIEWS = 255, 255
+_OF_PROVENANCE = ("view", "residual")  # colours that a generated dataset's table knows
 _RESIDUAL_SHARE = 0.9  # of residuals, that the colours tell apart
 _LEVELS = 65535
 _BESIDE_DEG = 20.0  # of the camera: straight from there a scan looks whole
@@ -166,8 +167,10 @@ def page(title: str, parts: Sequence[Part], *, colour: str = "", points: int | N
     shown = [thinned(one, most) for one in whole]
     modes = _modes(shown)
     if colour and colour not in modes:
+        how = "; a dataset has it if it was made with provenance=true"
         raise ConfigError(
             f"colour={colour}: nothing is known of it here; there are {', '.join(modes)}"
+            + how * (colour in _OF_PROVENANCE)
         )
     units = {part.unit for part in parts}
     data = _data(shown, modes, colour) | {

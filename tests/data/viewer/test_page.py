@@ -111,8 +111,10 @@ def test_colours_are_those_that_something_is_known_of():
     assert found["classes"] == ["bed", "chair"]
     assert found["views"] == list(range(8))
     assert len(found["view_colours"]) == 8
-    with pytest.raises(ConfigError, match="colour=view: nothing is known of it here"):
+    with pytest.raises(ConfigError, match=r"colour=view: nothing is known of it.*provenance=true"):
         of(one(), colour="view")
+    with pytest.raises(ConfigError, match=r"colour=class: .*there are height$"):
+        of(one(), colour="class")
 
 
 def test_residuals_have_254_steps_and_a_sign_for_not_known():
