@@ -75,6 +75,9 @@ def test_help_imports_nothing_heavy(tmp_path):
     for group in ("domain", "experiment", "logger", "method", "model", "selftraining", "trainer"):
         for path in (CONF / group).glob("*.yaml"):
             assert re.search(rf"\b{path.stem}\b", result.stdout), path
+    (launchers,) = (line for line in lines if "hydra/launcher=" in line)
+    for path in (CONF / "hydra" / "launcher").glob("*.yaml"):
+        assert re.search(rf"\b{path.stem}\b", launchers), path
 
 
 @pytest.mark.parametrize(
