@@ -118,7 +118,10 @@ def load(
         predictor.classes  # their names, in that order
         found = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
 
-    A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`).
+    A cloud is an [n, 3] array of x y z with any n, any size and place, z up (or `up=`). One that
+    knows sizes and heights, as "dgcnn-rooms" (`predictor.needs_floor`), takes metres and must be
+    told where the floor is: `predictor(clouds, floor=0.0)`, z of the floor, and
+    `predictor.predict_depth(..., camera_height=1.2)`.
 
     Args:
         run: its folder, or the file result.pt of it, which needs nothing beside it; or a folder

@@ -12,7 +12,7 @@ from qs3.data.importers.object_archive import read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.inference import pretrained
 from qs3.inference.depth_list import Shown, direction, find_shown, numbers
-from qs3.inference.floor import Floor, floor_under
+from qs3.inference.floor import Floor, camera_is_missing, floor_is_missing, floor_under
 from qs3.inference.inputs import (
     archive_part,
     archive_units,
@@ -53,21 +53,14 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     classes = predictor.classes
     inputs = source.find(predictor)
     if predictor.needs_floor and inputs.kind == "files" and settings.floor is None:
-        raise ConfigError(
-            "the classifier knows heights above the floor, and nothing in these clouds tells where "
-            "it is: give floor=Z, 0 if objects stand on z = 0, minus the camera's height if the "
-            "camera is the origin"
-        )
+        raise floor_is_missing()
     if settings.sample and settings.sample < len(inputs.units):
         drawn = np.random.default_rng(0).choice(len(inputs.units), settings.sample, replace=False)
         inputs = inputs._replace(units=[inputs.units[i] for i in sorted(drawn)])
     if _camera_is_missing(predictor, settings):
         key = "camera_height=METRES" if settings.depth else "floor=-METRES"
         why = f" ({source.floor.words})" if source.floor else ""
-        raise ConfigError(
-            "the classifier knows heights above the floor, and its target's clouds say nothing "
-            f"about a camera: give its height, {key}{why}"
-        )
+        raise camera_is_missing(key, why)
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
     began, gallery, rows = time.monotonic(), Gallery(classes), []

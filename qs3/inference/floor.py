@@ -52,6 +52,25 @@ def check_camera_height(metres: float) -> float:
     raise ConfigError(f"{said}: if these are {unit}, give {metres / per_metre:g}")
 
 
+def floor_is_missing() -> ConfigError:
+    """For a net that knows heights, of clouds of which nobody said where their floor is."""
+    return ConfigError(
+        f"{_HEIGHTS}, and nothing in these clouds tells where it is: give floor=Z, 0 if objects "
+        "stand on z = 0, minus the camera's height if the camera is the origin"
+    )
+
+
+def camera_is_missing(key: str = "camera_height=METRES", why: str = "") -> ConfigError:
+    """Likewise, of what a camera saw whose height nobody said; `key` would say it."""
+    return ConfigError(
+        f"{_HEIGHTS}, and its target's clouds say nothing about a camera: give its height, "
+        f"{key}{why}"
+    )
+
+
+_HEIGHTS = "the classifier knows heights above the floor"
+
+
 class Floor(NamedTuple):
     """What the objects say.
 

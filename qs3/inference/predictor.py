@@ -1,10 +1,11 @@
 """Using a trained classifier: `qs3.load(run)(clouds)`.
 
     predictor = qs3.load("logs/qs3_s2d/seed0-1a2b3c4d")
-    probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up;
-                                                   # in metres if predictor.in_metres, and with
-                                                   # floor= if predictor.needs_floor
+    probabilities = predictor([cloud_a, cloud_b])  # [n, 3] each, any n, any size and place, z up
     objects = predictor.predict_depth(depth_m, (fx, fy, cx, cy), mask=mask)  # or box=, up=
+    predictor = qs3.load("dgcnn-rooms")  # in_metres, and needs_floor
+    probabilities = predictor([cloud_a, cloud_b], floor=0.0)  # z of the floor, in metres
+    objects = predictor.predict_depth(depth_m, camera, mask=mask, camera_height=1.2)
     predictor = qs3.load(run, prior="rooms")  # or prior={"chair": 4, "bathtub": 0}
 
 A cloud goes the way of the target's clouds in the run: thinned to as many points as these were
@@ -40,7 +41,7 @@ from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
 from qs3.evaluation.prior import POWER, Prior, check_told, read_prior, shares_of
 from qs3.evaluation.trust import COMPARED, Known
-from qs3.inference.floor import check_camera_height
+from qs3.inference.floor import camera_is_missing, check_camera_height, floor_is_missing
 from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.allocator import keep_freed_memory
@@ -157,12 +158,12 @@ class Predictor:
             name: for messages: its file.
             up: the axis that points up in it: x, y, z, -x, -y or -z.
             floor: where the floor is along that axis, in metres: minus the camera's height where
-                the camera is the origin. For nets that see heights (`needs_floor`); None: as in the
-                target that it was trained for.
+                the camera is the origin. Nets that see heights (`needs_floor`) must be told; None:
+                as in their target, if that is a camera's (`camera_height`).
 
         Raises:
             DataError: no points, or NaN or infinite coordinates; says which.
-            ConfigError: `floor` is not a number.
+            ConfigError: `floor` is not a number, or nobody knows it.
         """
         cloud = _array(cloud, name)
         if cloud.ndim != 2 or cloud.shape[1] < 3:
@@ -184,6 +185,8 @@ class Predictor:
 
     def _floor(self, given: float | None) -> float:
         if given is None:
+            if self.needs_floor and self.camera_height is None:
+                raise floor_is_missing()
             return self.result.floor_m or 0.0
         return check_float("floor", given)
 
@@ -221,12 +224,14 @@ class Predictor:
                 in `prepare`.
             names: theirs, for messages; None counts them from 0.
             up: the axis that points up in them.
-            floor: where the floor is in them, as in `prepare`.
+            floor: where the floor is in them, in metres, as in `prepare`: 0 if objects stand on
+                z = 0. A net that sees heights must be told, "dgcnn-rooms" for one.
             batch_size: clouds that the net sees at a time.
 
         Raises:
             DataError: no list of clouds, or not as many names; or names the cloud that is empty or
                 not finite.
+            ConfigError: `floor` is needed, as `prepare` says.
         """
         if clouds is None or isinstance(clouds, str | bytes) or not hasattr(clouds, "__iter__"):
             raise DataError(f"got {clouds!r:.60}; give a list of clouds, [n, 3] arrays")
@@ -267,8 +272,8 @@ class Predictor:
             box: left, top, right, bottom in pixels.
             up: in the camera's frame (x right, y down, z forward), any length; None: by the planes
                 of the picture, and where it shows none, up in the picture.
-            camera_height: above the floor, in metres, for nets that see heights; None: as in the
-                target that it was trained for.
+            camera_height: above the floor, in metres. Nets that see heights must be told; None:
+                as in their target, if that is a camera's.
 
         Returns:
             In the order of the mask's numbers.
@@ -276,8 +281,10 @@ class Predictor:
         Raises:
             DataError: no depth image, a mask of another size, a box beside the picture, or
                 intrinsics that cannot be the picture's.
-            ConfigError: `camera_height` is no height in metres.
+            ConfigError: `camera_height` is no height in metres, or nobody knows it.
         """
+        if camera_height is None and self.needs_floor and self.camera_height is None:
+            raise camera_is_missing()
         floor = None if camera_height is None else -check_camera_height(camera_height)
         depth = np.asarray(depth_m)
         if depth.ndim != 2 or depth.dtype.kind != "f":
@@ -330,7 +337,8 @@ def load(
 
     Args:
         run: its folder, or the file result.pt of it, which needs nothing else; or a folder of
-            `qs3.inference.model_folder`; or a name of `qs3.inference.pretrained`.
+            `qs3.inference.model_folder`; or a name of `qs3.inference.pretrained`. One that knows
+            heights (`needs_floor`) is called with floor= or camera_height=.
         device: where to run it: "cpu", "cuda", "cuda:1".
         packages: where the net of the file may be defined. For a net of your own add your
             package, if you trust it to be built with any arguments.

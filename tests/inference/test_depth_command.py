@@ -134,6 +134,8 @@ def test_the_camera_s_height_is_for_nets_that_know_heights(high_net, frame, caps
     write_result(high_net, replace(predictor.result, floor_m=0.0))
     assert predict(high_net, frame / "none.csv", *words) == 1
     assert "say nothing about a camera: give its height, camera_height=" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="a camera: give its height, camera_height=METRES"):
+        qs3.load(high_net).predict_depth(depth / 1000, SHOT.camera, mask=mask)
     assert predict(high_net, frame / "none.csv", *words, "camera_height=1.25") == 0
     assert table(frame / "none.csv") == table(frame / "first.csv")
     np.testing.assert_array_equal(found[0], found[1])

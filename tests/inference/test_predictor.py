@@ -109,6 +109,14 @@ def test_a_net_of_heights_is_told_where_the_floor_is(metric_run, test_clouds, tm
     assert np.abs(high(test_clouds[:3], floor=1) - high(test_clouds[:3])).max() > 1e-2
     with pytest.raises(ConfigError, match="floor must be a finite number, got nan"):
         high.prepare(test_clouds[0], floor=float("nan"))
+    # One whose target stands on z = 0 knows of no floor in other clouds, and is not asked to guess.
+    standing = replace(high, result=replace(high.result, floor_m=0.0))
+    for ask in (standing, standing.prepare):
+        with pytest.raises(ConfigError, match="nothing in these clouds tells where it is: give fl"):
+            ask(test_clouds[:1] if ask is standing else test_clouds[0])
+    np.testing.assert_array_equal(
+        standing(test_clouds[:3], floor=0.5), high(test_clouds[:3], floor=0.5)
+    )
     write_result(tmp_path / "result.pt", high.result)
     assert read_result(tmp_path).floor_m == -1.25
     write_result(tmp_path / "result.pt", replace(high.result, floor_m=None))
@@ -349,7 +357,7 @@ def test_a_net_that_needs_too_much_memory_is_refused_unbuilt(run, tmp_path):
 
 
 def test_a_wrong_number_of_classes_is_noticed(run, tmp_path):
-    found = qs3.load(changed(run, tmp_path, classes=["a", "b"], held_out=None))
+    found = qs3.load(changed(run, tmp_path, classes=["a", "b"], held_out=None, learnt=None))
     with pytest.raises(DataError, match="3 classes apart, the file names 2"):
         found([np.eye(3)])
 
