@@ -3,7 +3,8 @@
     .xyz .txt   text, a row a point: x y z and perhaps more columns, by blanks, commas or
                 semicolons; # and // begin a comment
     .npy        [n, >= 3], or [m, n, >= 3]: m clouds, unless m and n are a depth camera's height
-                and width, as of one organised cloud: that is refused
+                and width, as of one organised cloud: that is refused, as are depth images
+                (more than 32 columns) and [3, n], x y z as rows
     .npz        the array `points` (or the only one) as in .npy; perhaps `label` or `cls`
     .ply        the vertices, text or binary; faces are passed over
     .pcd        x y z
@@ -27,6 +28,7 @@ import numpy as np
 from qs3.clouds.arrays import npy_header, read_npy, read_npz
 from qs3.clouds.hdf5 import read_hdf5
 from qs3.clouds.pcd import read_pcd
+from qs3.clouds.shape import check_shape
 from qs3.clouds.text import read_text
 from qs3.errors import DataError, MeshError, Qs3Error
 from qs3.utils.memory import check_memory
@@ -158,6 +160,7 @@ def _check_array(path: Path, shape: tuple[int, ...] | None, dtype: np.dtype) -> 
         raise DataError(f"{path}: the array holds {dtype}, not numbers")
     if len(shape) not in (2, 3) or shape[-1] < 3:
         raise DataError(f"{path}: the array has shape {shape}, expected [n, 3] or [m, n, 3]")
+    check_shape(path, shape)
     if len(shape) == 3 and shape[:2] in _PICTURES:
         raise DataError(
             f"{path}: the array has shape {shape}: is it one organised cloud, of a depth camera "

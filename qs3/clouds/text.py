@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from qs3.clouds.shape import check_shape
 from qs3.errors import DataError
 from qs3.utils.memory import check_memory
 from qs3.utils.plural import counted
@@ -25,7 +26,7 @@ def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
     """Coordinates of all rows, float64.
 
     Raises:
-        DataError: no rows of three numbers or more; names the line.
+        DataError: no rows of three numbers or more; names the line. Or a table that is no cloud.
     """
     data = path.read_bytes()
     # Copies and numbers, eight bytes from two letters; and each line is an object.
@@ -46,6 +47,7 @@ def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
         raise DataError(_bad_line(path, lines))
     if table.size == 0:
         raise DataError(f"{path}: there are no points")
+    check_shape(path, table.shape)
     return table[:, :3]
 
 

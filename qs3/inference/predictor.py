@@ -27,7 +27,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.clouds.finite import checked
 from qs3.config.checks import check_float
 from qs3.data.frames.given import Intrinsics, camera_of, check_intrinsics, check_metres
 from qs3.data.frames.images import Pinhole
@@ -42,6 +41,7 @@ from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
 from qs3.evaluation.prior import POWER, Prior, check_told, read_prior, shares_of
 from qs3.evaluation.trust import COMPARED, Known
 from qs3.inference.floor import camera_is_missing, check_camera_height, floor_is_missing
+from qs3.inference.given_cloud import given_cloud
 from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.allocator import keep_freed_memory
@@ -162,13 +162,10 @@ class Predictor:
                 as in their target, if that is a camera's (`camera_height`).
 
         Raises:
-            DataError: no points, or NaN or infinite coordinates; says which.
+            DataError: no points, NaN or infinite coordinates, or no cloud; says which.
             ConfigError: `floor` is not a number, or nobody knows it.
         """
-        cloud = _array(cloud, name)
-        if cloud.ndim != 2 or cloud.shape[1] < 3:
-            raise DataError(f"{name}: the array has shape {cloud.shape}, expected [n, 3]")
-        cloud = checked(cloud[:, :3], name)
+        cloud = given_cloud(cloud, name)
         # By the importer of one's own clouds, so that both ways give the same bits.
         rules = CloudFolder(".", points=self.result.stored_points, up=up)
         stored = rules.turn(check_cloud(rules.thin(cloud, name), rules.points, name), "")
@@ -364,23 +361,6 @@ def load(
     if learnt is None and found.held_out:  # a file of an older version
         learnt = shares_of(found.held_out.labels, len(found.classes))
     return replace(found, prior=read_prior(prior, found.classes, learnt, prior_power))
-
-
-def _array(cloud: Any, name: str) -> np.ndarray:
-    """An array, tensor or nested list of numbers as an array.
-
-    Raises:
-        DataError: something else.
-    """
-    if isinstance(cloud, Tensor):
-        cloud = cloud.detach().cpu()
-    try:
-        found = np.asarray(cloud)
-    except (TypeError, ValueError) as error:  # rows of different lengths
-        raise DataError(f"{name}: no array of numbers [n, 3] ({error})") from error
-    if found.dtype.kind not in "fiu":
-        raise DataError(f"{name}: {type(cloud).__name__} of {found.dtype}, no numbers [n, 3]")
-    return found
 
 
 def device_of(device: Any) -> torch.device:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zipfile
 from pathlib import Path
@@ -257,3 +258,42 @@ def test_one_organised_cloud_is_not_taken_for_as_many_as_it_has_rows(columns, tm
     assert len(parse_clouds(tmp_path / "a.npy").clouds) == 1
     np.save(tmp_path / "a.npy", image[:239])
     assert len(parse_clouds(tmp_path / "a.npy").clouds) == 239
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        (
+            (480, 640),
+            "looks like a depth image, 640 x 480 px: give it as depth= with mask= or box=",
+        ),
+        ((60, 33), "looks like a depth image"),
+        ((9, 480, 640), "looks like a depth image"),
+        ((3, 11), "is it transposed? A point is a row x y z: save array.T"),
+        ((3, 2048), "is it transposed?"),
+        ((6, 2048), "is it transposed?"),
+        ((5, 3, 64), "save array.transpose(0, 2, 1)"),
+    ],
+)
+def test_arrays_that_are_no_clouds_are_refused(shape, said, tmp_path):
+    array = np.random.default_rng(0).random(shape)
+    np.save(tmp_path / "a.npy", array)
+    np.savez(tmp_path / "a.npz", points=array)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["data"] = array
+    files = ["a.npy", "a.npz", "a.h5"]
+    if len(shape) == 2:
+        np.savetxt(tmp_path / "a.txt", array)
+        files.append("a.txt")
+    for name in files:
+        with pytest.raises(DataError, match=re.escape(said)) as told:
+            parse_clouds(tmp_path / name)
+        assert str(told.value).startswith(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (3, 6), (3, 9), (4, 10), (50, 32), (1, 3), (7, 3, 6)])
+def test_few_points_and_many_columns_are_clouds(shape, tmp_path):
+    array = np.random.default_rng(0).random(shape)
+    np.save(tmp_path / "a.npy", array)
+    found = parse_clouds(tmp_path / "a.npy").clouds
+    np.testing.assert_array_equal(np.stack(found), array.reshape(-1, *shape[-2:])[..., :3])

@@ -173,6 +173,12 @@ def test_bad_clouds_are_named(predictor):
         predictor([good, good[:0]])
     with pytest.raises(DataError, match=r"cloud 0.*shape"):
         predictor([good[:, :2]])
+    with pytest.raises(
+        DataError, match=r"cloud 0: the array has shape \(3, 50\): is it transposed"
+    ):
+        predictor([good.T])
+    with pytest.raises(DataError, match=r"cloud 0: .*looks like a depth image, 64 x 48 px"):
+        predictor([np.ones((48, 64))])
     with pytest.raises(ConfigError, match="up"):
         predictor([good], up="w")
     assert predictor([]).shape == (0, 3)

@@ -1,0 +1,42 @@
+"""What somebody gives to `predictor([cloud])`, as an array [n, 3]."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from qs3.clouds.finite import checked
+from qs3.clouds.shape import check_shape
+from qs3.errors import DataError
+
+
+def given_cloud(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
+    """The x y z of an array, tensor or nested list [n, >= 3] of numbers.
+
+    Args:
+        cloud: any n >= 1.
+        name: of it, for messages.
+
+    Raises:
+        DataError: something else, no points, or NaN or infinite coordinates; says which.
+    """
+    found = _array(cloud, name)
+    if found.ndim != 2 or found.shape[1] < 3:
+        raise DataError(f"{name}: the array has shape {found.shape}, expected [n, 3]")
+    check_shape(name, found.shape)
+    return checked(found[:, :3], name)
+
+
+def _array(cloud: Any, name: str) -> np.ndarray:
+    if isinstance(cloud, Tensor):
+        cloud = cloud.detach().cpu()
+    try:
+        found = np.asarray(cloud)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise DataError(f"{name}: no array of numbers [n, 3] ({error})") from error
+    if found.dtype.kind not in "fiu":
+        raise DataError(f"{name}: {type(cloud).__name__} of {found.dtype}, no numbers [n, 3]")
+    return found
