@@ -67,7 +67,7 @@ PREDICT = Command(
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
     ),
     (
-        "qs3 predict input=scans",
+        "qs3 predict scans",
         "qs3 predict ckpt=logs/own_scans/seed0-5f0c2a71 input=scans",
         "qs3 predict ckpt=RUN depth=frame.png mask=mask.png intrinsics=525,525,319.5,239.5",
         "qs3 predict ckpt=RUN depth=a.npy box=210,95,480,430 intrinsics=cam.yaml up=0,-0.97,-0.24",
@@ -105,6 +105,7 @@ guarantees nothing: an object of no known class also gets a class, often with hi
 The page shows the objects: with labels the errors first, the most confident before the others.
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.
 """,
+    bare="input",
     interrupted="nothing was saved",
 )
 

@@ -115,6 +115,17 @@ def test_a_net_of_heights_asks_where_the_floor_of_files_is(high_net, clouds, tmp
     assert "camera counts as" not in capsys.readouterr().out
 
 
+def test_a_bare_word_is_what_to_read(run, clouds, tmp_path, capsys):
+    write(tmp_path / "a.xyz", clouds[0])
+    with_key, bare = tmp_path / "key.csv", tmp_path / "bare.csv"
+    assert predict(run, tmp_path / "a.xyz", with_key, "page=false") == 0
+    assert main(["predict", str(tmp_path / "a.xyz"), f"ckpt={run}", f"out={bare}"]) == 0
+    assert bare.read_text() == with_key.read_text()
+    capsys.readouterr()
+    assert main(["predict", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("qs3 predict PATH: classes and confidences of your")
+
+
 def test_every_format_in_folders(run, clouds, tmp_path):
     folder = tmp_path / "scans"
     for i, suffix in enumerate(ONE):
@@ -245,7 +256,10 @@ def test_up_and_flags(run, clouds, tmp_path):
     ("words", "message"),
     [
         (["predict", "ckpt={run}"], "give input=PATH for clouds, or depth=PATH"),
-        (["predict", "ckpt={run}", "{clouds}"], "is not key=value; keys are ckpt, second, input"),
+        (["predict", "ckpt={run}", "{clouds}", "input={clouds}"], "input= is given twice"),
+        (["predict", "ckpt={run}", "{clouds}", "{clouds}"], "input= is given twice"),
+        (["predict", "ckpt={run}", "{run}/nothing"], "is not there"),
+        (["predict", "ckpt={run}", "--fast"], "'--fast' is not key=value; keys are ckpt, second"),
         (
             ["predict", "ckpt={run}", "input={clouds}", "gravity=z"],
             "unknown key 'gravity'; keys are",

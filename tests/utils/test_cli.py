@@ -93,8 +93,8 @@ def test_mistakes_are_one_line_and_status_1(words, message, capsys):
 
 
 def test_words_are_refused_where_none_belong():
-    with pytest.raises(ConfigError, match="'scans' is not key=value; keys are ckpt, second, input"):
-        QS3.command("predict").parse(["ckpt=x", "scans"])
+    with pytest.raises(ConfigError, match="'scans' is not key=value; keys are ckpt, out, judged"):
+        QS3.command("export").parse(["ckpt=x", "scans"])
 
 
 def test_one_bare_word_may_stand_for_a_key():
