@@ -20,6 +20,7 @@ from qs3.generation.recipes import Cloud
 from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.base import DepthFrame
+from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
     import trimesh
@@ -53,6 +54,15 @@ class Scan:
     frames: tuple[DepthFrame, ...] = ()
     provenance: np.ndarray | None = None
     colliders: int = 0
+
+    def __repr__(self) -> str:
+        """In a line, without its arrays."""
+        seen = f", {counted(self.views, 'view')}" if self.views else ""
+        twin = "" if self.clean is None else ", clean twin"
+        return (
+            f"Scan({self.id!r}, {counted(len(self.points), 'point')} of {self.valid_points} "
+            f"measured{seen}{twin})"
+        )
 
 
 class Scanner:

@@ -35,7 +35,7 @@ _EDGE = 10.0
 """Percentiles: of a cloud's points, where it ends; of these ends, the floor."""
 
 
-_HIGHEST_M = 30.0  # of a camera: centimetres and millimetres lie above it
+_HIGHEST_M = 30.0  # of a camera over a floor: centimetres and millimetres lie above it
 
 
 def check_camera_height(metres: float) -> float:
@@ -48,8 +48,24 @@ def check_camera_height(metres: float) -> float:
         raise ConfigError(f"{said}: if it is not known, leave it out")
     if metres < 0:
         raise ConfigError(f"{said}: it is measured from the floor up; {-metres:g}?")
-    per_metre, unit = (100, "centimetres") if metres < 10 * _HIGHEST_M else (1000, "millimetres")
-    raise ConfigError(f"{said}: if these are {unit}, give {metres / per_metre:g}")
+    raise ConfigError(f"{said}: {_other_unit(metres)}")
+
+
+def check_floor(z: float) -> float:
+    """Where a floor is in clouds, in metres along up; else ConfigError, with what may be meant."""
+    check_float("floor", z)
+    if abs(z) < _HIGHEST_M:
+        return z
+    raise ConfigError(
+        f"floor={z:g} is not where a floor is in metres: {_other_unit(z)}; of clouds in a map's "
+        "coordinates take the floor's height off first"
+    )
+
+
+def _other_unit(length: float) -> str:
+    small = abs(length) < 10 * _HIGHEST_M
+    per_metre, unit = (100, "centimetres") if small else (1000, "millimetres")
+    return f"if these are {unit}, give {length / per_metre:g}"
 
 
 def floor_is_missing() -> ConfigError:

@@ -26,6 +26,8 @@ from qs3.inference.held_out import checked_tensors
 from qs3.inference.model_folder import CONFIG, WEIGHTS, read_folder
 from qs3.runs.checkpoints import load, save
 from qs3.utils.memory import check_memory
+from qs3.utils.plural import counted
+from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
 
 FILE = "result.pt"
@@ -131,6 +133,19 @@ class Result:
     learnt: tuple[_Share, ...] | None = None
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
+
+    def __repr__(self) -> str:
+        """In a line: its weights, as the dataclass has them, fill a terminal."""
+        return f"Result({self.told})"
+
+    @property
+    def told(self) -> str:
+        """Net, classes, points, scale and target, for people."""
+        net = self.model["_target_"].rpartition(".")[2]
+        return printable(
+            f"{net}, {counted(len(self.classes), 'class', 'classes')}: {', '.join(self.classes)}; "
+            f"{counted(self.points, 'point')}, scale {self.scale}, target {self.target}"
+        )
 
 
 def write_result(path: Path, result: Result) -> None:

@@ -27,7 +27,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.config.checks import check_float
 from qs3.data.frames.given import Intrinsics, camera_of, check_intrinsics, check_metres
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import Pointed, point_out
@@ -40,7 +39,12 @@ from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
 from qs3.evaluation.prior import POWER, Prior, check_told, read_prior, shares_of
 from qs3.evaluation.trust import COMPARED, Known
-from qs3.inference.floor import camera_is_missing, check_camera_height, floor_is_missing
+from qs3.inference.floor import (
+    camera_is_missing,
+    check_camera_height,
+    check_floor,
+    floor_is_missing,
+)
 from qs3.inference.given_cloud import given_cloud
 from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
@@ -110,6 +114,12 @@ class Predictor:
     device: torch.device
     prior: Prior | None = None
 
+    def __repr__(self) -> str:
+        """In a line: net, classes, points, scale, target, device."""
+        floor = ", needs floor=" if self.needs_floor and self.camera_height is None else ""
+        prior = ", with a prior" if self.prior else ""
+        return f"Predictor({self.result.told}{floor}{prior}, on {self.device})"
+
     @property
     def classes(self) -> tuple[str, ...]:
         """Names in the order of the probabilities."""
@@ -163,7 +173,7 @@ class Predictor:
 
         Raises:
             DataError: no points, NaN or infinite coordinates, or no cloud; says which.
-            ConfigError: `floor` is not a number, or nobody knows it.
+            ConfigError: `floor` is no length in metres, or nobody knows it.
         """
         cloud = given_cloud(cloud, name)
         # By the importer of one's own clouds, so that both ways give the same bits.
@@ -185,7 +195,7 @@ class Predictor:
             if self.needs_floor and self.camera_height is None:
                 raise floor_is_missing()
             return self.result.floor_m or 0.0
-        return check_float("floor", given)
+        return check_floor(given)
 
     def probabilities(
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH

@@ -11,7 +11,7 @@ from qs3.config.checks import check_choice
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError
 from qs3.evaluation.prior import POWER
-from qs3.inference.floor import Floor, check_camera_height
+from qs3.inference.floor import Floor, check_camera_height, check_floor
 from qs3.inference.inputs import Unit
 from qs3.inference.predictor import Predictor
 
@@ -77,6 +77,8 @@ class Settings:
             raise ConfigError("floor= is for clouds; of depth images give camera_height=METRES")
         if self.camera_height is not None:
             check_camera_height(self.camera_height)
+        if self.floor is not None:
+            check_floor(self.floor)
         if self.input:
             check_choice("up", self.up or "z", UP_AXES)
         if Path(self.out).suffix.lower() not in (".csv", ".json"):

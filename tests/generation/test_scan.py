@@ -31,6 +31,8 @@ def test_from_memory_as_from_a_file(finished, meshes):
         assert (scan.id, scan.views) == (name, rows[index].views)
         assert scan.valid_points == rows[index].valid_points
         assert len(scan.frames) == 2
+        assert f"{scan.valid_points} measured, {scan.views} view" in repr(scan)
+        assert len(repr(scan)) < 120
 
 
 def test_one_mesh_a_list_and_a_scene(tmp_path, monkeypatch):
@@ -39,6 +41,7 @@ def test_one_mesh_a_list_and_a_scene(tmp_path, monkeypatch):
     one = qs3.generate(BOX, *words)
     assert one.points.shape == (64, 3)
     assert (one.id, one.clean, one.views, one.frames) == ("object", None, 0, ())
+    assert repr(one) == f"Scan('object', 64 points of {one.valid_points} measured)"
     listed = qs3.generate([BOX, trimesh.Scene(BOX)], *words)
     assert [scan.id for scan in listed] == ["0", "1"]
     named = qs3.generate({"0": load_mesh(_saved(tmp_path)), "object": BOX}, *words)

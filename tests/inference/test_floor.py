@@ -10,7 +10,8 @@ import pytest
 from qs3.data.importers.arrays import named_arrays
 from qs3.errors import ConfigError
 from qs3.inference import pretrained
-from qs3.inference.floor import CAMERA_M, FEWEST, check_camera_height, floor_under
+from qs3.inference.floor import CAMERA_M, FEWEST, check_camera_height, check_floor, floor_under
+from qs3.inference.settings import Settings
 
 
 def boxes(ends, seed=0):
@@ -52,6 +53,31 @@ def test_a_height_that_is_none_says_what_may_be_meant(given, said):
 
 def test_heights_that_cameras_have_pass():
     assert [check_camera_height(one) for one in (0.05, 1.25, 29.9)] == [0.05, 1.25, 29.9]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            -1180,
+            "floor=-1180 is not where a floor is in metres: if these are millimetres, give -1.",
+        ),
+        (1180, "if these are millimetres, give 1.18"),
+        (-118.0, "if these are centimetres, give -1.18"),
+        (np.inf, "floor must be a finite number, got inf"),
+        (True, "floor must be a number"),
+    ],
+)
+def test_a_floor_in_another_unit_is_refused(given, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        check_floor(given)
+    if not isinstance(given, bool):
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            Settings(input="scans", floor=given)
+
+
+def test_floors_above_and_below_the_origin_pass():
+    assert [check_floor(one) for one in (-29.9, -1.18, 0, 2.5)] == [-29.9, -1.18, 0, 2.5]
 
 
 @pytest.mark.parametrize("camera", [1.1, 1.4, 1.7])

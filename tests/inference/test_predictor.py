@@ -109,6 +109,8 @@ def test_a_net_of_heights_is_told_where_the_floor_is(metric_run, test_clouds, tm
     assert np.abs(high(test_clouds[:3], floor=1) - high(test_clouds[:3])).max() > 1e-2
     with pytest.raises(ConfigError, match="floor must be a finite number, got nan"):
         high.prepare(test_clouds[0], floor=float("nan"))
+    with pytest.raises(ConfigError, match=r"if these are millimetres, give -1\.25"):
+        high(test_clouds[:1], floor=-1250)
     # One whose target stands on z = 0 knows of no floor in other clouds, and is not asked to guess.
     standing = replace(high, result=replace(high.result, floor_m=0.0))
     for ask in (standing, standing.prepare):
@@ -122,6 +124,15 @@ def test_a_net_of_heights_is_told_where_the_floor_is(metric_run, test_clouds, tm
     write_result(tmp_path / "result.pt", replace(high.result, floor_m=None))
     with pytest.raises(DataError, match="floor_m: should be a number for scale above_floor"):
         read_result(tmp_path)
+
+
+def test_what_is_printed_fits_a_line(predictor, metric_run):
+    told = "dgcnn, 3 classes: ball, rod, slab; 32 points, scale unit_ball, target kinectsim10"
+    assert repr(predictor) == f"Predictor({told}, on cpu)"
+    assert repr(predictor.result) == f"Result({told})"
+    high = over_the_floor(qs3.load(metric_run)).result
+    standing = replace(qs3.load(metric_run, prior={"rod": 2}), result=replace(high, floor_m=0.0))
+    assert "scale above_floor, target kinectsim10, needs floor=, with a prior" in repr(standing)
 
 
 def test_any_number_of_points_any_size_any_place(predictor, test_clouds):

@@ -108,7 +108,7 @@ def test_runs_of_other_classes_are_judged_on_what_all_know(archive, logs, tmp_pa
     standing = add_net(tmp_path, 3, scale="above_floor", floor_m=0.0)
     with pytest.raises(ConfigError, match=r"heights above the floor, .* clouds stand at 0"):
         judge([str(standing)], archive)
-    low, high = (judge([str(standing)], archive, floor=floor) for floor in (-1.2, -40.0))
+    low, high = (judge([str(standing)], archive, floor=floor) for floor in (-1.2, -25.0))
     assert low.families[0].figures != high.families[0].figures
     assert "the floor lies at -1.2 m" in text(low)
     with pytest.raises(MissingDataError, match=r"none\.npz"):
