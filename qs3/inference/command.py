@@ -6,12 +6,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from qs3.data.importers.object_archive import read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.inference import pretrained
 from qs3.inference.depth_list import Shown, direction, find_shown, numbers
+from qs3.inference.draw import clouds_in, draw, objects_in
 from qs3.inference.floor import Floor, camera_is_missing, floor_is_missing, floor_under
 from qs3.inference.inputs import (
     archive_part,
@@ -54,9 +53,7 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     inputs = source.find(predictor)
     if predictor.needs_floor and inputs.kind == "files" and settings.floor is None:
         raise floor_is_missing()
-    if settings.sample and settings.sample < len(inputs.units):
-        drawn = np.random.default_rng(0).choice(len(inputs.units), settings.sample, replace=False)
-        inputs = inputs._replace(units=[inputs.units[i] for i in sorted(drawn)])
+    inputs = draw(inputs, settings.sample)
     if _camera_is_missing(predictor, settings):
         key = "camera_height=METRES" if settings.depth else "floor=-METRES"
         why = f" ({source.floor.words})" if source.floor else ""
@@ -175,7 +172,7 @@ def _clouds(settings: Settings) -> Source:
 
     def find(predictor: Predictor) -> Inputs:
         units = cloud_units(files, root, settings.up or "z", predictor.classes)
-        return Inputs(units, others, "files")
+        return Inputs(units, others, "files", sizes=lambda: clouds_in(files))
 
     return Source(find, settings.floor is not None, "floor=Z, if they are in metres,")
 
@@ -214,6 +211,6 @@ def _depth_images(settings: Settings) -> Source:
 
     def find(predictor: Predictor) -> Inputs:
         units = depth_units(shown, predictor.result.gravity, predictor.classes)
-        return Inputs(units, others, "depth images")
+        return Inputs(units, others, "depth images", sizes=lambda: objects_in(shown))
 
     return Source(find, settings.camera_height is not None, "camera_height=METRES")

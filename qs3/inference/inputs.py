@@ -17,16 +17,24 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
-from qs3.clouds.files import SUFFIXES, parse_clouds
+from qs3.clouds.files import SUFFIXES, CloudFile, parse_clouds
 from qs3.clouds.finite import measured
 from qs3.data.frames.cutting import Piece, faults
-from qs3.data.frames.given import check_intrinsics, read_depth, read_intrinsics, read_mask
+from qs3.data.frames.given import (
+    check_intrinsics,
+    off_centre,
+    read_depth,
+    read_intrinsics,
+    read_mask,
+)
 from qs3.data.frames.pointed import RULES, Caution, Pointed, point_out
 from qs3.data.importers.object_archive import ADAPT, JUDGE, Archive
 from qs3.errors import DataError, MissingDataError, Qs3Error
+from qs3.geometry.sampling import surface_sample
 from qs3.inference.depth_list import IMAGES, Shown
 from qs3.inference.table import Row
 from qs3.meshes.io import SUFFIXES as MESHES
+from qs3.meshes.io import is_mesh, load_mesh
 from qs3.utils.text_table import printable
 
 ALL = "all"
@@ -34,6 +42,7 @@ ALL = "all"
 
 Z = "z"
 _KEY = "xyz_tenth_mm.npy"  # of an archive of cut objects
+_ON_MESH = 8192  # points; nets take some of them, as far apart as can be
 
 
 class Sample(NamedTuple):
@@ -45,6 +54,7 @@ class Sample(NamedTuple):
         dropped: points that were left out.
         axis: that points up in it.
         picture: the depth image and the object's pixels in it; None if it comes from none.
+        drawn: whether its points were drawn on the surface of a mesh.
     """
 
     name: str
@@ -56,6 +66,7 @@ class Sample(NamedTuple):
     cautions: tuple[Caution, ...] = ()
     up: str = Z
     picture: tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]] | None = None
+    drawn: bool = False
 
     def row(self, reason: str, probabilities: np.ndarray | None) -> Row:
         """Its row of the table, with the net's prediction or the reason why there is none."""
@@ -69,6 +80,7 @@ class Sample(NamedTuple):
             self.tier,
             self.cautions,
             self.up,
+            drawn=self.drawn,
         )
 
 
@@ -181,8 +193,9 @@ def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterat
     name = _printable(path.relative_to(root).as_posix())
     folders = [known_as(part, classes) for part in path.relative_to(root).parts[:-1]]
     folder = next((cls for cls in reversed(folders) if cls), "")
+    mesh = is_mesh(path)
     try:
-        found = parse_clouds(path)
+        found = CloudFile((_on_surface(path),)) if mesh else parse_clouds(path)
     except DataError as error:
         yield Row(name, None, None, reason_of(error, str(path)), None, folder)
         return
@@ -194,7 +207,13 @@ def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterat
         except DataError as error:
             yield Row(own, 0, len(given), reason_of(error, own), None, label)
             continue
-        yield Sample(own, cloud, dropped, axis, label, up=axis)
+        yield Sample(own, cloud, dropped, axis, label, up=axis, drawn=mesh)
+
+
+def _on_surface(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Points on a mesh: its vertices alone lie at corners, and say little of what is between."""
+    mesh = load_mesh(path)
+    return surface_sample(mesh.vertices, mesh.faces, _ON_MESH, np.random.default_rng(0))
 
 
 def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sample]:
@@ -229,7 +248,7 @@ def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sam
         yield Row(name, None, None, shown.wrong, None, label)
         return
     try:
-        depth, found, bent = _read_picture(shown)
+        depth, found, unsure = _read_picture(shown)
     except Qs3Error as error:
         yield Row(name, None, None, reason_of(error, str(shown.depth)), None, label)
         return
@@ -244,7 +263,7 @@ def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sam
             one.without_depth,
             label=label,
             tier=one.tier,
-            cautions=(*one.cautions, *bent),
+            cautions=(*one.cautions, *unsure),
             up=one.up,
             picture=(depth, one.mask),
         )
@@ -259,8 +278,10 @@ def _read_picture(
     camera = check_intrinsics(given, depth, str(shown.depth))
     mask = None if shown.mask is None else read_mask(shown.mask)
     found = point_out(depth, camera, mask=mask, box=shown.box, up=shown.up, only=shown.only)
-    bent = Caution("lens", "the camera's distortion is known and not corrected")
-    return depth, found, (bent,) * given.bent
+    unsure = [Caution("camera", words)] if (words := off_centre(given, depth)) else []
+    if given.bent:
+        unsure.append(Caution("lens", "the camera's distortion is known and not corrected"))
+    return depth, found, tuple(unsure)
 
 
 def reason_of(error: Qs3Error, name: str) -> str:

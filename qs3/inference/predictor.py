@@ -27,7 +27,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.data.frames.given import Intrinsics, camera_of, check_intrinsics, check_metres
+from qs3.data.frames.given import Intrinsics, camera_of, check_intrinsics, check_metres, off_centre
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import Pointed, point_out
 from qs3.data.importers.base import check_cloud
@@ -301,12 +301,16 @@ class Predictor:
         check_metres(depth, "the depth image")
         if not isinstance(camera, Pinhole):
             camera = camera_of([float(value) for value in np.ravel(camera)], "camera")
-        check_intrinsics(Intrinsics(camera), depth, "the depth image")
+        check_intrinsics(given := Intrinsics(camera), depth, "the depth image")
+        unsure = [words] if (words := off_centre(given, depth)) else []
         found = point_out(depth, camera, mask=mask, box=box, up=up)
-        return [self._of_depth(one, floor) for one in found]
+        return [self._of_depth(one, unsure, floor) for one in found]
 
-    def _of_depth(self, one: Pointed, floor: float | None) -> DepthPrediction:
-        points, cautions = one.piece.points_m, tuple(caution.words for caution in one.cautions)
+    def _of_depth(
+        self, one: Pointed, unsure: Sequence[str], floor: float | None
+    ) -> DepthPrediction:
+        points = one.piece.points_m
+        cautions = (*(caution.words for caution in one.cautions), *unsure)
         if one.why:
             nothing = np.full(len(self.classes), np.nan)
             said = (*cautions, one.why)

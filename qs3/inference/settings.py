@@ -35,7 +35,7 @@ class Settings:
         prior: how common classes are; "": as in training. See `qs3.evaluation.prior`.
         prior_power: how much of that is believed.
         part: of an archive; "" for what one chooses on, "all" for all: see `archive_units`.
-        sample: so many of the files, images or objects, drawn at random; None: all.
+        sample: so many of all clouds or objects, drawn at random; None: all.
         out: .csv or .json.
         page: also write a page beside it.
         batch_size: clouds that the net sees at a time.
@@ -88,13 +88,15 @@ class Settings:
 class Inputs(NamedTuple):
     """What there is to read, how many files are passed over, and what a unit is called.
 
-    `part` says which part of an archive they are, if it has parts.
+    `part` says which part of an archive they are, if it has parts; `sizes` counts the objects of
+    each unit, None: each is one.
     """
 
     units: Sequence[Unit]
     others: int
     kind: str
     part: str = ""
+    sizes: Callable[[], Sequence[int]] | None = None
 
 
 class Source(NamedTuple):

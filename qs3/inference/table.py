@@ -40,6 +40,7 @@ class Row(NamedTuple):
         second: the class that another classifier names; "" if none was asked.
         measures: `qs3.evaluation.trust.COMPARED` of the cloud; () if it failed.
         plain: `probabilities` before a prior; None if it failed.
+        drawn: whether its points were drawn on the surface of a mesh.
     """
 
     file: str
@@ -54,6 +55,7 @@ class Row(NamedTuple):
     second: str = ""
     measures: tuple[float, ...] = ()
     plain: Float[np.ndarray, " c"] | None = None
+    drawn: bool = False
 
 
 def record(row: Row, classes: Sequence[str]) -> dict[str, Any]:

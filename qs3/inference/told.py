@@ -39,6 +39,7 @@ def told(
     if good:
         lines.append("predicted " + ", ".join(f"{name} {n}" for name, n in counts.most_common()))
         lines += _scored(rows, predictor.classes)
+        lines += _no_class(rows, predictor.classes)
         strange = sum(one["out_of_range"] for one in good)
         lines.append(f"{strange} of them out of range (column out_of_range)")
     if cautioned := sum(one["caution"] is not None for one in good):
@@ -49,6 +50,13 @@ def told(
         of = counted(len(holed), "cloud" if files else "object")
         why = "NaN or infinite" if files else "without depth or stray"
         lines.append(f"left out of {of}: {counted(sum(holed), 'point')}, {why} (column dropped)")
+    if drawn := sum(row.drawn for row in rows):
+        lines.append(
+            f"{counted(drawn, 'file is a mesh', 'files are meshes')}: points were drawn on "
+            f"{'its surface' if drawn == 1 else 'their surfaces'}; to see "
+            f"{'it as a sensor does: ' if drawn == 1 else 'them as a sensor does: '}"
+            "python generate.py meshes=FOLDER"
+        )
     if predictor.in_metres and inputs.kind == "files":
         lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
     if predictor.needs_floor and settings.floor is None and settings.camera_height is None:
@@ -83,6 +91,18 @@ def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
     label, times = found.majority
     balanced = f", balanced {found.balanced:.1%}"
     return [f"right {of(found.all)}{balanced}{tiers}; always {label}: {times / found.all.of:.1%}"]
+
+
+def _no_class(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
+    """Labels that no answer can be right for, which scores leave out."""
+    said = (row.label for row in rows if row.probabilities is not None)
+    counts = Counter(label for label in said if label and label not in classes).most_common()
+    if not counts:
+        return []
+    shown = ", ".join(f"{label} {n}" for label, n in counts[:_SHOWN])
+    more = f" and {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
+    of = counted(sum(n for _, n in counts), "label")
+    return [f"{of} left out, no class of the classifier: {shown}{more}"]
 
 
 def _vertical(rows: Sequence[Row]) -> list[str]:

@@ -13,6 +13,7 @@ formats the caller says it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +43,7 @@ _READERS: dict[str, Callable[[bytes, Path, Colliders, FoundFinishes | None], Tri
 _PEAK = {".off": 4, ".stl": 7, ".obj": 10, ".ply": 10, ".dae": 10, ".glb": 12, ".gltf": 12}
 """Peak memory over a file's size, as measured with 330,000 triangles; 3MF knows its own."""
 
+_PLY_HEADER = 1 << 16  # bytes that its header is looked for in
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """Suffixes of the files that `load_mesh` reads, in lower case."""
 
@@ -51,6 +53,18 @@ DECLARE_UP = (".glb", ".gltf", ".dae", ".3mf")
 
 AXES = ("z", "y")
 """Which axis may be up in the other files."""
+
+
+def is_mesh(path: Path) -> bool:
+    """Whether a file has a surface, by its name; of a PLY, which may hold points, by its header."""
+    if path.suffix.lower() != ".ply":
+        return path.suffix.lower() in SUFFIXES
+    try:
+        with open(path, "rb") as file:
+            header = file.read(_PLY_HEADER).partition(b"end_header")[0]
+    except OSError:
+        return False  # said when it is read
+    return re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is not None
 
 
 def load_mesh(

@@ -11,9 +11,11 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 import qs3
 from qs3.data.store import open_pointset
+from qs3.geometry.sampling import surface_sample
 from qs3.inference.model_file import read_result, write_result
 from qs3.runs.predictions import read_predictions
 from tests.commands import main
@@ -146,6 +148,32 @@ def test_every_format_in_folders(run, clouds, tmp_path):
     (record,) = json.loads(single.read_text())["clouds"]
     assert record["file"] == "cloud0.xyz"
     np.testing.assert_allclose(list(record["probabilities"].values()), expected[0], atol=1e-6)
+
+
+def test_of_a_mesh_the_surface_is_seen_and_not_its_corners(run, clouds, tmp_path, capsys):
+    folder, out = tmp_path / "scans", tmp_path / "said.csv"
+    folder.mkdir()
+    box = trimesh.creation.box((0.5, 0.5, 0.75))
+    box.export(folder / "box.ply")
+    write(folder / "cloud.ply", clouds[0])
+    assert predict(run, folder, out, "page=false") == 0
+    rows = table(out)
+    assert [row["points"] for row in rows] == ["8192", "64"]
+    points = surface_sample(box.vertices, box.faces, 8192, np.random.default_rng(0))
+    np.testing.assert_allclose(probabilities(rows[0]), qs3.load(run)([points])[0], atol=1e-6)
+    said = capsys.readouterr().out
+    assert "1 file is a mesh: points were drawn on its surface; to see it as a sensor" in said
+    assert "python generate.py meshes=FOLDER\n" in said
+    box.export(folder / "again.ply")
+    assert predict(run, folder, out, "page=false") == 0
+    assert "2 files are meshes: points were drawn on their surfaces; " in capsys.readouterr().out
+    line = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False)
+    line.export(folder / "line.ply")
+    assert predict(run, folder, out, "page=false") == 1
+    assert [row["file"] for row in table(out) if row["status"] == "failed"] == ["line.ply"]
+    capsys.readouterr()
+    assert predict(run, folder / "cloud.ply", out, "page=false") == 0
+    assert "a mesh" not in capsys.readouterr().out
 
 
 def test_damaged_files_are_listed_and_the_others_go_on(run, clouds, tmp_path, capsys):

@@ -375,6 +375,87 @@ def test_a_sample_is_always_the_same(run, tmp_path):
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
+def test_a_sample_is_of_the_objects_whatever_holds_them(run, frame):
+    _, mask = seen()
+    parts = np.where(mask > 0, 2 * mask - (np.arange(mask.shape[1]) % 2), 0)  # four numbers
+    np.save(frame / "parts.npy", parts)
+    words = (f"intrinsics={CAMERA}", "up=-y", "page=false")
+    one = (f"depth={frame}/depth.png", f"mask={frame}/parts.npy", *words)
+    everything, some, same = frame / "all.csv", frame / "some.csv", frame / "same.csv"
+    assert predict(run, everything, *one) == 0
+    for out in (some, same):
+        assert predict(run, out, *one, "sample=3") == 0
+    rows = table(everything)
+    assert len(rows) == 4
+    assert len(table(some)) == 3
+    assert {row["file"] for row in table(some)} < {row["file"] for row in rows}
+    assert some.read_text() == same.read_text()
+    # Of a list, too: 4 objects, 1, a picture that is not there, and one that is broken.
+    (frame / "broken.png").write_bytes(b"not a picture")
+    (frame / "objects.csv").write_text(
+        "depth,mask,object,box\ndepth.png,parts.npy,,\ndepth.png,mask.png,2,\n"
+        "gone.png,gone.npy,,\nbroken.png,parts.npy,,\n"
+    )
+    listed = (f"depth={frame}/objects.csv", *words)
+    assert predict(run, everything, *listed) == 1
+    names = [row["file"] for row in table(everything)]
+    assert len(names) == 7
+    assert predict(run, some, *listed, "sample=9") == 1
+    drawn = [row["file"] for row in table(some)]
+    assert set(drawn) <= {*names}
+    assert "broken.png" in drawn
+
+
+def test_a_sample_is_of_the_clouds_of_files(run, tmp_path):
+    clouds = np.random.default_rng(0).normal(size=(6, 64, 3))
+    np.save(tmp_path / "a.npy", clouds)
+    np.savez(tmp_path / "b.npz", points=clouds[:2])
+    np.save(tmp_path / "c.npy", clouds[0])
+    (tmp_path / "d.npz").write_bytes(b"damaged")
+    said = tmp_path / "out" / "said.csv"
+    words = (f"input={tmp_path}", "page=false")
+    assert predict(run, said, *words) == 1
+    names = [row["file"] for row in table(said)]
+    assert len(names) == 10
+    predict(run, said, *words, "sample=5")
+    drawn = [row["file"] for row in table(said)]
+    assert len(drawn) == 5
+    assert set(drawn) < {*names}
+    assert predict(run, said, *words, "sample=10") == 1
+    assert [row["file"] for row in table(said)] == names
+
+
+def test_labels_that_are_no_class_of_the_net_are_named(run, frame, capsys):
+    rows = "depth,mask,object,label\n"
+    for label in ("ball", "stool", "stool", "door"):
+        rows += f"depth.png,mask.png,1,{label}\n"
+    (frame / "objects.csv").write_text(rows)
+    words = (f"depth={frame}/objects.csv", f"intrinsics={CAMERA}", "up=-y", "page=false")
+    assert predict(run, frame / "said.csv", *words) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"right [01] of 1 \(", said)
+    assert "3 labels left out, no class of the classifier: stool 2, door 1\n" in said
+    (frame / "objects.csv").write_text(rows.replace("stool", "rod").replace("door", "rod"))
+    assert predict(run, frame / "said.csv", *words) == 0
+    assert "left out, no class" not in capsys.readouterr().out
+
+
+def test_intrinsics_of_another_resolution_are_cautioned(run, frame):
+    fx, fy, cx, cy = SHOT.camera
+    words = (f"depth={frame}/depth.png", f"mask={frame}/mask.png", "up=-y", "page=false")
+    half = (fx / 2, fy / 2, cx / 2, cy / 2)
+    numbers = ",".join(map(str, half))
+    assert predict(run, frame / "said.csv", *words, f"intrinsics={numbers}") == 0
+    depth, mask = seen()
+    height, width = depth.shape
+    told = f"lies 25% of a side from the middle of the picture of {width} x {height} px"
+    assert all(told in row["caution"] for row in table(frame / "said.csv"))
+    found = qs3.load(run).predict_depth(depth / 1000, half, mask=mask, up=(0, -1, 0))
+    assert all("are those of another resolution" in one.cautions[-1] for one in found)
+    assert predict(run, frame / "said.csv", *words, f"intrinsics={CAMERA}") == 0
+    assert not any("principal point" in row["caution"] for row in table(frame / "said.csv"))
+
+
 def test_labels_of_clouds_are_their_files_or_folders(run, tmp_path):
     rng = np.random.default_rng(0)
     (tmp_path / "in" / "Rod" / "new").mkdir(parents=True)

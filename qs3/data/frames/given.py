@@ -46,6 +46,7 @@ _DOCUMENT = re.compile(r"^---\s*$", re.MULTILINE)  # begins one, or ends the one
 _SIZES = (("width", "height"), ("image_width", "image_height"))
 _CENTRES = (("cx", "cy"), ("ppx", "ppy"))
 _BENT = ("D", "d", "coeffs", "distortion_coefficients")
+_OFF = 0.2  # of a side, from the picture's middle
 _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the unit is wrong
 
 
@@ -214,6 +215,24 @@ def check_intrinsics(given: Intrinsics, depth_m: Float[np.ndarray, "h w"], where
                 f"{field:.1f}°; focal lengths are in pixels"
             )
     return camera
+
+
+def off_centre(given: Intrinsics, depth_m: Float[np.ndarray, "h w"]) -> str:
+    """Why the camera may be that of a picture of another size, in words; "" if nothing says so.
+
+    Lenses sit before the middle of their sensors to a few per cent of its sides. Of a crop the
+    centre may lie anywhere, so this is no error. A file that has the picture's size is believed.
+    """
+    height, width = depth_m.shape
+    camera = given.camera
+    off = abs(camera.cx_px - (width - 1) / 2) / width, abs(camera.cy_px - (height - 1) / 2) / height
+    if given.size is not None or max(off) <= _OFF:
+        return ""
+    return (
+        f"the principal point ({camera.cx_px:g}, {camera.cy_px:g}) lies {max(off):.0%} of a side "
+        f"from the middle of the picture of {width} x {height} px: unless that is a crop, the "
+        "intrinsics are those of another resolution"
+    )
 
 
 def check_metres(depth_m: Float[np.ndarray, "h w"], where: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from qs3.data.viewer.page import Part, Shown, captions, page, points_each, thinn
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.inputs import find_files, is_archive, reason_of
-from qs3.meshes.io import DECLARE_UP, load_mesh
+from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.runs.data import is_run, read_run
 from qs3.report.runs.viewed import part_of_run, worst_first
@@ -36,7 +35,6 @@ from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import printable
 
 _KNOWN = tuple(dict.fromkeys((*SUFFIXES, *MESHES)))
-_HEADER = 1 << 16  # bytes of a PLY file that its header is looked for in
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,7 @@ def _files(place: Path, most: int, settings: Settings) -> Part:
     with progress_bar("files", total=len(few)) as advance:
         for i in few:
             name = printable(names[i])
-            if _is_mesh(files[i]):
+            if is_mesh(files[i]):
                 found = _of_mesh(files[i], name, settings, len(few))
             else:
                 found = _of_file(files[i], name, most, settings.up)
@@ -174,18 +172,6 @@ def _files(place: Path, most: int, settings: Settings) -> Part:
     about = f"{len(few)} of {len(files)} files in {place.name}" if place.is_dir() else place.name
     clouds = f", {counted(len(shown), 'cloud')}" if len(shown) != len(few) else ""
     return Part(shown, about + clouds, failed=failed)
-
-
-def _is_mesh(path: Path) -> bool:
-    """Whether a file has a surface; PLY may have one."""
-    if path.suffix.lower() != ".ply":
-        return path.suffix.lower() in MESHES
-    try:
-        with open(path, "rb") as file:
-            header = file.read(_HEADER).partition(b"end_header")[0]
-    except OSError:
-        return False  # said when it is read
-    return re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is not None
 
 
 def _of_mesh(path: Path, name: str, settings: Settings, files: int) -> Iterator[Shown | str]:
