@@ -131,6 +131,14 @@ def point_out(
         sides = _sides(box, image.depth_m.shape)
         found, odd = in_box(image, sides)
         name = "[" + ",".join(f"{value:g}" for value in box) + "]"
+        if not found.any():
+            found[sides[0] : sides[1], sides[2] : sides[3]] = True  # as pointed at
+            if some := int((found & _in_range(image.depth_m, RULES)).sum()):
+                why = (
+                    f"all of its {some} pixels with depth belong to the plane it stands on: a mask "
+                    "tells more than a box"
+                )
+                return [_judged(name, image, found, 0, how, (), why)]
         return [_judged(name, image, found, 0, how, (*unsure, *odd))]
     assert mask is not None
     numbers = checked_mask(np.asarray(mask), "the mask")
@@ -156,11 +164,15 @@ def _judged(
     edge_px: int,
     how: str,
     unsure: Sequence[Caution],
+    why: str = "",
 ) -> Pointed:
-    piece = cut_out(image, mask, RULES, edge_px)
+    """`why`: it cannot be used, whatever is measured there; "" otherwise."""
+    piece = cut_out(image, np.zeros_like(mask) if why else mask, RULES, edge_px)
     if not piece.pixels and edge_px:  # so thin that nothing else is there
         piece = cut_out(image, mask, RULES, 0)
     without, turn = int((mask & (image.depth_m <= 0)).sum()), image.world_from_camera
+    if why:
+        return Pointed(name, piece, mask, without, POOR, (), how, turn, why)
     if not piece.pixels:
         near, far = RULES.near_m, RULES.far_m
         some = (mask & (image.depth_m > 0)).any()
@@ -278,7 +290,7 @@ def in_box(
     inner = np.zeros(image.depth_m.shape, dtype=bool)
     inner[top:bottom, left:right] = True
     depth, points, inside = image.depth_m[at], image.points_m[at], inner[at]
-    measured = (depth >= rules.near_m) & (depth <= rules.far_m)
+    measured = _in_range(depth, rules)
     low = np.zeros_like(inside)
     low[top - at[0].start + 2 * (bottom - top) // 3 :] = True
     height_m = _above_support(points, measured & low & ~inside)
@@ -306,6 +318,10 @@ def in_box(
     near = replace(rules, join_m=min(rules.join_m, _JOIN * size))
     result[at] = body(number, points, near)
     return result, ()
+
+
+def _in_range(depth_m: Float[np.ndarray, "h w"], rules: Rules) -> Bool[np.ndarray, "h w"]:
+    return (depth_m >= rules.near_m) & (depth_m <= rules.far_m)
 
 
 def _fit(piece: Bool[np.ndarray, "h w"], box: Bool[np.ndarray, "h w"]) -> float:
