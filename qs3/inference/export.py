@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.inference.judgement import read_judgement
-from qs3.inference.model_card import card
+from qs3.inference.model_card import card, carried
 from qs3.inference.model_file import build_net, find_result, read_result, values_of
 from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
 from qs3.inference.predictor import Predictor, load
@@ -41,6 +41,7 @@ SUFFIXES = (".onnx", ".pt2")
 INPUT, OUTPUT = "points", "logits"
 _CHECKED = 32  # clouds to compare on
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
+_MOST_CARD = 1 << 20  # bytes
 _PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 
 
@@ -134,7 +135,7 @@ def export_folder(
     """Write a model's folder (see `qs3.inference.model_folder`); text for the terminal.
 
     Args:
-        ckpt: what is exported.
+        ckpt: what is exported; of an exported folder its card is carried over.
         folder: where to.
         judged: what `qs3 report judge runs=CKPT out=FILE.json` wrote, for the card; "" for none.
         half: matrices as numbers of 16 bits: half the size, and other probabilities in the fourth
@@ -156,7 +157,11 @@ def export_folder(
         for name in (CARD, CONFIG):
             if (folder / name).exists():
                 raise ConfigError(f"out={folder}: a {name} of something else is there; refused")
-    text = card(result, read_metrics(file.parent), _command(file.parent), judgement)
+    metrics, beside = read_metrics(file.parent), _card_beside(file)
+    if metrics is None and beside:
+        text = carried(beside, judgement)
+    else:
+        text = card(result, metrics, _command(file.parent), judgement)
     write_folder(folder, values_of(result), text)
     again = read_result(folder)
     same = again.weights.keys() == result.weights.keys() and all(
@@ -170,6 +175,14 @@ def export_folder(
         f"and {CARD}\nqs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it; read "
         f"{CARD}, which is the model's card, before you publish it"
     )
+
+
+def _card_beside(file: Path) -> str:
+    """The card of a folder that was exported before; "" if there is none, or it is no card."""
+    path = file.parent / CARD
+    if file.name != WEIGHTS or not path.is_file() or path.stat().st_size > _MOST_CARD:
+        return ""
+    return path.read_text("utf-8", errors="replace")
 
 
 def _halved(weights: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -68,7 +68,7 @@ def card(
         _accuracy(metrics),
         "",
         *([*_judged(judgement), ""] if judgement else []),
-        "## Limits",
+        _LIMITS,
         "",
         "- Every object gets one of these classes, also one of no class, often with high "
         "confidence.",
@@ -83,6 +83,20 @@ def card(
     return "\n".join(lines)
 
 
+def carried(text: str, judgement: Judgement | None) -> str:
+    """The card of an exported classifier for its copy; a new judgement takes the place of its own.
+
+    What its run knew stands on it and nowhere else.
+    """
+    if judgement is None:
+        return text
+    before, limits, after = text.partition(_LIMITS)
+    before = before.partition(_REAL)[0].rstrip("\n")
+    return "\n".join([before, "", *_judged(judgement), "", limits + after])
+
+
+_REAL = "\nOn real objects of "
+_LIMITS = "## Limits"
 _SCALE = {
     "unit_ball": "Any unit and size: clouds are put into the unit ball.",
     "metres": "Metres: the net knows sizes.",
@@ -130,7 +144,7 @@ def _judged(judgement: Judgement) -> list[str]:
         for name, value in every.recall.items()
     )
     return [
-        f"On real objects of {_file(judgement.data)}{part}:",
+        f"{_REAL.strip()} {_file(judgement.data)}{part}:",
         "",
         "| objects | number | accuracy, 95 % interval | balanced | commonest class % |",
         "|---|---|---|---|---|",

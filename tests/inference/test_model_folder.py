@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 
 import qs3
 from qs3.errors import DataError
+from qs3.inference import pretrained
 from qs3.inference.export import export_folder
-from qs3.inference.model_card import card, wilson
+from qs3.inference.judgement import Interval, Judgement, Tier
+from qs3.inference.model_card import card, carried, wilson
 from qs3.inference.model_file import read_result
 from qs3.inference.tensor_file import read_tensors, write_tensors
 from qs3.runs.metrics import read_metrics
@@ -224,6 +226,35 @@ def test_the_card_says_what_the_run_knows(run, folder, tmp_path):
     other = (tmp_path / "other" / "README.md").read_text()
     assert "%" not in other
     assert "Not recorded" in other
+
+
+def test_a_copy_of_an_exported_folder_keeps_its_card(run, folder, tmp_path):
+    card = (folder / "README.md").read_text()
+    export_folder(folder, tmp_path / "copy", half=True)
+    assert (tmp_path / "copy" / "README.md").read_text() == card
+    export_folder(pretrained.FOLDER / pretrained.ANY_SIZE, tmp_path / "own")
+    ours = (tmp_path / "own" / "README.md").read_text()
+    assert ours == (pretrained.FOLDER / pretrained.ANY_SIZE / "README.md").read_text()
+    assert "Not recorded" not in ours
+    copy = shutil.copytree(folder, tmp_path / "bare")
+    (copy / "README.md").unlink()
+    export_folder(copy, tmp_path / "again")
+    assert "Not recorded" in (tmp_path / "again" / "README.md").read_text()
+
+
+def test_a_new_judgement_takes_the_place_of_the_card_s_own(run, folder):
+    share = Interval(0.5, 0.4, 0.6)
+    tier = Tier("all", 30, share, share, 0.2, {"rod": 0.5}, {"rod": 30})
+    before, old, new = (
+        (folder / "README.md").read_text(),
+        *(Judgement(name, "adapt", (tier,)) for name in ("old.npz", "new.npz")),
+    )
+    once = carried(before, old)
+    assert "On real objects of `old.npz`, part adapt:" in once
+    assert once.replace("old.npz", "new.npz") == carried(once, new) == carried(before, new)
+    assert carried(once, None) == once
+    said = ("## Training", "## Accuracy", "test clouds of kinectsim10", "## Limits", "Written by")
+    assert all(once.count(words) == 1 for words in said)
 
 
 def test_the_command_on_the_card_has_no_folders_of_its_machine(run, tmp_path, monkeypatch):
