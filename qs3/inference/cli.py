@@ -44,7 +44,7 @@ PREDICT = Command(
         Option(
             "second",
             text("RUN"),
-            "another one to ask, or none (default: see below)",
+            "another one to ask, for column second (see below), or none",
             "",
         ),
         Option(
@@ -93,15 +93,15 @@ object is and a number for each object. A list is .csv, .json or .yaml with a ro
 picture: depth, mask, object (number in the mask), box, intrinsics, up, depth_scale, label; files
 are relative to it, and what is empty holds as given here. up=x,y,z is up in the camera's frame (x
 right, y down, z forward), at any length: what an accelerometer at rest reads, in these axes. -y is
-a level camera. Without it up is fitted to the planes of the picture, else the camera counts as
-level; the column up says which. camera_height= is for nets that know heights above the floor.
+a level camera. Without it planes of the picture tell, else the camera counts as level (column up).
 
 prior=rooms takes classes as common as in ScanNet's rooms (42 % chairs), prior=chair:4,bathtub:0 as
 in your place: others count as 1, 0 is never. More answers are right then, fewer of rare classes.
 
 A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status, class,
-confidence, label, points, dropped (NaN or infinite, or pixels without depth), tier (clean, hard, or
-poor, what datasets leave out), caution, up, out_of_range, reason, and a p_<class> for each class.
+confidence, second (the class that another net names, pointnet-speckle without ckpt=: where the two
+differ, look yourself), label, points, dropped (NaN or infinite, or pixels without depth), tier
+(clean, hard, or poor, what datasets leave out), caution, up, out_of_range, reason, p_<class> each.
 
 out_of_range=yes: a cloud unlike all those of training (fewer points than the net samples and than
 training had; spacing, flatness, height or stray points outside what 99.8 % of them had). It

@@ -26,7 +26,7 @@ from qs3.inference.predictor import Predictor, load
 from qs3.inference.settings import Inputs, Settings, Source
 from qs3.inference.table import as_csv, as_json, record
 from qs3.inference.told import agreement, chosen, told
-from qs3.inference.trusted import trust_of
+from qs3.inference.trusted import trust_of, without_labels
 from qs3.inference.units import predict_units
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import make_folder, write_text
@@ -79,7 +79,7 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     lines += taken
     lines += told(rows, records, inputs, predictor, settings, seconds)
     if any(row.probabilities is not None for row in rows):  # else nothing was said to be judged
-        lines.append(verdict)
+        lines.append(without_labels(verdict, rows, classes))
         lines += [agreement(rows, classes)] if second else []
         lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
         lines += [f"what it is worth: {worth}"] * bool(worth)
@@ -91,7 +91,8 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     if settings.page:
         title = f"{Path(settings.input or settings.depth).name}, as {ckpt} sees it"
         where = _floor_m(settings, predictor)
-        html = page(title, rows, gallery, classes, trained_on, worth, taken, verdict, where)
+        shown = without_labels(verdict, rows, classes)
+        html = page(title, rows, gallery, classes, trained_on, worth, taken, shown, where)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
 

@@ -124,8 +124,7 @@ def page(
     for note in notes:
         parts.append(f'<p class="note">{escape(note[:1].upper() + note[1:])}</p>')
     if verdict:
-        without = "Without a look at labels: " if found else ""
-        parts.append(f'<p class="note">{without}{escape(verdict)}</p>')
+        parts.append(f'<p class="note">{escape(verdict)}</p>')
     if trained_on:
         parts.append(f'<p class="soft">The net\'s data: {escape(trained_on)}</p>')
     if worth:

@@ -10,8 +10,15 @@ from qs3.evaluation.estimates_text import trust_in_words
 from qs3.evaluation.trust import FEWEST, Seen, judge
 from qs3.evaluation.trust_file import read_calibration
 from qs3.inference.predictor import Predictor
+from qs3.inference.scores import right
 from qs3.inference.table import Row
 from qs3.runs.metrics import Trust
+
+
+def without_labels(verdict: str, rows: Sequence[Row], classes: Sequence[str]) -> str:
+    """The verdict as it is said beside a count of right ones, if there are labels to count by."""
+    judged = any(right(row, classes) is not None for row in rows)
+    return f"Without a look at labels: {verdict}" if judged else verdict
 
 
 def trust_of(rows: Sequence[Row], predictor: Predictor) -> tuple[Trust | None, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +46,18 @@ def test_a_run_s_own_source_gets_an_estimate_and_noise_a_refusal(run, data_dir, 
     (line,) = (line for line in text.splitlines() if line.startswith(DO_NOT_TRUST))
     assert "shaped unlike the labelled ones" in line
     assert line.split(": ")[1] in page
+
+
+def test_beside_a_count_of_right_ones_it_is_said_to_be_without_labels(run, tmp_path, capsys):
+    clouds = np.random.default_rng(0).normal(size=(40, 64, 3))
+    text, _, page = predict(run, clouds, tmp_path, capsys)
+    assert "look at labels" not in text + page
+    np.savez(tmp_path / "labelled.npz", points=clouds, label=np.arange(40) % 3)
+    words = [f"input={tmp_path / 'labelled.npz'}", f"out={tmp_path / 'said.csv'}"]
+    assert main(["predict", f"ckpt={run}", *words]) == 0
+    (line,) = re.findall("^Without a look at labels: .*$", capsys.readouterr().out, re.MULTILINE)
+    assert "expected to be right" in line
+    assert (tmp_path / "said.html").read_text().count("Without a look at labels: ") == 1
 
 
 def test_few_clouds_and_older_files_say_that_it_cannot_be_told(run, tmp_path, capsys):
