@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+from qs3.evaluation.selection_rules import chosen_in_words
 from qs3.inference.judgement import Judgement, percent
 from qs3.inference.model_file import Result
 from qs3.runs.metrics import RunMetrics
@@ -114,7 +115,8 @@ def _training(metrics: RunMetrics) -> list[str]:
     return [
         f"- Source, with labels: {m.source} ({m.made_of.source})",
         f"- Target, without: {m.target_text} ({m.made_of.target})",
-        f"- Method: {m.method}; self-training: {m.selftraining}; selected by {m.selection.teacher}",
+        f"- Method: {m.method}; self-training: {m.selftraining}; selected by "
+        f"{chosen_in_words(m.selection.teacher)}",
         f"- Settings: {m.hash} (SHA-256 {m.config_sha256}), seed {m.seed}",
         f"- Data (SHA-256): source {m.data.source}, target {m.data.target}",
         f"- Versions: {', '.join(f'{name} {version}' for name, version in m.versions.items())}",
