@@ -17,7 +17,7 @@ from qs3.evaluation.ood import MEASURES, OF_HEIGHTS, OF_METRES
 from qs3.inference.inputs import Sample
 from qs3.inference.scores import DISPUTED, STRANGE, Count, Scores, disputed, kinds, right, scores
 from qs3.inference.table import Row
-from qs3.inference.thumbnails import cloud_png, depth_png
+from qs3.inference.thumbnails import around, cloud_png, depth_png
 from qs3.utils import html
 from qs3.utils.plural import counted
 from qs3.utils.version import VERSION
@@ -67,11 +67,13 @@ class Gallery:
     def add(self, row: Row, sample: Sample) -> None:
         """Offer a row with what it was made of."""
         self._count += 1
-        one = (rank(row, self._classes), -self._count, row, sample)
-        if len(self._kept) < self._most:
-            heapq.heappush(self._kept, one)
-        elif one[:2] > self._kept[0][:2]:
-            heapq.heapreplace(self._kept, one)
+        first = (rank(row, self._classes), -self._count)
+        full = len(self._kept) >= self._most
+        if full and first <= self._kept[0][:2]:
+            return
+        if sample.picture:  # whole frames would be gigabytes
+            sample = sample._replace(picture=around(*sample.picture))
+        (heapq.heapreplace if full else heapq.heappush)(self._kept, (*first, row, sample))
 
     def shown(self) -> list[tuple[Row, Sample]]:
         """Those kept, in the order of the page."""

@@ -35,6 +35,18 @@ def cloud_png(cloud: Float[np.ndarray, "n 3"]) -> bytes:
     return _png(picture)
 
 
+def around(
+    depth_m: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "v u"], Bool[np.ndarray, "v u"]]:
+    """Of both the part that `depth_png` shows, copied: a frame need not be kept for one object."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    side = max(np.ptp(rows), np.ptp(columns)) + 1
+    half = int(side * (0.5 + _MARGIN)) + 4
+    v, u = (int(rows[0] + rows[-1]) // 2, int(columns[0] + columns[-1]) // 2)
+    at = slice(max(v - half, 0), v + half), slice(max(u - half, 0), u + half)
+    return depth_m[at].copy(), mask[at].copy()
+
+
 def depth_png(depth_m: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> bytes:
     """The part of a depth image around an object, near is light, with the outline of its pixels.
 
@@ -42,12 +54,7 @@ def depth_png(depth_m: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) 
         depth_m: 0 where nothing was measured, which is black.
         mask: what was pointed at; at least one pixel.
     """
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    side = max(np.ptp(rows), np.ptp(columns)) + 1
-    half = int(side * (0.5 + _MARGIN)) + 4
-    v, u = (int(rows[0] + rows[-1]) // 2, int(columns[0] + columns[-1]) // 2)
-    at = slice(max(v - half, 0), v + half), slice(max(u - half, 0), u + half)
-    depth, own = depth_m[at], mask[at]
+    depth, own = around(depth_m, mask)
     measured = depth > 0
     grey = np.zeros(depth.shape)
     if measured.any():
