@@ -41,6 +41,7 @@ BOX = "box"
 """The kind of caution of a box that does not part its object from what is around it."""
 
 _MOST_TILT_DEG = 90.0  # of an up that is told: beyond, it is down
+_MOST_OFF_DEG = 20.0  # from an up that is told to that of the planes
 _AROUND = 0.25  # of a box's sides, looked at around it
 _AROUND_PX = 12  # at least
 _BIN_M = 0.02
@@ -223,7 +224,9 @@ def _vertical(
             f"up points {tilt:.0f}° away from up in the picture: is it where gravity pulls? In "
             "camera coordinates y points down, so a level camera has up=0,-1,0"
         )
-        return way, GIVEN, (Caution("up", words),) if tilt > _MOST_TILT_DEG else ()
+        if tilt > _MOST_TILT_DEG:
+            return way, GIVEN, (Caution("up", words),)
+        return way, GIVEN, _against_planes(image, way / length)
     fitted, sure = planes_up_steep(image.depth_m, image.camera)
     if fitted is not None:
         words = (
@@ -233,6 +236,16 @@ def _vertical(
         return fitted, PLANES, () if sure else (Caution("up", words),)
     words = "up is not known: the picture shows no planes, so the camera counts as level"
     return CAMERA_UP, LEVEL, (Caution("up", words),)
+
+
+def _against_planes(image: DepthImage, up: np.ndarray) -> tuple[Caution, ...]:
+    """A caution if the picture has level planes, and they lie otherwise than by the unit `up`."""
+    fitted, sure = planes_up_steep(image.depth_m, image.camera)
+    if fitted is None or not sure or (off := angle_deg(fitted, up)) <= _MOST_OFF_DEG:
+        return ()
+    shown = ",".join(f"{value:.2f}" for value in fitted)
+    words = f"the planes of the picture say up={shown}, {off:.0f}° from what is given"
+    return (Caution("up", words),)
 
 
 def _sides(box: Sequence[Any], shape: tuple[int, ...]) -> tuple[int, int, int, int]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+
+import cv2
 import numpy as np
 import pytest
 
@@ -140,6 +143,22 @@ def test_an_object_without_depth_says_so_and_the_others_go_on():
     none, some = point_out(depth, CAMERA, mask=mask, up=ROOM.up_in_camera)
     assert none.why == f"none of its {(mask == 1).sum()} pixels has depth"
     assert some.why == ""
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 15.0, 30.0, 60.0])
+def test_an_up_that_the_planes_contradict_is_cautioned(off_deg):
+    """Beyond 20 degrees, with what they say; the up that is given is used nevertheless."""
+    depth, mask = seen()
+    turn, _ = cv2.Rodrigues(np.array([0.0, 0.0, np.deg2rad(off_deg)]))
+    given = turn @ ROOM.up_in_camera
+    (one,) = point_out(depth, CAMERA, mask=mask == 1, up=given)
+    assert one.up == "given"
+    said = [caution.words for caution in one.cautions if caution.kind == "up"]
+    assert len(said) == (off_deg > 20)
+    if said:
+        x, y, z, off = map(float, re.search(r"up=(\S+),(\S+),(\S+), (\d+)°", said[0]).groups())
+        assert abs(off - angle_deg(given, ROOM.up_in_camera)) < 3
+        assert angle_deg(np.array([x, y, z]), ROOM.up_in_camera) < 3
 
 
 def test_up_is_fitted_or_level_and_says_which():
