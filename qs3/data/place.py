@@ -9,7 +9,7 @@ from shlex import quote
 
 from qs3.clouds.files import SUFFIXES
 
-_ARCHIVE_KEY = "xyz_tenth_mm.npy"  # of an archive of cut objects (`importers.object_archive`)
+_ARCHIVE_KEY = "xyz_tenth_mm.npy"  # see `importers.object_archive`
 _BEGUN = ("recipe.json", "manifest.csv")  # of a generation; of a store, which meta.yaml completes
 _BESIDE = ".{}.parts", ".{}.importing"  # of an import (`importers.base`)
 _SHOWN = 5  # names of datasets
@@ -39,7 +39,7 @@ def instead_of_dataset(place: Path, meta: str) -> str:
 
 
 def _of_file(path: Path) -> str:
-    if _is_archive(path):
+    if is_archive(path):
         return (
             f"{path} is an archive of objects, not a dataset's folder; it is the domain objects: "
             f"qs3 inspect domain=objects published.file={quote(str(path.absolute()))}"
@@ -52,14 +52,15 @@ def _of_file(path: Path) -> str:
     return text
 
 
-def _is_archive(path: Path) -> bool:
+def is_archive(path: Path) -> bool:
+    """Whether a file is an .npz of objects cut from depth images."""
     if path.suffix.lower() != ".npz":
         return False
     try:
         with zipfile.ZipFile(path) as file:
             return _ARCHIVE_KEY in file.namelist()
     except Exception:  # what zipfile makes of damaged bytes cannot be listed
-        return False
+        return False  # said when it is read as clouds
 
 
 def _holds_clouds(folder: Path) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from qs3.data.importers.object_archive import read_archive
+from qs3.data.place import is_archive
 from qs3.errors import ConfigError, DataError
 from qs3.inference import pretrained
 from qs3.inference.depth_list import Shown, direction, find_shown, numbers
@@ -18,7 +19,6 @@ from qs3.inference.inputs import (
     cloud_units,
     depth_units,
     find_files,
-    is_archive,
 )
 from qs3.inference.model_file import find_result
 from qs3.inference.page import Gallery, page

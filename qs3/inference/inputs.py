@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import os
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -41,7 +40,6 @@ ALL = "all"
 """For `part=`: every object of an archive."""
 
 Z = "z"
-_KEY = "xyz_tenth_mm.npy"  # of an archive of cut objects
 _ON_MESH = 8192  # points; nets take some of them, as far apart as can be
 
 
@@ -142,17 +140,6 @@ def cloud_units(files: Sequence[Path], root: Path, axis: str, classes: Sequence[
     folder below `root` that is called as a class.
     """
     return [functools.partial(_clouds, path, root, axis, classes) for path in files]
-
-
-def is_archive(path: Path) -> bool:
-    """Whether a file is an .npz of objects cut from depth images."""
-    if path.suffix.lower() != ".npz":
-        return False
-    try:
-        with zipfile.ZipFile(path) as file:
-            return _KEY in file.namelist()
-    except Exception:  # what zipfile makes of damaged bytes cannot be listed
-        return False  # said when it is read as clouds
 
 
 def archive_part(archive: Archive, part: str) -> tuple[list[int], str]:

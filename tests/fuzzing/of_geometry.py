@@ -85,7 +85,7 @@ def _cloud(suffix: str, module: str, shape: Any = None) -> Reader:
         for cloud in parse_clouds(path).clouds[:50]:
             checked(measured(cloud, "a")[0], "a")
         if path.suffix == ".npz":
-            from qs3.inference.inputs import is_archive
+            from qs3.data.place import is_archive
 
             is_archive(path)
         if path.suffix == ".npy":

@@ -18,12 +18,13 @@ from qs3.data.importers.folders import UP_AXES
 from qs3.data.importers.object_archive import JUDGE, read_archive
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.viewed import chosen, part_of
+from qs3.data.place import is_archive
 from qs3.data.store import is_finished
 from qs3.data.viewer import MOST_POINTS
 from qs3.data.viewer.page import Part, Shown, captions, page, points_each, thinned
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import surface_sample
-from qs3.inference.inputs import find_files, is_archive, reason_of
+from qs3.inference.inputs import find_files, reason_of
 from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.runs.data import is_run, read_run
