@@ -69,6 +69,14 @@ def check_ranges(settings: object, prefix: str = "", /, **ranges: str) -> None:
             _check_range(f"{prefix}{name}", value, allowed)
 
 
+def check_order(settings: object, prefix: str, /, *names: str) -> None:
+    """Raise ConfigError unless `min_NAME` is not above `max_NAME`, for each name."""
+    for name in names:
+        low, high = getattr(settings, f"min_{name}"), getattr(settings, f"max_{name}")
+        if low > high:
+            raise ConfigError(f"{prefix}min_{name}={low} is above {prefix}max_{name}={high}")
+
+
 def _check_range(key: str, value: Any, allowed: str) -> None:
     if not _inside(value, allowed):
         word = "in " if allowed[0] in "[(" else ""

@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from qs3.config.checks import check_order, check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import look_at, rotation_xyz
 
@@ -48,6 +49,8 @@ class AnchoredViews:
 
     def __post_init__(self) -> None:
         _check(self.count, self.min_distance_m, self.max_distance_m)
+        check_ranges(self, "recipe.views.", max_shift_m=">= 0", max_turn_rad=">= 0")
+        check_order(self, "recipe.views.", "elevation_deg")
 
     def poses(
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
@@ -91,6 +94,8 @@ class HandheldViews:
 
     def __post_init__(self) -> None:
         _check(self.count, self.min_distance_m, self.max_distance_m)
+        check_ranges(self, "recipe.views.", aim_m=">= 0")
+        check_order(self, "recipe.views.", "elevation_deg", "arc_deg")
 
     def poses(
         self, rng: np.random.Generator, box_m: np.ndarray, object_id: str = ""
@@ -121,6 +126,9 @@ class Drift:
 
     shift_m: float = 0.0
     turn_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "tracking.", shift_m=">= 0", turn_rad=">= 0")
 
     def believed(self, poses: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
         """The poses that fusion uses instead of the true ones."""

@@ -28,7 +28,8 @@ from qs3.data.store import (
     open_pointset,
     write_pointset,
 )
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.generation.code_fingerprint import code_fingerprint
 from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
 from qs3.generation.disk import check_folder, disk_errors_explained
 from qs3.generation.made_of import made_of
@@ -117,7 +118,7 @@ def generate(cfg: DictConfig) -> PointSet:
             return pointset
         start = time.perf_counter()
         _warn_of_meshes(cfg, job, items)
-        parts.begin(recipe)
+        parts.begin_by(code_fingerprint(), recipe)
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
             job = replace(job, expected={**software(), **renderer}, check_place=place)
@@ -199,7 +200,18 @@ def _scan_missing(
 def _collect(
     items: list[MeshItem], parts: Parts, passing: dict[str, Outcome], folder: Path
 ) -> list[Outcome]:
-    """One outcome an item; DataError if no object gave a cloud."""
+    """One outcome an item.
+
+    Raises:
+        MissingDataError: meshes could not be read any more; the parts of the others stay.
+        DataError: no object gave a cloud.
+    """
+    if gone := [outcome for outcome in passing.values() if outcome.unavailable]:
+        raise MissingDataError(
+            f"{len(gone)} of {len(items)} meshes cannot be read any more; the first: "
+            f"{gone[0].reason}. Run the same command again when they can: "
+            f"{parts.state(len(items))}"
+        )
     outcomes: list[Outcome] = []
     for item in items:
         outcome = passing.get(item.id) or parts.load(item.id)
@@ -310,6 +322,11 @@ def _report(
     if len(failures) > _FAILURES_SHOWN:
         more = len(failures) - _FAILURES_SHOWN
         log.warning("and %d more: %s says why", more, folder / "manifest.csv")
+    if passing := sum(not outcome.lasting for outcome in failures):
+        log.warning(
+            "%s not by fault of the mesh itself: force=true makes the dataset again",
+            counted(passing, "object failed", "objects failed"),
+        )
     if noted := sum(COLLIDERS in outcome.note for outcome in outcomes):
         hold = counted(noted, "file holds", "files hold")
         log.info("%s colliders, which were left out (manifest.csv); colliders=keep", hold)

@@ -1,19 +1,27 @@
-"""The unfinished dataset of a generation: what became of each object, in a file of its own."""
+"""The unfinished dataset of a generation: what became of each object, in a file of its own.
+
+Beside them lies which code made them (`code.txt`). A finished dataset is not asked for it, as every
+change of the code would make it another: `meta.yaml` has it in the recipe's fingerprint.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 
 from qs3.data.parts import PartFiles
+from qs3.errors import ConfigError
 from qs3.generation.recipes import Cloud
 from qs3.generation.workers import Outcome
+from qs3.utils.files import write_text
+from qs3.utils.memory import read_whole
 
 _PREVIEW = "preview_"
+_CODE = "code.txt"
 
 
 class Parts(PartFiles):
@@ -21,6 +29,32 @@ class Parts(PartFiles):
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, elsewhere="paths.data_dir")
+
+    def begin_by(self, code: str, recipe: Mapping[str, Any]) -> None:
+        """Start, or continue what the same code made with the same recipe.
+
+        Args:
+            code: its `code_fingerprint`.
+            recipe: see `PartFiles.begin`, which raises where it is another.
+
+        Raises:
+            ConfigError: there are parts that other code made, so that one dataset would be of two.
+        """
+        self.begin(recipe)
+        if self.count() and self._code() != code.encode():
+            raise ConfigError(
+                f"{self.folder} was begun with another version of qs3's code, which may make other "
+                f"clouds, and mixing them is refused: finish it with that version "
+                f"({self.count()} objects are done), give another paths.data_dir, or force=true to "
+                "start over"
+            )
+        write_text(self._parts / _CODE, code)
+
+    def _code(self) -> bytes:
+        try:
+            return read_whole(self._parts / _CODE, peak=1)
+        except OSError:
+            return b""  # of versions that did not write it
 
     def save(self, outcome: Outcome) -> None:
         """Write one outcome, atomically."""

@@ -20,7 +20,7 @@ from qs3.classes import CLASSES, class_list
 from qs3.config.checks import check_bool, check_choice, check_float, check_int
 from qs3.config.hydra import build
 from qs3.data.dataset_folder import VIEWS as VIEWS_FOLDER
-from qs3.errors import ConfigError, MeshError
+from qs3.errors import ConfigError, MeshError, MissingDataError
 from qs3.generation.materials import OwnMaterials
 from qs3.generation.provenance import Keep
 from qs3.generation.released.poses import read_poses
@@ -58,6 +58,8 @@ def check(cfg: DictConfig) -> None:
     if cfg.classes is not None:
         if not isinstance(cfg.classes, ListConfig):
             raise ConfigError(f"classes is a list: classes=[{cfg.classes}]")
+        if not cfg.classes:
+            raise ConfigError("classes=[] leaves nothing to scan: name some, classes=[chair,table]")
         known = known_classes(cfg)
         if unknown := sorted(set(cfg.classes) - set(known)):
             raise ConfigError(f"classes: {unknown} are not among the known {', '.join(known)}")
@@ -74,6 +76,8 @@ def check(cfg: DictConfig) -> None:
     check_choice("up", cfg.up, UPS)
     if cfg.paths.data_dir is None or not str(cfg.paths.data_dir).strip():
         raise ConfigError(f"paths.data_dir must name a folder, got {cfg.paths.data_dir!r}")
+    if cfg.meshes is not None and not str(cfg.meshes).strip():
+        raise ConfigError("meshes= must name a folder; leave it out for the embedded catalogue")
     if cfg.meshes is None and cfg.half != "all":
         raise ConfigError("half= divides a folder of meshes: give one with meshes=PATH")
     if cfg.meshes is None and cfg.fill_up:
@@ -170,6 +174,12 @@ def mesh_items(cfg: DictConfig) -> list[MeshItem]:
     else:
         items = _chosen(mesh_folder(cfg).items(), cfg)
     scans = [_scan_of(item, scan) for item in items for scan in range(cfg.scans)]
+    names = Counter(item.id for item in scans)
+    if same := next((item for item in items if names[item.id] > 1), None):
+        raise ConfigError(
+            f"{same.path}: with scans={cfg.scans} another mesh's scan is called {same.id!r}, too: "
+            "rename the file"
+        )
     return _filled_up(scans, cfg) if cfg.fill_up else scans
 
 
@@ -212,8 +222,18 @@ def _filled_up(own: Sequence[MeshItem], cfg: DictConfig) -> list[MeshItem]:
 
 
 def left_alone(cfg: DictConfig) -> list[str]:
-    """Folders of other classes beside the user's; see `MeshFolder.left_alone`."""
-    return [] if cfg.meshes is None else mesh_folder(cfg).left_alone()
+    """Folders of other classes beside the user's; see `MeshFolder.left_alone`.
+
+    Raises:
+        MissingDataError: the user's folder is there no more.
+    """
+    try:
+        return [] if cfg.meshes is None else mesh_folder(cfg).left_alone()
+    except OSError as error:
+        raise MissingDataError(
+            f"{mesh_root(cfg)} cannot be read any more ({error.strerror}): run the same command "
+            "again when it can, what is done is kept"
+        ) from error
 
 
 def mesh_folder(cfg: DictConfig) -> MeshFolder:

@@ -15,7 +15,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from qs3.config.checks import check_ranges
+from qs3.config.checks import check_int, check_order, check_ranges
 from qs3.errors import ConfigError, DataError
 from qs3.generation.camera_poses import AnchoredViews, Drift, Views
 from qs3.generation.depth_errors import DepthErrors
@@ -35,6 +35,7 @@ from qs3.sensors.renderers.base import Renderer
 from qs3.utils.seeding import object_rng
 
 _BARE = Keep()
+_SPARE = 5  # times as many samples as wanted, of which regions may take all but a fifth
 
 
 class TooFewPointsError(DataError):
@@ -108,6 +109,9 @@ class MaskCrop(BoxCrop):
     a little background comes in and a little of the object's rim goes. Of what came in, the
     annotated box, taken generously, keeps what is near the object.
 
+    Pixels are those of the depth image: of a sensor that measures every fourth of the camera's
+    (`step_px=4`), one is four of these.
+
     Attributes:
         min_grow_px, max_grow_px: the mask's outline moves outwards by a whole number of
             pixels drawn from this range.
@@ -119,6 +123,10 @@ class MaskCrop(BoxCrop):
     min_grow_px: int = -1
     max_grow_px: int = 3
     max_shift_px: int = 2
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "crop.", max_shift_px=">= 0")
+        check_order(self, "crop.", "grow_px")
 
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray:
         """[h, w] bool."""
@@ -173,7 +181,8 @@ class Mesh2Point:
     needs_renderer: bool = True
 
     def __post_init__(self) -> None:
-        check_ranges(self, points=">= 1")
+        least = dict.fromkeys(("min_points", "min_view_points", "min_clean_points"), ">= 0")
+        check_ranges(self, "recipe.", points=">= 1", **least)
         if self.poses is not None:
             object.__setattr__(self, "placing", self.poses.placing)
             object.__setattr__(self, "views", self.poses.views(self.views.count))
@@ -261,13 +270,25 @@ class RegionDropout:
     """Holes in a surface sample, to imitate missing parts (the paper's M_d).
 
     The paper gives no parameters; these are ours: one to three balls around random points
-    of the cloud, each emptying a share of the cloud.
+    of the cloud, each emptying a share of the cloud. All together take four fifths at most.
     """
 
     min_regions: int = 1
     max_regions: int = 3
     min_share: float = 0.1
     max_share: float = 0.25
+
+    def __post_init__(self) -> None:
+        prefix = "recipe.dropout."
+        for name in ("min_regions", "max_regions"):
+            check_int(f"{prefix}{name}", getattr(self, name), 0)
+        check_ranges(self, prefix, min_share="[0, 1]", max_share="[0, 1]")
+        check_order(self, prefix, "regions", "share")
+        if (taken := self.max_regions * self.max_share) > 1 - 1 / _SPARE:
+            raise ConfigError(
+                f"{prefix}max_regions={self.max_regions} times {prefix}max_share="
+                f"{self.max_share:g} is {taken:.0%} of a cloud: take at most {1 - 1 / _SPARE:.0%}"
+            )
 
     def apply(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """The points [N, 3] that remain; each region takes its share of the N."""
@@ -290,14 +311,16 @@ class SurfaceSamples:
     points: int = 2048
     needs_renderer: bool = False
 
+    def __post_init__(self) -> None:
+        check_ranges(self, "recipe.", points=">= 1")
+
     def make(
         self, mesh: Mesh, object_id: str, seed: int, renderer: Renderer | None, keep: Keep = _BARE
     ) -> Cloud:
         """See Recipe.make."""
         rng = object_rng(seed, object_id, 0)
         placed = self.placing.place(mesh, rng, object_id)
-        # Regions take up to 75 % of the cloud; five times as many samples leave enough.
-        drawn = self.points if self.dropout is None else 5 * self.points
+        drawn = self.points if self.dropout is None else _SPARE * self.points
         points = surface_sample(placed.vertices, placed.faces, drawn, rng)
         if self.dropout is not None:
             points = self.dropout.apply(points, rng)

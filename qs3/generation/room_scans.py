@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool
 
-from qs3.config.checks import check_float, check_ranges
+from qs3.config.checks import check_float, check_order, check_ranges
 from qs3.data.frames.cutting import cut, inliers, own_pixels
 from qs3.data.frames.images import DepthImage, Pinhole
 from qs3.data.frames.pieces import pieces
@@ -71,12 +71,7 @@ class RoomCamera:
         check_ranges(
             self, "recipe.camera.", clearance_m=">= 0", spread="[0, 1]", side_deg="[0, 180]"
         )
-        for name in ("height_m", "distance_m", "pitch_deg"):
-            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
-            if low > high:
-                raise ConfigError(
-                    f"recipe.camera.min_{name}={low} is above recipe.camera.max_{name}={high}"
-                )
+        check_order(self, "recipe.camera.", "height_m", "distance_m", "pitch_deg")
 
     def pose(
         self,
@@ -165,6 +160,11 @@ class RoomScan:
         if not isinstance(self.mask, MaskCrop):
             raise ConfigError(
                 "a scan of a room is cut by a mask: leave crop out, or take crop=mask"
+            )
+        if not isinstance(self.scene, Room):
+            raise ConfigError(
+                "a scan of a room needs a room, whose floor and furniture its objects stand on: "
+                "leave scene out, or take scene=room"
             )
 
     def make(

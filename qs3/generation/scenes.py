@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from qs3.config.checks import check_ranges
+from qs3.config.checks import check_int, check_order, check_ranges
 from qs3.errors import ConfigError
 from qs3.meshes.mesh import Mesh, merge
 from qs3.sensors.renderers.base import Body
@@ -123,6 +123,14 @@ class Room:
     max_albedo: float = 0.9
     support: Support = field(default_factory=Support)
 
+    def __post_init__(self) -> None:
+        for name in ("max_clutter", "max_occluders", "max_between"):
+            check_int(f"scene.{name}", getattr(self, name), 0)
+        sizes = dict.fromkeys(("clutter_m", "occluder_m", "between_m", "between_height_m"), "> 0")
+        shares = dict.fromkeys(("wall", "min_albedo", "max_albedo"), "[0, 1]")
+        check_ranges(self, "scene.", **sizes, **shares)
+        check_order(self, "scene.", "albedo")
+
     def bodies(
         self,
         mesh: Mesh,
@@ -134,8 +142,9 @@ class Room:
 
         Args:
             mesh: the object, placed.
-            eyes_m: [V, 3] where the cameras will be; nothing is put there, and no wall
-                between them and the object.
+            eyes_m: [V, 3] where the cameras will be; nothing is put there, and the wall is behind
+                the object as seen from their mean: on a long walk around a small object it can
+                stand before one of them (in 0.25 % of the views of objects of 0.3 m).
             rng: of the scene.
             floor_m: height of the floor, on which all else stands; None: the object does, too.
         """

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from qs3.errors import Qs3Error, RenderError
+from qs3.errors import MeshMemoryError, MeshUnavailableError, Qs3Error, RenderError
 from qs3.generation.materials import MixedMaterials
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud, Recipe
@@ -46,6 +46,7 @@ class Outcome:
         reason: why it failed; empty if it did not.
         lasting: whether it would fail again: the object is to blame, and not the machine or a
             defect of ours. Other failures are tried again at the next start.
+        unavailable: its mesh is there no more: the dataset is not finished without it.
         note: what else its manifest row should say of an object that did not fail.
         saved: the worker has saved it (`Job.save`); then `cloud` is None here.
         seconds: that the scan took.
@@ -57,6 +58,7 @@ class Outcome:
     cloud: Cloud | None
     reason: str
     lasting: bool = True
+    unavailable: bool = False
     note: str = ""
     saved: bool = False
     seconds: float = 0.0
@@ -103,7 +105,7 @@ def scan_one(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
 
 
 def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
-    sha256, lasting = "", True
+    sha256, lasting, unavailable = "", True, False
     try:
         mesh = item.load()
         sha256 = mesh.sha256
@@ -111,6 +113,10 @@ def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
         return Outcome(item.id, sha256, replace(cloud, frames=()), "", note=_note(job, mesh))
     except DiskError:
         raise
+    except MeshUnavailableError as error:  # it was there when its content was hashed
+        reason, lasting, unavailable = str(error), False, True
+    except MeshMemoryError as error:
+        reason, lasting = str(error), False
     except Qs3Error as error:
         reason = str(error)
     except MemoryError:
@@ -118,7 +124,7 @@ def _scan(job: Job, renderer: Renderer | None, item: MeshItem) -> Outcome:
     except Exception as error:  # one odd mesh must not stop thousands
         log.exception("%s: unexpected error", item.id)
         reason, lasting = f"unexpected {type(error).__name__}: {error}", False
-    return Outcome(item.id, sha256, None, reason, lasting)
+    return Outcome(item.id, sha256, None, reason, lasting, unavailable)
 
 
 def _note(job: Job, mesh: Mesh) -> str:

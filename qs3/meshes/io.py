@@ -13,6 +13,7 @@ formats the caller says it.
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,10 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from qs3.config.checks import check_choice
-from qs3.errors import MeshError
+from qs3.errors import MeshError, MeshMemoryError, MeshUnavailableError
 from qs3.meshes.finishes import FoundFinishes
 from qs3.meshes.formats import collada, gltf, mtl, obj, off, ply, stl, threemf
-from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts
+from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts, without_strays
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.mesh import Mesh
 from qs3.utils.memory import check_memory
@@ -43,6 +44,8 @@ _READERS: dict[str, Callable[[bytes, Path, Colliders, FoundFinishes | None], Tri
 _PEAK = {".off": 4, ".stl": 7, ".obj": 10, ".ply": 10, ".dae": 10, ".glb": 12, ".gltf": 12}
 """Peak memory over a file's size, as measured with 330,000 triangles; 3MF knows its own."""
 
+# Errors of the system that a file can cause by itself: a decoder's, and a name in it that none has.
+_BY_THE_FILE = (None, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL, errno.ENOTDIR)
 _PLY_HEADER = 1 << 16  # bytes that its header is looked for in
 SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """Suffixes of the files that `load_mesh` reads, in lower case."""
@@ -72,7 +75,8 @@ def load_mesh(
 ) -> Mesh:
     """Read a mesh; polygons are cut into triangles, the parts of a scene are put together.
 
-    Duplicate faces and faces of either orientation are accepted, and vertices are not merged.
+    Duplicate faces and faces of either orientation are accepted, and vertices are not merged;
+    those that no face uses are left out.
 
     Args:
         path: of a file with one of `SUFFIXES`, in any case.
@@ -84,8 +88,10 @@ def load_mesh(
             faces, as `Mesh.finishes`; the other formats say nothing that is read.
 
     Raises:
-        MeshError: the file is missing, empty, truncated, too large or damaged, or holds no
-            surface; the message names the file and the reason.
+        MeshError: the file is empty, truncated or damaged, or holds no surface; the message names
+            the file and the reason.
+        MeshMemoryError: it is too large, for the machine or for `QS3_MEMORY_GB`.
+        MeshUnavailableError: it is not there, or its disk does not give it.
     """
     check_choice("up", up, AXES)
     path, colliders = Path(path), Colliders(skip=not keep_colliders)
@@ -97,15 +103,25 @@ def load_mesh(
                 vertices = vertices @ Y_UP_TO_Z_UP.T
             mesh = _checked(vertices, faces, colliders)
             return mesh if found is None else replace(mesh, finishes=found.of(len(mesh.faces)))
+    except (MeshMemoryError, MeshUnavailableError) as error:
+        raise type(error)(f"{path}: {error}") from error
     except MeshError as error:
         raise MeshError(f"{path}: {error}. Export the mesh again or remove the file") from error
     except MemoryError as error:
-        raise MeshError(f"{path}: is too large for this machine's memory") from error
+        raise MeshMemoryError(f"{path}: is too large for this machine's memory") from error
+    except OSError as error:
+        if error.errno in _BY_THE_FILE:
+            raise _unreadable(path, error) from error
+        raise MeshUnavailableError(f"{path}: cannot be read now ({error.strerror})") from error
     except Exception as error:  # what a reader raises on damaged bytes cannot be listed
-        raise MeshError(
-            f"{path}: cannot be read as {path.suffix[1:].upper()} "
-            f"({type(error).__name__}: {error}). Export the mesh again or remove the file"
-        ) from error
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> MeshError:
+    return MeshError(
+        f"{path}: cannot be read as {path.suffix[1:].upper()} "
+        f"({type(error).__name__}: {error}). Export the mesh again or remove the file"
+    )
 
 
 def _read(path: Path, colliders: Colliders, found: FoundFinishes | None) -> Triangles:
@@ -113,11 +129,11 @@ def _read(path: Path, colliders: Colliders, found: FoundFinishes | None) -> Tria
     if reader is None:
         raise MeshError(f"is not of a known format ({', '.join(SUFFIXES)})")
     if not path.is_file():
-        raise MeshError("is not a file" if path.exists() else "does not exist")
+        raise MeshUnavailableError("is not a file" if path.exists() else "does not exist")
     size = path.stat().st_size
     if size == 0:
         raise MeshError("is empty")
-    check_memory(_PEAK.get(path.suffix.lower(), 1) * size, "", MeshError)
+    check_memory(_PEAK.get(path.suffix.lower(), 1) * size, "", MeshMemoryError)
     return reader(path.read_bytes(), path.parent, colliders, found)
 
 
@@ -135,7 +151,7 @@ def _checked(vertices: np.ndarray, faces: np.ndarray, colliders: Colliders) -> M
     if low < 0 or high >= len(vertices):  # before Mesh makes them 32 bits wide
         bad = low if low < 0 else high
         raise MeshError(f"has a face with vertex {bad}, but there are {len(vertices)} vertices")
-    mesh = Mesh(vertices, faces, colliders.count)
+    mesh = Mesh(*without_strays(vertices, faces), colliders.count)
     if not _has_area(mesh):
         raise MeshError("has no surface: all its faces have zero area")
     return mesh

@@ -10,6 +10,7 @@ import numpy as np
 
 from qs3.errors import MeshError
 from qs3.meshes.finishes import Finishes
+from qs3.meshes.formats.arrays import without_strays
 from qs3.meshes.formats.colliders import Colliders
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ class Mesh:
     ) -> Mesh:
         """The triangles of a mesh of trimesh, or of a scene put together, as they stand.
 
-        z is up here and lengths are metres; nothing is turned or scaled.
+        Vertices that no triangle uses are left out. z is up here and lengths are metres; nothing is
+        turned or scaled.
 
         Args:
             solid: a mesh, whatever its name, or a scene.
@@ -83,7 +85,7 @@ class Mesh:
             return replace(merge(parts), colliders=colliders.count)
         if not isinstance(solid, trimesh.Trimesh):
             raise MeshError(f"expected a trimesh.Trimesh or Scene, got {type(solid).__name__}")
-        return cls(np.array(solid.vertices), np.array(solid.faces))
+        return cls(*without_strays(np.array(solid.vertices), np.array(solid.faces)))
 
     def to_trimesh(self) -> trimesh.Trimesh:
         """The same triangles in the same order, unprocessed, in arrays of their own."""

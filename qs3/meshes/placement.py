@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from qs3.config.checks import check_float, check_ranges
+from qs3.config.checks import check_float, check_order, check_ranges
 from qs3.errors import ConfigError, MeshError
 from qs3.meshes.mesh import Mesh
 
@@ -49,6 +49,11 @@ class RealSize:
     max_side_m: float = 4.0
     fallback_side_m: float = 1.0
 
+    def __post_init__(self) -> None:
+        sides = ("min_side_m", "max_side_m", "fallback_side_m")
+        check_ranges(self, "recipe.placing.", **dict.fromkeys(sides, "> 0"))
+        check_order(self, "recipe.placing.", "side_m")
+
     def keeps(self, side: float) -> bool:
         """Whether this is the largest side of a mesh in metres."""
         return self.min_side_m <= side <= self.max_side_m
@@ -78,6 +83,7 @@ class OnFurniture(RealSize):
     tallest_m: float = 1.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_ranges(self, "recipe.placing.", tallest_m="> 0")
         for cls, chance in self.raised.items():
             check_float(f"recipe.placing.raised.{cls}", chance, "[0, 1]")

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from qs3.generation.command import generate
 from qs3.generation.object_parts import Parts
 from qs3.generation.recipes import Cloud
 from qs3.generation.workers import Outcome
+from qs3.meshes import io
+from qs3.utils.memory import memory_limit
 from tests.generation.generating import ROOT, command, composed, config, fingerprint
 
 
@@ -100,6 +103,67 @@ def test_a_resume_with_another_version_is_refused(finished, meshes, tmp_path):
     (folder / "recipe.json").write_text(json.dumps(recipe))
     with pytest.raises(ConfigError, match=r"versions\.mitsuba"):
         generate(config(tmp_path, meshes, "workers=0"))
+
+
+def test_a_resume_by_other_code_is_refused_and_a_finished_dataset_is_not_asked(
+    meshes, tmp_path, monkeypatch
+):
+    def made(*more):
+        return generate(
+            config(tmp_path, meshes, "workers=0", "limit=2", *more, domain="modelnet10")
+        )
+
+    with monkeypatch.context() as patch:
+        stop = MagicMock(side_effect=KeyboardInterrupt)
+        patch.setattr("qs3.generation.command.write_pointset", stop)
+        with pytest.raises(KeyboardInterrupt):
+            made()
+    code = tmp_path / "modelnet10" / "parts" / "code.txt"
+    own = code.read_text()
+    for other in ("0" * 64, None):
+        code.write_text(other) if other else code.unlink()
+        with pytest.raises(ConfigError, match=r"another version of qs3's code.*9 objects are done"):
+            made()
+    code.write_text(own)
+    first = made()
+    assert not code.parent.exists()
+    with monkeypatch.context() as patch:
+        patch.setattr("qs3.generation.command.code_fingerprint", lambda: "another")
+        assert made().sha256 == first.sha256
+        assert made("force=true").sha256 == first.sha256
+
+
+def test_meshes_that_are_gone_leave_an_unfinished_dataset(meshes, tmp_path, monkeypatch):
+    """As where a network's disk is lost for a while."""
+    mine, away = tmp_path / "meshes", tmp_path / "away"
+    shutil.copytree(meshes, mine)
+    whole = config(tmp_path, mine, "workers=0", "limit=2", domain="modelnet10")
+    save = Parts.save
+
+    def save_and_lose(parts, outcome):
+        save(parts, outcome)
+        if parts.count() == 2:
+            mine.rename(away)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Parts, "save", save_and_lose)
+        with pytest.raises(MissingDataError, match=r"7 of 9 meshes.*ply: does not exist.*2 of 9"):
+            generate(whole)
+    away.rename(mine)
+    assert len(generate(whole).ids) == 9
+
+
+def test_a_limit_of_memory_is_not_the_meshs_fault(meshes, tmp_path, monkeypatch, caplog):
+    caplog.set_level("WARNING")
+    biggest = max(path.stat().st_size for path in meshes.rglob("*.ply"))
+    whole = config(tmp_path, meshes, "workers=0", domain="modelnet10")
+    with monkeypatch.context() as patch:
+        patch.setitem(io._PEAK, ".ply", 1.01 * memory_limit() / biggest)
+        ids = generate(whole).ids
+    assert 0 < len(ids) < 9
+    assert "not by fault of the mesh itself: force=true makes the dataset again" in caplog.text
+    again = config(tmp_path, meshes, "workers=0", "force=true", domain="modelnet10")
+    assert len(generate(again).ids) == 9
 
 
 def test_parts_without_a_recipe_are_not_taken_over(finished, meshes, tmp_path):

@@ -307,3 +307,45 @@ def test_meta_holds_the_whole_config_but_places_and_what_changes_no_byte():
 def test_switches_are_true_or_false(key):
     with pytest.raises(ConfigError, match=f"{key} must be true or false, got 'maybe'"):
         check(config(f"{key}=maybe"))
+
+
+@pytest.mark.parametrize(
+    ("domain", "words", "message"),
+    [
+        ("modelnet10", "recipe.points=0", r"recipe\.points must be >= 1, got 0"),
+        ("specklenet10", "recipe.min_points=oops", r"recipe\.min_points must be >= 0, got 'oops'"),
+        (
+            "modelnet10_dropout",
+            "recipe.dropout.max_share=0.4",
+            r"max_regions=3 times recipe\.dropout\.max_share=0\.4 is 120% of a cloud: .* 80%",
+        ),
+        ("modelnet10_dropout", "recipe.dropout.min_regions=5", r"min_regions=5 is above .*=3"),
+        ("specklenet10", "recipe.views.min_elevation_deg=60", "min_elevation_deg=60 is above"),
+        ("kinectsim10", "+recipe.placing.fallback_side_m=-1", "fallback_side_m must be > 0"),
+        ("kinectsim10", "crop.min_grow_px=5", r"crop\.min_grow_px=5 is above crop\.max_grow_px=3"),
+        ("kinectsim10", "recipe.views.max_arc_deg=10", "min_arc_deg=30.0 is above"),
+        ("kinectsim10", "tracking.shift_m=-1", r"tracking\.shift_m must be >= 0, got -1"),
+        ("kinectsim10", "scene.max_clutter=-2", r"scene\.max_clutter must be a whole number >= 0"),
+        ("kinectsim10", "scene.min_albedo=0.95", r"scene\.min_albedo=0\.95 is above"),
+    ],
+)
+def test_ranges_are_checked_before_anything_is_made(domain, words, message):
+    with pytest.raises(ConfigError, match=message):
+        build(config(f"domain={domain}", words).recipe)
+
+
+@pytest.mark.parametrize(("words", "key"), [("classes=[]", "classes"), ("meshes=", "meshes")])
+def test_nothing_is_not_everything(words, key):
+    with pytest.raises(ConfigError, match=f"^{key}="):
+        check(config("domain=modelnet10", words))
+
+
+def test_scans_that_would_share_a_name_are_refused(tmp_path):
+    folder = tmp_path / "chair" / "train"
+    folder.mkdir(parents=True)
+    for name in ("a", "a~1"):
+        (folder / f"{name}.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    words = ("domain=modelnet10", f"meshes={tmp_path}", "classes=[chair]")
+    assert len(mesh_items(config(*words))) == 2
+    with pytest.raises(ConfigError, match=r"a~1\.off: with scans=2 another mesh's scan is called"):
+        mesh_items(config(*words, "scans=2"))

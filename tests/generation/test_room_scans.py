@@ -111,7 +111,7 @@ def test_a_range_upside_down_names_its_key():
         RoomCamera(min_height_m=2)
 
 
-@pytest.mark.parametrize("word", ["views=3", "crop=box"])
+@pytest.mark.parametrize("word", ["views=3", "crop=box", "scene=alone"])
 def test_what_a_scan_of_a_room_does_not_have_is_refused(word):
     with pytest.raises(ConfigError, match=f"^.*{word.split('=')[0]}"):
         build(composed("domain=roomscan10", word).recipe)

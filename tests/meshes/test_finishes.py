@@ -120,6 +120,17 @@ def test_no_library_outside_of_the_folder_is_opened(name, tmp_path):
             read()
 
 
+def test_a_library_as_windows_names_it_and_with_byte_order_marks(tmp_path):
+    plain = by_side(load_mesh(write_obj(tmp_path), materials=True))
+    mark = b"\xef\xbb\xbf"
+    library = (tmp_path / "plates.mtl").read_bytes()
+    save(tmp_path, "plates.mtl", mark + library)
+    text = obj().replace("mtllib plates.mtl", "  mtllib .\\plates.mtl")
+    path = save(tmp_path, "a.obj", mark + text.encode())
+    assert by_side(load_mesh(path, materials=True)) == plain
+    assert [p.name for p in libraries(path)] == ["plates.mtl"]
+
+
 def test_several_libraries_and_names_with_spaces(tmp_path):
     save(tmp_path, "b c.mtl", "newmtl bright one\nKd 0.5\n")
     path = write_obj(tmp_path, library="b c.mtl")

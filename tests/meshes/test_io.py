@@ -65,3 +65,11 @@ def test_loading_is_silent_and_errors_travel_between_processes(tmp_path, caplog,
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     assert not caplog.records
     assert capfd.readouterr() == ("", "")
+
+
+def test_vertices_that_no_face_uses_change_nothing(tmp_path):
+    """They would make furniture larger, and move where shadow rays begin."""
+    square = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+    plain = load_mesh(save(tmp_path, "plain.obj", square + b"f 1 2 3 4\n"))
+    stray = load_mesh(save(tmp_path, "stray.obj", b"v 500 0 0\n" + square + b"f 2 3 4 5\n"))
+    assert stray.sha256 == plain.sha256

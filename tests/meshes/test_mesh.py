@@ -10,12 +10,21 @@ from tests.meshes.written import PYRAMID, corners
 
 
 def test_there_and_back_nothing_changes():
-    mesh = Mesh([*PYRAMID.vertices, [9, 9, 9]], [*PYRAMID.faces[::-1], [0, 0, 1]])
+    mesh = Mesh(PYRAMID.vertices, [*PYRAMID.faces[::-1], [0, 0, 1]])
+    largest = mesh.vertices.max()
     solid = mesh.to_trimesh()
     assert isinstance(solid, trimesh.Trimesh)
     assert Mesh.from_trimesh(solid).sha256 == mesh.sha256
     solid.apply_scale(2)  # its own arrays
-    assert mesh.vertices.max() == 9
+    assert mesh.vertices.max() == largest
+
+
+def test_vertices_that_no_face_uses_are_left_out():
+    strays = trimesh.Trimesh(
+        [[9, 9, 9], *PYRAMID.vertices, [np.nan, 9, 9]], PYRAMID.faces + 1, process=False
+    )
+    mesh = Mesh.from_trimesh(strays)
+    assert mesh.sha256 == Mesh(PYRAMID.vertices, PYRAMID.faces).sha256
 
 
 def test_a_scene_is_put_together():

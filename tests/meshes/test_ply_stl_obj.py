@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from qs3.meshes.io import load_mesh
-from tests.meshes.written import PYRAMID, export, mixed_ply, refused, save
+from tests.meshes.written import PYRAMID, corners, export, mixed_ply, refused, save
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -100,6 +100,13 @@ def test_obj_indices_of_all_kinds(tmp_path):
 )
 def test_broken_obj_is_refused_with_the_reason(tmp_path, content, reason):
     refused(tmp_path, "a.obj", content, reason)
+
+
+def test_obj_with_a_byte_order_mark_has_all_its_vertices(tmp_path):
+    """Without the first one, the others would be taken for each other."""
+    text = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 9 9 9\nf 1 2 3\n"
+    mesh = load_mesh(save(tmp_path, "a.obj", b"\xef\xbb\xbf" + text))
+    np.testing.assert_array_equal(corners(mesh), [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
 def test_obj_opens_no_other_file(tmp_path):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from qs3.config.checks import check_ranges
+from qs3.config.checks import check_order, check_ranges
 from qs3.errors import ConfigError
 from qs3.generation.camera_poses import direction
 from qs3.geometry.cameras import look_at, rotation_xyz
@@ -54,12 +54,7 @@ class GrowingJitterViews:
     def __post_init__(self) -> None:
         if self.count < 1:
             raise ConfigError(f"views must be at least 1, got {self.count}: set views=N")
-        for name in ("distance_m", "elevation_deg", "azimuth_deg"):
-            low, high = getattr(self, f"min_{name}"), getattr(self, f"max_{name}")
-            if not low <= high:
-                raise ConfigError(
-                    f"recipe.views.min_{name} must not exceed max_{name}, got {low} and {high}"
-                )
+        check_order(self, "recipe.views.", "distance_m", "elevation_deg", "azimuth_deg")
         drift = ("shift_sigma_m", "turn_sigma_rad", "max_shift_m", "max_turn_rad")
         check_ranges(self, "recipe.views.", min_distance_m="> 0", **dict.fromkeys(drift, ">= 0"))
 

@@ -20,7 +20,11 @@ Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def lines(data: bytes) -> Iterator[bytes]:
-    """Lines one by one, whatever ends them: a list of all takes several times the file."""
+    """Lines one by one, whatever ends them: a list of all takes several times the file.
+
+    Without the byte order mark that some editors put before the first.
+    """
+    data = data.removeprefix(b"\xef\xbb\xbf")
     if b"\n" not in data:
         data = data.replace(b"\r", b"\n")
     return iter(io.BytesIO(data))
@@ -84,6 +88,17 @@ def used_part(vertices: np.ndarray, faces: np.ndarray) -> Triangles:
         raise MeshError(f"has a face with a vertex that is not among {len(vertices)}")
     used, flat = np.unique(faces, return_inverse=True)
     return vertices[used].astype(np.float64), flat.reshape(-1, 3)
+
+
+def without_strays(vertices: np.ndarray, faces: np.ndarray) -> Triangles:
+    """The same without vertices that no face uses; the same arrays where there are none.
+
+    Modelling programs leave some behind. Nobody sees them, but furniture is as large, and shadow
+    rays begin as far away, as all vertices say.
+    """
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    return (vertices, faces) if used.all() else used_part(vertices, faces)
 
 
 def joined(parts: Iterable[Triangles]) -> Triangles:

@@ -20,7 +20,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from qs3.errors import MeshError
+from qs3.errors import MeshError, MeshMemoryError
 from qs3.meshes.finishes import FoundFinishes
 from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts
 from qs3.meshes.formats.by_trimesh import MAX_PARTS, assembled, loaded
@@ -76,7 +76,7 @@ def buffer_files(path: Path) -> list[Path]:
     if suffix not in (".gltf", ".glb"):
         return []
     try:
-        check_memory(path.stat().st_size, "", MeshError)
+        check_memory(path.stat().st_size, "", MeshMemoryError)
         with path.open("rb") as file:
             length = _HEADER.unpack(file.read(_HEADER.size))[2] if suffix == ".glb" else -1
             buffers = _parsed(file.read(length)).get("buffers", [])

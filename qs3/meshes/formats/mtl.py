@@ -70,9 +70,11 @@ def _libraries(data: bytes, folder: Path) -> list[Path]:
     root = folder.resolve()
     there: dict[Path, None] = {}
     for line in lines(data):
-        if not line.startswith(b"mtllib"):
+        if b"mtllib" not in line:
             continue
-        words = line.split(b"#", 1)[0].split()[1:]
+        keyword, *words = line.split(b"#", 1)[0].split() or [b""]
+        if keyword != b"mtllib":
+            continue
         # One name that may have spaces, or several without.
         whole = _inside(root, _name(words))
         for path in [whole] if whole else [_inside(root, _name([word])) for word in words]:
@@ -85,13 +87,16 @@ def _libraries(data: bytes, folder: Path) -> list[Path]:
 
 def _inside(root: Path, name: str) -> Path | None:
     """The file of this name, if it is there; MeshError if it lies outside of the folder."""
-    try:
-        path = (root / name).resolve()
-        if not path.is_relative_to(root):
-            raise MeshError(f"refers to {name!r:.200}, which lies outside of its folder")
-        return path if path.is_file() else None
-    except (OSError, RuntimeError):  # a name that no file can have, links in a circle
-        return None
+    for spelt in (name, name.replace("\\", "/")):  # as Windows writes it
+        try:
+            path = (root / spelt).resolve()
+            if not path.is_relative_to(root):
+                raise MeshError(f"refers to {name!r:.200}, which lies outside of its folder")
+            if path.is_file():
+                return path
+        except (OSError, RuntimeError):  # a name that no file can have, links in a circle
+            continue
+    return None
 
 
 def _name(words: Sequence[bytes]) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.errors import MeshError
+from qs3.errors import MeshError, MeshMemoryError
 from qs3.meshes.finishes import FoundFinishes
 from qs3.meshes.formats.arrays import Triangles, check_counts, fan, numbers, whole
 from qs3.meshes.formats.ply_colours import add_colours, colours_of
@@ -179,7 +179,7 @@ def _read_ragged(element: _Element, body: bytes, offset: int) -> tuple[dict, int
     if offset + element.count * least > len(body):
         raise _truncated(element)
     lists = sum(p.count_dtype is not None for p in element.properties)
-    check_memory(120 * element.count * lists + 30 * len(body), "", MeshError)
+    check_memory(120 * element.count * lists + 30 * len(body), "", MeshMemoryError)
     starts: dict[str, list[int]] = {p.name: [] for p in element.properties if p.count_dtype}
     sizes: dict[str, list[int]] = {name: [] for name in starts}
     for _ in range(element.count):

@@ -10,7 +10,7 @@ import zipfile
 from typing import Any
 from xml.parsers import expat
 
-from qs3.errors import MeshError
+from qs3.errors import MeshError, MeshMemoryError
 from qs3.meshes.formats.arrays import Triangles
 from qs3.meshes.formats.by_trimesh import assembled, check_instances, loaded
 from qs3.meshes.formats.colliders import Colliders
@@ -28,7 +28,9 @@ def read(data: bytes, colliders: Colliders) -> Triangles:
     """Read the model; one that is spread over several files of the archive is refused."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            check_memory(_PEAK * sum(info.file_size for info in archive.infolist()), "", MeshError)
+            check_memory(
+                _PEAK * sum(info.file_size for info in archive.infolist()), "", MeshMemoryError
+            )
             names = [n for n in archive.namelist() if "3d/3dmodel.model" in n.lower()]
             if len(names) != 1:
                 raise MeshError("is not a 3MF file: its archive holds no 3D/3dmodel.model")

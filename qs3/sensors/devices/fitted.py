@@ -34,7 +34,8 @@ class FittedDepth(DepthSensor):
         min_depth_m, max_depth_m: depths outside are dropped.
         noise_floor_m, noise_factor, noise_power: of sigma(Z), Z in metres; power 2 for cameras
             that triangulate, 1 for time of flight.
-        correlation_px: standard deviation of the Gaussian that smooths the noise; 0 is white.
+        correlation_px: standard deviation of the Gaussian that smooths the noise, in the camera's
+            pixels, whatever `step_px`; 0 is white.
         inverse_step_per_m: step of 1 / Z in 1/m (Kinect v1: 1 / (8 f b)); 0 is none.
         depth_step_m: step of Z, applied after that; 0 is none.
         bias_m: coefficients of bias(Z), the constant first.
@@ -103,7 +104,8 @@ class FittedDepth(DepthSensor):
             [h, w] float32 depth with NaN; [h, w] uint8 `Reason`.
         """
         noise, holes = (
-            _smooth(clean_m.shape, size, rng) for size in (self.correlation_px, self.hole_px)
+            _smooth(clean_m.shape, size / self.step_px, rng)
+            for size in (self.correlation_px, self.hole_px)
         )
         hit = np.isfinite(clean_m)
         true = np.where(hit, clean_m, 1.0).astype(np.float64)
@@ -152,12 +154,12 @@ def _kernel(size_px: float) -> np.ndarray:
 
 def _smooth(shape: tuple[int, ...], size_px: float, rng: np.random.Generator) -> np.ndarray:
     """[h, w] float32 normal noise of variance 1, correlated over size_px."""
-    white = rng.standard_normal(shape, dtype=np.float32)
-    if size_px <= 0 or white.size == 0:
-        return white
+    if size_px <= 0 or 0 in shape:
+        return rng.standard_normal(shape, dtype=np.float32)
     kernel = _kernel(size_px)
-    border = cv2.BORDER_REFLECT_101
-    smooth = cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel, borderType=border)
+    reach = len(kernel) // 2  # drawn beyond the border, where mirrored noise would be stronger
+    white = rng.standard_normal([side + 2 * reach for side in shape], dtype=np.float32)
+    smooth = cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel)[reach:-reach, reach:-reach]
     return smooth / np.float32((kernel**2).sum())
 
 

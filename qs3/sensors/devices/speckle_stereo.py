@@ -180,7 +180,9 @@ class SpeckleStereo(TriangulatingSensor):
     def _canvas(self, left: Window, right: Window) -> Window:
         """Where both images lie side by side, with room for the matcher's reach around them.
 
-        What is outside the rendered windows is dark, as it is in the render: nothing is there.
+        What is outside the rendered windows is dark. Where the object stands alone, nothing is
+        there; in a room a strip of background right of the object has no match by it, whose
+        disparity is smaller than the object's.
         """
         margin = 2 * self.matcher.reach_px
         first = min(left.left, right.left) - margin

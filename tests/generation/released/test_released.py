@@ -116,7 +116,7 @@ def test_the_views_follow_the_released_law():
 
 
 def test_views_that_contradict_themselves_are_refused():
-    with pytest.raises(ConfigError, match="min_azimuth_deg must not exceed"):
+    with pytest.raises(ConfigError, match="min_azimuth_deg=100 is above"):
         GrowingJitterViews(min_azimuth_deg=100)
     with pytest.raises(ConfigError, match="turn_sigma_rad must be >= 0"):
         GrowingJitterViews(turn_sigma_rad=-1)
