@@ -31,6 +31,7 @@ def card(
     """
     net = result.model["_target_"].rpartition(".")[2]
     title = f"{net}, {metrics.source} to {metrics.target}" if metrics else f"{net}"
+    floor = ", floor=0.0" if result.scale == "above_floor" else ""
     lines = [
         "---",
         "library_name: qs3",
@@ -47,10 +48,10 @@ def card(
         "import qs3",
         "",
         'predictor = qs3.load("this folder")',
-        "probabilities = predictor([cloud])  # [n, 3], any n, z up" + _frame(result),
+        f"probabilities = predictor([cloud]{floor})  # [n, 3], any n, z up" + _frame(result),
         "```",
         "",
-        "Or: `qs3 predict ckpt=FOLDER input=SCANS`.",
+        f"Or: `qs3 predict ckpt=FOLDER input=SCANS{floor.replace(',', '')}`.",
         "",
         "## Input",
         "",
@@ -107,7 +108,7 @@ _GRAVITY = {"z": "z up.", "none": "In the frame of the depth camera: x right, y 
 
 
 def _frame(result: Result) -> str:
-    return {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor=Z"}[result.scale]
+    return {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor: its z"}[result.scale]
 
 
 def _training(metrics: RunMetrics) -> list[str]:

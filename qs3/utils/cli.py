@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import functools
 import os
+import re
 import shlex
 import signal
 import sys
@@ -382,6 +383,11 @@ def _page(
         begin = (
             f"  {left}".ljust(column) if len(left) + 4 <= column else f"  {left}\n{' ' * column}"
         )
-        wrapped = textwrap.wrap(right, _WIDTH - column)
+        # A long list without spaces is broken behind its commas, and nowhere else.
+        spaced = re.sub(r"\S{40,}", lambda word: word[0].replace(",", ",\0 "), right)
+        wrapped = [
+            line.replace("\0 ", "").rstrip("\0")
+            for line in textwrap.wrap(spaced, _WIDTH - column)
+        ]
         lines.append(begin + f"\n{' ' * column}".join(wrapped))
     return "\n".join([*lines, *(["", about.strip("\n")] if about else [])])

@@ -142,6 +142,16 @@ def test_help_shows_defaults_and_choices():
     assert values.items() >= vars(Extraction()).items()
 
 
+def test_a_long_list_is_broken_behind_its_commas():
+    keys = [f"sensor.infrared.number_{i}" for i in range(9)]
+    option = Option("keys", text("KEY,..."), "of 1,000 that are tuned", ",".join(keys))
+    page = Command("qs3 x", "is", print, (option,), ("qs3 x",)).help()
+    assert all(key in page for key in keys)
+    assert "of 1,000 that" in page
+    assert "\0" not in page
+    assert max(map(len, page.splitlines())) <= 100
+
+
 def test_every_example_is_understood():
     """Continued lines and those of other commands aside."""
     tried = 0
