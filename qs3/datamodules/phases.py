@@ -176,6 +176,13 @@ class SelfTrainingConfig:
                 f"(theta={self.theta}, epsilon={self.epsilon}, rounds={self.rounds})"
             )
 
+    @property
+    def more_labels(self) -> str:
+        """What would select more, as messages advise it."""
+        if self.share is not None:
+            return "raise selftraining.share"
+        return getattr(self.selector, "more_labels", None) or "lower selftraining.theta"
+
     def theta_of(self, round_: int, confidence: Float[np.ndarray, " n"] | None = None) -> float:
         """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly.
 

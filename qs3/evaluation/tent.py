@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.evaluation.metrics import adapt_norms, even_batches
-from qs3.models.norms import norms_for, running_norms, use_domain
+from qs3.models.norms import check_has_norms, norms_for, running_norms, use_domain
 
 RATE = 1e-3
 """Adam's learning rate, as in the paper; without weight decay."""
@@ -37,6 +37,9 @@ def minimise_entropy(
     In batches as `adapt_norms` has them, each a step on its mean entropy, normalised by its own
     statistics. There the paper predicts, too; here the target's test clouds come later, one by one
     if need be, so statistics of all training clouds are left behind. Other weights stay.
+
+    Raises:
+        ConfigError: the net has no batch norm.
     """
     parameters, modes = list(net.parameters()), {m: m.training for m in net.modules()}
     wanted = [p.requires_grad for p in parameters]
@@ -44,6 +47,7 @@ def minimise_entropy(
     net.eval()  # no dropout
     try:
         with use_domain(net, norms_for(net, "target")), torch.enable_grad():
+            check_has_norms(net, "tent")
             norms = running_norms(net)
             for norm in norms:
                 norm.training = True

@@ -108,7 +108,9 @@ _GRAVITY = {"z": "z up.", "none": "In the frame of the depth camera: x right, y 
 
 
 def _frame(result: Result) -> str:
-    return {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor: its z"}[result.scale]
+    return {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor: its z"}[
+        result.scale
+    ]
 
 
 def _training(metrics: RunMetrics) -> list[str]:

@@ -227,9 +227,11 @@ def adapt_batchnorm(net: nn.Module, batches: Iterable[Tensor]) -> list[nn.Module
         The adapted norms.
 
     Raises:
-        ConfigError: a norm takes no statistics in a pass, so there are none to store.
+        ConfigError: there is no norm, or one takes no statistics in a pass, so that there are none
+            to store.
         DataError: there are no batches.
     """
+    check_has_norms(net, "adabn")
     norms = running_norms(net)
     modes = {module: module.training for module in net.modules()}
     momenta = [norm.momentum for norm in norms]
@@ -244,6 +246,19 @@ def adapt_batchnorm(net: nn.Module, batches: Iterable[Tensor]) -> list[nn.Module
         for module, mode in modes.items():
             module.training = mode
     return list(norms)
+
+
+def check_has_norms(net: nn.Module, what: str) -> None:
+    """Refuse a net without batch norm, of which there is nothing to adapt.
+
+    Raises:
+        ConfigError: `evaluation.norms` is `what`, and the net has no running statistics.
+    """
+    if not running_norms(net):
+        raise ConfigError(
+            f"evaluation.norms={what} adapts batch norms, and this net has none: set "
+            "evaluation.norms=trained"
+        )
 
 
 def running_norms(net: nn.Module) -> list[_BatchNorm]:

@@ -124,7 +124,7 @@ def _save(at: str, table: Table, found: Sequence[Any], base: str = "") -> None:
     from qs3.utils.files import write_text
 
     write_text(f"{at}.md", text(found, base, markdown=True, table=table))
-    write_text(f"{at}.csv", csv_text(found, table))
+    write_text(f"{at}.csv", csv_text(found))
     print(text(found, base, table=table))
     print(f"saved {at}.md, .csv")
 

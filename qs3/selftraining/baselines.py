@@ -40,6 +40,16 @@ class Random:
         """Whether the other selector has thresholds of its own."""
         return bool(getattr(self.of, "own_thresholds", False))
 
+    @property
+    def more_labels(self) -> str | None:
+        """What would make the other selector keep more; None: a lower theta."""
+        return getattr(self.of, "more_labels", None)
+
+    @property
+    def needs_features(self) -> bool:
+        """Whether the other selector looks at features."""
+        return bool(getattr(self.of, "needs_features", False))
+
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; figures are those of the other selector."""
         given = self.of.select(teacher, theta, round_)

@@ -112,15 +112,21 @@ class SelfTraining(Callback):
         phases: of the run.
         scheme: settings of the rounds.
         classes: names in label order.
+        given: whether the first teacher was given, so that no warm-up makes it better.
 
     Attributes:
         records: what `metrics.json` says about each round so far.
     """
 
     def __init__(
-        self, folder: Path, phases: Phases, scheme: SelfTrainingConfig, classes: Sequence[str]
+        self,
+        folder: Path,
+        phases: Phases,
+        scheme: SelfTrainingConfig,
+        classes: Sequence[str],
+        given: bool = False,
     ) -> None:
-        self.folder, self.phases, self.scheme = folder, phases, scheme
+        self.folder, self.phases, self.scheme, self._given = folder, phases, scheme, given
         self.classes = tuple(classes)
         self.records: list[RoundRecord] = []
         self._previous: Int[Tensor, " n"] | None = None  # [n] predicted labels of the round before
@@ -169,7 +175,14 @@ class SelfTraining(Callback):
                 selection.selected,
                 self.classes,
             )
-        missing = check_selection(selection, self.classes, round_, self.scheme.missing_class)
+        missing = check_selection(
+            selection,
+            self.classes,
+            round_,
+            self.scheme.missing_class,
+            more=self.scheme.more_labels,
+            trainable=not self._given,
+        )
 
         labels = torch.from_numpy(said.predicted)
         index = torch.from_numpy(selection.selected.nonzero()[0])

@@ -65,6 +65,7 @@ class Cbst:
     """
 
     own_thresholds: ClassVar[bool] = True
+    more_labels: ClassVar[str] = f"raise {_KEY}.portion"
 
     portion: float = 0.2
     step: float = 0.05

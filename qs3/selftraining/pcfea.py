@@ -53,11 +53,12 @@ class Pcfea(Method):
         plain: e_0 / E, rounded up to whole epochs: 0.1.
         every: epochs between two pools, of E: 0.05.
         selector: which clouds of the target are in the pool: None for the growing share, or a
-            selector of `selftraining`, such as QBST.
+            selector of `selftraining`, such as QBST; pools count as its rounds.
         theta: of that selector.
         pool: "share", as above, or "threshold", the released code's default: of the source what the
             net names rightly with a probability above t, of the target what it names with one above
-            1 - t; t is `every` in the first pool and grows by `every` with each.
+            1 - t; t is `every` in the first pool and grows evenly over
+            the epochs, by 1 - e_0 / E in all.
         rank: what makes a source cloud probable: "label", the probability of its label, or "most",
             as in the released code, that of the class which the net names, right or wrong.
         momentum: m; pools are made by a running mean of the net, which takes 1 - m of its weights
@@ -95,6 +96,11 @@ class Pcfea(Method):
         self.theta = check_float("method.theta", theta, "[0, 1)")
         if selector is not None and not hasattr(selector, "select"):
             raise ConfigError("method.selector must be null or a selector, as in selftraining=qbst")
+        if getattr(selector, "needs_features", False):
+            raise ConfigError(
+                "method.selector chooses by features, which pools do not give it; take one such as "
+                "QBST's or SPST's"
+            )
         self.selector = selector
         self.styled = False  # whether there is a pool
         self.teacher: Any = None  # the running mean, if there is one
@@ -154,10 +160,12 @@ class Pcfea(Method):
         """A new pool, if one is due."""
         first = math.ceil(self.plain * epochs)
         self.styled = epoch >= first
-        if not self.styled or (epoch - first) % max(1, round(self.every * epochs)):
+        between = max(1, round(self.every * epochs))
+        if not self.styled or (epoch - first) % between:
             return
         if epoch == first:
-            begin_target_norms(net)
+            for one in (net, self.teacher) if self.teacher is not None else (net,):
+                begin_target_norms(one)
         size, classes = data.eval_batch_size, len(self.mean)
         labels, asked = data.labelled.labels.numpy(), self.teacher or net
         f, p = _features(asked, data.labelled.clouds.all(), size, "source", self.mean.device)
@@ -174,7 +182,7 @@ class Pcfea(Method):
             of_source = most_confident(own, labels, 1 - progress)
             of_target = most_confident(said.confidence, named, progress)
         if self.selector is not None:
-            chosen = self.selector.select(said, self.theta)
+            chosen = self.selector.select(said, self.theta, (epoch - first) // between)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels
         source_mean, _ = moments(f, torch.from_numpy(labels), classes)
         pool = torch.cat([f[torch.from_numpy(of_source)], g[torch.from_numpy(of_target)]])

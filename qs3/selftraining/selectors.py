@@ -18,6 +18,8 @@ from qs3.config.checks import check_choice
 from qs3.errors import SelectionError
 from qs3.utils.plural import counted
 
+LOWER_THETA = "lower selftraining.theta"
+
 
 @dataclass(frozen=True, eq=False)
 class TeacherPredictions:
@@ -190,9 +192,22 @@ def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
 
 
 def check_selection(
-    selection: Selection, class_names: Sequence[str], round_: int, missing_class: str
+    selection: Selection,
+    class_names: Sequence[str],
+    round_: int,
+    missing_class: str,
+    more: str = LOWER_THETA,
+    trainable: bool = True,
 ) -> list[str]:
     """Names of the classes without a pseudo-label, after checking that training is possible.
+
+    Args:
+        selection: of the round.
+        class_names: in label order.
+        round_: for messages.
+        missing_class: "warn" or "error".
+        more: what would select more, for messages; see `SelfTrainingConfig.more_labels`.
+        trainable: whether the teacher could have been trained for longer.
 
     Raises:
         SelectionError: fewer than two samples were selected (batch normalisation needs two), or
@@ -209,19 +224,18 @@ def check_selection(
     facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
     if total < 2:
         own_mu = selection.mu[selection.confident > 0]
+        longer = ["train the teacher longer (protocol.epochs)"] * trainable
         if len(own_mu) == 1 and own_mu[0] == 0:
-            why = (
-                "all confident samples are of one class, so its mu is 0; train the teacher longer "
-                "(protocol.epochs), or set selftraining.selector.mu=one"
-            )
+            why = "all confident samples are of one class, so its mu is 0; "
+            ways = [more, *longer, "set selftraining.selector.mu=one"]
         else:
-            own = selection.thresholds is not None
-            key = "raise selftraining.selector.portion" if own else "lower selftraining.theta"
-            why = f"{key}, or train the teacher longer (protocol.epochs)"
-        raise SelectionError(f"only {counted(total, 'pseudo-label')} selected in {facts}; {why}")
+            why, ways = "", [more, *longer]
+        raise SelectionError(
+            f"only {counted(total, 'pseudo-label')} selected in {facts}; {why}{', or '.join(ways)}"
+        )
     if missing and missing_class == "error":
         raise SelectionError(
-            f"no pseudo-label for {', '.join(missing)} in {facts}; lower selftraining.theta, or "
-            "accept it with selftraining.missing_class=warn"
+            f"no pseudo-label for {', '.join(missing)} in {facts}; {more}, or accept it with "
+            "selftraining.missing_class=warn"
         )
     return missing

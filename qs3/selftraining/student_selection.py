@@ -31,6 +31,7 @@ from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
 from qs3.runs.checkpoints import copy_weights, save
+from qs3.selftraining.selectors import LOWER_THETA
 from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
@@ -89,6 +90,7 @@ class StudentSelection(Callback):
         phases: of the run.
         rule: one of `selection_rules.STUDENT_RULES`.
         classes: names in label order.
+        more: what would select more pseudo-labels, for messages.
 
     Attributes:
         scores: by epoch, of those of the last round so far; none with `last`.
@@ -96,8 +98,15 @@ class StudentSelection(Callback):
         held_out: positions in the target's training clouds [h], and their pseudo-labels [h].
     """
 
-    def __init__(self, folder: Path, phases: Phases, rule: str, classes: Sequence[str]) -> None:
-        self.folder, self.phases, self.rule = folder, phases, rule
+    def __init__(
+        self,
+        folder: Path,
+        phases: Phases,
+        rule: str,
+        classes: Sequence[str],
+        more: str = LOWER_THETA,
+    ) -> None:
+        self.folder, self.phases, self.rule, self._more = folder, phases, rule, more
         self.classes = tuple(classes)
         self.scores: dict[int, float] = {}
         self.epoch: int | None = None
@@ -166,8 +175,8 @@ class StudentSelection(Callback):
             found = ", ".join(f"{n} {c}" for n, c in zip(self.classes, counts, strict=True))
             raise SelectionError(
                 f"round {round_}: selection.student={PSEUDO_VAL} holds out a fifth of each class's "
-                f"pseudo-labels, but no class has three ({found}); lower selftraining.theta, or "
-                f"set selection.student={LAST}"
+                f"pseudo-labels, but no class has three ({found}); {self._more}, or set "
+                f"selection.student={LAST}"
             )
         mask = torch.from_numpy(held)
         self.held_out = (index[mask], hard[mask])

@@ -14,6 +14,7 @@ from qs3.engine.classifier import Classifier
 from qs3.engine.loggers import CsvHistory, EpochRows
 from qs3.engine.trainer import build_each, make_trainer
 from qs3.methods.base import Method
+from qs3.models.norms import check_has_norms
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.student_loss import Student
 from qs3.selftraining.student_selection import StudentSelection
@@ -49,8 +50,11 @@ def build_training(
     classifier = _classifier(run, method, given)
     classes = loaded.evaluation.classes
     warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
-    rounds = SelfTraining(folder, phases, run.scheme, classes)
-    student = StudentSelection(folder, phases, cfg.selection.student, classes)
+    was_given = cfg.selection.teacher == "given"
+    rounds = SelfTraining(folder, phases, run.scheme, classes, was_given)
+    student = StudentSelection(
+        folder, phases, cfg.selection.student, classes, run.scheme.more_labels
+    )
     shared = SharedWarmup(
         folder, cfg.paths.warmup_dir, warmup_sha256(cfg, loaded.started), run.seed, phases.warmup
     )
@@ -89,6 +93,8 @@ def _classifier(run: Run, method: Method, given: Given | None) -> Classifier:
         regulariser_weight=cfg.protocol.regulariser,
         weights=given.weights if given else None,
     )
+    if cfg.evaluation.norms != "trained":
+        check_has_norms(classifier.net, cfg.evaluation.norms)
     if cfg.compile:
         classifier.net.compile()  # in place; nets that are only evaluated stay as they are
     return classifier

@@ -20,6 +20,7 @@ from qs3.data.store import is_finished
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.errors import ConfigError, Qs3Error
 from qs3.evaluation.estimates_text import in_words
+from qs3.evaluation.prior import check_told
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective, chosen_in_words
 from qs3.inference import pretrained
 from qs3.runs import folder as runs
@@ -267,6 +268,8 @@ def _check_settings(cfg: DictConfig) -> None:
             why = f"{group}.file={file} cannot be read" if file else f"{group}.file is not set"
             raise ConfigError(f"{why}; {what}, {group}.file=PATH")
     check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
+    power = check_float("evaluation.prior_power", cfg.evaluation.prior_power)
+    check_told(cfg.evaluation.prior, power)
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
     if not 0 <= check_float("protocol.smoothing", cfg.protocol.smoothing) <= highest:

@@ -386,8 +386,7 @@ def _page(
         # A long list without spaces is broken behind its commas, and nowhere else.
         spaced = re.sub(r"\S{40,}", lambda word: word[0].replace(",", ",\0 "), right)
         wrapped = [
-            line.replace("\0 ", "").rstrip("\0")
-            for line in textwrap.wrap(spaced, _WIDTH - column)
+            line.replace("\0 ", "").rstrip("\0") for line in textwrap.wrap(spaced, _WIDTH - column)
         ]
         lines.append(begin + f"\n{' ' * column}".join(wrapped))
     return "\n".join([*lines, *(["", about.strip("\n")] if about else [])])

@@ -115,6 +115,8 @@ def test_only_the_current_domain_is_adapted() -> None:
 def test_nothing_to_adapt_on() -> None:
     with pytest.raises(DataError, match="no batches"):
         adapt_batchnorm(dgcnn(4), [])
+    with pytest.raises(ConfigError, match=r"norms=adabn adapts batch norms, and this net has none"):
+        adapt_batchnorm(nn.Linear(3, 4), [_clouds(4)])
 
 
 def test_instance_norm_has_nothing_to_adapt_but_in_the_head() -> None:

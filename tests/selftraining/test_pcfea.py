@@ -16,7 +16,12 @@ from torch.nn import functional as F
 from qs3.errors import ConfigError
 from qs3.methods.base import Method
 from qs3.models.base import PointClassifier
+from qs3.models.norms import DomainNorm
+from qs3.models.pointnet import pointnet
+from qs3.selftraining.baselines import Random
+from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.pcfea import Pcfea, moments, penultimate, style
+from qs3.selftraining.sd import GraphRefined
 from qs3.selftraining.selectors import Qbst
 from tests.methods.shapes import CLASSES, accuracy, tiny_net
 from tests.methods.test_learning import OneLayer
@@ -163,6 +168,38 @@ def test_a_selector_chooses_the_target_s_part() -> None:
     torch.testing.assert_close(chosen.mean[0], f[best].mean(0), rtol=1e-4, atol=1e-5)
 
 
+def test_pools_are_the_selector_s_rounds() -> None:
+    asked = []
+
+    class Watched(Cbst):
+        def select(self, teacher, theta, round_=0):
+            asked.append(round_)
+            return super().select(teacher, theta, round_)
+
+    net, data = tiny_net(), _data()
+    method = Pcfea(selector=Watched())
+    method.prepare(net)
+    for epoch in range(26):
+        method.start_epoch(net, data, epoch, 100)
+    assert asked == [0, 1, 2, 3]
+
+
+def test_a_running_mean_of_domain_norms_knows_the_target() -> None:
+    """Its target's norms begin with the source's, as the net's do, and not with nothing."""
+    net, data = pointnet(CLASSES, norm="domain"), _data()
+    method = Pcfea(momentum=0.9)
+    method.prepare(net)
+    source = {"points": data.labelled.clouds.all(), "y_source": data.labelled.labels}
+    for _ in range(2):
+        method.loss(net, {"source": source, "progress": 0.05}, torch.Generator())
+    method.start_epoch(net, data, 10, 100)
+    norms = [m for m in method.teacher.modules() if isinstance(m, DomainNorm)]
+    assert norms
+    for norm in norms:
+        torch.testing.assert_close(norm.target.running_mean, norm.source.running_mean)
+        torch.testing.assert_close(norm.target.running_var, norm.source.running_var)
+
+
 @pytest.mark.parametrize(("epoch", "t"), [(10, 0.05), (55, 0.5), (95, 0.9)])
 def test_a_pool_by_thresholds(epoch: int, t: float) -> None:
     """The released code's: what the net names rightly above t, and of the target above 1 - t."""
@@ -276,6 +313,8 @@ def test_terms_before_and_with_a_pool() -> None:
         ({"momentum": 1.0}, r"method.momentum must be in \[0, 1\)"),
         ({"every": 0.0}, r"method.every must be in \(0, 1\]"),
         ({"selector": "qbst"}, "method.selector must be null or a selector"),
+        ({"selector": GraphRefined()}, "method.selector chooses by features"),
+        ({"selector": Random(of=GraphRefined())}, "method.selector chooses by features"),
     ],
 )
 def test_wrong_settings_name_the_key(settings: dict, message: str) -> None:

@@ -7,7 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.errors import ConfigError, SelectionError
+from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.selectors import (
     Qbst,
@@ -122,9 +124,22 @@ def test_advice_is_about_the_selector_in_use():
         (Qbst(mu="one"), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
         (Spst(), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
         (Cbst(), 0.0, r"b 0/0; raise selftraining.selector.portion, or train"),
+        (Random(of=Cbst()), 0.0, r"b 0/0; raise selftraining.selector.portion, or train"),
     ):
+        more = SelfTrainingConfig(selector, rounds=1, theta=theta).more_labels
+        selection = selector.select(teacher, theta)
         with pytest.raises(SelectionError, match=advice):
-            check_selection(selector.select(teacher, theta), ("a", "b"), 0, "warn")
+            check_selection(selection, ("a", "b"), 0, "warn", more)
+    more = SelfTrainingConfig(Qbst(), rounds=1, share=0.2).more_labels
+    selection = Qbst().select(teacher, 0.8)
+    with pytest.raises(SelectionError, match=r"its mu is 0; raise selftraining.share, or set .*mu"):
+        check_selection(selection, ("a", "b"), 0, "warn", more, trainable=False)
+    selection = Qbst(mu="one").select(teacher, 0.5)
+    assert check_selection(selection, ("a", "b"), 0, "warn", more) == ["b"]
+    with pytest.raises(
+        SelectionError, match=r"no pseudo-label for b .*; raise selftraining.share,"
+    ):
+        check_selection(selection, ("a", "b"), 0, "error", more)
 
 
 def test_predictions_selections_and_rules_cannot_be_changed():

@@ -98,3 +98,11 @@ def test_what_is_refused(frozen, tmp_path):
 def test_a_method_that_trains_features_is_refused(frozen):
     with pytest.raises(ConfigError, match="method=dann trains a net's features, and this model's"):
         train(frozen("method=dann", "selftraining=none"))
+
+
+@pytest.mark.parametrize("norms", ["adabn", "tent"])
+def test_a_linear_probe_has_no_norms_to_adapt(frozen, norms):
+    cfg = frozen("model.hidden=[]", "selftraining=none", f"evaluation.norms={norms}")
+    with pytest.raises(ConfigError, match=f"evaluation.norms={norms} adapts batch norms, and this"):
+        train(cfg)
+    assert not list(hashing.run_folder(cfg).glob("*.ckpt"))

@@ -91,6 +91,7 @@ class Group:
         finished: runs with a result, by seed.
         problems: for the reader: unfinished or diverged seeds, different datasets, a seed twice.
         comparable: whether the finished runs may be averaged.
+        notes: for the reader, too: what is odd, but lets no seed be missing or not fit.
     """
 
     experiment: str
@@ -98,6 +99,7 @@ class Group:
     finished: tuple[Run, ...]
     problems: tuple[str, ...]
     comparable: bool
+    notes: tuple[str, ...] = ()
 
     @property
     def results(self) -> list[RunMetrics]:
@@ -193,7 +195,7 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
         for run in runs
         if run.status != FINISHED
     ]
-    comparable = True
+    comparable, notes = True, []
     twice = sorted(seed for seed, n in Counter(r.seed for r in finished).items() if n > 1)  # type: ignore[type-var]
     if twice:
         comparable = False
@@ -210,14 +212,14 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
         if len(hashes) > 1:
             seen = "; ".join(f"seeds {_list(seeds)}: {sha[:12]}" for sha, seeds in hashes.items())
             if role in _DATASETS and same_data((run.metrics for run in finished), role):
-                problems.append(
+                notes.append(
                     f"the {role} was made by one recipe on several machines, whose bytes differ by "
                     f"rounding ({seen}): averaged"
                 )
                 continue
             comparable = False
             problems.append(f"{what} ({seen}): not averaged")
-    return Group(*key, tuple(finished), tuple(problems), comparable)
+    return Group(*key, tuple(finished), tuple(problems), comparable, tuple(notes))
 
 
 _DATASETS = ("source", "target")
@@ -318,7 +320,7 @@ def summarise(folders: list[Path], settings: Mapping[Path, str] | None = None) -
         )
         if g.unlabelled:
             notes.append(f"{g.experiment} {g.hash}: no target labels, so no accuracy")
-        notes += [f"{g.experiment} {g.hash}, {problem}" for problem in g.problems]
+        notes += [f"{g.experiment} {g.hash}, {problem}" for problem in (*g.problems, *g.notes)]
     if any("(!)" in line[-2] for line in lines):
         notes.append(f"(!) fewer than {FEW_SEEDS} seeds")
     notes += data_lines(result for g in groups for result in g.results)

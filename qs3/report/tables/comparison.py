@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.report.clustered import LEVEL
 from qs3.report.tables.aggregate import data_differences, data_lines, same_data
 from qs3.report.tables.cells import Cell, Table
-from qs3.report.tables.formats import SIMULATED, marks
+from qs3.report.tables.formats import SIMULATED, marks, problems_of
 from qs3.report.tables.made_of import data_marks, results_of
 from qs3.report.tables.paired import Difference, compare_on_average
 from qs3.runs.predictions import FILE, Predictions, read_predictions
@@ -41,6 +41,7 @@ class Compared:
         tiers_unknown: the target has tiers, but no predictions say which cloud is of which.
         clusters: what clouds of one cluster share: one of `MESHES`, `BLOCKS`, `ROOMS`.
         made_of: what the row's source, the base's source and the target are made of.
+        simulated: whether a target is.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Compared:
     tiers_unknown: bool = False
     clusters: str = MESHES
     made_of: tuple[str, str, str] = ("", "", "")
+    simulated: bool = False
 
     @property
     def subsets(self) -> dict[str, Pair]:
@@ -202,6 +204,11 @@ class _Tiers:
 
 def _compared(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) -> Compared:
     """The mean difference of pairs of cells, or why there is none."""
+    simulated = any(cell.simulated for pair in pairs for cell in pair)
+    return replace(_difference(name, pairs, tiers), simulated=simulated)
+
+
+def _difference(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) -> Compared:
     cells = [cell for pair in pairs for cell in pair]
     if any(cell.take != "final" for cell in cells):
         return Compared(name, None, "a warm-up's predictions are not kept")
@@ -339,21 +346,22 @@ def text(
         simulated = [mark for mark in marks(table) if mark.startswith(SIMULATED)]
         head = [f"{'## ' if markdown else ''}{table.title}", "", *simulated, *data_marks(table), ""]
         notes += data_lines(results_of(table))
+        notes += problems_of(table)
     layout = text_table.markdown if markdown else text_table.aligned
     body = layout(lines) if len(lines) > 1 else []
     return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"
 
 
-def csv_text(found: Sequence[Compared], table: Table) -> str:
+def csv_text(found: Sequence[Compared]) -> str:
     """A line a difference, metric and tier, in percentage points."""
     rows: list[list[Any]] = [
         ["name", "clouds", "metric", "difference", "low", "high", "seeds", "clusters",
          "clusters_are", "seeds_needed", "simulated", "source_made_of", "other_source_made_of",
          "target_made_of", "why"]
     ]  # fmt: skip
-    simulated = str(any(cell.simulated for cell in table.cells)).lower()
     metrics = ("accuracy", "balanced accuracy")
     for one in found:
+        simulated = str(one.simulated).lower()
         if one.differences is None:
             rows += [
                 [one.name, ALL, name, *[""] * 7, simulated, *one.made_of, one.why]
@@ -361,7 +369,7 @@ def csv_text(found: Sequence[Compared], table: Table) -> str:
             ]
         for subset, pair in one.subsets.items():
             for metric, d in zip(metrics, pair, strict=True):
-                points = [f"{100 * value:.4f}" for value in (d.mean, d.low, d.high)]
+                points = [f"{value:.4f}" for value in _points(d)]
                 needed = "" if d.seeds_needed is None else d.seeds_needed
                 known = [d.seeds, d.meshes, one.clusters, needed, simulated, *one.made_of, ""]
                 rows.append([one.name, subset, metric, *points, *known])
@@ -369,8 +377,13 @@ def csv_text(found: Sequence[Compared], table: Table) -> str:
 
 
 def _shown(d: Difference) -> str:
-    star = " *" if d.clear else ""
-    return f"{100 * d.mean:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}]{star}"
+    mean, low, high = _points(d)
+    return f"{mean:+.1f} [{low:+.1f}, {high:+.1f}]{' *' if d.clear else ''}"
+
+
+def _points(d: Difference) -> tuple[float, float, float]:
+    """Mean and ends in percentage points: none is beyond 100, whatever two seeds' spread says."""
+    return 100 * d.mean, max(100 * d.low, -100.0), min(100 * d.high, 100.0)
 
 
 def _hopeless(d: Difference) -> bool:

@@ -220,12 +220,21 @@ def remarks(table: Table) -> list[str]:
     for source in dict.fromkeys(c.paper.source for c in table.cells if c.paper and c.paper.source):
         rows = dict.fromkeys(c.row for c in table.cells if c.paper and c.paper.source == source)
         lines.append(f"published numbers of {', '.join(rows)}: {source}")
-    for cell in table.cells:
-        for problem in cell.group.problems if cell.group else ():
-            lines.append(f"{cell.row}, {cell.column}: {problem}")
+    lines += problems_of(table)
     missing = [c for c in table.cells if c.missing]
     for reason in dict.fromkeys(c.missing for c in missing):
         lines.append(f"not available yet: {reason}")
+    return list(dict.fromkeys(lines))
+
+
+def problems_of(table: Table) -> list[str]:
+    """What is wrong with cells' runs, or odd about them, each once."""
+    lines = [
+        f"{cell.row}, {cell.column}: {said}"
+        for cell in table.cells
+        if cell.group
+        for said in (*cell.group.problems, *cell.group.notes)
+    ]
     return list(dict.fromkeys(lines))
 
 
@@ -310,7 +319,9 @@ def csv_text(table: Table) -> str:
             for name in ("core_seconds", "memory_gb", "gpu_memory_gb"):
                 found = [getattr(one, name) for one in taken]
                 values.append(" ".join("" if one is None else f"{one:g}" for one in found))
-            values.append("; ".join(cell.group.problems) if cell.group else "")
+            values.append(
+                "; ".join((*cell.group.problems, *cell.group.notes)) if cell.group else ""
+            )
             rows.append([*values, cell.group.hash if cell.group else "", cell.command])
     return text_table.csv_text(rows)
 

@@ -149,8 +149,9 @@ def test_one_recipe_on_two_machines_is_averaged_and_said(tmp_path, role):
     (found,) = group(load_runs(tmp_path))
     assert found.stat("accuracy").n == 2
     said = f"the {role} was made by one recipe on several machines"
-    assert said in found.problems[0]
-    assert "seeds 0: cccccccccccc; seeds 1: dddddddddddd" in found.problems[0]
+    assert said in found.notes[0]
+    assert "seeds 0: cccccccccccc; seeds 1: dddddddddddd" in found.notes[0]
+    assert found.problems == ()
     assert said in summarise([r.folder for r in load_runs(tmp_path)])
     run(2, "c", "2" * 12)  # by other code
     (found,) = group(load_runs(tmp_path))

@@ -157,7 +157,7 @@ def test_compare_by_hand(tmp_path):
         shown = text(list(found.values()), "source only", markdown, table)
         assert shown.splitlines()[0].removeprefix("## ") == table.title
         assert "SIMULATED target: kinectsim10" in shown.splitlines()
-    rows = list(csv.DictReader(io.StringIO(csv_text(list(found.values()), table))))
+    rows = list(csv.DictReader(io.StringIO(csv_text(list(found.values())))))
     assert len(rows) == 2 * len(found)
     (row,) = (r for r in rows if (r["name"], r["metric"]) == ("DANN", "accuracy"))
     assert float(row["difference"]) == pytest.approx(20)
@@ -266,7 +266,7 @@ def test_each_tier_is_compared_by_itself(tmp_path):
     assert [line.split()[:2] for line in shown.splitlines() if line.startswith("DANN")] == [
         ["DANN", "all"], ["DANN", "clean"], ["DANN", "hard"],
     ]  # fmt: skip
-    rows = list(csv.DictReader(io.StringIO(csv_text(found, table))))
+    rows = list(csv.DictReader(io.StringIO(csv_text(found))))
     hard = next(row for row in rows if (row["name"], row["clouds"]) == ("DANN", "hard"))
     assert float(hard["difference"]) == pytest.approx(30)
     assert (hard["clusters"], hard["clusters_are"]) == ("2", "blocks of frames")
