@@ -48,6 +48,7 @@ OWN = {
     "utils/processor_time.py": "/proc, the kernel's",
     "cluster/slurm_arrays.py": "journals of jobs of our own",
     "generation/code_fingerprint.py": "this program's own files",
+    "generation/object_parts.py": "a hash, which is compared and not read",
     "generation/travel.py": "bytes of meshes, for the reader of meshes",
 }
 """Modules that open what nobody else has made, or what the user wants to be run."""

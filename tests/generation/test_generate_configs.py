@@ -321,7 +321,7 @@ def test_switches_are_true_or_false(key):
         ),
         ("modelnet10_dropout", "recipe.dropout.min_regions=5", r"min_regions=5 is above .*=3"),
         ("specklenet10", "recipe.views.min_elevation_deg=60", "min_elevation_deg=60 is above"),
-        ("kinectsim10", "+recipe.placing.fallback_side_m=-1", "fallback_side_m must be > 0"),
+        ("kinectsim10", "recipe.placing.fallback_side_m=-1", "fallback_side_m must be > 0"),
         ("kinectsim10", "crop.min_grow_px=5", r"crop\.min_grow_px=5 is above crop\.max_grow_px=3"),
         ("kinectsim10", "recipe.views.max_arc_deg=10", "min_arc_deg=30.0 is above"),
         ("kinectsim10", "tracking.shift_m=-1", r"tracking\.shift_m must be >= 0, got -1"),

@@ -94,11 +94,13 @@ def without_strays(vertices: np.ndarray, faces: np.ndarray) -> Triangles:
     """The same without vertices that no face uses; the same arrays where there are none.
 
     Modelling programs leave some behind. Nobody sees them, but furniture is as large, and shadow
-    rays begin as far away, as all vertices say.
+    rays begin as far away, as all vertices say. Where one is not finite the file is damaged, which
+    `Mesh` says: then none is left out.
     """
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
-    return (vertices, faces) if used.all() else used_part(vertices, faces)
+    whole = used.all() or not np.isfinite(vertices).all()
+    return (vertices, faces) if whole else used_part(vertices, faces)
 
 
 def joined(parts: Iterable[Triangles]) -> Triangles:

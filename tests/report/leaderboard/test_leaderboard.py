@@ -86,7 +86,7 @@ def test_rows_say_nothing_beyond_the_rules():
         assert prior in ([], ["evaluation.prior=rooms"])
         assert row.get("columns") == (["R → N", "R → A", "R → A0"] if prior else None)
     five = {row["name"] for row in SPEC["rows"] if row.get("seeds") == 5}
-    assert five == {"source only", "QS3 (PCM+QBST)", "Twins (ours)"}
+    assert five == {"source only", "QS3 (PCM+QBST)", "Twins (ours)", "MLSP", "DefRec+PCM"}
     assert {row.get("seeds", 3) for row in SPEC["rows"]} == {3, 5}
 
 
