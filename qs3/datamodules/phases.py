@@ -17,6 +17,9 @@ from qs3.config.checks import check_choice, check_float, check_int
 from qs3.errors import ConfigError
 from qs3.utils.plural import counted
 
+LOWER_THETA = "lower selftraining.theta"
+"""What selects more where a scheme has nothing else for it, in messages."""
+
 
 @dataclass(frozen=True)
 class Phases:
@@ -181,7 +184,7 @@ class SelfTrainingConfig:
         """What would select more, as messages advise it."""
         if self.share is not None:
             return "raise selftraining.share"
-        return getattr(self.selector, "more_labels", None) or "lower selftraining.theta"
+        return getattr(self.selector, "more_labels", None) or LOWER_THETA
 
     def theta_of(self, round_: int, confidence: Float[np.ndarray, " n"] | None = None) -> float:
         """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly.

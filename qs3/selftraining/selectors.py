@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from qs3.config.checks import check_choice
+from qs3.datamodules.phases import LOWER_THETA
 from qs3.errors import SelectionError
 from qs3.utils.plural import counted
-
-LOWER_THETA = "lower selftraining.theta"
 
 
 @dataclass(frozen=True, eq=False)

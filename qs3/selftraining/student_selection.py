@@ -24,14 +24,13 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor, nn
 
 from qs3.datamodules.adaptation import AdaptationData
-from qs3.datamodules.phases import Phases
+from qs3.datamodules.phases import LOWER_THETA, Phases
 from qs3.engine.classifier import Classifier
 from qs3.errors import SelectionError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
 from qs3.runs.checkpoints import copy_weights, save
-from qs3.selftraining.selectors import LOWER_THETA
 from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
