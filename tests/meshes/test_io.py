@@ -1,12 +1,14 @@
 """Reading CAD files: what trimesh writes, and what the file itself can be."""
 
+import errno
 import os
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from qs3.errors import MeshError
+from qs3.errors import MeshError, MeshUnavailableError
 from qs3.meshes.formats import arrays
 from qs3.meshes.io import load_mesh
 from tests.meshes.written import EXPORTS, PYRAMID, SQUARE_OFF, corners, export, save, z_up
@@ -65,6 +67,23 @@ def test_loading_is_silent_and_errors_travel_between_processes(tmp_path, caplog,
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     assert not caplog.records
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "reason"),
+    [
+        (errno.ESTALE, MeshUnavailableError, "cannot be read now"),
+        (errno.EIO, MeshUnavailableError, "cannot be read now"),
+        (errno.ENAMETOOLONG, MeshError, "cannot be read as OFF"),
+    ],
+)
+def test_whether_the_disk_or_the_file_is_to_blame(tmp_path, monkeypatch, number, kind, reason):
+    path = save(tmp_path, "a.off", SQUARE_OFF)
+    broken = OSError(number, os.strerror(number))
+    monkeypatch.setattr(Path, "read_bytes", lambda self: (_ for _ in ()).throw(broken))
+    with pytest.raises(MeshError, match=rf"a\.off: {reason}") as caught:
+        load_mesh(path)
+    assert type(caught.value) is kind
 
 
 def test_vertices_that_no_face_uses_change_nothing(tmp_path):
