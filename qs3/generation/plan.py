@@ -62,7 +62,10 @@ def check(cfg: DictConfig) -> None:
             raise ConfigError("classes=[] leaves nothing to scan: name some, classes=[chair,table]")
         known = known_classes(cfg)
         if unknown := sorted(set(cfg.classes) - set(known)):
-            raise ConfigError(f"classes: {unknown} are not among the known {', '.join(known)}")
+            raise ConfigError(
+                f"classes: {unknown} are not among the known {', '.join(known)}; others are "
+                "given as '+domain.classes=[...]', with domain.path= for their dataset"
+            )
     if cfg.splits is not None:
         if not (isinstance(cfg.splits, ListConfig) and cfg.splits):
             raise ConfigError(f"splits is a list: splits=[train], got {cfg.splits}")

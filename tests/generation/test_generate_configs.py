@@ -340,6 +340,13 @@ def test_nothing_is_not_everything(words, key):
         check(config("domain=modelnet10", words))
 
 
+def test_who_names_other_classes_learns_how_to_give_them():
+    words = ("domain=modelnet10", "classes=[bracket]")
+    with pytest.raises(ConfigError, match=r"\['bracket'\] are not .*'\+domain.classes=\[\.\.\.\]'"):
+        check(config(*words))
+    check(config(*words, "+domain.classes=[bracket]", "domain.path=data/parts"))
+
+
 def test_scans_that_would_share_a_name_are_refused(tmp_path):
     folder = tmp_path / "chair" / "train"
     folder.mkdir(parents=True)
