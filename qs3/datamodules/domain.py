@@ -13,7 +13,6 @@ With `twin="whole"` a training batch holds each cloud's whole object as "twin", 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -26,12 +25,12 @@ from torch import Tensor
 
 from qs3.config.checks import check_choice
 from qs3.data.domain import Domain, compose_domain
-from qs3.data.meta import sha256_of
 from qs3.data.store import PointSet
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
+from qs3.datamodules.beside import SOURCE_TWINS, beside_sha256, views_of
 from qs3.datamodules.clouds import Clouds
-from qs3.datamodules.random_views import RandomViews, views_of
+from qs3.datamodules.random_views import RandomViews
 from qs3.datamodules.splits import (
     Labelled,
     Unlabelled,
@@ -40,7 +39,7 @@ from qs3.datamodules.splits import (
     load_clouds,
     subsample_splits,
 )
-from qs3.datamodules.twins import SOURCE_TWINS, augmented
+from qs3.datamodules.twins import augmented
 from qs3.datamodules.validation_split import RULES
 from qs3.errors import ConfigError, DataError
 
@@ -68,7 +67,7 @@ class DomainData(LightningDataModule):
         clouds_a_class: only the first so many training clouds of each class.
         data_dir: where the dataset of a named domain lies.
         asks: who needs the labels, for the message where there are none; None: the domain.
-        twin: one of `twins.SOURCE_TWINS`: load the twins of the training clouds, too.
+        twin: one of `beside.SOURCE_TWINS`: load the twins of the training clouds, too.
 
     Attributes:
         train, validation, test: clouds of each part, after `setup`.
@@ -139,13 +138,7 @@ class DomainData(LightningDataModule):
         """Bring published files into the store if that has not been done; check it, once."""
         if not self._checked:
             self.domain.open()
-            beside: list[PointSet] = []
-            if self.twin and (array := SOURCE_TWINS[self.twin]):
-                beside.append(self.domain.open_array(array))
-            if self.domain.views == "random":
-                beside += itertools.chain(*views_of(self.domain, verify=True))
-            if beside:
-                self.beside_sha256 = sha256_of(" ".join(one.sha256 for one in beside))
+            self.beside_sha256 = beside_sha256(self.domain, self.twin, verify=True)
             self._checked = True
 
     def setup(self, stage: str | None = None) -> None:

@@ -17,10 +17,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from qs3.data.domain import Domain
 from qs3.data.sharded import ShardedArray
-from qs3.data.store import PointSet
-from qs3.errors import ConfigError
 from qs3.geometry.sampling import farthest_point_sampling_np
 
 POOL = 2
@@ -102,25 +99,3 @@ def drawn(draw: Float[np.ndarray, " draws"]) -> tuple[Int[np.ndarray, " k"], flo
     views = len(draw) - 2
     count = 1 + min(int(draw[views] * views), views - 1)
     return np.argsort(draw[:views], kind="stable")[:count], float(draw[-1])
-
-
-def views_of(domain: Domain, verify: bool) -> tuple[list[PointSet], list[PointSet]]:
-    """The views that a domain's store keeps, and their clouds without error, where it has them.
-
-    Of a store without single views its clouds are the only view.
-
-    Raises:
-        ConfigError: there is neither more than a view nor a cloud without error: nothing to draw.
-    """
-    names = domain.kept_views() or ["points"]
-    measured = [domain.open_array(name, verify) for name in names]
-    exact = [f"{name}_exact" for name in names]
-    known = domain.has_array(exact[0])
-    if len(names) == 1 and not known:
-        raise ConfigError(
-            f"data.source.views=random: the store of {domain.name} keeps neither views nor clouds "
-            f"without error. Generate it again with them: python generate.py domain={domain.name} "
-            "force=true twins=[views,exact], or twins=[exact] if it has one view; its clouds will "
-            "be the same"
-        )
-    return measured, [domain.open_array(name, verify) for name in exact] if known else []

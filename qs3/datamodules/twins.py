@@ -25,16 +25,13 @@ from torch import Tensor
 
 from qs3.datamodules.augment import Augment
 
-SOURCE_TWINS = {"whole": "points_whole", "clean": "points_clean", "scan": None}
-"""What a teacher can see of a source cloud, and the store's array; None: the cloud itself."""
-
 
 @dataclass(frozen=True)
 class Wants:
     """What a method wants beside clouds and labels; nothing by default, which costs nothing.
 
     Attributes:
-        twin: of source clouds, one of `SOURCE_TWINS`.
+        twin: of source clouds, one of `qs3.datamodules.beside.SOURCE_TWINS`.
         again: a second draw of source clouds.
         target_twin: target clouds that are not cut.
     """

@@ -78,6 +78,7 @@ def read_prior(
     classes: Sequence[str],
     learnt: Float[np.ndarray, " c"] | None = None,
     power: float = POWER,
+    key: str = "prior",
 ) -> Prior:
     """A prior as it is given.
 
@@ -88,27 +89,28 @@ def read_prior(
         classes: that the net knows.
         learnt: u, shares of the classes in its training, each above 0; None: all alike.
         power: t >= 0.
+        key: what it is called where it is given, for messages.
 
     Raises:
         ConfigError: what is given is no such thing, or names a class that the net does not know.
     """
-    power = check_float("prior_power", power, ">= 0")
+    power = check_float(f"{key}_power", power, ">= 0")
     if given == "rooms":
-        given = _of_rooms(classes)
+        given = _of_rooms(classes, key)
     if not isinstance(given, str | Mapping):
-        raise ConfigError(f"prior={given!r:.60} should be words or a mapping, {{'chair': 4}}")
-    pairs = _pairs(given) if isinstance(given, str) else list(given.items())
+        raise ConfigError(f"{key}={given!r:.60} should be words or a mapping, {{'chair': 4}}")
+    pairs = _pairs(given, key) if isinstance(given, str) else list(given.items())
     common: dict[str, float] = {}
     for word, value in pairs:
         name = known_as(str(word), classes)
         if name is None:
-            raise ConfigError(f"prior={word}: the classifier's classes are {', '.join(classes)}")
+            raise ConfigError(f"{key}={word}: the classifier's classes are {', '.join(classes)}")
         if name in common:
-            raise ConfigError(f"prior= names {name} twice")
-        common[name] = check_float(f"prior={word}", value, ">= 0")
+            raise ConfigError(f"{key}= names {name} twice")
+        common[name] = check_float(f"{key}={word}", value, ">= 0")
     here = np.array([common.get(name, 1.0) for name in classes], dtype=np.float64)
     if not here.any():
-        raise ConfigError("prior= leaves no class that there could be")
+        raise ConfigError(f"{key}= leaves no class that there could be")
     here /= here.max()  # sums of huge numbers are none
     shares = here / here.sum()
     if learnt is None:
@@ -126,39 +128,44 @@ def shares_of(labels: Int[np.ndarray, " n"] | Sequence[int], classes: int) -> np
     return counts / counts.sum()
 
 
-def check_told(prior: object, power: float) -> None:
-    """Refuse a power that nothing reads.
+def check_told(prior: object, power: float, key: str = "prior") -> None:
+    """Refuse a power that nothing reads. `key`: as of `read_prior`.
 
     Raises:
         ConfigError: it is not `POWER`, and there is no prior.
     """
     if not prior and power != POWER:
-        raise ConfigError("prior_power= is for prior=; give prior=rooms or prior=chair:4,...")
+        raise ConfigError(f"{key}_power= is for {key}=; give {key}=rooms or {_example(key)}")
 
 
-def _of_rooms(classes: Sequence[str]) -> dict[str, float]:
+def _example(key: str) -> str:
+    """As it is typed: Hydra, which reads keys with dots, takes no colons and commas."""
+    return f"'{key}={{chair: 4, table: 2}}'" if "." in key else f"{key}=chair:4,table:2"
+
+
+def _of_rooms(classes: Sequence[str], key: str) -> dict[str, float]:
     if unknown := [name for name in classes if name not in ROOMS]:
         raise ConfigError(
-            f"prior=rooms knows {', '.join(ROOMS)}; the classifier also tells "
-            f"{', '.join(unknown)}: say how common they are, prior=chair:4,table:2"
+            f"{key}=rooms knows {', '.join(ROOMS)}; the classifier also tells "
+            f"{', '.join(unknown)}: say how common they are, {_example(key)}"
         )
     return {name: ROOMS[name] for name in classes}
 
 
-def _pairs(words: str) -> list[tuple[str, float]]:
+def _pairs(words: str, key: str) -> list[tuple[str, float]]:
     pairs: list[tuple[str, float]] = []
     for part in words.split(","):
         name, colon, value = part.rpartition(":")
         if not colon or not name.strip():
             raise ConfigError(
-                f"prior={words}: {part.strip()!r} should be CLASS:NUMBER, as in chair:4,table:2; "
-                "or say prior=rooms"
+                f"{key}={words}: {part.strip()!r} should be CLASS:NUMBER, as in "
+                f"{_example(key)}; or say {key}=rooms"
             )
         try:
             pairs.append((name.strip(), float(value)))
         except ValueError:
             raise ConfigError(
-                f"prior={words}: {value.strip()!r} after {name.strip()} should be a number"
+                f"{key}={words}: {value.strip()!r} after {name.strip()} should be a number"
             ) from None
     return pairs
 

@@ -48,7 +48,7 @@ def card(
         "import qs3",
         "",
         'predictor = qs3.load("this folder")',
-        f"probabilities = predictor([cloud]{floor})  # [n, 3], any n, z up" + _frame(result),
+        f"probabilities = predictor([cloud]{floor})  # [n, 3], any n, {_frame(result)}",
         "```",
         "",
         f"Or: `qs3 predict ckpt=FOLDER input=SCANS{floor.replace(',', '')}`.",
@@ -108,9 +108,9 @@ _GRAVITY = {"z": "z up.", "none": "In the frame of the depth camera: x right, y 
 
 
 def _frame(result: Result) -> str:
-    return {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor: its z"}[
-        result.scale
-    ]
+    up = {"z": "z up", "none": "z forward"}[result.gravity]
+    unit = {"unit_ball": "", "metres": ", metres", "above_floor": ", metres; floor: its z"}
+    return up + unit[result.scale]
 
 
 def _training(metrics: RunMetrics) -> list[str]:
@@ -137,6 +137,17 @@ def _accuracy(metrics: RunMetrics | None) -> str:
         f"On {counted(final.n, 'test cloud')} of {metrics.target_text}: {final.accuracy:.1%} (95 % "
         f"interval {low:.1%} to {high:.1%} if clouds are independent), balanced "
         f"{final.balanced_accuracy:.1%}; always the commonest class {final.majority_rate:.1%}."
+        f"{_told(metrics.evaluation.prior)}"
+    )
+
+
+def _told(prior: str) -> str:
+    """What the figures above were told, which the files beside the card do not hold."""
+    if not prior:
+        return ""
+    return (
+        f" That is with `evaluation.prior`: {_text(prior)}. Without `prior=` of `qs3.load` or "
+        "`qs3 predict`, this classifier is told nothing of the kind."
     )
 
 

@@ -371,10 +371,16 @@ def load(
     found = Predictor(build_net(result, packages).to(place), result, place)
     if prior is None:
         return found
-    learnt = None if result.learnt is None else np.array(result.learnt)
-    if learnt is None and found.held_out:  # a file of an older version
-        learnt = shares_of(found.held_out.labels, len(found.classes))
-    return replace(found, prior=read_prior(prior, found.classes, learnt, prior_power))
+    return replace(found, prior=read_prior(prior, found.classes, learnt_of(result), prior_power))
+
+
+def learnt_of(result: Result) -> Float[np.ndarray, " c"] | None:
+    """Shares of the classes in a classifier's training; None where its file says nothing of it."""
+    if result.learnt is not None:
+        return np.array(result.learnt)
+    if result.held_out:  # a file of an older version: those of clouds that were held out
+        return shares_of(result.held_out["labels"].numpy(), len(result.classes))
+    return None
 
 
 def device_of(device: Any) -> torch.device:

@@ -20,7 +20,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
-from qs3.datamodules.twins import SOURCE_TWINS, Wants
+from qs3.datamodules.beside import SOURCE_TWINS
+from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
 from qs3.methods.base import check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher

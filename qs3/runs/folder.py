@@ -58,32 +58,39 @@ def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:
     write_json(Path(folder) / STARTED, started)
 
 
-def check_data(folder: Path, domain: str, expected: str, found: str) -> None:
+ANEW = "choose another experiment_name, or start again with force=true"
+"""What to do about a run that cannot be gone on with."""
+
+
+def check_data(folder: Path, domain: str, expected: str, found: str, instead: str = ANEW) -> None:
     """Refuse to continue, or to reuse, a run whose data have changed since.
 
     Raises:
-        DataError: the hashes differ.
+        DataError: the hashes differ. `instead`: of bringing the old data back.
     """
     if found != expected:
         raise DataError(
-            f"{folder} was begun with another version of {domain} ({expected[:12]}, now "
-            f"{found[:12]}); bring the old data back, choose another experiment_name, or start "
-            "again with force=true"
+            f"{folder} was begun with another version of {domain} ({expected[:12] or 'without it'},"
+            f" now {found[:12] or 'without it'}); bring the old data back, {instead}"
         )
 
 
-def check_config(folder: Path, expected: str | None, found: str) -> None:
+def check_config(folder: Path, expected: str | None, found: str, instead: str = ANEW) -> None:
     """Refuse to continue, or to reuse, the run of another config (of the same 8 digits).
 
     Raises:
-        ConfigError: the hashes differ.
+        ConfigError: the hashes differ. `instead`: of it.
     """
     if found != expected:
         raise ConfigError(
             f"{folder} holds a run with other settings (config hash {expected}, now {found}; they "
-            "are in .hydra/config.yaml); choose another experiment_name, or start again with "
-            "force=true"
+            f"are in .hydra/config.yaml); {instead}"
         )
+
+
+def beside(name: str) -> str:
+    """What twins and views are called in messages."""
+    return f"what lies beside {name}"
 
 
 def clear(folder: str | Path) -> None:

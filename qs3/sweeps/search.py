@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ from qs3.sweeps.listed_jobs import ListedJobs, OverLauncher
 from qs3.sweeps.ray_launcher import RayLauncher
 from qs3.sweeps.search_report import FAILED, Tried, report
 from qs3.sweeps.search_space import distribution, overrides, split, words
+from qs3.training.reuse import check_finished
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -85,6 +86,7 @@ class LabelFreeSearch(OverLauncher):
             )
         space = {key: distribution(one) for key, one in searched.items()}
         study = self._study(cfg, space)
+        self._refuse_changed(study, fixed)
         _try_again(study)
         done: list[JobReturn] = []
         while (left := self.trials - _count(study)) > 0 or _any(study, "WAITING"):
@@ -102,6 +104,20 @@ class LabelFreeSearch(OverLauncher):
         for result in done:
             _ = result.return_value  # raises if the job failed
         return done
+
+    def _refuse_changed(self, study: Study, fixed: Sequence[str]) -> None:
+        """Raise if the study's runs were trained on other data, or on another classifier.
+
+        Objectives of two datasets say nothing about settings. One run stands for all: who went on
+        with the study came by here.
+        """
+        from optuna.trial import TrialState
+
+        loader = self.hydra_context.config_loader
+        for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            one = loader.load_sweep_config(self.config, [*fixed, *overrides(words(trial.params))])
+            if check_finished(one, "or begin another search with another experiment_name"):
+                return
 
     def _study(self, cfg: DictConfig, space: Mapping[str, BaseDistribution]) -> Study:
         from optuna import create_study

@@ -106,7 +106,7 @@ class SummaryOfSeeds(Callback):
         self.journal = None
         in_order = sorted(jobs, key=lambda job: job.get("job", 0))  # of the sweep, not of hashes
         folders = list(dict.fromkeys(Path(job["folder"]) for job in in_order))
-        if self.table and self.objective is not None:
+        if self.table and self.objective is not None and jobs:
             sys.stdout.write(objectives(jobs, self.objective) + "\n")
         elif self.table and any((folder / METRICS).is_file() for folder in folders):
             from qs3.report.tables.aggregate import summarise

@@ -20,6 +20,7 @@ from qs3.selftraining.student_loss import Student
 from qs3.selftraining.student_selection import StudentSelection
 from qs3.training.given import Given
 from qs3.training.load import Loaded
+from qs3.training.provenance import is_as_begun
 from qs3.training.run import Run
 from qs3.training.shared_warmup import SharedWarmup, warmup_sha256
 from qs3.utils.processor_time import Moment
@@ -55,8 +56,10 @@ def build_training(
     student = StudentSelection(
         folder, phases, cfg.selection.student, classes, run.scheme.more_labels
     )
+    # A warm-up of two versions is nobody else's.
+    sharing = cfg.paths.warmup_dir if is_as_begun(loaded.started) else None
     shared = SharedWarmup(
-        folder, cfg.paths.warmup_dir, warmup_sha256(cfg, loaded.started), run.seed, phases.warmup
+        folder, sharing, warmup_sha256(cfg, loaded.started), run.seed, phases.warmup
     )
     clock = Clock(began)
     # In this order: rounds select before the student is scored, and all is done before it is saved.

@@ -20,18 +20,18 @@ from qs3.runs.metrics import RoundRecord
 Shares = Float[np.ndarray, " c"]
 
 
-def of_warmup(data: AdaptationData, classes: int) -> Shares:
+def of_labelled(data: AdaptationData, classes: int) -> Shares:
     """Of the labelled clouds, as `data.sampler` draws them."""
     if data.labelled_domain.sampler == "balanced":
         return shares_of([], classes)
     return shares_of(data.labelled.labels.numpy(), classes)
 
 
-def of_student(scheme: SelfTrainingConfig, warmup: Shares, last: RoundRecord) -> Shares:
+def of_student(scheme: SelfTrainingConfig, labelled: Shares, last: RoundRecord) -> Shares:
     """Of the last round's pseudo-labels; with as many of the source beside them, of both."""
     counts = list(last.selected.values())
     pseudo = shares_of(np.repeat(np.arange(len(counts)), counts), len(counts))
-    return (pseudo + warmup) / 2 if scheme.use_source else pseudo
+    return (pseudo + labelled) / 2 if scheme.use_source else pseudo
 
 
 def prior_of(settings: Any, classes: Sequence[str], learnt: Shares) -> Prior | None:
@@ -44,4 +44,4 @@ def prior_of(settings: Any, classes: Sequence[str], learnt: Shares) -> Prior | N
         return None
     given: Any = settings.prior
     given = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
-    return read_prior(given, classes, learnt, settings.prior_power)
+    return read_prior(given, classes, learnt, settings.prior_power, "evaluation.prior")

@@ -7,26 +7,24 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from qs3.config import hashing
 from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
 from qs3.config.hydra import build, component_names, in_multirun
 from qs3.data.ensure_source import check_or_make
-from qs3.data.store import is_finished
-from qs3.datamodules.phases import Phases, SelfTrainingConfig
-from qs3.errors import ConfigError, Qs3Error
+from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.prior import check_told
 from qs3.evaluation.selection_rules import LAST, STUDENT_RULES, check_objective, chosen_in_words
 from qs3.inference import pretrained
 from qs3.runs import folder as runs
-from qs3.runs.metrics import METRICS, DataHashes, RunMetrics, read_metrics, write_metrics
+from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
-from qs3.training.run import Run
+from qs3.training.reuse import refuse_changed
+from qs3.training.run import Run, run_of
 from qs3.utils.locks import owned
 
 log = logging.getLogger(__name__)
@@ -61,7 +59,7 @@ CENTRED_ONLY = {
 }
 """Parts that cannot see heights, likewise."""
 
-_STILL = {
+STILL = {
     **{"crop": 1.0, "drop_regions": 0, "rotate_z": False, "scale": 1.0},
     **{"shift": 0.0, "lift": 0.0, "jitter_sigma": 0.0},
 }
@@ -69,7 +67,6 @@ _STILL = {
 
 _ONNX = "model=features needs an ONNX file"
 _FEATURES = "qs3.models.features.features"
-_SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
 
 
 def train(cfg: DictConfig) -> RunMetrics:
@@ -78,22 +75,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     Everything that can be wrong with the settings or the data is found before torch is imported.
     """
     _check_settings(cfg)
-    scheme: SelfTrainingConfig = build(cfg.selftraining)
-    run = Run(
-        cfg=cfg,
-        seed=check_int("seed", cfg.seed, 0),
-        folder=hashing.run_folder(cfg),
-        scheme=scheme,
-        phases=Phases(
-            cfg.protocol.epochs,
-            scheme.rounds,
-            scheme.epochs,
-            cfg.protocol.steps,
-            scheme.steps,
-        ),
-        source=build(cfg.data.source),
-        target=build(cfg.data.target),
-    )
+    run = run_of(cfg)
     _check_rounds(run)
     _check_scale(run)
     _check_frozen(run)
@@ -115,9 +97,7 @@ def train(cfg: DictConfig) -> RunMetrics:
                 write_metrics(run.folder, metrics)
                 _report(run)
         else:
-            runs.check_config(run.folder, metrics.config_sha256, hashing.config_sha256(cfg))
-            _refuse_other_data(run, metrics.data)
-            _refuse_other_weights(run, metrics.versions)
+            refuse_changed(run, metrics)
             log.info("already finished (force=true repeats it)")
     log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
     if (run.folder / OF_FILES).is_file():
@@ -269,7 +249,7 @@ def _check_settings(cfg: DictConfig) -> None:
             raise ConfigError(f"{why}; {what}, {group}.file=PATH")
     check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
     power = check_float("evaluation.prior_power", cfg.evaluation.prior_power)
-    check_told(cfg.evaluation.prior, power)
+    check_told(cfg.evaluation.prior, power, "evaluation.prior")
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)
     highest = 1 - 1 / check_int("num_classes", cfg.num_classes, 2)  # there all classes are alike
     if not 0 <= check_float("protocol.smoothing", cfg.protocol.smoothing) <= highest:
@@ -290,13 +270,9 @@ def _check_keys(cfg: DictConfig) -> None:
         check_keys(prefix, keys, known)
 
 
-def _is_upper_bound(cfg: DictConfig) -> bool:
-    return cfg.method.get("_target_") == _SUPERVISED
-
-
 def _check_rounds(run: Run) -> None:
     """Refuse rounds for the upper bound, and a choice among epochs of rounds there are not."""
-    if _is_upper_bound(run.cfg) and run.scheme.rounds:
+    if run.is_upper_bound and run.scheme.rounds:
         raise ConfigError(
             "method=supervised trains on the target's labels and has no use for pseudo-labels; "
             "set selftraining=none"
@@ -313,7 +289,7 @@ def _check_rounds(run: Run) -> None:
 def _check_scale(run: Run) -> None:
     """Refuse metres or heights for clouds that have none, and for parts that cannot see them."""
     cfg = run.cfg
-    used = (run.target,) if _is_upper_bound(cfg) else (run.source, run.target)
+    used = (run.target,) if run.is_upper_bound else (run.source, run.target)
     for domain in used:
         domain.check_scale(cfg.data.scale)
     for table, allowed in (
@@ -332,7 +308,7 @@ def _check_scale(run: Run) -> None:
 def _check_frozen(run: Run) -> None:
     """Refuse augmentation of clouds whose features are kept: no cloud would come twice."""
     augment = run.cfg.protocol.augment
-    changes = [key for key, value in _STILL.items() if augment.get(key, value) != value]
+    changes = [key for key, value in STILL.items() if augment.get(key, value) != value]
     if run.cfg.model.get("_target_") == _FEATURES and changes:
         raise ConfigError(
             "model=features keeps the features of clouds as they are stored, and protocol.augment "
@@ -341,40 +317,13 @@ def _check_frozen(run: Run) -> None:
 
 
 def _warn_of_one_domain(run: Run) -> None:
-    if run.source.folder == run.target.folder and not _is_upper_bound(run.cfg):
+    if run.source.folder == run.target.folder and not run.is_upper_bound:
         log.warning(
             "data.source (%s) and data.target (%s) are the same dataset: the target's training "
             "labels are used, so this is not adaptation",
             run.source.name,
             run.target.name,
         )
-
-
-def _refuse_other_data(run: Run, hashes: DataHashes) -> None:
-    """Raise if a dataset is there and is not the one that the finished run used."""
-    used = {"source": run.source, "target": run.target}
-    if _is_upper_bound(run.cfg):
-        del used["source"]
-    for role, domain in used.items():
-        if is_finished(domain.folder):  # else it was put away since, and the result stands
-            runs.check_data(
-                run.folder, domain.name, getattr(hashes, role), domain.open(verify=False).sha256
-            )
-
-
-def _refuse_other_weights(run: Run, versions: Mapping[str, str]) -> None:
-    """Raise if the classifier that `weights` names is there and is another than it was."""
-    if run.cfg.weights is None:
-        return
-    from qs3.training.given import read_given  # and torch with it
-
-    name, _, sha256 = versions.get("weights", "").rpartition(" ")
-    try:
-        given = read_given(run.cfg)
-    except Qs3Error:  # it was put away since, and the result stands
-        return
-    if given is not None:
-        runs.check_data(run.folder, f"the classifier {name}", sha256, given.sha256)
 
 
 def _refuse_ddp_in_multirun(cfg: DictConfig) -> None:

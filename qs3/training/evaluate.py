@@ -148,7 +148,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
 
     learnt, prior = loaded.learnt, loaded.prior
     if run.scheme.rounds:
-        learnt = class_shares.of_student(run.scheme, loaded.learnt, built.rounds.records[-1])
+        learnt = class_shares.of_student(run.scheme, loaded.labelled, built.rounds.records[-1])
         prior = class_shares.prior_of(run.cfg.evaluation, evaluation.classes, learnt)
     of_teacher = (files["selected"], files["last"])
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from qs3.training.build import Built, build_training
 from qs3.training.evaluate import evaluate
 from qs3.training.given import read_given
 from qs3.training.load import Loaded, load_data
+from qs3.training.provenance import warn_of_changes
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
@@ -48,10 +50,11 @@ def fit(run: Run) -> RunMetrics:
     method: Method = build(run.cfg.method)
     given = read_given(run.cfg)
     loaded = load_data(run, method, given)
+    if not run.cfg.force:
+        loaded = replace(loaded, started=take_checkpoint(run, loaded.started))
     if run.cfg.trainer.threads == "auto":
         _take_threads_of(loaded.started)
-    if not run.cfg.force:
-        take_checkpoint(run, loaded.started)
+    warn_of_changes(loaded.started)
     built = build_training(run, method, loaded, given, began)
     _remember(run, loaded, built)
     _fit(run, loaded, built)

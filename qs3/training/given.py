@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from qs3.errors import ConfigError, DataError
 from qs3.inference.model_file import read_result
+from qs3.inference.predictor import learnt_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,14 +27,14 @@ class Given:
         classes: in the order of its logits.
         weights: of its net, float32 where they are floats.
         sha256: of them.
-        learnt: shares of the classes in its training; None: nobody knows.
+        learnt: [C] shares of the classes in its training; None: nobody knows.
     """
 
     name: str
     classes: tuple[str, ...]
     weights: dict[str, Tensor]
     sha256: str
-    learnt: tuple[float, ...] | None = None
+    learnt: Float[np.ndarray, " c"] | None = None
 
     def check_classes(self, classes: Sequence[str]) -> None:
         """Raise DataError if the run's are others."""
@@ -73,7 +75,7 @@ def read_given(cfg: DictConfig) -> Given | None:
         key: value.float() if value.is_floating_point() else value
         for key, value in result.weights.items()
     }
-    return Given(name, result.classes, weights, _sha256(weights), result.learnt)
+    return Given(name, result.classes, weights, _sha256(weights), learnt_of(result))
 
 
 def _sha256(weights: Mapping[str, Tensor]) -> str:

@@ -6,8 +6,6 @@ import logging
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from qs3.config.hydra import build
 from qs3.data.domain import Domain
 from qs3.data.manifest import read_manifest
@@ -38,7 +36,8 @@ class Loaded:
         stored_points: of a cloud on disk.
         started: what `started.json` says: hashes of data and config, versions.
         made_of: what the labelled dataset and the target are made of.
-        learnt: shares of the classes in what the warm-up's net learns from.
+        labelled: shares of the classes in the labelled clouds, as they are drawn.
+        learnt: the same in what the warm-up's net learnt from; another's, if it was given.
         prior: how common classes are in the target, for that net, if `evaluation.prior` says so.
     """
 
@@ -48,6 +47,7 @@ class Loaded:
     stored_points: int
     started: dict[str, Any]
     made_of: DataMadeOf
+    labelled: class_shares.Shares
     learnt: class_shares.Shares
     prior: Prior | None
 
@@ -82,9 +82,9 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
-    learnt = class_shares.of_warmup(data, len(target.classes))
-    if given and run.cfg.selection.teacher == "given" and given.learnt:
-        learnt = np.array(given.learnt)
+    learnt = drawn = class_shares.of_labelled(data, len(target.classes))
+    if given and run.cfg.selection.teacher == "given" and given.learnt is not None:
+        learnt = given.learnt
     prior = class_shares.prior_of(cfg.evaluation, target.classes, learnt)
     if (few := cfg.data.clouds_a_split) is not None:
         target = subsample_splits(target, few)
@@ -105,7 +105,9 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         _tiers_by_id(target, run.target),
     )
     made_of = DataMadeOf(source=labelled, target=of_target)
-    return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, learnt, prior)
+    return Loaded(
+        data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt, prior
+    )
 
 
 def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:

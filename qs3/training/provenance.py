@@ -18,6 +18,7 @@ from qs3.data.store import PointSet
 from qs3.datamodules.fps_cache import remove_old_leftovers
 from qs3.errors import ConfigError
 from qs3.runs import folder as runs
+from qs3.runs.checkpoints import LAST
 from qs3.training.given import Given
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
@@ -37,17 +38,11 @@ def note_start(
 
     `beside_sha256`: of twins and views that are trained on; "" where there are none.
     """
+    weights = {"weights": f"{given.name} {given.sha256}"} if given else {}
     now: dict[str, Any] = {
         "data": {"source": source.sha256, "target": target.sha256},
         **({"beside": beside_sha256} if beside_sha256 else {}),
-        "versions": {
-            "qs3": VERSION,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "lightning": lightning.__version__,
-            "numpy": np.__version__,
-            **({"weights": f"{given.name} {given.sha256}"} if given else {}),
-        },
+        "versions": versions() | weights,
         "commit": commit(),
         "threads": torch.get_num_threads(),
         "config_sha256": hashing.config_sha256(run.cfg),
@@ -71,17 +66,53 @@ def note_start(
     runs.check_config(run.folder, started.get("config_sha256"), now["config_sha256"])
     for role, dataset in (("source", source), ("target", target)):
         runs.check_data(run.folder, dataset.name, started["data"][role], dataset.sha256)
-    name = f"what lies beside {source.name}"
-    runs.check_data(run.folder, name, started.get("beside", ""), beside_sha256)
-    warn_of_versions(started["versions"], now["versions"])
+    beside = started.get("beside", "")
+    runs.check_data(run.folder, runs.beside(source.name), beside, beside_sha256)
+    runs.check_data(run.folder, WEIGHTS, given_sha256(started), given_sha256(now))
+    if not (run.folder / LAST).is_file():  # nothing of it is left to go on with
+        runs.write_started(run.folder, now)
+        return now
     return started
 
 
-def warn_of_versions(begun: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Say if a run goes on with other versions than it was begun with."""
-    if begun != now:
+WEIGHTS = "the classifier that weights= names"
+
+
+def given_sha256(started: Mapping[str, Any]) -> str:
+    """Of the classifier that a run was begun with; "" without one."""
+    return started["versions"].get("weights", "").rpartition(" ")[2]
+
+
+def versions() -> dict[str, str]:
+    """Of what decides a result beside settings and data."""
+    return {
+        "qs3": VERSION,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "lightning": lightning.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def is_as_begun(started: Mapping[str, Any]) -> bool:
+    """Whether versions and torch's number of threads, which orders sums, are those of the start."""
+    return not _changed(started)
+
+
+def warn_of_changes(started: Mapping[str, Any]) -> None:
+    """Say if a run goes on with other versions or threads than it was begun with."""
+    if changed := _changed(started):
         log.warning(
             "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
-            begun,
-            now,
+            ", ".join(f"{name} {was}" for name, (was, _) in changed.items()),
+            ", ".join(f"{name} {now}" for name, (_, now) in changed.items()),
         )
+
+
+def _changed(started: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """What is another than at the start, by name: what it was, what it is."""
+    now: dict[str, Any] = versions() | {"threads": torch.get_num_threads()}
+    begun = {name: value for name, value in started["versions"].items() if name != "weights"}
+    begun["threads"] = started.get("threads") or now["threads"]  # older runs do not say
+    names = [name for name in {**begun, **now} if begun.get(name) != now.get(name)]
+    return {name: (begun.get(name, "none"), now.get(name, "none")) for name in names}

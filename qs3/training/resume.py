@@ -12,7 +12,7 @@ from qs3.errors import ConfigError, MissingDataError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST, check
 from qs3.runs.metrics import METRICS
-from qs3.training.provenance import warn_of_versions
+from qs3.training.provenance import WEIGHTS, given_sha256
 from qs3.training.run import Run
 from qs3.utils.files import copy_file
 from qs3.utils.locks import check_idle
@@ -20,21 +20,30 @@ from qs3.utils.locks import check_idle
 log = logging.getLogger(__name__)
 
 _LAST = "last"
+_ROLES = ("source", "target")
+_OF_BEGINNING = ("versions", "threads", "commit")  # of what was trained there
 _STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, METRICS)
 
 
-def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
+_INSTEAD = "or leave ckpt_path out to begin anew"
+
+
+def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
     """Do what `ckpt_path` asks for, before training begins.
 
     null does nothing. "last" insists on a checkpoint of the run. A path, of a run's folder or of
     the `last.ckpt` in it, brings the same run from elsewhere: another machine's logs, a backup. As
     settings, seed and data must be the same, the result is that of a run that was never moved;
-    other versions of torch may change it, which is a warning. A run that has a checkpoint of its
+    other versions of torch, or another number of threads, may
+    change it, which is a warning. A run that has a checkpoint of its
     own goes on from that.
 
     Args:
         run: whose folder it is.
         started: what the run is started with, as in `started.json`.
+
+    Returns:
+        What it was begun with, there or here.
 
     Raises:
         MissingDataError: there is no such checkpoint.
@@ -45,7 +54,7 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
     where = run.cfg.ckpt_path
     own = run.folder / LAST
     if where is None or own.is_file() or int(os.environ.get("LOCAL_RANK", 0)) > 0:
-        return
+        return dict(started)
     if where == _LAST:
         raise MissingDataError(
             f"ckpt_path={_LAST}, but {own} is not there: a run with these settings and seed has "
@@ -66,16 +75,20 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> None:
             f"{run.folder.name} (seed and hash of the settings). Give the command that began it, "
             "or leave ckpt_path out"
         )
-    runs.check_config(other, begun.get("config_sha256"), started["config_sha256"])
+    runs.check_config(other, begun.get("config_sha256"), started["config_sha256"], _INSTEAD)
     check_idle(other)
-    warn_of_versions(begun["versions"], started["versions"])
-    for role in ("source", "target"):
-        runs.check_data(other, f"data.{role}", begun["data"][role], started["data"][role])
-    twins = (one.get("beside", "") for one in (begun, started))
-    runs.check_data(other, "the twins of data.source", *twins)
+    for name, was, now in (
+        *((f"data.{role}", begun["data"][role], started["data"][role]) for role in _ROLES),
+        (runs.beside("data.source"), *(one.get("beside", "") for one in (begun, started))),
+        (WEIGHTS, *map(given_sha256, (begun, started))),
+    ):
+        runs.check_data(other, name, was, now, _INSTEAD)
     check(path, "copy it again from where it comes from, or leave ckpt_path out to begin anew")
     log.info("going on from %s", path)
+    begun = {**started, **{key: begun[key] for key in _OF_BEGINNING if key in begun}}
+    runs.write_started(run.folder, begun)
     bring(other, run.folder)
+    return begun
 
 
 def bring(other: Path, folder: Path) -> None:

@@ -99,13 +99,16 @@ def tune(wanted: Wanted, overrides: Sequence[str]) -> Found:
     items = [item for item in mesh_items(cfg) if item.split == "train"]
     trained, held = _drawn(items, wanted)
     target, digest = target_clouds(wanted.target, wanted.sample, wanted.points, wanted.seed)
-    distance = Distance(descriptor(wanted.features), target)
+    describe = descriptor(wanted.features)
+    distance = Distance(describe, target)
+    net = {"net": describe.sha256} if isinstance(describe, NetFeatures) else {}
     settings = json.dumps(
         {
             "recipe": plan_settings(cfg),
             "objects": [item.id for item in (*trained, *held)],
             "target": digest,
             "keys": keys,
+            **net,
             **{
                 name: getattr(wanted, name)
                 for name in (

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from qs3.errors import ConfigError
 from qs3.methods.mmd import mmd2
+from qs3.runs.checkpoints import weights_sha256
 
 ROUGHNESS = "roughness"
 _NEIGHBOURS = 12
@@ -52,12 +53,16 @@ class NetFeatures:
 
     Args:
         net: with `features(points).global_`; put into eval mode, without gradients of its own.
+
+    Attributes:
+        sha256: of its weights.
     """
 
     def __init__(self, net: nn.Module) -> None:
         if not hasattr(net, "features"):
             raise ConfigError("features= names a net that has no features of clouds; take another")
         self.net = net.eval().requires_grad_(False)
+        self.sha256 = weights_sha256(net.state_dict())
 
     def __call__(self, clouds: Float[Tensor, "b n 3"]) -> Float[Tensor, "b d"]:
         """See `Descriptor`."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +12,8 @@ from hypothesis import strategies as st
 
 from qs3.classes import CLASSES, MODELNET40
 from qs3.errors import ConfigError
-from qs3.evaluation.prior import ROOMS, read_prior, shares_of
+from qs3.evaluation.prior import ROOMS, check_told, read_prior, shares_of
+from tests.composing import compose
 
 AB = ("a", "b")
 THREE = ("chair", "table", "lamp")
@@ -111,6 +115,28 @@ def test_shares_whatever_the_unit_and_no_more(
 def test_what_is_no_prior_says_so(given, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         read_prior(given, THREE)
+
+
+@pytest.mark.parametrize("key", ["prior", "evaluation.prior"])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda key: check_told(None, 0.7, key),
+        lambda key: read_prior("chair", THREE, key=key),
+        lambda key: read_prior("rooms", (*THREE, "crate"), key=key),
+    ],
+)
+def test_what_is_advised_is_a_prior(key, wrong) -> None:
+    """Typed as it stands, in the grammar of the command that it is for."""
+    with pytest.raises(ConfigError) as told:
+        wrong(key)
+    if key == "prior":
+        (words,) = re.findall(r"prior=([a-z]+:\S+:\d)", str(told.value))
+        given: Any = words
+    else:
+        (words,) = re.findall(r"'evaluation.prior=([^']+)'", str(told.value))
+        given = dict(compose("train", [f"evaluation.prior={words}"]).evaluation.prior)
+    assert read_prior(given, THREE).shares == pytest.approx([4 / 7, 2 / 7, 1 / 7])
 
 
 def test_rooms_know_ten_classes() -> None:

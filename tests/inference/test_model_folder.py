@@ -3,6 +3,7 @@
 import json
 import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -228,6 +229,18 @@ def test_the_card_says_what_the_run_knows(run, folder, tmp_path):
     assert "Not recorded" in other
 
 
+def test_figures_that_were_told_something_say_so(run):
+    result, metrics = read_result(run), read_metrics(run)
+    assert "prior" not in card(result, metrics)
+    told = replace(metrics.evaluation, prior="classes count as this common: rod 90.0%")
+    text = card(result, replace(metrics, evaluation=told))
+    assert "That is with `evaluation.prior`: classes count as this common" in text
+    assert "Without `prior=` of `qs3.load`" in text
+    camera = card(replace(result, gravity="none"), metrics)
+    assert "z forward" in camera
+    assert "z up" not in camera
+
+
 def test_a_copy_of_an_exported_folder_keeps_its_card(run, folder, tmp_path):
     card = (folder / "README.md").read_text()
     export_folder(folder, tmp_path / "copy", half=True)
@@ -269,8 +282,6 @@ def test_the_command_on_the_card_has_no_folders_of_its_machine(run, tmp_path, mo
 
 
 def test_names_of_classes_mean_nothing_on_the_card(run):
-    from dataclasses import replace
-
     result = replace(read_result(run), classes=("a", "<img src=x>", "[b](http://c)"))
     body = card(result, None)
     assert "<img" not in body

@@ -27,7 +27,7 @@ from qs3.training.command import judged, objective_of, train
 from tests.commands import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
-from tests.training.toy import CONF, overrides
+from tests.training.toy import CONF, overrides, write_domain
 
 SEARCH = "hparams_search=qbst_optuna"
 GRID = "hparams_search=qbst_grid"
@@ -336,6 +336,14 @@ def test_a_search_with_trainings(tmp_path, toy_data):  # noqa: F811
     assert "accura" not in console
     assert "balanced" not in console
     assert len(re.findall(r"quickstart, seed 0: objective=infomax \d\.\d{4}", console)) == 3
+    for name in ("specklenet10", "kinectsim10"):
+        write_domain(tmp_path / "others", name, noise=0.2)
+    words[words.index(f"paths.data_dir={toy_data}")] = f"paths.data_dir={tmp_path / 'others'}"
+    result = command(tmp_path, *words)  # objectives of two datasets are none of one study
+    assert result.returncode == 1
+    assert "another version of specklenet10" in result.stderr
+    assert "or begin another search with another experiment_name" in result.stderr
+    assert "Best: trial" not in result.stdout
     grid = [*overrides(tmp_path, f"paths.data_dir={toy_data}"), GRID, "selftraining.theta=0.4"]
     result = command(
         tmp_path, *grid, "selftraining.epsilon=0.0", "selftraining.rounds=1,2", "logger=wandb"

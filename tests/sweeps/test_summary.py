@@ -94,6 +94,16 @@ def test_no_table_without_a_finished_run(summary, tmp_path, capsys):
     )
 
 
+def test_objectives_of_a_sweep_whose_first_job_never_began(tmp_path, capsys):
+    """Its launcher could not start, say: what kept it from that stands last on the terminal."""
+    summary = SummaryOfSeeds()
+    beginning = config(tmp_path)
+    beginning.objective, beginning.hydra.sweeper = "infomax", {}
+    summary.on_multirun_start(beginning)
+    summary.on_multirun_end(beginning)
+    assert capsys.readouterr().out == ""
+
+
 def test_finished_runs_make_a_table(summary, tmp_path, capsys):
     ended(summary, write_run(tmp_path, seed=0))
     summary.on_multirun_end(config(tmp_path))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from qs3.config import hashing
 from qs3.data.store import open_pointset
@@ -15,11 +16,11 @@ from qs3.datamodules.splits import subsample_splits
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.runs.metrics import TrainingAccuracy
-from qs3.training.command import train
+from qs3.training.command import STILL, train
 from qs3.utils.locks import owned
 from tests.composing import compose
 from tests.training.conftest import result_of
-from tests.training.toy import write_domain
+from tests.training.toy import CONF, write_domain
 from tests.training.watching import interrupt
 
 
@@ -163,14 +164,67 @@ def test_ckpt_path_of_a_run_that_is_being_trained(toy, begun):
         train(toy(f"ckpt_path={begun}", "paths.warmup_dir=null"))
 
 
+def change_started(folder, **changes) -> None:
+    """`started.json` of a run that other software began."""
+    file = folder / "started.json"
+    document = json.loads(file.read_text())
+    for key, value in changes.items():
+        (document["versions"] if key == "torch" else document)[key] = value
+    file.write_text(json.dumps(document))
+
+
 def test_ckpt_path_warns_of_other_versions(toy, begun, caplog):
-    started = begun / "started.json"
-    document = json.loads(started.read_text())
-    document["versions"]["torch"] = "1.0"
-    started.write_text(json.dumps(document))
-    train(toy(f"ckpt_path={begun}", "paths.warmup_dir=null"))
-    assert "begun with" in caplog.text
-    assert "'torch': '1.0'" in caplog.text
+    change_started(begun, torch="1.0", threads=77)
+    cfg = toy(f"ckpt_path={begun}", "paths.warmup_dir=null")
+    interrupt(cfg, epoch=7)
+    assert "begun with torch 1.0, threads 77, continued with torch" in caplog.text
+    caplog.clear()
+    metrics = train(cfg)  # whose own checkpoint it goes on from: still that of both
+    assert "begun with torch 1.0, threads 77, continued with" in caplog.text
+    assert metrics.versions["torch"] == "1.0"
+
+
+def test_as_many_threads_as_elsewhere(toy, begun, monkeypatch):
+    """By `auto`: sums are ordered by them."""
+    threads = torch.get_num_threads()
+    change_started(begun, threads=threads + 1)
+    taken = []
+    monkeypatch.setattr(torch, "set_num_threads", taken.append)
+    words = (f"ckpt_path={begun}", "paths.warmup_dir=null", "trainer.threads=auto")
+    cfg = toy(*words)
+    other = begun.with_name(hashing.run_folder(cfg).name)  # another setting, another hash
+    begun.rename(other)
+    change_started(other, config_sha256=hashing.config_sha256(cfg))
+    train(toy(f"ckpt_path={other}", *words[1:]))
+    assert taken[-1] == threads + 1
+
+
+@pytest.mark.parametrize("changed", [{}, {"torch": "1.0"}, {"threads": 77}])
+def test_a_warm_up_of_two_versions_is_given_to_nobody(toy, changed, tmp_path, caplog):
+    cfg = toy(f"paths.warmup_dir={tmp_path / 'warmups'}")
+    interrupt(cfg, epoch=2)
+    change_started(hashing.run_folder(cfg), **changed)
+    train(cfg)
+    assert ("begun with" in caplog.text) == bool(changed)
+    assert (tmp_path / "warmups").exists() == (not changed)
+
+
+def test_a_run_without_a_checkpoint_begins_with_what_there_is(toy, caplog):
+    cfg = toy()
+    interrupt(cfg, epoch=0)
+    change_started(hashing.run_folder(cfg), torch="1.0")
+    metrics = train(cfg)
+    assert "begun with" not in caplog.text
+    assert metrics.versions["torch"] == torch.__version__
+
+
+def test_nothing_about_clouds_is_random_in_overfit():
+    """Of any experiment: each has settings of its own."""
+    for file in (CONF / "experiment").glob("*.yaml"):
+        cfg = compose("train", [f"experiment={file.stem}", "debug=overfit"])
+        changes = {key: cfg.protocol.augment[key] for key in STILL if key in cfg.protocol.augment}
+        assert changes.items() <= STILL.items(), file.stem
+        assert cfg.data.source.get("views", "stored") == "stored", file.stem
 
 
 def test_ckpt_path_and_force_contradict_each_other(toy, begun):

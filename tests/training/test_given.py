@@ -63,6 +63,50 @@ def test_another_classifier_under_its_name_is_refused(toy, finished, tmp_path):
     assert train(cfg).final == before.final  # put away: the result stands
 
 
+def test_a_run_does_not_go_on_with_another_classifier(toy, finished, tmp_path):
+    """Nor does it give others a warm-up that two classifiers had a part in."""
+    teacher = tmp_path / "teacher.pt"
+    result = read_result(finished)
+    write_result(teacher, result)
+    cfg = toy("selftraining=none", "protocol.epochs=3", f"weights={teacher}")
+    interrupt(cfg, epoch=1)
+    changed = {name: value + 1 for name, value in result.weights.items()}
+    write_result(teacher, replace(result, weights=changed))
+    with pytest.raises(DataError, match="another version of the classifier that weights= names"):
+        train(cfg)
+    moved = tmp_path / "elsewhere" / hashing.run_folder(cfg).name
+    moved.parent.mkdir()
+    hashing.run_folder(cfg).rename(moved)
+    with pytest.raises(DataError, match=r"classifier .* bring the old data back, or leave ckpt_p"):
+        train(toy("selftraining=none", "protocol.epochs=3", f"weights={teacher}",
+                  f"ckpt_path={moved}", "paths.warmup_dir=null"))  # fmt: skip
+
+
+def test_a_finished_run_is_not_that_of_another_kind_of_net(toy, finished, tmp_path):
+    teacher = tmp_path / "teacher.pt"
+    result = read_result(finished)
+    write_result(teacher, result)
+    cfg = toy("selftraining=none", "protocol.epochs=1", f"weights={teacher}")
+    train(cfg)
+    write_result(teacher, replace(result, model={**result.model, "more": 5}))
+    with pytest.raises(ConfigError, match="its net has more=5"):
+        train(cfg)
+
+
+def test_a_students_shares_are_of_its_own_source(toy, finished, tmp_path):
+    """Beside pseudo-labels it is trained on the run's source, not on its teacher's."""
+    result = read_result(finished)
+    uneven = (0.8, 0.1, 0.1)
+    write_result(tmp_path / "teacher.pt", replace(result, learnt=uneven))
+    words = ("selftraining.rounds=1", "selftraining.use_source=true")
+    cfg = toy(*ONLY_ROUNDS, *words, f"weights={tmp_path / 'teacher.pt'}")
+    metrics = train(cfg)
+    chosen = [metrics.rounds[-1].selected[name] + 1 for name in result.classes]
+    both = [(one / sum(chosen) + 1 / 3) / 2 for one in chosen]  # the toy source is even, but for
+    learnt = read_result(hashing.run_folder(cfg)).learnt  # clouds that validate
+    assert learnt == pytest.approx(both, abs=0.02)
+
+
 def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
     words = (*ONLY_ROUNDS, f"weights={finished}")
     whole = toy(*words)

@@ -13,6 +13,7 @@ from qs3.errors import ConfigError
 from qs3.generation.command import generate
 from qs3.generation.plan import mesh_items
 from qs3.generation.scan import composed_recipe
+from qs3.inference.model_file import read_result, write_result
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.tuning import parameters
 from qs3.tuning.features import Distance, roughness
@@ -132,6 +133,18 @@ def test_the_command_writes_a_preset_that_composes_and_goes_on(target, tmp_path,
     assert main(words(target, out, "steps=2")) == 0
     assert out.read_text() == before
     assert main(words(target, out, "steps=2", "rate=0.3")) == 1
+    assert "other settings" in capsys.readouterr().err
+
+
+def test_another_net_under_its_name_is_another_search(target, tmp_path, capsys):
+    net, out = tmp_path / "net.pt", tmp_path / "tuned.yaml"
+    result = read_result("pointnet-speckle")
+    write_result(net, result)
+    given = words(target, out, "steps=1", f"features={net}")
+    assert main(given) == 0
+    changed = {name: value + 1 for name, value in result.weights.items()}
+    write_result(net, replace(result, weights=changed))
+    assert main(given) == 1
     assert "other settings" in capsys.readouterr().err
 
 
