@@ -24,9 +24,8 @@ def python_command(name: str) -> list[str]:
 
 
 def typed(text: str) -> str:
-    """A text with commands such as `python train.py ...` as they are typed here."""
-    if not _INSTALLED:
-        return text
+    """A text with commands such as `python train.py ...` as they are typed in this folder."""
     for name in ("train", "generate"):
-        text = text.replace(f"python {name}.py", f"qs3-{name}")
+        if _INSTALLED or not Path(f"{name}.py").is_file():
+            text = text.replace(f"python {name}.py", f"qs3-{name}")
     return text

@@ -264,9 +264,10 @@ class Domain:
         if not self.has_array(name):
             twin = "whole" if name == "points_whole" else "exact,views"
             raise DataError(
-                f"{self.folder} has no {name}.npy: generate it again with it, python generate.py "
-                f"domain={self.name} force=true twins=[{twin}] (its clouds will be the same), or "
-                "set method.sees=scan, which takes the clouds themselves"
+                f"{self.folder} has no {name}.npy: generate it again with it, "
+                + typed(f"python generate.py domain={self.name} force=true twins=[{twin}]")
+                + " (its clouds will be the same), or set method.sees=scan, which takes the clouds "
+                "themselves"
             )
         return replace(open_pointset(self.folder, name, verify=verify), floor_m=self.floor_m)
 

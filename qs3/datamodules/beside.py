@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+from qs3.config.location import typed
 from qs3.data.domain import Domain
 from qs3.data.meta import sha256_of
 from qs3.data.store import PointSet
@@ -47,8 +48,8 @@ def views_of(domain: Domain, verify: bool) -> tuple[list[PointSet], list[PointSe
     if len(names) == 1 and not known:
         raise ConfigError(
             f"data.source.views=random: the store of {domain.name} keeps neither views nor clouds "
-            f"without error. Generate it again with them: python generate.py domain={domain.name} "
-            "force=true twins=[views,exact], or twins=[exact] if it has one view; its clouds will "
-            "be the same"
+            "without error. Generate it again with them: "
+            + typed(f"python generate.py domain={domain.name} force=true twins=[views,exact]")
+            + ", or twins=[exact] if it has one view; its clouds will be the same"
         )
     return measured, [domain.open_array(name, verify) for name in exact] if known else []

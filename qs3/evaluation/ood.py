@@ -37,6 +37,7 @@ ALL = (*MEASURES, *OF_METRES, *OF_HEIGHTS)
 """Names of all there are."""
 
 _TAIL = 0.001  # of the clouds of a domain, on either side
+OTHER_UNITS = "as of other units than metres"
 _NO_METRES = 10.0  # times the largest size: centimetres, millimetres or inches
 _MOST = 1000  # clouds that are measured of a domain; 3 ms each
 
@@ -116,7 +117,7 @@ def ood_reasons(measured: Mapping[str, float], usual: Mapping[str, list[float]])
         if low <= value <= high:
             continue
         limit = f"under {low:.4g}" if value < low else f"over {high:.4g}"
-        unit = ", as of other units than metres" * (name in OF_METRES and value > _NO_METRES * high)
+        unit = f", {OTHER_UNITS}" * (name in OF_METRES and value > _NO_METRES * high)
         reasons.append(f"{name} {value:.4g} is {limit}{unit}")
     return reasons
 

@@ -122,7 +122,7 @@ def generate(cfg: DictConfig) -> PointSet:
         if pool.elsewhere:
             place = partial(parts.check_there, parts.recipe_sha256()) if pool.shared_disk else None
             job = replace(job, expected={**software(), **renderer}, check_place=place)
-        passing = _scan_missing(job, items, parts, pool, domain.label)
+        passing = _scan_missing(job, items, parts, pool, _heading(domain))
         outcomes = _collect(items, parts, passing, folder)
         # The dataset last: with meta.yaml it counts as finished, and the parts can go.
         _draw(domain, items, outcomes, folder)
@@ -236,10 +236,17 @@ def _draw(domain: Domain, items: list[MeshItem], outcomes: list[Outcome], folder
             clouds[item.cls].append(outcome.cloud.arrays)
         if outcome.cloud.preview and item.cls not in previews:
             previews[item.cls] = (item.id, outcome.cloud.preview)
+    heading = _heading(domain)
     twin = any("points_clean" in arrays for some in clouds.values() for arrays in some)
-    clouds_picture(folder / CLOUDS, clouds, domain.label, twin)
+    clouds_picture(folder / CLOUDS, clouds, heading, twin)
     if previews:
-        infrared_picture(folder / INFRARED, previews, domain.label)
+        infrared_picture(folder / INFRARED, previews, heading)
+
+
+def _heading(domain: Domain) -> str:
+    """What its pictures are called: classes of one's own are another dataset than the published."""
+    own = domain.classes is not None and not isinstance(domain.classes, str)
+    return f"{domain.folder.name}, scanned as {domain.label}" if own else domain.label
 
 
 def _costs(items: list[MeshItem], outcomes: list[Outcome]) -> str:

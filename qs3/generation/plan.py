@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import hashlib
 import json
 import math
@@ -17,7 +18,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.classes import CLASSES, class_list
-from qs3.config.checks import check_bool, check_choice, check_float, check_int
+from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
 from qs3.config.hydra import build
 from qs3.data.dataset_folder import VIEWS as VIEWS_FOLDER
 from qs3.errors import ConfigError, MeshError, MissingDataError
@@ -31,6 +32,15 @@ from qs3.meshes.formats.mtl import libraries
 from qs3.meshes.source import MeshItem
 from qs3.utils.files import sha256_file
 from qs3.utils.version import VERSION
+
+KEYS = (
+    *("seed", "meshes", "fill_up", "poses", "half", "test_fraction", "up", "colliders", "classes"),
+    *("splits", "limit", "fraction", "scans", "provenance", "keep_views", "twins", "workers"),
+    *("shard_mb", "force", "strict", "paths", "domain", "catalogue", "renderer", "scene"),
+    *("tracking", "crop", "views", "recipe", "sensor", "counts", "released", "engine"),
+    *("materials", "light", "depth_errors", "benchmark", "cutting"),
+)
+"""The keys at the top of conf/generate.yaml and of all that it composes."""
 
 _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0, "shard_mb": 1}
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
@@ -51,6 +61,8 @@ _UNSTORED = ("paths", "workers", "engine", "shard_mb", "force", "strict")
 
 def check(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that no later step would explain as well."""
+    text = OmegaConf.to_yaml(cfg, resolve=False)
+    check_keys("", [str(key) for key in cfg if f"${{{key}" not in text], KEYS)
     for key, least in _WHOLE.items():
         if cfg[key] is not None or key != "limit":
             check_int(key, cfg[key], least)
@@ -62,9 +74,15 @@ def check(cfg: DictConfig) -> None:
             raise ConfigError("classes=[] leaves nothing to scan: name some, classes=[chair,table]")
         known = known_classes(cfg)
         if unknown := sorted(set(cfg.classes) - set(known)):
+            near = difflib.get_close_matches(str(unknown[0]), known, n=1)
+            hint = (
+                f"did you mean {near[0]}?"
+                if near
+                else "others are given as '+domain.classes=[...]', with domain.path= for their "
+                "dataset"
+            )
             raise ConfigError(
-                f"classes: {unknown} are not among the known {', '.join(known)}; others are "
-                "given as '+domain.classes=[...]', with domain.path= for their dataset"
+                f"classes: {unknown} are not among the known {', '.join(known)}; {hint}"
             )
     if cfg.splits is not None:
         if not (isinstance(cfg.splits, ListConfig) and cfg.splits):

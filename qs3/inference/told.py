@@ -6,7 +6,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from qs3.config.location import typed
 from qs3.data.frames.pointed import LEVEL, PLANES
+from qs3.evaluation.ood import OTHER_UNITS
 from qs3.inference.predictor import Predictor
 from qs3.inference.pretrained import HEIGHTS
 from qs3.inference.scores import Count, disputed, right, scores
@@ -15,6 +17,7 @@ from qs3.inference.table import Row
 from qs3.utils.plural import counted
 
 _SHOWN = 10  # failures in the text for the terminal
+_LINES = 8  # that an organised scan has at least
 
 
 def told(
@@ -42,6 +45,8 @@ def told(
         lines += _no_class(rows, predictor.classes)
         strange = sum(one["out_of_range"] for one in good)
         lines.append(f"{strange} of them out of range (column out_of_range)")
+        lines += _other_units(good)
+        lines += _several(rows, inputs)
     if cautioned := sum(one["caution"] is not None for one in good):
         lines.append(f"{cautioned} of them with a caution (column caution)")
     lines += _vertical(rows)
@@ -55,7 +60,7 @@ def told(
             f"{counted(drawn, 'file is a mesh', 'files are meshes')}: points were drawn on "
             f"{'its surface' if drawn == 1 else 'their surfaces'}; to see "
             f"{'it as a sensor does: ' if drawn == 1 else 'them as a sensor does: '}"
-            "python generate.py meshes=FOLDER"
+            + typed("python generate.py meshes=FOLDER")
         )
     if predictor.in_metres and inputs.kind == "files":
         lines.append("the classifier knows real sizes: the files' coordinates were taken as metres")
@@ -91,6 +96,39 @@ def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
     label, times = found.majority
     balanced = f", balanced {found.balanced:.1%}"
     return [f"right {of(found.all)}{balanced}{tiers}; always {label}: {times / found.all.of:.1%}"]
+
+
+def _other_units(good: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Clouds of which the size says so."""
+    count = sum(OTHER_UNITS in one["reason"] for one in good)
+    if not count:
+        return []
+    they = "it was" if count == 1 else "they were"
+    return [
+        f"{count} of them as large as if {they} not in metres, so these answers mean nothing: "
+        "divide millimetres by 1000"
+    ]
+
+
+def _several(rows: Sequence[Row], inputs: Inputs) -> list[str]:
+    """Arrays [m, n, 3] whose every cloud is odd: one organised scan of m lines, perhaps."""
+    if inputs.kind != "files":
+        return []
+    of_file: dict[str, list[str]] = {}
+    for row in rows:
+        name, bracket, _ = row.file.rpartition("[")
+        if bracket and name.endswith(".npy"):
+            of_file.setdefault(name, []).append(row.reason)
+    odd = [(name, found) for name, found in of_file.items() if len(found) >= _LINES and _odd(found)]
+    return [
+        f"{name} is an array of {len(found)} clouds, all out of range: if it is one organised "
+        "scan, save it as array.reshape(-1, 3)"
+        for name, found in odd[:_SHOWN]
+    ]
+
+
+def _odd(reasons: Sequence[str]) -> bool:
+    return all(reason and OTHER_UNITS not in reason for reason in reasons)
 
 
 def _no_class(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:

@@ -189,6 +189,8 @@ class Command:
             key, equals, value = word.partition("=")
             if self.bare and not equals and not word.startswith("-"):
                 key, equals, value = self.bare, "=", word
+                if key in given:
+                    raise ConfigError(self._one(known[key], word))
             option = known.get(key) or known.get(key.removeprefix("paths."))
             if not equals and self.words:
                 words.append(word)
@@ -209,6 +211,11 @@ class Command:
         extra |= {"line": f"{self.name} {shlex.join(argv)}"} if self.line else {}
         return given | extra
 
+    def _one(self, option: Option, word: str) -> str:
+        folder = "; of several files give the folder" if option.kind.word == "PATH" else ""
+        what = f"one {option.kind.word} is enough, and {word} is another"
+        return f"{what}{folder} (see {self.name} --help)"
+
     def _unknown(self, word: str, key: str) -> str:
         known = [*(option.key for option in self.options), *self.others]
         what = f"unknown key {key!r}" if key else f"{word!r} is not key=value"
@@ -220,7 +227,9 @@ class Command:
         keys = ", ".join(f"{option.key}={option.kind.word}" for option in options)
         near = [f"; not {_near(o.key, given)}=" for o in options if _near(o.key, given)]
         choices = [f": one of {', '.join(o.choices())}" for o in options if o.choices is not tuple]
-        return f"{keys} is missing{''.join(near or choices)} (see {self.name} --help)"
+        example = f"; for example: {self.examples[0]}" if self.examples else ""
+        hint = "".join(near or choices) or example
+        return f"{keys} is missing{hint} (see {self.name} --help)"
 
     def help(self) -> str:
         """What `--help` prints."""
@@ -370,6 +379,9 @@ def hint_of(error: BaseException | None, words: Sequence[str]) -> str:
     place = str(getattr(cause, "full_key", key)).removesuffix(key)
     if near := _near(key, keys := [str(known) for known in node]):
         return f"did you mean {place}{near}=?"
+    below = [str(one) for one in node if isinstance(node.get(one), Mapping) and key in node[one]]
+    if below:
+        return f"did you mean {place}{below[0]}.{key}=?"
     keys = [known for known in keys if not known.startswith("_")]
     return f"keys of {place.rstrip('.') or 'the config'} are {', '.join(keys)}" if keys else ""
 

@@ -63,8 +63,13 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise Qs3Error(f"cannot make the folder {path}: {error}; choose another one") from error
-    if not os.access(path, os.W_OK):
-        raise Qs3Error(f"cannot write in {path}; check the permissions or choose another folder")
+    try:  # permissions do not tell: not those of root, nor of a disk that is read-only
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise Qs3Error(
+            f"cannot write in {path} ({error}); check the permissions or choose another folder"
+        ) from error
     return Path(path)
 
 

@@ -6,7 +6,7 @@ from PIL import Image
 
 from qs3.data.store import open_pointset
 from qs3.generation.command import generate
-from qs3.generation.contact_sheets import clouds_picture, infrared_picture
+from qs3.generation.contact_sheets import _range, clouds_picture, infrared_picture
 from tests.generation.generating import config, fingerprint
 
 
@@ -71,6 +71,17 @@ def test_one_scale_a_row(tmp_path):
     assert widths[0] == pytest.approx(117, abs=5)
     assert widths[1] == pytest.approx(widths[0] / 2, abs=5)
     assert widths[2] == pytest.approx(widths[0], abs=5)  # another row, another scale
+
+
+def test_an_image_is_told_apart_where_the_object_is():
+    """One in ten of its pixels was matched with something else, anywhere in the search range."""
+    rng = np.random.default_rng(0)
+    values = rng.uniform(16, 18, 9000)
+    low, high = _range(np.concatenate([values, rng.uniform(1, 90, 1000)]))
+    assert low == pytest.approx(15.2, abs=0.4)
+    assert high == pytest.approx(18.8, abs=0.4)
+    assert _range(values) == pytest.approx(np.percentile(values, [1, 99]))
+    assert _range(np.array([3.0])) == (3, 3)
 
 
 def test_a_class_without_clouds_and_a_view_without_depth_are_drawn(tmp_path):

@@ -1,11 +1,13 @@
 """Every domain that can be generated composes, instantiates, and says what it needs."""
 
+import contextlib
 import re
 import subprocess
 import sys
 from collections import Counter
 
 import pytest
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from qs3.classes import CLASSES
@@ -13,7 +15,15 @@ from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.errors import ConfigError, MissingDataError
 from qs3.generation.camera_poses import AnchoredViews
-from qs3.generation.plan import benchmark, check, describe, mesh_items, settings, stored_config
+from qs3.generation.plan import (
+    KEYS,
+    benchmark,
+    check,
+    describe,
+    mesh_items,
+    settings,
+    stored_config,
+)
 from qs3.generation.scenes import Alone, Room
 from qs3.tools import quickstart
 from tests.generation.generating import ROOT
@@ -338,6 +348,25 @@ def test_ranges_are_checked_before_anything_is_made(domain, words, message):
 def test_nothing_is_not_everything(words, key):
     with pytest.raises(ConfigError, match=f"^{key}="):
         check(config("domain=modelnet10", words))
+
+
+def test_a_key_that_was_added_and_that_nothing_reads_is_refused():
+    """Hydra advises + for any key it does not know; +limt=1 would scan everything."""
+    with pytest.raises(ConfigError, match="limt is no setting, nothing reads it; did you mean lim"):
+        check(config("domain=modelnet10", "+limt=1"))
+    check(config("domain=modelnet10", "+few=3", "limit=${few}"))
+
+
+@pytest.mark.parametrize("file", sorted((CONF / "synthesis").glob("*.yaml")), ids=lambda f: f.stem)
+def test_every_key_of_conf_is_known(file):
+    for more in ((), ("materials=mixed", "light=area"), ("released=yes",), ("engine=ray",)):
+        with contextlib.suppress(HydraException):  # not every domain has a light
+            assert set(config(f"synthesis={file.stem}", *more)) <= set(KEYS)
+
+
+def test_a_class_that_was_misspelt_is_told_which_is_meant():
+    with pytest.raises(ConfigError, match=r"\['chairs'\] are not .*; did you mean chair\?$"):
+        check(config("domain=modelnet10", "classes=[chairs,table]"))
 
 
 def test_who_names_other_classes_learns_how_to_give_them():

@@ -14,6 +14,7 @@ import torch
 import trimesh
 
 import qs3
+from qs3.config.location import typed
 from qs3.data.store import open_pointset
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.model_file import read_result, write_result
@@ -103,6 +104,10 @@ def test_a_net_of_metres_says_how_it_took_the_files(metric_run, run, clouds, tmp
     expected = read_predictions(metric_run / "predictions.csv").probabilities
     np.testing.assert_allclose([probabilities(row) for row in table(out)], expected, atol=1e-6)
     assert predict(metric_run, tmp_path / "millimetres.npy", out, "page=false") == 0
+    said = capsys.readouterr().out
+    n = len(clouds)
+    assert f"{n} of them as large as if they were not in metres, so these answers mean noth" in said
+    assert "organised" not in said
     assert all("size " in row["reason"] for row in table(out))
 
 
@@ -163,7 +168,7 @@ def test_of_a_mesh_the_surface_is_seen_and_not_its_corners(run, clouds, tmp_path
     np.testing.assert_allclose(probabilities(rows[0]), qs3.load(run)([points])[0], atol=1e-6)
     said = capsys.readouterr().out
     assert "1 file is a mesh: points were drawn on its surface; to see it as a sensor" in said
-    assert "python generate.py meshes=FOLDER\n" in said
+    assert typed("python generate.py meshes=FOLDER\n") in said
     box.export(folder / "again.ply")
     assert predict(run, folder, out, "page=false") == 0
     assert "2 files are meshes: points were drawn on their surfaces; " in capsys.readouterr().out
@@ -266,6 +271,18 @@ def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):
     assert row["reason"].isprintable()
 
 
+def test_lines_of_an_organised_scan_are_no_clouds(run, clouds, tmp_path, capsys):
+    """[h, w, 3], as other software has it; clouds of one file that are usual say nothing of it."""
+    lines = clouds[0][np.argsort(clouds[0][:, 2])].reshape(8, -1, 3)
+    (tmp_path / "in").mkdir()
+    np.save(tmp_path / "in" / "organised.npy", lines)
+    np.save(tmp_path / "in" / "several.npy", clouds[:9])
+    assert predict(run, tmp_path / "in", tmp_path / "said.csv", "page=false") == 0
+    said = capsys.readouterr().out
+    assert "organised.npy is an array of 8 clouds, all out of range: if it is one" in said
+    assert "several.npy is" not in said
+
+
 def test_up_and_flags(run, clouds, tmp_path):
     y_up = np.stack([clouds[0][:, 0], clouds[0][:, 2], -clouds[0][:, 1]], 1)
     write(tmp_path / "in" / "a.xyz", y_up)
@@ -285,7 +302,7 @@ def test_up_and_flags(run, clouds, tmp_path):
     [
         (["predict", "ckpt={run}"], "give input=PATH for clouds, or depth=PATH"),
         (["predict", "ckpt={run}", "{clouds}", "input={clouds}"], "input= is given twice"),
-        (["predict", "ckpt={run}", "{clouds}", "{clouds}"], "input= is given twice"),
+        (["predict", "ckpt={run}", "{clouds}", "b.xyz"], "b.xyz is another; of several files give"),
         (["predict", "ckpt={run}", "{run}/nothing"], "is not there"),
         (["predict", "ckpt={run}", "--fast"], "'--fast' is not key=value; keys are ckpt, second"),
         (

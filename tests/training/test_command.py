@@ -83,13 +83,17 @@ def test_help_imports_nothing_heavy(tmp_path):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ((), ("specklenet10", "meta.yaml", "generate.py")),
+        ((), ("specklenet10", "meta.yaml", "qs3-generate")),  # no generate.py is here
         (("method=supervised",), ("ConfigError", "set selftraining=none")),
         (("data.source=modelnet10",), ("ConfigError: data.source must", "domain@data.source=NAME")),
         (("method=pmc",), ("did you mean method=pcm?",)),
         (("domain@data.target=objcts",), ("did you mean domain@data.target=objects?",)),
         (("domain@data.source=specklenet",), ("did you mean domain@data.source=specklenet10?",)),
         (("method.wieght=1", "method=twin"), ("did you mean method.twin_weight=?",)),
+        (
+            ("experiment=own_scans", "data.target.up=y"),
+            ("did you mean data.target.published.up=?",),
+        ),
         (("force=no",), ("ConfigError: force must be true or false, got 'no'",)),
         (("compile=off",), ("ConfigError: compile must be true or false, got 'off'",)),
         (("trainer.deterministic=no",), ("trainer.deterministic must be true or false",)),

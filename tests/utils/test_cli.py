@@ -68,7 +68,7 @@ def test_values_have_their_kinds():
     [
         (["ehco"], "unknown command 'ehco'; did you mean echo? (see qs3 --help)"),
         (["zzz"], "unknown command 'zzz'; there are echo"),
-        (["echo"], "path=PATH is missing (see qs3 echo --help)"),
+        (["echo"], "path=PATH is missing; for example: qs3 echo path=here (see qs3 echo --help)"),
         (["echo", "path=x", "cuont=1"], "unknown key 'cuont'; did you mean count=?"),
         (["echo", "path=x", "z=1"], "unknown key 'z'; keys are path, data_dir, count"),
         (["echo", "path=x", "path=y"], "path= is given twice"),
@@ -103,9 +103,11 @@ def test_one_bare_word_may_stand_for_a_key():
         ["domain=modelnet10", "sample=9"]
     )
     assert inspect.help().startswith("qs3 inspect NAME: ")
-    for words in (["modelnet10", "shapenet10"], ["domain=modelnet10", "modelnet10"]):
-        with pytest.raises(ConfigError, match="domain= is given twice"):
-            inspect.parse(words)
+    for first in ("modelnet10", "domain=modelnet10"):
+        with pytest.raises(ConfigError, match=r"one NAME is enough, and shapenet10 is another \(s"):
+            inspect.parse([first, "shapenet10"])
+    with pytest.raises(ConfigError, match="domain= is given twice"):
+        inspect.parse(["modelnet10", "domain=shapenet10"])
     with pytest.raises(ConfigError, match="'--sample' is not key=value"):
         inspect.parse(["modelnet10", "--sample"])
     with pytest.raises(ConfigError, match="domain=NAME is missing"):

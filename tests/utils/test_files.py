@@ -7,6 +7,7 @@ import signal
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ import pytest
 
 from qs3.errors import Qs3Error
 from qs3.utils import files
+from qs3.utils.files import make_folder
 from qs3.utils.locks import locked
 
 
@@ -72,6 +74,19 @@ def test_a_file_in_the_way_of_a_folder(tmp_path):
     (tmp_path / "f").write_text("")
     with pytest.raises(Qs3Error, match="cannot write"):
         files.write_text(tmp_path / "f" / "x.txt", "")
+
+
+def test_a_folder_that_only_looks_writable(tmp_path, monkeypatch):
+    """As /sys does to root: permissions say yes, and writing fails."""
+
+    def refused(**where):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    assert make_folder(tmp_path / "a" / "b").is_dir()
+    assert not list((tmp_path / "a" / "b").iterdir())
+    monkeypatch.setattr(tempfile, "TemporaryFile", refused)
+    with pytest.raises(Qs3Error, match=r"cannot write in .* another folder"):
+        make_folder(tmp_path)
 
 
 def test_permissions_follow_the_umask(tmp_path):

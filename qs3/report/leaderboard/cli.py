@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from qs3.config.compose import choices
+from qs3.config.location import typed
 from qs3.errors import ConfigError
 from qs3.utils.cli import Command, Option, path, several, text, whole
 from qs3.utils.plural import counted
@@ -138,7 +139,7 @@ def _check_rules(table: Table, name: str) -> None:
             raise ConfigError(
                 f"table={table.name}: its row {row!r} is not of {ALONE}, so it has other steps or "
                 "points than yours would have. By that table's own rules yours is trained by: "
-                "python train.py experiment=NAME method=own method.file=FILE"
+                + typed("python train.py experiment=NAME method=own method.file=FILE")
             )
 
 
