@@ -62,7 +62,7 @@ _UNSTORED = ("paths", "workers", "engine", "shard_mb", "force", "strict")
 def check(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that no later step would explain as well."""
     text = OmegaConf.to_yaml(cfg, resolve=False)
-    check_keys("", [str(key) for key in cfg if f"${{{key}" not in text], KEYS)
+    check_keys("", [key for key in map(str, cfg) if f"${{{key}" not in text], KEYS)
     for key, least in _WHOLE.items():
         if cfg[key] is not None or key != "limit":
             check_int(key, cfg[key], least)
