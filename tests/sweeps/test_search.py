@@ -58,7 +58,7 @@ def test_it_finds_goes_on_and_is_repeatable(tmp_path):
     assert "Accuracy" not in result.stdout
     (best,) = re.findall(r"Best: trial (\d+)", result.stdout)
     assert values[int(best)] == max(values)
-    (typed,) = re.findall(r"python train.py -m (.*)", result.stdout)
+    (typed,) = re.findall(r"qs3-train -m (.*)", result.stdout)
     assert typed.startswith("experiment=qs3_s2d ")
     assert typed.endswith(" seed=0,1,2")
     assert "optuna" not in typed
@@ -276,7 +276,7 @@ def test_the_grid_is_every_combination(tmp_path):
     assert {row[4].removeprefix("qs3_s2d/") for row in rows} == set(light_runs(tmp_path))
     assert "accuracy" not in result.stdout.lower()
     assert "infomax, which needs no labels, of each run" in result.stdout
-    (typed,) = re.findall(r"Best: trial 2\..*\n  python train.py -m (.*)", result.stdout)
+    (typed,) = re.findall(r"Best: trial 2\..*\n  qs3-train -m (.*)", result.stdout)
     words = typed.split()
     assert set(words) == {
         "experiment=qs3_s2d", "selftraining.rounds=6", "selftraining.epsilon=0.0",
