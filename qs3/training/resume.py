@@ -23,8 +23,6 @@ _LAST = "last"
 _ROLES = ("source", "target")
 _OF_BEGINNING = ("versions", "threads", "commit")  # of what was trained there
 _STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, METRICS)
-
-
 _INSTEAD = "or leave ckpt_path out to begin anew"
 
 
@@ -34,9 +32,8 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
     null does nothing. "last" insists on a checkpoint of the run. A path, of a run's folder or of
     the `last.ckpt` in it, brings the same run from elsewhere: another machine's logs, a backup. As
     settings, seed and data must be the same, the result is that of a run that was never moved;
-    other versions of torch, or another number of threads, may
-    change it, which is a warning. A run that has a checkpoint of its
-    own goes on from that.
+    other versions of torch, or another number of threads, may change it, which is a warning. A run
+    that has a checkpoint of its own goes on from that.
 
     Args:
         run: whose folder it is.

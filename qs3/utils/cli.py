@@ -379,11 +379,19 @@ def hint_of(error: BaseException | None, words: Sequence[str]) -> str:
     place = str(getattr(cause, "full_key", key)).removesuffix(key)
     if near := _near(key, keys := [str(known) for known in node]):
         return f"did you mean {place}{near}=?"
-    below = [str(one) for one in node if isinstance(node.get(one), Mapping) and key in node[one]]
-    if below:
+    if below := [known for known in keys if _has(node, known, key)]:
         return f"did you mean {place}{below[0]}.{key}=?"
     keys = [known for known in keys if not known.startswith("_")]
     return f"keys of {place.rstrip('.') or 'the config'} are {', '.join(keys)}" if keys else ""
+
+
+def _has(node: Mapping[str, Any], name: str, key: str) -> bool:
+    """Whether a part of a config has a key; values that cannot be resolved yet have none."""
+    try:
+        part = node[name]
+    except Exception:  # of any resolver: a hint never takes the place of the error it belongs to
+        return False
+    return isinstance(part, Mapping) and key in part
 
 
 def _page(

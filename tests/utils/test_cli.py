@@ -11,11 +11,25 @@ import time
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
+from omegaconf.errors import ConfigKeyError
 
 from qs3.__main__ import QS3
 from qs3.data.scannet.settings import Extraction
 from qs3.errors import ConfigError
-from qs3.utils.cli import FLAG, NUMBER, Command, Group, Option, one_of, run, several, text, whole
+from qs3.utils.cli import (
+    FLAG,
+    NUMBER,
+    Command,
+    Group,
+    Option,
+    hint_of,
+    one_of,
+    run,
+    several,
+    text,
+    whole,
+)
 
 ROOT = Path(__file__).parents[2]
 GIVEN: dict = {}
@@ -112,6 +126,16 @@ def test_one_bare_word_may_stand_for_a_key():
         inspect.parse(["modelnet10", "--sample"])
     with pytest.raises(ConfigError, match="domain=NAME is missing"):
         inspect.parse(["variant=x"])
+
+
+def test_a_hint_survives_values_that_cannot_be_resolved():
+    """Beside the key that is meant, one level down, stands what needs more than there is."""
+    node = OmegaConf.create({"a": "${nowhere.b}", "c": "${oc.env:QS3_NOT_SET}", "d": {"up": "z"}})
+    cause = ConfigKeyError("Key 'up' is not in struct")
+    cause.key, cause.full_key, cause.parent_node = "up", "data.target.up", node
+    error = RuntimeError()
+    error.__cause__ = cause
+    assert hint_of(error, ["data.target.up=y"]) == "did you mean data.target.d.up=?"
 
 
 def test_a_key_that_any_domain_might_have_is_named_if_one_is_missing():
