@@ -227,8 +227,8 @@ class Command:
         keys = ", ".join(f"{option.key}={option.kind.word}" for option in options)
         near = [f"; not {_near(o.key, given)}=" for o in options if _near(o.key, given)]
         choices = [f": one of {', '.join(o.choices())}" for o in options if o.choices is not tuple]
-        example = f"; for example: {self.examples[0]}" if self.examples else ""
-        hint = "".join(near or choices) or example
+        first = "\n".join(self.examples).replace("\\\n", "").partition("\n")[0]
+        hint = "".join(near or choices) or f"; for example: {' '.join(first.split())}"
         return f"{keys} is missing{hint} (see {self.name} --help)"
 
     def help(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -126,6 +127,13 @@ def test_one_bare_word_may_stand_for_a_key():
         inspect.parse(["modelnet10", "--sample"])
     with pytest.raises(ConfigError, match="domain=NAME is missing"):
         inspect.parse(["variant=x"])
+
+
+def test_an_example_of_two_lines_is_shown_whole():
+    with pytest.raises(ConfigError) as told:
+        QS3.command("fit").parse([])
+    assert "\\" not in str(told.value)
+    assert re.search(r"for example: qs3 fit \S.* out=\S+ .*\(see qs3 fit --help\)", str(told.value))
 
 
 def test_a_hint_survives_values_that_cannot_be_resolved():
