@@ -26,6 +26,7 @@ from torch.utils._pytree import tree_leaves
 
 from qs3.geometry import ball_query, neighbours
 from qs3.models import fast
+from qs3.models.fast import edgeconv
 
 
 class Autocast(torch.autocast):
@@ -134,6 +135,17 @@ def _starts_nothing(func: Any) -> bool:
         return True
     returned = [r.alias_info for r in func._schema.returns]
     return bool(returned) and all(a is not None and not a.is_write for a in returned)
+
+
+@contextmanager
+def as_on_gpu() -> Iterator[None]:
+    """As `as_on_device`, by the operations that Triton's kernels stand for."""
+    with (
+        as_on_device(),
+        patch.object(edgeconv, "takes_triton", lambda x: True),
+        patch.object(neighbours, "takes_triton", lambda x: True),
+    ):
+        yield
 
 
 @contextmanager

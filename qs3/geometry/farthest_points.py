@@ -6,12 +6,12 @@ with torch's builds for it; elsewhere the operation takes the steps itself.
 
 from __future__ import annotations
 
-from functools import cache
-from importlib.util import find_spec
 from typing import Any, no_type_check
 
 import torch
 from torch import Tensor
+
+from qs3.geometry.device import takes_triton
 
 _LARGEST = 1 << 14  # points that a thread block can hold
 
@@ -28,7 +28,7 @@ def farthest_points(x: Tensor, n: int, start: Tensor) -> Tensor:
     Returns:
         [b, n] int64.
     """
-    if x.is_cuda and x.shape[1] <= _LARGEST and _has_triton():
+    if x.is_cuda and x.shape[1] <= _LARGEST and takes_triton(x):
         from qs3.geometry import triton_farthest_points
 
         return triton_farthest_points.farthest_points(x, n, start)
@@ -70,8 +70,3 @@ def _step(x, state):
     distance = (x - taken).square().sum(-1)
     nearest = torch.minimum(nearest, distance).scatter(1, last, -1.0)  # never again
     return (nearest, nearest.argmax(1, keepdim=True)), last.clone()
-
-
-@cache
-def _has_triton() -> bool:
-    return find_spec("triton") is not None

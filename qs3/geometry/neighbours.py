@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from qs3.geometry import compiled
+from qs3.geometry import compiled, smallest
+from qs3.geometry.device import takes_triton
 from qs3.geometry.farthest_points import farthest_points, farthest_points_by_scan
 from qs3.geometry.matmul import matmul_t
 from qs3.geometry.sampling import farthest_point_sampling_np
@@ -55,7 +56,7 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
         return _smallest(x @ scaled.transpose(1, 2) + squares, k)
     on_cpu = takes_numpy(x)
     block = _CPU_BLOCK if on_cpu else _BLOCK
-    smallest = _smallest_on_cpu if on_cpu else _smallest
+    least = _smallest_on_cpu if on_cpu else _smallest
     added = on_cpu and n >= 3 * compiled.groups_for(k) and compiled.usable(x)
     rows = max(1, min(n, block // n))
     clouds = max(1, block // (n * rows))
@@ -68,10 +69,12 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
                 product = matmul_t(x[i, j : j + rows], scaled[i])[None]
             else:
                 product = x[c, j : j + rows] @ scaled[c].transpose(1, 2)
-            if added:
+            if takes_triton(x):
+                found = smallest.smallest_sums(product, squares[c, 0], k)
+            elif added:
                 found = compiled.smallest_sums(product.view(-1, n), squares[c, 0], k)
             else:
-                found = smallest(product.add_(squares[c]).view(-1, n), k)
+                found = least(product.add_(squares[c]).view(-1, n), k)
             part.copy_(found.view(part.shape))
     return out
 

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from importlib.util import find_spec
-
 import pytest
 import torch
 
 from qs3.geometry.farthest_points import farthest_points
+from tests.triton import in_interpreter, needs_triton
 
-# A process of its own: Triton asks for its interpreter when it is first imported.
 COMPARE = """
 import torch
 from qs3.geometry import farthest_points, triton_farthest_points
@@ -26,19 +21,9 @@ for b, n, taken in ((3, 70, 70), (2, 64, 9), (1, 1, 1)):
 """
 
 
-@pytest.mark.skipif(
-    find_spec("triton") is None,
-    reason="Triton is missing: docs/reference/accelerators.md says how to bring it",
-)
+@needs_triton
 def test_the_kernel_takes_the_steps() -> None:
-    found = subprocess.run(
-        [sys.executable, "-c", COMPARE],
-        env=os.environ | {"TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert found.stdout.split() == ["same"] * 3, found.stderr
+    assert in_interpreter(COMPARE) == ["same"] * 3
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -5,22 +5,25 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
 import torch
 from torch.nn import functional as F
 
+from qs3.geometry import neighbours
 from qs3.geometry.farthest_points import farthest_points
 from qs3.models import fast
 from qs3.models.base import PointClassifier
+from qs3.models.fast import edgeconv
 from qs3.models.norms import KINDS, use_domain
-from tests.device import Watch, as_on_device
+from tests.device import Watch, as_on_device, as_on_gpu
 from tests.models.test_all_nets import NETS, build, clouds
 
 # Kernels of a step. The authors' DGCNN has 167. tests/methods/test_steps.py has those of methods.
 BARS = {
-    "dgcnn": 250,
+    "dgcnn": 190,
     "pointdan": 350,
     "pointnet": 180,
     "pointnet2": 450,
@@ -43,6 +46,17 @@ def test_kernels_of_a_step(name: str) -> None:
     watch = _step(net, torch.empty(16, 1024, 3, device="meta"))
     assert watch.carried == []
     assert 100 < watch.kernels.total() <= BARS[name]
+
+
+def test_kernels_of_dgcnn_without_triton(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (edgeconv, neighbours):
+        monkeypatch.setattr(module, "takes_triton", lambda x: False)
+    watch = _step(
+        build("dgcnn").float().train().to("meta"), torch.empty(16, 1024, 3, device="meta")
+    )
+    assert watch.carried == []
+    assert BARS["dgcnn"] < watch.kernels.total() <= 250
+    assert not any("qs3" in name for name in watch.kernels)
 
 
 @pytest.mark.slow
@@ -80,20 +94,18 @@ def test_the_way_of_a_device_is_that_of_the_cpu(name: str, training: bool) -> No
             part.eps = 0.1
     state = {key: value.clone() for key, value in net.state_dict().items()}
     found = []
-    for on_device in (False, True):
+    for way in (nullcontext, as_on_device, as_on_gpu):
         net.load_state_dict(state)
         net.zero_grad()
         torch.manual_seed(2)
-        if on_device:
-            with as_on_device():
-                out = net(points)
-        else:
+        with way():
             out = net(points)
         F.cross_entropy(out, torch.arange(2)).backward()
         grads = [p.grad.clone() for p in net.parameters() if p.grad is not None]
         buffers = [value.clone() for value in net.buffers()]
         found.append((out.detach(), grads, buffers))
-    for mine, theirs in zip(*found, strict=True):
+    for mine, theirs, by_triton in zip(*found, strict=True):
+        torch.testing.assert_close(mine, by_triton, rtol=1e-7, atol=1e-9)
         torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
 
 

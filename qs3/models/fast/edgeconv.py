@@ -18,7 +18,8 @@ moments of the *inputs*: with A the adjacency (A_ij = 1 if j is a neighbour of i
 
 That is for the CPU, where what goes along the edges, A and the maximum, is compiled
 (`qs3.geometry.compiled`). To an accelerator these are 164 kernels a layer, forward and backward,
-each started by itself; there z_ij is written out where its statistics are asked for, in 30.
+each started by itself; there `edge_norm` takes the statistics on its way over the edges, and where
+it is not at hand z_ij is written out for them, in 30.
 """
 
 from __future__ import annotations
@@ -32,9 +33,11 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.geometry import compiled
+from qs3.geometry.device import takes_triton
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import exporting
 from qs3.models import fast
+from qs3.models.fast.edge_norm import MOST_NEIGHBOURS, edge_norm
 from qs3.models.fast.pointwise_max import max_over_members, max_over_rows
 from qs3.models.norms import active, normed, track, uses_batch
 
@@ -153,9 +156,15 @@ def edge_conv(
     k = index.shape[2]
     first = torch.arange(b, device=x.device)[:, None, None] * n
     flat = (index + first).view(b * n, k)  # rows of all clouds put together
+    norm = active(norm)
+    if uses_batch(norm) and _takes_edge_norm(x, norm, k, negative_slope):
+        both = weight.view(-1, 2, c).transpose(0, 1).reshape(-1, c)  # W1 above W2
+        pr = x.reshape(b * n, c) @ both.T
+        y, mean, var = edge_norm(pr, flat, norm.weight, norm.bias, norm.eps, negative_slope)
+        track(norm, mean, var, b * n * k)
+        return y.view(b, n, -1)
     w1, w2 = weight.split(c, dim=1)  # [d, c] each
     e = w2 - w1
-    norm = active(norm)
     if uses_batch(norm) and not fast.on_cpu(x):
         points = x.reshape(b * n, c)
         p, q = points @ w1.T, points @ e.T
@@ -178,6 +187,11 @@ def edge_conv(
     q = _product(rows, h[:, :, None] * e) + shift[:, None]
     best = neighbour_max(p.flatten(0, 1), flat).view_as(q)
     return F.leaky_relu(best + q, negative_slope).view(b, n, -1)
+
+
+def _takes_edge_norm(x: Tensor, norm: nn.Module, k: int, negative_slope: float) -> bool:
+    batch_norm = isinstance(norm, nn.BatchNorm1d) and norm.affine
+    return takes_triton(x) and batch_norm and k <= MOST_NEIGHBOURS and negative_slope >= 0
 
 
 def _statistics(x: Tensor, flat: Tensor, w1: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,7 @@ from qs3.models.norms import KINDS, use_domain
 from qs3.models.pointnet import PointMLP
 from qs3.models.pointnet2 import GroupedMLP
 from qs3.models.rscnn import RSConv, group
-from tests.device import as_on_device
+from tests.device import as_on_device, as_on_gpu
 
 Draw = Callable[[int, int], int]
 Inputs = list[Tensor]  # what gets a gradient
@@ -133,7 +133,8 @@ def test_kernel_equals_formula(layer: Callable[[Draw, str], Case], data: st.Data
             nn.init.normal_(values, 0.3)
     found = []
     # an accelerator takes most layers by their formulas
-    forms = (nullcontext, plain, as_on_device) if layer is edge_conv else (nullcontext, plain)
+    others = (as_on_device, as_on_gpu) if layer is edge_conv else ()
+    forms = (nullcontext, plain, *others)
     for form in forms:
         net = copy.deepcopy(module).train(training)
         leaves = [x.clone().requires_grad_() for x in inputs]
