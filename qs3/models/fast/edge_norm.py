@@ -271,7 +271,7 @@ def edge_norm(
         gamma, beta, eps: of the batch norm.
         negative_slope: of LeakyReLU, at least 0.
     """
-    return _EdgeNorm.apply(pr, index, gamma, beta, eps, negative_slope)
+    return _EdgeNorm.apply(pr.contiguous(), index.contiguous(), gamma, beta, eps, negative_slope)
 
 
 def _implementation(x: Tensor) -> Any:

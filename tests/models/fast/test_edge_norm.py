@@ -69,6 +69,22 @@ def test_operations_are_as_torch_wants_them() -> None:
             )
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")  # torch's own
+def test_torchs_compiler_takes_them() -> None:
+    """As one graph, without its code generator, which has nothing to add to operations."""
+    pr, index, gamma, beta = _inputs(40, 5, 4, torch.float32)
+    leaves = [x.requires_grad_() for x in (pr, gamma, beta)]
+
+    def layer(pr: Tensor, gamma: Tensor, beta: Tensor) -> Tensor:
+        return edge_norm.edge_norm(pr, index, gamma, beta, 1e-5, 0.2)[0].square().sum()
+
+    expected = torch.autograd.grad(layer(*leaves), leaves)
+    compiled = torch.compile(layer, backend="aot_eager", fullgraph=True)
+    for ours, theirs in zip(torch.autograd.grad(compiled(*leaves), leaves), expected, strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
 def _tuple(x: Tensor | tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     return (x,) if isinstance(x, Tensor) else x
 
