@@ -27,6 +27,7 @@ _UNHASHED = (
     "ckpt_path",
     "objective",
     "trainer.gpus",  # which of several GPUs trains a run
+    "trainer.cuda_graphs",  # the same kernels, started at once
     "data.cache_dir",
     "data.make_source",
     *("method.file", "model.file"),  # their content matters, wherever they lie: .sha256

@@ -12,10 +12,11 @@ from torch import Tensor, nn
 
 from qs3.datamodules.batches import generator_of
 from qs3.datamodules.phases import Phases
+from qs3.engine.cuda_graphs import GraphedNet
 from qs3.engine.schedules import Plateau, cosine
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, total_loss
-from qs3.models.base import Backbone
+from qs3.models.base import Backbone, PointClassifier
 from qs3.models.norms import norms_for, use_domain
 from qs3.utils.seeding import derive
 
@@ -44,6 +45,7 @@ class Classifier(LightningModule):
         metres: whether clouds keep their size.
         regulariser_weight: of what a backbone wants in the loss (`Features.regulariser`).
         weights: of the net, to begin with; None: new ones.
+        cuda_graphs: whether one GPU replays passes as graphs, see `qs3.engine.cuda_graphs`.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class Classifier(LightningModule):
         metres: bool = False,
         regulariser_weight: float = 0.0,
         weights: Mapping[str, Tensor] | None = None,
+        cuda_graphs: bool = False,
     ) -> None:
         super().__init__()
         self.build_net, self.build_optimizer = build_net, build_optimizer
@@ -81,6 +84,8 @@ class Classifier(LightningModule):
                 if isinstance(module, Backbone):
                     module.register_forward_hook(self._keep_regulariser)
         self._hits: list[Tensor] = []
+        self.cuda_graphs = cuda_graphs
+        self._graphed: GraphedNet | None = None
 
     def fresh_net(self, phase: int) -> nn.Module:
         """A net with new weights: a function of (seed, phase), whatever was drawn before."""
@@ -126,10 +131,28 @@ class Classifier(LightningModule):
         self._loaded_plateau = checkpoint.get("plateau")
 
     def on_train_start(self) -> None:
-        """Give the plateau its memory back."""
+        """Give the plateau its memory back; the net is where it stays."""
+        if self.cuda_graphs and self._takes_graphs():
+            assert isinstance(self.net, PointClassifier)
+            self._graphed = GraphedNet(self.net)
         if self._plateau is not None and self._loaded_plateau is not None:
             self._plateau.load_state_dict(self._loaded_plateau)
             self._loaded_plateau = None
+
+    def _takes_graphs(self) -> bool:
+        """Whether passes are on one GPU, and gradients of one step alone lie in a graph's memory.
+
+        A frozen backbone's pass goes through the host.
+        """
+        alone = self.trainer.world_size == 1 and self.trainer.accumulate_grad_batches == 1
+        trained = isinstance(self.net, PointClassifier) and any(
+            p.requires_grad for p in self.net.backbone.parameters()
+        )
+        return self.device.type == "cuda" and alone and trained
+
+    def on_train_end(self) -> None:
+        """Graphs keep memory."""
+        self._graphed = None
 
     def _optimizer(self) -> torch.optim.Optimizer:
         own = self.method.learning_rates(self.net)
@@ -149,6 +172,8 @@ class Classifier(LightningModule):
         """Go on with `weights`, or with the net's if None; forget the optimiser's moments."""
         if weights is not None:
             self.net.load_state_dict(weights)
+        if self._graphed is not None:
+            self._graphed.forget()
         optimizer = self.optimizers()
         assert isinstance(optimizer, torch.optim.Optimizer)
         if not keep_moments:
@@ -173,7 +198,11 @@ class Classifier(LightningModule):
         method = self.method if warmup else self.student
         generator = generator_of(batch, "method", self.seed, self.global_rank, self.device)
         self._regularisers.clear()
-        terms = method.loss(self.net, {**batch, "progress": self._progress(batch_idx)}, generator)
+        net: Any = self.net
+        if self._graphed is not None:
+            net = self._graphed
+            net.begin_step()
+        terms = method.loss(net, {**batch, "progress": self._progress(batch_idx)}, generator)
         total = total_loss(method, terms)
         if self._regularisers:
             total = total + self.regulariser_weight * torch.stack(self._regularisers).sum()

@@ -32,7 +32,7 @@ def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
 def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
     settings = OmegaConf.to_container(cfg.trainer, resolve=True)
     assert isinstance(settings, dict)
-    ours = ("threads", "gpus")
+    ours = ("threads", "gpus", "cuda_graphs")
     given = {str(key): value for key, value in settings.items() if key not in ours}
     if isinstance(given.get("profiler"), dict):
         given["profiler"] = build(cfg.trainer.profiler)

@@ -95,6 +95,7 @@ def _classifier(run: Run, method: Method, given: Given | None) -> Classifier:
         metres=cfg.data.scale == "metres",
         regulariser_weight=cfg.protocol.regulariser,
         weights=given.weights if given else None,
+        cuda_graphs=cfg.trainer.get("cuda_graphs", True) and not cfg.compile,
     )
     if cfg.evaluation.norms != "trained":
         check_has_norms(classifier.net, cfg.evaluation.norms)

@@ -225,7 +225,7 @@ def _check_settings(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, key)
         if value is not None and (key, value) != ("trainer.threads", "auto"):
             check_int(key, value, 1)
-    for key in ("data.make_source", "force", "compile"):
+    for key in ("data.make_source", "force", "compile", "trainer.cuda_graphs"):
         check_bool(key, OmegaConf.select(cfg, key))
     if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
         check_bool("trainer.deterministic", exactly)
