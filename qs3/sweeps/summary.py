@@ -65,7 +65,9 @@ class SummaryOfSeeds(Callback):
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Note that the job has begun: a job that is killed says nothing later."""
-        self._note(config, overrides=list(config.hydra.overrides.task))
+        # As they were given, which is how a job's end names them; `${...}` would be resolved.
+        task = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
+        self._note(config, overrides=task)
 
     def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
         """Note how the job has ended (and say what went wrong: Hydra shows the first error only).

@@ -144,6 +144,17 @@ def test_a_job_that_never_ended(summary, tmp_path, capsys):
     assert out[-1].startswith("    seed=1  (")
 
 
+def test_a_job_is_the_same_whether_what_it_names_is_resolved(summary, tmp_path, capsys):
+    """A table's cells have such overrides; each would count twice, once as one without an end."""
+    words = ["data.source.path=${paths.data_dir}/cad10", "seed=0"]
+    begun = config(tmp_path / "exp" / "seed0-0123abcd", *words)
+    begun.paths = {"data_dir": "data"}
+    summary.on_job_start(begun)
+    summary.on_job_end(begun, SimpleNamespace(_return_value=None, overrides=words))
+    summary.on_multirun_end(config(tmp_path))
+    assert "failed" not in capsys.readouterr().out
+
+
 def test_a_damaged_line_costs_only_itself(summary, tmp_path, capsys):
     """Two machines that write at the same place of a network's disk."""
     ended(summary, write_run(tmp_path, seed=0))
