@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from qs3.datamodules.batches import generator_of
 from qs3.datamodules.phases import Phases
-from qs3.engine.cuda_graphs import GraphedNet
+from qs3.engine.cuda_graphs import Graphs
 from qs3.engine.schedules import Plateau, cosine
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, total_loss
@@ -85,7 +85,7 @@ class Classifier(LightningModule):
                     module.register_forward_hook(self._keep_regulariser)
         self._hits: list[Tensor] = []
         self.cuda_graphs = cuda_graphs
-        self._graphed: GraphedNet | None = None
+        self._graphs: Graphs | None = None
 
     def fresh_net(self, phase: int) -> nn.Module:
         """A net with new weights: a function of (seed, phase), whatever was drawn before."""
@@ -131,28 +131,24 @@ class Classifier(LightningModule):
         self._loaded_plateau = checkpoint.get("plateau")
 
     def on_train_start(self) -> None:
-        """Give the plateau its memory back; the net is where it stays."""
+        """Give the plateau its memory back; the net is on its device by now."""
         if self.cuda_graphs and self._takes_graphs():
             assert isinstance(self.net, PointClassifier)
-            self._graphed = GraphedNet(self.net)
+            self._graphs = Graphs(self.net)
         if self._plateau is not None and self._loaded_plateau is not None:
             self._plateau.load_state_dict(self._loaded_plateau)
             self._loaded_plateau = None
 
     def _takes_graphs(self) -> bool:
-        """Whether passes are on one GPU, and gradients of one step alone lie in a graph's memory.
-
-        A frozen backbone's pass goes through the host.
-        """
-        alone = self.trainer.world_size == 1 and self.trainer.accumulate_grad_batches == 1
+        """Whether passes are on one GPU; a frozen backbone's go through the host."""
         trained = isinstance(self.net, PointClassifier) and any(
             p.requires_grad for p in self.net.backbone.parameters()
         )
-        return self.device.type == "cuda" and alone and trained
+        return self.device.type == "cuda" and self.trainer.world_size == 1 and trained
 
     def on_train_end(self) -> None:
         """Graphs keep memory."""
-        self._graphed = None
+        self._graphs = None
 
     def _optimizer(self) -> torch.optim.Optimizer:
         own = self.method.learning_rates(self.net)
@@ -172,8 +168,8 @@ class Classifier(LightningModule):
         """Go on with `weights`, or with the net's if None; forget the optimiser's moments."""
         if weights is not None:
             self.net.load_state_dict(weights)
-        if self._graphed is not None:
-            self._graphed.forget()
+        if self._graphs is not None:
+            self._graphs.forget()
         optimizer = self.optimizers()
         assert isinstance(optimizer, torch.optim.Optimizer)
         if not keep_moments:
@@ -186,6 +182,8 @@ class Classifier(LightningModule):
 
         In the warm-up the method prepares its epoch.
         """
+        if self._graphs is not None:
+            self._graphs.begin_epoch()
         if self.phases.phase(self.current_epoch) == 0:
             torch.manual_seed(derive(self.seed, "start", self.current_epoch, self.global_rank))
             data = self.trainer.datamodule  # type: ignore[attr-defined]
@@ -199,9 +197,10 @@ class Classifier(LightningModule):
         generator = generator_of(batch, "method", self.seed, self.global_rank, self.device)
         self._regularisers.clear()
         net: Any = self.net
-        if self._graphed is not None:
-            net = self._graphed
-            net.begin_step()
+        # Gradients that are summed over steps would lie where the next one's are written.
+        if self._graphs is not None and self.trainer.accumulate_grad_batches == 1:
+            self._graphs.begin_step()
+            net = self._graphs.stand_in
         terms = method.loss(net, {**batch, "progress": self._progress(batch_idx)}, generator)
         total = total_loss(method, terms)
         if self._regularisers:

@@ -21,116 +21,183 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
-from qs3.models.base import Features, PointClassifier
-from qs3.models.norms import DomainNorm
+from qs3.models import fast
+from qs3.models.base import Features, PointClassifier, check_points
 
 log = logging.getLogger(__name__)
 
 Pass = Callable[[Tensor], tuple[Tensor, ...]]
 Capture = Callable[[nn.Module, Tensor], Pass]
 EAGER = 8
-"""How often a pass is made as usual before it is captured, which costs as much as some of them: an
-epoch's last batch, which may be smaller, comes once an epoch."""
+"""How often a pass is made as usual before it is captured, which costs as much as some of them, and
+is done where it has come in this epoch before: an epoch's last, smaller batch comes once."""
+MOST = 16
+"""Graphs of one module: each keeps its activations in memory."""
+_KNOWN = 256
+_HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
 
 
-class GraphedNet:
-    """What a method's loss calls as its net: passes in training mode become graphs.
+class Graphs:
+    """The graphs of a net's passes in training mode.
 
     A step may have several passes; the first, the second, ... have graphs of their own, as each
-    needs its activations until the way back. Whatever else a graph depends on but weights and
-    points is compared: shapes, norms' domains and momenta, modes, which weights are trained. Passes
-    in evaluation mode, without gradients, in autocast, of points that want a gradient, and those
-    through modules with hooks are made as usual, as is everything beside a pass (heads of a method,
-    losses, the optimiser). Everything else is asked of the net itself.
+    needs its activations until the way back. What else a pass depends on is compared with what was
+    captured: points' shapes and strides; which modules, parameters and buffers the net consists of
+    and which are trained; every number and word among the modules' attributes, such as modes,
+    dropout's rate and a domain's name. Passes that differ in it are made as usual, as are those in
+    evaluation mode, without gradients, in autocast, of points that want a gradient, and those
+    through modules with hooks. Chance must come from torch's generator of the device. Outputs that
+    the loss does not use have gradients of zero, so what they alone depend on has such, not none.
 
     Args:
         net: whose `forward` and `features` are captured.
         capture: makes a pass a graph, see `captured`.
+
+    Attributes:
+        stand_in: what a loss calls in place of `net`, which it is but for its passes.
     """
 
     def __init__(self, net: PointClassifier, capture: Capture | None = None) -> None:
-        self.net = net
-        capture = capture or captured
-        self._whole, self._backbone = (_Passes(one, capture) for one in (net, net.backbone))
+        self.capture = capture or captured
+        self.off = False
+        self.whole, self.backbone = _Passes(self, net), _Passes(self, net.backbone)
+        self.stand_in = _stand_in(net, self.whole, self.backbone)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.net, name)
-
-    def __deepcopy__(self, memo: Any) -> nn.Module:
-        """A copy of the net: graphs are of the weights in their place."""
-        return copy.deepcopy(self.net, memo)
-
-    def __call__(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
-        """Logits."""
-        return self._whole(points)
-
-    def features(self, points: Float[Tensor, "b n 3"]) -> Features:
-        """As `PointClassifier.features`; a device does not look at a training step's values."""
-        return self._backbone(points)
+    def begin_epoch(self) -> None:
+        """What came in an epoch before is known to come, but how often in one is not."""
+        for passes in (self.whole, self.backbone):
+            passes.lately.clear()
 
     def begin_step(self) -> None:
         """The next pass is its step's first."""
-        self._whole.place = self._backbone.place = 0
+        self.whole.place = self.backbone.place = 0
 
     def forget(self) -> None:
         """Give the graphs' memory back: other shapes come."""
-        self._whole.forget()
-        self._backbone.forget()
+        for passes in (self.whole, self.backbone):
+            for kept in (passes.seen, passes.lately, passes.graphs):
+                kept.clear()
+
+    def give_up(self, error: Exception) -> None:
+        """Go on without graphs, also those there are: they know torch's generator as it was."""
+        self.off = True
+        self.forget()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
+        why = str(error).split("\n", 1)[0]
+        log.warning("no CUDA graphs of this net, steps go on without (%s)", why)
+
+
+def _stand_in(net: PointClassifier, whole: _Passes, backbone: _Passes) -> Any:
+    """The net under another class, whose passes are these; its modules and attributes are shared.
+
+    A copy of it is one of the net: graphs are of the weights in their place.
+    """
+    kind: Any = type(net)
+
+    class StandIn(kind):
+        def __call__(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
+            return whole(points)
+
+        def features(self, points: Float[Tensor, "b n 3"]) -> Features:
+            if kind.features is not PointClassifier.features:
+                return super().features(points)
+            check_points(points)
+            return backbone(points)
+
+        def __copy__(self) -> Any:
+            return copy.copy(net)
+
+        def __deepcopy__(self, memo: Any) -> Any:
+            return copy.deepcopy(net, memo)
+
+    one = StandIn.__new__(StandIn)
+    object.__setattr__(one, "__dict__", net.__dict__)
+    return one
 
 
 class _Passes:
     """The passes of a step through one module."""
 
-    def __init__(self, module: nn.Module, capture: Capture) -> None:
-        self.module, self.capture = module, capture
+    def __init__(self, of: Graphs, module: nn.Module) -> None:
+        self.of, self.module = of, module
+        self.parts: _Parts | None = None
         self.place = 0
-        self.off = False
-        self.forget()
-
-    def forget(self) -> None:
         self.seen: Counter[Hashable] = Counter()
+        self.lately: set[Hashable] = set()
         self.graphs: dict[Hashable, _Graph] = {}
 
     def __call__(self, points: Tensor) -> Any:
-        if self.off or not self._can_be_captured(points):
+        if self.of.off or not self._can_be_captured(points):
             return self.module(points)
+        assert self.parts is not None
         self.place += 1
-        key = (self.place, points.shape, points.dtype, *_state(self.module))
-        if key not in self.graphs:
-            self.seen[key] += 1
-            if self.seen[key] <= EAGER:
+        shown = points.shape, points.stride(), points.dtype
+        key = (self.place, *shown, fast.is_plain(), self.parts.state())
+        graph = self.graphs.get(key)
+        if graph is None:
+            if not self._comes_often(key) or len(self.graphs) == MOST:
                 return self.module(points)
             try:
-                self.graphs[key] = _Graph(self.module, points, self.capture)
-            except RuntimeError as error:
-                self.off = True
-                why = str(error).split("\n", 1)[0]
-                log.warning("no CUDA graphs of this net, steps go on without (%s)", why)
+                graph = _Graph(self.module, points, self.of.capture)
+            except Exception as error:
+                self.of.give_up(error)
                 return self.module(points)
-        return self.graphs[key](points)
+            self.graphs[key] = graph
+        return graph(points)
+
+    def _comes_often(self, key: Hashable) -> bool:
+        again = key in self.lately
+        if len(self.seen) > _KNOWN:  # sizes that are drawn anew each step
+            self.seen.clear()
+        self.seen[key] += 1
+        self.lately.add(key)
+        return again and self.seen[key] > EAGER
 
     def _can_be_captured(self, points: Tensor) -> bool:
-        return (
-            torch.is_grad_enabled()
-            and not points.requires_grad
-            and not torch.is_autocast_enabled(points.device.type)
-            and self.module.training
-            and not any(
-                module._forward_hooks or module._forward_pre_hooks or module._backward_hooks
-                for module in self.module.modules()
-            )
-        )
+        if (
+            not torch.is_grad_enabled()
+            or points.requires_grad
+            or torch.is_autocast_enabled(points.device.type)
+            or not self.module.training
+        ):
+            return False
+        if self.parts is None:
+            self.parts = _Parts(self.module)
+        return self.parts.are_there() and not self.parts.have_hooks()
 
 
-def _state(module: nn.Module) -> tuple[Hashable, ...]:
-    """What decides which kernels a pass starts, and with which numbers, beside its tensors."""
-    modules = list(module.modules())
-    return (
-        tuple(one.training for one in modules),
-        tuple(one.domain for one in modules if isinstance(one, DomainNorm)),
-        tuple(one.momentum for one in modules if isinstance(one, nn.modules.batchnorm._NormBase)),
-        tuple(p.requires_grad for p in module.parameters()),
-    )
+class _Parts:
+    """What a module consists of: by name and identity, as graphs know tensors by their place."""
+
+    def __init__(self, module: nn.Module) -> None:
+        modules = list(module.modules())
+        self.slots = [
+            slots for m in modules for slots in (m._parameters, m._buffers, m._modules) if slots
+        ]
+        self.filled: list[tuple[Any, str, Any]] = [
+            (slots, name, part) for slots in self.slots for name, part in slots.items()
+        ]
+        self.sizes = [len(slots) for slots in self.slots]
+        self.weights = list(module.parameters())
+        plain = (bool, int, float, str, type(None))
+        self.values = [
+            (vars(m), name) for m in modules for name, x in vars(m).items() if isinstance(x, plain)
+        ]
+        self.hooks = [vars(m)[kind] for m in modules for kind in _HOOKS]
+
+    def are_there(self) -> bool:
+        """Whether each is still the one it was, and none has come."""
+        same = all(slots.get(name) is part for slots, name, part in self.filled)
+        return same and [len(slots) for slots in self.slots] == self.sizes
+
+    def have_hooks(self) -> bool:
+        return any(self.hooks)
+
+    def state(self) -> tuple[Hashable, ...]:
+        """Every number and word of the modules, and which weights are trained."""
+        values = tuple(found.get(name) for found, name in self.values)
+        return (*values, *(p.requires_grad for p in self.weights))
 
 
 class _Graph:
@@ -139,19 +206,39 @@ class _Graph:
     def __init__(self, module: nn.Module, points: Tensor, capture: Capture) -> None:
         self.module = _Tensors(module)
         self.replay = capture(self.module, points)
+        self.replays = 0
 
     def __call__(self, points: Tensor) -> Any:
-        # Copied, because the next step's replay writes where these lie.
-        found = iter([one.clone() for one in self.replay(points)])
+        found = iter(_Copied.apply(self, *self.replay(points)))
         spec, are_tensors = self.module.spec
         return tree_unflatten([next(found) if one else None for one in are_tensors], spec)
 
 
-class _Tensors(nn.Module):
-    """A module's forward pass, of whose outputs all are tensors, as torch asks for it.
+class _Copied(torch.autograd.Function):
+    """Outputs outside of a graph's memory, which the next step's replay writes over.
 
-    It is no hook's business, and torch puts its graphs into the module that it is given.
+    On the way back the activations there are used up.
     """
+
+    @staticmethod
+    def forward(ctx: Any, graph: _Graph, *outputs: Tensor) -> tuple[Tensor, ...]:
+        graph.replays += 1
+        ctx.graph, ctx.turn, ctx.done = graph, graph.replays, False
+        return tuple(one.clone() for one in outputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        if ctx.done or ctx.turn != ctx.graph.replays:
+            raise RuntimeError(
+                "a pass that is replayed as a CUDA graph goes back once, in its own step: set "
+                "trainer.cuda_graphs=false for a loss that asks for more"
+            )
+        ctx.done = True
+        return None, *grads
+
+
+class _Tensors(nn.Module):
+    """A module's forward pass, of whose outputs all are tensors, as torch asks for it."""
 
     spec: tuple[TreeSpec, list[bool]]
 
@@ -161,6 +248,8 @@ class _Tensors(nn.Module):
 
     def forward(self, points: Tensor) -> tuple[Tensor, ...]:
         leaves, spec = tree_flatten(self.module.forward(points))
+        if not all(leaf is None or isinstance(leaf, Tensor) for leaf in leaves):
+            raise TypeError(f"{type(self.module).__name__} returns more than tensors and None")
         self.spec = spec, [leaf is not None for leaf in leaves]
         return tuple(leaf for leaf in leaves if leaf is not None)
 
@@ -175,7 +264,7 @@ def captured(module: nn.Module, points: Float[Tensor, "b n 3"]) -> Pass:
         points: of the shape and on the GPU of all that will be passed.
 
     Raises:
-        RuntimeError: a pass waits for the device, or has something else that no graph can hold.
+        Exception: a pass waits for the device, or has something else that no graph can hold.
     """
     names, weights = zip(*module.named_parameters(), strict=True)
     # Leaves of their own: those of passes before are of another stream, which a capture refuses.
@@ -187,12 +276,11 @@ def captured(module: nn.Module, points: Float[Tensor, "b n 3"]) -> Pass:
     buffers = [(buffer, buffer.clone()) for buffer in module.buffers()]
     drawn = torch.cuda.get_rng_state(points.device)
     try:
-        # Whatever stream a failed capture ends on; torch warns of its own warm-up's.
-        with torch.cuda.stream(torch.cuda.current_stream(points.device)), _quiet():
+        with _capturing(points.device):
             graphed: Any = torch.cuda.make_graphed_callables(
                 run, (points.clone(), *leaves), allow_unused_input=True
             )
-    except RuntimeError:
+    except Exception:
         _new_generator(points.device)
         raise
     finally:
@@ -204,9 +292,22 @@ def captured(module: nn.Module, points: Float[Tensor, "b n 3"]) -> Pass:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    with warnings.catch_warnings():
+def _capturing(device: torch.device) -> Iterator[None]:
+    """Captures on this device; afterwards the current stream is that of before, whatever fails.
+
+    torch keeps one stream for all captures of a process, of the first one's GPU: on another's
+    nothing would be captured, of which torch only warns. It also warns of its own warm-up's stream.
+    """
+    kept = torch.cuda.graph.default_capture_stream
+    if kept is not None and kept.device != device:
+        torch.cuda.graph.default_capture_stream = None
+    with (
+        torch.cuda.device(device),
+        torch.cuda.stream(torch.cuda.current_stream(device)),
+        warnings.catch_warnings(),
+    ):
         warnings.filterwarnings("ignore", message="The AccumulateGrad node's stream does not match")
+        warnings.filterwarnings("error", message="The CUDA Graph is empty")
         yield
 
 

@@ -225,8 +225,9 @@ def _check_settings(cfg: DictConfig) -> None:
         value = OmegaConf.select(cfg, key)
         if value is not None and (key, value) != ("trainer.threads", "auto"):
             check_int(key, value, 1)
-    for key in ("data.make_source", "force", "compile", "trainer.cuda_graphs"):
+    for key in ("data.make_source", "force", "compile"):
         check_bool(key, OmegaConf.select(cfg, key))
+    check_bool("trainer.cuda_graphs", cfg.trainer.get("cuda_graphs", True))
     if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
         check_bool("trainer.deterministic", exactly)
     if cfg.trainer.get("limit_val_batches") == 0:

@@ -17,7 +17,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from torch import nn
 from torch.nn import functional as F
 
-from qs3.engine.cuda_graphs import EAGER, GraphedNet
+from qs3.engine.cuda_graphs import EAGER, Graphs
 from qs3.models.base import PointClassifier
 from tests.benchmarks.device import DEVICE, WHERE, deterministic, finish
 from tests.benchmarks.test_kernels import STRAIGHT
@@ -40,14 +40,13 @@ def _or_nan(measured: Callable[[], float]) -> float:
 def _milliseconds(net: nn.Module, points: torch.Tensor, graphs: bool = False) -> float:
     """The median of some steps, forward and backward; NaN if the memory is too small."""
     labels = torch.arange(len(points), device=points.device) % 5
-    passes: Any = net
-    if graphs:
-        assert isinstance(net, PointClassifier)
-        passes = GraphedNet(net)
+    assert isinstance(net, PointClassifier) or not graphs
+    made: Any = Graphs(net) if graphs else None
+    passes: Any = made.stand_in if graphs else net
 
     def step() -> None:
         if graphs:
-            passes.begin_step()
+            made.begin_step()
         net.zero_grad()
         F.cross_entropy(passes(points), labels).backward()
         finish()

@@ -10,6 +10,7 @@ import torch
 from qs3.config import hashing
 from qs3.engine import cuda_graphs
 from qs3.engine.classifier import Classifier
+from qs3.engine.cuda_graphs import captured
 from qs3.runs.checkpoints import load
 from qs3.training.command import train
 from qs3.training.run import STUDENT
@@ -44,3 +45,20 @@ def _weights(config: Any) -> dict[str, torch.Tensor]:
     """Of the last student."""
     train(config)
     return load(hashing.run_folder(config) / STUDENT)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_s_run_is_the_same_with_graphs(toy: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    def counted(*args: Any) -> Any:
+        made.append(args)
+        return captured(*args)
+
+    monkeypatch.setattr(cuda_graphs, "captured", counted)
+    settings = (*POINTNET, "method=pcm", "force=true", "trainer=gpu", "protocol.batch_size=4")
+    one = _weights(toy(*settings, "trainer.cuda_graphs=false"))
+    assert not made
+    other = _weights(toy(*settings))
+    assert made
+    assert all(torch.equal(one[key], other[key]) for key in one)

@@ -34,6 +34,11 @@ def usable(x: Tensor, *, anywhere: bool = False, traceable: bool = False) -> boo
     return (anywhere or on_cpu(x)) and not _plain and (traceable or not exporting())
 
 
+def is_plain() -> bool:
+    """Whether this is inside `plain`."""
+    return _plain
+
+
 @contextmanager
 def plain() -> Iterator[None]:
     """Inside, all nets of this process compute what their formulas say, step by step."""
