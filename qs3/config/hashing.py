@@ -79,6 +79,8 @@ def config_sha256(cfg: DictConfig) -> str:
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None
     trainer = plain.get("trainer")
+    if isinstance(trainer, dict) and trainer.get("float32_matmul") == "highest":
+        trainer.pop("float32_matmul")  # as it was before there was such a key
     devices = trainer.get("devices") if isinstance(trainer, dict) else None
     if isinstance(devices, list) and len(devices) == 1:
         trainer["devices"] = 1

@@ -32,7 +32,7 @@ def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
 def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:
     settings = OmegaConf.to_container(cfg.trainer, resolve=True)
     assert isinstance(settings, dict)
-    ours = ("threads", "gpus", "cuda_graphs")
+    ours = ("threads", "gpus", "cuda_graphs", "float32_matmul")
     given = {str(key): value for key, value in settings.items() if key not in ours}
     if isinstance(given.get("profiler"), dict):
         given["profiler"] = build(cfg.trainer.profiler)
@@ -51,16 +51,18 @@ def build_each(group: DictConfig | None) -> list[Any]:
     return [build(node) for node in (group or {}).values() if node is not None]
 
 
-def settle_process(threads: int) -> None:
+def settle_process(threads: int, float32_matmul: str = "highest") -> None:
     """What a training sets for its whole process: memory is kept, no tensor is filled in vain.
 
     Args:
         threads: of torch.
+        float32_matmul: see `torch.set_float32_matmul_precision`.
     """
     keep_freed_memory()
     # With `trainer.deterministic` torch fills each new tensor with NaN, lest one be read unwritten.
     torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
     torch.set_num_threads(threads)
+    torch.set_float32_matmul_precision(float32_matmul)
 
 
 def quieten() -> None:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from qs3.geometry import compiled, smallest
-from qs3.geometry.device import takes_triton
+from qs3.geometry.device import exact_products, takes_triton
 from qs3.geometry.farthest_points import farthest_points, farthest_points_by_scan
 from qs3.geometry.matmul import matmul_t
 from qs3.geometry.sampling import farthest_point_sampling_np
@@ -33,7 +33,7 @@ def knn(x: Float[Tensor, "b n c"], k: int) -> Int[Tensor, "b n k"]:
     n = x.shape[1]
     if k > n:
         return knn(x, n)[:, :, torch.arange(k, device=x.device) % n]
-    with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+    with torch.no_grad(), torch.autocast(x.device.type, enabled=False), exact_products():
         if x.dtype in (torch.float16, torch.bfloat16):
             x = x.float()
         if takes_numpy(x) and x.shape[2] == 3 and n >= _TREE_FROM:

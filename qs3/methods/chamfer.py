@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import gather
 
 
@@ -25,7 +26,7 @@ def masked_chamfer(
     float32 at least, also under autocast. Nearest points are found without gradient; the
     gradient is that of the distances to them, as that of the minimum.
     """
-    with torch.autocast(a.device.type, enabled=False):
+    with torch.autocast(a.device.type, enabled=False), exact_products():
         a, b = (x.float() if x.dtype in (torch.float16, torch.bfloat16) else x for x in (a, b))
         to_b, to_a = nearest(a.detach(), b.detach(), mask_a, mask_b)
         forth = (a - gather(b, to_b)).square().sum(2)  # [b, n]

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
+from qs3.geometry.device import exact_products
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import gather, knn
 from qs3.models import fast
@@ -150,7 +151,9 @@ class DGCNN(Backbone):
         k = n if n < self.k else self.k  # a number in an export too; min() would be a symbol
         x, levels = points, []
         if self.transform is not None:
-            x = points @ self.transform(points, k).transpose(1, 2)
+            transform = self.transform(points, k)  # [b, 3, 3]
+            with exact_products():  # as in PointNet
+                x = points @ transform.transpose(1, 2)
         for layer in self.edge_convs:
             x = layer(x, knn(x, k))
             levels.append(x)

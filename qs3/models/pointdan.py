@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.geometry.ball_query import ball_query
+from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.models.base import Backbone, Features, PointClassifier
 from qs3.models.norms import head_norm, make_norm
@@ -74,7 +75,7 @@ class NodeModule(nn.Module):
         towards = gather(x, ball) - place[:, :, None]  # [b, m, k, 3]
         how_far = torch.tanh(self.offset(gather(f, ball) - feature[:, :, None]))
         place = place + (how_far * towards).mean(2)  # [b, m, 3]
-        with torch.no_grad(), torch.autocast(x.device.type, enabled=False):
+        with torch.no_grad(), torch.autocast(x.device.type, enabled=False), exact_products():
             squares = _squared_distances(place.detach().float(), x.float())  # [b, m, n]
             nearest = squares.topk(k, dim=2, largest=False)[1]
             three = squares.topk(min(3, self.nodes), dim=1, largest=False)[1]  # [b, 3, n]
@@ -115,7 +116,9 @@ class PointDanBackbone(Backbone):
     def with_nodes(self, points: Float[Tensor, "b n 3"]) -> tuple[Features, Nodes]:
         """The same, and the nodes, for alignment."""
         with torch.autocast(points.device.type, enabled=False):  # as in PointNet
-            turned = points @ self.input_transform(points)
+            transform = self.input_transform(points)
+            with exact_products():
+                turned = points @ transform
         x = self.first(turned)
         x = x @ self.feature_transform(x)  # [b, n, 64]
         nodes = self.node_module(points, x)

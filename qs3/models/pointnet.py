@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError
+from qs3.geometry.device import exact_products
 from qs3.models import fast
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
 from qs3.models.fast.pointwise_max import normed_maximum
@@ -140,9 +141,11 @@ class PointNet(Backbone):
         """
         x, levels, regulariser = points, [], None
         if self.input_transform is not None:
-            # bfloat16 has 8 bits for a coordinate: rounding would differ as much as clouds do
+            # bfloat16 has 8 bits for a coordinate, TF32 11: rounded ones would differ as clouds do
             with torch.autocast(points.device.type, enabled=False):
-                x = x @ self.input_transform(x)
+                transform = self.input_transform(x)
+                with exact_products():
+                    x = x @ transform
         for layer in self.first:
             x = layer(x)
             levels.append(x)

@@ -228,6 +228,7 @@ def _check_settings(cfg: DictConfig) -> None:
     for key in ("data.make_source", "force", "compile"):
         check_bool(key, OmegaConf.select(cfg, key))
     check_bool("trainer.cuda_graphs", cfg.trainer.get("cuda_graphs", True))
+    _check_products(cfg.trainer)
     if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
         check_bool("trainer.deterministic", exactly)
     if cfg.trainer.get("limit_val_batches") == 0:
@@ -269,6 +270,17 @@ def _check_keys(cfg: DictConfig) -> None:
         found: Any = OmegaConf.select(cfg, prefix.rstrip(".")) if prefix else cfg
         keys = [str(key) for key in found if prefix or f"${{{key}" not in text]
         check_keys(prefix, keys, known)
+
+
+def _check_products(trainer: DictConfig) -> None:
+    """Refuse a rounding that is not one, and one that would be a GPU's on the CPU."""
+    key, rounding = "trainer.float32_matmul", trainer.get("float32_matmul", "highest")
+    check_choice(key, rounding, ("highest", "high"))
+    if rounding == "high" and trainer.accelerator == "cpu":
+        raise ConfigError(
+            f"{key}=high rounds a GPU's products, and trainer.accelerator is cpu; set "
+            "trainer=gpu, or leave it at highest"
+        )
 
 
 def _check_rounds(run: Run) -> None:

@@ -46,7 +46,8 @@ def fit(run: Run) -> RunMetrics:
     """
     began = Moment(time.time(), processor_seconds())
     quieten()
-    settle_process(number_of(run.cfg.trainer.threads))
+    trainer = run.cfg.trainer
+    settle_process(number_of(trainer.threads), trainer.get("float32_matmul", "highest"))
     method: Method = build(run.cfg.method)
     given = read_given(run.cfg)
     loaded = load_data(run, method, given)

@@ -97,6 +97,15 @@ def test_help_imports_nothing_heavy(tmp_path):
         (("force=no",), ("ConfigError: force must be true or false, got 'no'",)),
         (("compile=off",), ("ConfigError: compile must be true or false, got 'off'",)),
         (("trainer.deterministic=no",), ("trainer.deterministic must be true or false",)),
+        (("trainer.cuda_graphs=no",), ("ConfigError: trainer.cuda_graphs must be true or false",)),
+        (
+            ("trainer.float32_matmul=medium",),
+            ("ConfigError: trainer.float32_matmul must be one of ('highest', 'high')",),
+        ),
+        (
+            ("trainer.float32_matmul=high",),
+            ("ConfigError: trainer.float32_matmul=high rounds a GPU's products", "trainer=gpu"),
+        ),
         (("trainer.limit_val_batches=0",), ("ConfigError: trainer.limit_val_batches must",)),
         (("selection.best=1",), ("keys of selection are teacher, student",)),
         (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),

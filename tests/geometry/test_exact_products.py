@@ -1,0 +1,105 @@
+"""Which products `trainer.float32_matmul=high` may round: not those of distances and coordinates.
+
+The rounding itself is a GPU's; here it is looked at what each product would be told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from qs3.config.hashing import config_sha256
+from qs3.geometry.device import exact_products
+from qs3.geometry.neighbours import knn
+from qs3.methods.chamfer import masked_chamfer
+from tests.composing import compose
+from tests.device import as_on_device
+from tests.models.test_all_nets import NETS, build
+
+PRODUCTS = ("mm", "bmm", "addmm", "baddbmm", "mv", "dot")
+
+
+class Told(TorchDispatchMode):
+    """Of each product: what it may round, and its two factors' shapes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[str, list[list[int]]]] = []
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if func._schema.name.split("::")[1].rstrip("_") in PRODUCTS:
+            factors = [list(x.shape) for x in tree_leaves(args) if isinstance(x, Tensor)][-2:]
+            self.found.append((torch.get_float32_matmul_precision(), factors))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture(autouse=True)
+def high() -> Iterator[None]:
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    yield
+    torch.set_float32_matmul_precision(before)
+
+
+def _fails_inside() -> None:
+    with exact_products():
+        assert torch.get_float32_matmul_precision() == "highest"
+        raise ZeroDivisionError
+
+
+def test_afterwards_it_is_as_before() -> None:
+    with pytest.raises(ZeroDivisionError):
+        _fails_inside()
+    assert torch.get_float32_matmul_precision() == "high"
+
+
+def test_distances_are_exact() -> None:
+    points, features = torch.randn(3, 40, 3), torch.randn(3, 40, 9)
+    mask = torch.ones(3, 40, dtype=torch.bool)
+    for ask in (
+        lambda: knn(points, 5),
+        lambda: knn(features, 5),
+        lambda: masked_chamfer(points, points + 1, mask, mask),
+    ):
+        with as_on_device(), Told() as told:
+            ask()
+        assert [word for word, _ in told.found] == ["highest"] * len(told.found)
+        assert told.found
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_nets_round_layers_but_no_coordinates(name: str) -> None:
+    """Turned clouds stay exact, and distances; a first layer is a layer like others."""
+    net = build(name, **({"variant": "defrec"} if name == "dgcnn" else {})).float().train()
+    with as_on_device(), Told() as told:
+        net(torch.randn(4, 128, 3))
+    turns, distances, layers = [], [], []
+    for word, (a, b) in told.found:
+        if b == [4, 3, 3]:
+            turns.append(word)
+        elif len(a) == len(b) == 3 and b[2] == 128:  # to every point
+            distances.append(word)
+        else:
+            layers.append(word)
+    assert set(layers) <= {"high"}
+    assert set(turns) | set(distances) <= {"highest"}
+    assert len(turns) == (name in ("dgcnn", "pointnet", "pointdan"))
+    assert len(distances) == {"dgcnn": 5, "pointdan": 1}.get(name, 0)
+
+
+def test_only_rounded_runs_are_other_runs() -> None:
+    def sha256(*words: str) -> str:
+        return config_sha256(compose("train", ["trainer=gpu", *words]))
+
+    plain = sha256()
+    assert sha256("trainer.float32_matmul=highest") == plain == sha256("~trainer.float32_matmul")
+    assert sha256("trainer.float32_matmul=high") != plain
+    assert sha256("trainer.cuda_graphs=false") == plain == sha256("~trainer.cuda_graphs")
