@@ -119,7 +119,8 @@ class Option:
                 return self.kind.read(words)
         except ValueError:
             pass
-        raise ConfigError(f"{self.key} must be {self.kind.must}, got {words!r}")
+        without = "" if words or self.required else f"; for the default leave {self.key}= out"
+        raise ConfigError(f"{self.key} must be {self.kind.must}, got {words!r}{without}")
 
     def explained(self) -> str:
         """For the help: what it means, its default and its choices."""

@@ -88,6 +88,7 @@ def test_values_have_their_kinds():
         (["echo", "path=x", "z=1"], "unknown key 'z'; keys are path, data_dir, count"),
         (["echo", "path=x", "path=y"], "path= is given twice"),
         (["echo", "path="], "path must be text, got ''"),
+        (["echo", "path=x", "law="], "got ''; for the default leave law= out"),
         (["echo", "path=x", "count=1"], "count must be a whole number of at least 2, got '1'"),
         (["echo", "path=x", "count=two"], "count must be a whole number of at least 2, got 'two'"),
         (["echo", "path=x", "share=much"], "share must be a number, got 'much'"),
