@@ -16,7 +16,7 @@ VERSION ?=
 GO ?= false
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor quickstart lint format test test-all bench mutants docs release clean
+.PHONY: help install doctor quickstart lint format test test-all test-triton bench mutants docs release clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -54,6 +54,11 @@ test test-all: export PYTHONDONTWRITEBYTECODE =
 
 test: install ## all tests that are not slow, on 2 cores
 	$(RUN) -m pytest $(PARALLEL) --ignore=tests/benchmarks
+
+test-triton: install ## kernels for GPUs in Triton's interpreter, which is fetched for it (286 MB)
+	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) --no-deps --target out/triton triton==3.9.0
+	PYTHONPATH=out/triton $(RUN) -m pytest $(PARALLEL) tests/geometry/test_triton_farthest_points.py \
+	  tests/geometry/test_smallest.py tests/models/fast/test_edge_norm.py
 
 test-all: install ## the slow tests too, shapes in signatures checked, and the benchmarks once each
 	QS3_CHECK_SHAPES=1 $(RUN) -m pytest $(PARALLEL) -m ''

@@ -39,6 +39,7 @@ def deterministic(setting: bool | Literal["warn"]) -> Iterator[None]:
     name = "CUBLAS_WORKSPACE_CONFIG"
     before = torch.get_deterministic_debug_mode(), os.environ.get(name)
     torch.use_deterministic_algorithms(bool(setting), warn_only=setting == "warn")
+    os.environ.pop(name, None)  # of a training in this process
     if setting:
         os.environ[name] = ":4096:8"
     try:

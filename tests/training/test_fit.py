@@ -13,11 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch import Callback
 
 from qs3.config import hashing
+from qs3.engine import trainer as engine_trainer
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, SelectionError
 from qs3.inference.model_file import read_result
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
+from qs3.training import build as built
 from qs3.training.command import CENTRED_ONLY, UNIT_BALL_ONLY, train
 from qs3.utils.locks import owned
 from qs3.utils.version import VERSION, commit
@@ -346,3 +349,21 @@ def test_damaged_checkpoint(toy, tmp_path):
     (folder / "last.ckpt").write_bytes(b"not a checkpoint")
     with pytest.raises(DataError, match=r"last\.ckpt cannot be read.*force=true"):
         train(cfg)
+
+
+def test_trainings_keep_memory_and_fill_no_tensor_in_vain(toy, tmp_path, monkeypatch):
+    """Both are speed alone, so nothing else would notice that they are gone."""
+    seen = []
+
+    class Looks(Callback):
+        def on_train_start(self, trainer, pl_module):
+            seen.append(torch.utils.deterministic.fill_uninitialized_memory)
+
+    monkeypatch.setattr(torch.utils.deterministic, "fill_uninitialized_memory", True)
+    monkeypatch.setattr(engine_trainer, "keep_freed_memory", lambda: seen.append("kept"))
+    config = toy("selftraining=none", "protocol.epochs=1")
+    monkeypatch.setattr(
+        built, "build_each", lambda group: [Looks()] if group == config.callbacks else []
+    )
+    train(config)
+    assert seen == ["kept", False]
