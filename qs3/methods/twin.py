@@ -37,12 +37,12 @@ class Twin(MeanTeacher):
     + b CE(f(x'), y) + v JS(f(x), f(x')) + u e^{-5 (1 - p)²} H(t(z); T_t, f(z')).
 
     x: a source cloud as the student sees it, noisy, hidden and cut; w: its twin (`sees`), turned
-    alike; x': x drawn again, by another cut and, with `data.source.views=random`, another sensor
-    and number of views; z, z': a target cloud as it was measured, and cut. f: class probabilities
-    of the student, φ_f its vector of a cloud before the head; t, φ_t those of the teacher, which no
-    gradient reaches. KL(·; T): of softmaxes at temperature T; JS: their Jensen-Shannon divergence;
-    H(·; T_t, ·): cross-entropy with the teacher's softmax at T_t, which sharpens it; all are means
-    over the clouds, in nats. p: progress of the warm-up.
+    alike; x': x drawn again, by another cut and, with `data.source.views=random`, another share of
+    its sensor's error and number of views; z, z': a target cloud as it was measured, and cut. f:
+    class probabilities of the student, φ_f its vector of a cloud before the head; t, φ_t those of
+    the teacher, which no gradient reaches. KL(·; T): of softmaxes at temperature T; JS: their
+    Jensen-Shannon divergence; H(·; T_t, ·): cross-entropy with the teacher's softmax at T_t, which
+    sharpens it; all are means over the clouds, in nats. p: progress of the warm-up.
 
     The normalised squared distance |û - v̂|² is 2 (1 - cos), so it is no further choice.
 

@@ -75,6 +75,7 @@ CASES = {
     "twin": Case(Twin, 2),
     "twin_everything": Case(lambda: Twin(**EVERYTHING), 4),
     "twin_shared": Case(lambda: Twin(**EVERYTHING, teacher="shared"), 5),
+    "twin_own": Case(lambda: Twin(**OF_WHOLES, teacher="own"), 2),  # and one of the other net's
     "twin_of_the_source": Case(lambda: Twin(**OF_WHOLES, again_weight=0.0), 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),

@@ -29,7 +29,7 @@ REFUSED = {
     **dict.fromkeys(("defrec", "defrec_on_source", "defrec_pcm", "mlsp"), NO_POINTS),
     **dict.fromkeys(("dann", "dann_apart", "sd", "sd_cut_both"), FROZEN),
     **dict.fromkeys(("gast", "gast_no_rotation", "gast_pcm"), FROZEN),
-    **dict.fromkeys(("twin_everything", "twin_shared", "twin_of_the_source"), FROZEN),
+    **dict.fromkeys(("twin_everything", "twin_shared", "twin_own", "twin_of_the_source"), FROZEN),
 }
 
 
