@@ -1,4 +1,9 @@
-"""The page's figures on real objects are those of the tables, and the tables' of the kept runs."""
+"""The page's figures on real objects are those of the tables, and the tables' of the kept runs.
+
+Where runs were kept since: `qs3 report table` of each column and `compare` of R -> A, as asked
+below, with `out=` a folder, whose CSV files go to docs/results/leaderboard; then `page_lines()`
+are the page's.
+"""
 
 from __future__ import annotations
 
