@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,6 +40,12 @@ def rendered(renderer: MitsubaRenderer) -> Image:
     return image
 
 
+def has_avx512() -> bool:
+    """Whether this is known to be a processor on which Embree takes sixteen rays as one."""
+    told = Path("/proc/cpuinfo")
+    return told.is_file() and " avx512dq" in told.read_text()
+
+
 @pytest.mark.parametrize("width", [4, 16])
 def test_whatever_the_processor_would_take(renderer, monkeypatch, width):
     before = rendered(renderer)
@@ -49,7 +56,7 @@ def test_whatever_the_processor_would_take(renderer, monkeypatch, width):
     after = rendered(renderer)
     np.testing.assert_array_equal(after.radiance, before.radiance)
     np.testing.assert_array_equal(after.depth_m, before.depth_m)
-    if width == 16:  # else there is nothing to fix
+    if width == 16 and has_avx512():  # else Embree takes eight twice, and there is nothing to fix
         assert (other.radiance != before.radiance).any()
     assert "width" not in renderer.provenance()
 
