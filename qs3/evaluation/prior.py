@@ -25,6 +25,9 @@ from qs3.classes import CLASSES, known_as
 from qs3.config.checks import check_float
 from qs3.errors import ConfigError
 
+ESTIMATED = "estimated"
+"""In a config: shares of the target's training clouds, see `qs3.evaluation.share_estimates`."""
+
 POWER = 0.5
 """t: on real objects half of it is right more often than all of it (docs/how-to/predict.md)."""
 

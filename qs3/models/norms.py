@@ -185,7 +185,8 @@ class _Pooled:
 
     def __init__(self, norm: _BatchNorm) -> None:
         assert norm.running_mean is not None
-        self.norm, self.seen = norm, 0
+        assert norm.running_var is not None
+        self.norm, self.before = norm, (norm.running_mean.clone(), norm.running_var.clone())
         self.total = 0
         self.mean = torch.zeros_like(norm.running_mean, dtype=torch.float64)
         self.squares = torch.zeros_like(self.mean)  # sum of squares about the mean
@@ -202,26 +203,32 @@ class _Pooled:
         self.mean += step * (count / total)
         self.total = total
 
-    def store(self) -> None:
+    def store(self, kept: float) -> None:
         norm = self.norm
         assert norm.running_mean is not None
         assert norm.running_var is not None
-        norm.running_mean.copy_(self.mean)
-        norm.running_var.copy_(self.squares / max(self.total - 1, 1))
+        mean, var = self.before
+        norm.running_mean.copy_(self.mean.lerp(mean.double(), kept))
+        norm.running_var.copy_((self.squares / max(self.total - 1, 1)).lerp(var.double(), kept))
 
 
 @torch.no_grad()
-def adapt_batchnorm(net: nn.Module, batches: Iterable[Tensor]) -> list[nn.Module]:
+def adapt_batchnorm(
+    net: nn.Module, batches: Iterable[Tensor], kept: float = 0.0
+) -> list[nn.Module]:
     """AdaBN: give every batch norm the statistics of these clouds (Li et al., 2016, alg. 1).
 
     No weight changes. One pass, in which a layer's input was normalised with the statistics of its
     own batch. Means and variances are pooled over all batches: neither the order of the batches nor
-    a smaller last one matters, and nothing is left of the former statistics.
+    a smaller last one matters, and of the former statistics no more is left than `kept` says.
 
     Args:
         net: takes a batch of clouds. Of domain-specific norms those of the current domain are
             re-estimated: call it inside `use_domain(net, "target")`.
         batches: of clouds [B, N, 3], of at least two each.
+        kept: in [0, 1], the share of the former means and variances in what the norms then hold
+            (alpha-BN: You et al., "Test-time Batch Statistics Calibration for Covariate Shift",
+            arXiv 2110.04065, 2021; there layer by layer as a batch passes, here after the pass).
 
     Returns:
         The adapted norms.
@@ -239,7 +246,7 @@ def adapt_batchnorm(net: nn.Module, batches: Iterable[Tensor]) -> list[nn.Module
         net.eval()  # no dropout, and nothing else that is left to chance
         for norm in norms:
             norm.training, norm.momentum = True, 1.0
-        _estimate(net, norms, batches)
+        _estimate(net, norms, batches, kept)
     finally:
         for norm, momentum in zip(norms, momenta, strict=True):
             norm.momentum = momentum
@@ -272,7 +279,9 @@ def running_norms(net: nn.Module) -> list[_BatchNorm]:
     return [norm for norm in found if norm not in asleep]
 
 
-def _estimate(net: nn.Module, norms: list[_BatchNorm], batches: Iterable[Tensor]) -> None:
+def _estimate(
+    net: nn.Module, norms: list[_BatchNorm], batches: Iterable[Tensor], kept: float
+) -> None:
     pooled = [_Pooled(norm) for norm in norms]
 
     def count(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
@@ -300,4 +309,4 @@ def _estimate(net: nn.Module, norms: list[_BatchNorm], batches: Iterable[Tensor]
     if not seen:
         raise DataError("no batches to take statistics of")
     for pool in pooled:
-        pool.store()
+        pool.store(kept)

@@ -90,7 +90,7 @@ class Evaluated:
         split: "test"; "train" where there is no other.
         labels: whether anybody knows the clouds' classes.
         rotations: rotations about the up axis over which the further scores average; 0: none.
-        norms: "trained", "adabn" or "tent".
+        norms: "trained", "adabn", "alpha_bn" or "tent".
         prior: how common classes counted as, in words; "": as in training.
         final_over_rotations, warmup_over_rotations: those scores.
         tiers: the final scores of the clouds of each tier, for datasets that have tiers ("clean",

@@ -5,7 +5,7 @@ See `qs3.evaluation.prior`, whose u these are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from omegaconf import OmegaConf
 
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import SelfTrainingConfig
-from qs3.evaluation.prior import Prior, read_prior, shares_of
+from qs3.evaluation.prior import ESTIMATED, Prior, read_prior, shares_of
+from qs3.evaluation.share_estimates import estimate_shares
 from qs3.runs.metrics import RoundRecord
 
 Shares = Float[np.ndarray, " c"]
@@ -34,8 +35,15 @@ def of_student(scheme: SelfTrainingConfig, labelled: Shares, last: RoundRecord) 
     return (pseudo + labelled) / 2 if scheme.use_source else pseudo
 
 
-def prior_of(settings: Any, classes: Sequence[str], learnt: Shares) -> Prior | None:
+def prior_of(
+    settings: Any,
+    classes: Sequence[str],
+    learnt: Shares,
+    said: Callable[[], Float[np.ndarray, "n c"]],
+) -> Prior | None:
     """`evaluation.prior` beside these shares; None if there is none.
+
+    `said`: the net's probabilities of the target's training clouds, for shares that are estimated.
 
     Raises:
         ConfigError: it is no prior.
@@ -43,5 +51,7 @@ def prior_of(settings: Any, classes: Sequence[str], learnt: Shares) -> Prior | N
     if settings.prior is None:
         return None
     given: Any = settings.prior
+    if given == ESTIMATED:
+        given = dict(zip(classes, estimate_shares(said(), learnt).tolist(), strict=True))
     given = OmegaConf.to_container(given) if OmegaConf.is_config(given) else given
     return read_prior(given, classes, learnt, settings.prior_power, "evaluation.prior")

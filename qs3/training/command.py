@@ -46,6 +46,7 @@ KEYS = {
 
 TEACHERS = ("source_val", "last", "given")
 SCHEDULES = ("cosine", "plateau")
+NORMS = ("trained", "adabn", "alpha_bn", "tent")
 UNIT_BALL_ONLY = {
     "qs3.models.simpleview.simpleview": "its cameras stand 1.4 from the cloud's middle and would "
     "lose a large object's points"
@@ -249,7 +250,7 @@ def _check_settings(cfg: DictConfig) -> None:
             file = cfg[group].file
             why = f"{group}.file={file} cannot be read" if file else f"{group}.file is not set"
             raise ConfigError(f"{why}; {what}, {group}.file=PATH")
-    check_choice("evaluation.norms", cfg.evaluation.norms, ("trained", "adabn", "tent"))
+    check_choice("evaluation.norms", cfg.evaluation.norms, NORMS)
     power = check_float("evaluation.prior_power", cfg.evaluation.prior_power)
     check_told(cfg.evaluation.prior, power, "evaluation.prior")
     check_choice("protocol.schedule", cfg.protocol.schedule, SCHEDULES)

@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Float
 from torch import nn
 
-from qs3.datamodules.splits import Labelled, Unlabelled
+from qs3.datamodules.splits import Labelled
 from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy
-from qs3.evaluation.metrics import adapt_norms, predict, predict_rotated
+from qs3.evaluation.metrics import adapt_norms, alpha_norms, predict, predict_rotated
+from qs3.evaluation.prior import Prior
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.tent import minimise_entropy
 from qs3.evaluation.trust import Known
@@ -34,6 +35,9 @@ from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
 
+ADAPTERS = {"adabn": adapt_norms, "alpha_bn": alpha_norms, "tent": minimise_entropy}
+"""Values of `evaluation.norms` (`qs3.training.command.NORMS`), beside "trained"."""
+
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
@@ -43,6 +47,7 @@ class Outcome:
         net: the reported one.
         predictions: its, for each evaluated cloud; these and all scores are with
             `evaluation.prior`, estimates and validators without.
+        prior: that one, of the reported net.
         choice: how its epoch was chosen; None: the last one's, or the warm-up's.
         final: its scores.
         scores: of "selected" and "last", the warm-up's epochs, and "student", the last round's.
@@ -56,6 +61,7 @@ class Outcome:
 
     net: nn.Module
     predictions: Predictions
+    prior: Prior | None
     choice: Choice | None
     final: Scores
     scores: Mapping[str, Scores]
@@ -75,7 +81,7 @@ class SavedNets:
 
     Args:
         run: whose they are.
-        loaded: clouds, and the target's for norms that adapt to them.
+        loaded: clouds, and the target's for norms and a prior that follow them.
         built: how a net is made, and where it runs.
     """
 
@@ -102,6 +108,14 @@ class SavedNets:
             self._predicted[key] = found
         return self._predicted[key]
 
+    def of_target(self, file: Path) -> Float[np.ndarray, "n c"]:
+        """Probabilities of the target's training clouds."""
+        key = self._weights_in(file), "target", 0.0
+        if key not in self._predicted:
+            clouds, size = self.data.target.points, self.run.cfg.data.eval_batch_size
+            self._predicted[key] = predict(self(file), clouds, size, self.device)
+        return self._predicted[key]
+
     def of_validation(self, file: Path) -> Float[np.ndarray, "v c"]:
         """Probabilities of the labelled validation clouds, with the norms for their domain."""
         key = self._weights_in(file), "validation", 0.0
@@ -123,7 +137,7 @@ class SavedNets:
             net = self.classifier.fresh_net(phase=0).to(self.device)
             net.load_state_dict(load(file, self.device))
             if norms != "trained":
-                adapt = adapt_norms if norms == "adabn" else minimise_entropy
+                adapt = ADAPTERS[norms]
                 size, seed = self.run.cfg.protocol.batch_size, derive(self.run.seed, norms)
                 adapt(net, self.data.target.points, size, seed, self.device)
             self._nets[key] = net
@@ -146,15 +160,19 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     file = choice.file if choice else files[last]
     net, device = nets(file), nets.device
 
-    learnt, prior = loaded.learnt, loaded.prior
+    learnt = loaded.learnt
     if run.scheme.rounds:
         learnt = class_shares.of_student(run.scheme, loaded.labelled, built.rounds.records[-1])
-        prior = class_shares.prior_of(run.cfg.evaluation, evaluation.classes, learnt)
-    of_teacher = (files["selected"], files["last"])
+
+    @cache
+    def prior_of(weights: Path) -> Prior | None:
+        met = loaded.learnt if weights in (files["selected"], files["last"]) else learnt
+        said = partial(nets.of_target, weights)
+        return class_shares.prior_of(run.cfg.evaluation, evaluation.classes, met, said)
 
     def reported(weights: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
-        found, its = nets.of_test(weights, turn), loaded.prior if weights in of_teacher else prior
-        return its(found) if its else found
+        found, prior = nets.of_test(weights, turn), prior_of(weights)
+        return prior(found) if prior else found
 
     predictions = evaluation.predictions_of(reported(file))
     batch_size, data = run.cfg.data.eval_batch_size, loaded.data
@@ -162,6 +180,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
     return Outcome(
         net=net,
         predictions=predictions,
+        prior=prior_of(file),
         choice=choice,
         final=evaluation.scores_of(predictions.probabilities),
         scores={name: evaluation.scores_of(reported(path)) for name, path in files.items()},
@@ -169,7 +188,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
             evaluation.rotation_averaged(partial(reported, file)),
             evaluation.rotation_averaged(partial(reported, files["selected"])),
         ),
-        validators=without_labels(net, data.target, choice, batch_size, device),
+        validators=without_labels(nets.of_target(file), choice),
         quality=quality,
         held_out=held_out,
         learnt=learnt,
@@ -201,14 +220,18 @@ def _quality(
 
 
 def without_labels(
-    net: nn.Module, target: Unlabelled, choice: Choice | None, batch_size: int, device: Any
+    table: Float[np.ndarray, "n c"], choice: Choice | None
 ) -> dict[str, float | None]:
     """The reported net's scores by `qs3.evaluation.validators`, on the target's training clouds.
 
-    Scores by name; None for one that is not a number, of a net that has diverged. SND needs two
-    clouds. If the student was chosen by `pseudo_val`, its score is here.
+    Args:
+        table: what it says of them.
+        choice: how it was chosen: if by `pseudo_val`, that score is here, too.
+
+    Returns:
+        Scores by name; None for one that is not a number, of a net that has diverged. SND needs two
+        clouds.
     """
-    table = predict(net, target.points, batch_size, device)
     scores = {
         name: one.score(table)
         for name, one in LABEL_FREE.items()

@@ -14,7 +14,6 @@ from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.splits import labels_of, load_clouds, subsample_splits
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
-from qs3.evaluation.prior import Prior
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf
 from qs3.training import class_shares
@@ -38,7 +37,6 @@ class Loaded:
         made_of: what the labelled dataset and the target are made of.
         labelled: shares of the classes in the labelled clouds, as they are drawn.
         learnt: the same in what the warm-up's net learnt from; another's, if it was given.
-        prior: how common classes are in the target, for that net, if `evaluation.prior` says so.
     """
 
     data: AdaptationData
@@ -49,7 +47,6 @@ class Loaded:
     made_of: DataMadeOf
     labelled: class_shares.Shares
     learnt: class_shares.Shares
-    prior: Prior | None
 
 
 def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
@@ -85,7 +82,8 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     learnt = drawn = class_shares.of_labelled(data, len(target.classes))
     if given and run.cfg.selection.teacher == "given" and given.learnt is not None:
         learnt = given.learnt
-    prior = class_shares.prior_of(cfg.evaluation, target.classes, learnt)
+    # What is no prior ends a run before it trains.
+    class_shares.prior_of(cfg.evaluation, target.classes, learnt, lambda: learnt[None])
     if (few := cfg.data.clouds_a_split) is not None:
         target = subsample_splits(target, few)
     split = _evaluated_split(target)
@@ -105,9 +103,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         _tiers_by_id(target, run.target),
     )
     made_of = DataMadeOf(source=labelled, target=of_target)
-    return Loaded(
-        data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt, prior
-    )
+    return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt)
 
 
 def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None:

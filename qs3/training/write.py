@@ -78,7 +78,7 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
             labels=evaluation.labelled,
             rotations=evaluation.rotations,
             norms=cfg.evaluation.norms,
-            prior=loaded.prior.words if loaded.prior else "",
+            prior=outcome.prior.words if outcome.prior else "",
             final_over_rotations=over,
             warmup_over_rotations=before,
             tiers=evaluation.scores_of_tiers(outcome.predictions.probabilities),

@@ -11,7 +11,8 @@ from qs3.datamodules.splits import load_clouds
 from qs3.evaluation.metrics import adapt_norms
 from qs3.methods.source_only import SourceOnly
 from qs3.runs.checkpoints import load
-from qs3.training.command import train
+from qs3.training.command import NORMS, train
+from qs3.training.evaluate import ADAPTERS
 from tests.methods import shapes
 from tests.methods.test_learning import POINTS, aside
 from tests.training.toy import TinyNet
@@ -33,6 +34,27 @@ def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
     x = torch.relu(target.points @ after["lift.weight"].T + after["lift.bias"]).amax(1)  # [n, 16]
     torch.testing.assert_close(after["norm.running_mean"], x.mean(0), rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(after["norm.running_var"], x.var(0), rtol=1e-4, atol=1e-5)
+
+
+def test_alpha_bn_holds_half_of_each(toy):
+    changes = ("method=source_only", "selftraining=none", "protocol.epochs=2")
+    held = {}
+    for norms in ("trained", "adabn", "alpha_bn"):
+        cfg = toy(*changes, f"evaluation.norms={norms}")
+        assert train(cfg).evaluation.norms == norms
+        held[norms] = load(hashing.run_folder(cfg) / "result.pt")["weights"]
+    for name, halves in held["alpha_bn"].items():
+        before, target = held["trained"][name], held["adabn"][name]
+        if name.endswith(("running_mean", "running_var")):
+            assert not torch.equal(before, target)
+            # The order in which clouds are drawn differs, and pooled statistics by its roundings.
+            torch.testing.assert_close(halves, (before + target) / 2, rtol=1e-5, atol=1e-6)
+        elif not name.endswith("num_batches_tracked"):
+            torch.testing.assert_close(halves, before, rtol=0, atol=0)
+
+
+def test_all_names_are_known():
+    assert set(NORMS) == {"trained", *ADAPTERS}
 
 
 @pytest.mark.slow
