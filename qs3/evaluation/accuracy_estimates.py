@@ -57,6 +57,7 @@ def estimate_accuracy(
     owner: str,
     classes: Sequence[str],
     teacher: Said | None = None,
+    asked: Said | None = None,
     turned: Callable[[float], Float[np.ndarray, "n c"]] | None = None,
 ) -> tuple[AccuracyEstimates, Known | None]:
     """What `metrics.json` has under `quality`, and what the net knows of its labelled clouds.
@@ -74,6 +75,8 @@ def estimate_accuracy(
         owner: of the labels, "source" or "target_train".
         classes: names in label order.
         teacher: by the net before self-training; None if there was none.
+        asked: by the net as it was before the target's clouds changed it, by whose answers the
+            verdict is (`trust`); None: nothing did.
         turned: by the reported net of the judged clouds after a rotation about z by an angle in
             radians; None if z does not point up in them.
     """
@@ -100,10 +103,12 @@ def estimate_accuracy(
         if teacher.finite:
             accuracy = agreement(teacher.validation, np.eye(len(classes))[labels])
             found = estimates(teacher.validation, labels, teacher.target)
-            # A student was taught to be sure of these clouds: its teacher was not.
-            before = Known(teacher.validation, labels, held_out.measures)
-            about["trust"] = judge(before, Seen(teacher.target, measures), read_calibration())
             about["teacher"] = Estimates(validation_accuracy=accuracy, **found)
+    if asked is not None and asked.finite:
+        # A student was taught to be sure of these clouds, and the target's statistics make a net
+        # surer of them: as it was before, it was not.
+        before = Known(asked.validation, labels, held_out.measures)
+        about["trust"] = judge(before, Seen(asked.target, measures), read_calibration())
     return AccuracyEstimates(**about), held_out
 
 

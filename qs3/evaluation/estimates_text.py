@@ -62,8 +62,10 @@ def trust_in_words(trust: Trust) -> str:
 
 
 def _of_whom(quality: AccuracyEstimates) -> str:
-    """A student was taught to be sure, so it is its teacher that was asked."""
-    return " (of the net before self-training)" if quality.teacher else ""
+    """A net that was adapted is surer than it is right, so it was asked before."""
+    found = ["before self-training"] if quality.teacher else []
+    found += ["with the norms it was trained with"] if quality.trust_without_norms else []
+    return f" (of the net {' and '.join(found)})" if found else ""
 
 
 def reasons(trust: Trust, most: int = 3) -> list[str]:

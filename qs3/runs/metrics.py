@@ -212,8 +212,11 @@ class AccuracyEstimates(Estimates):
         unlike_source: share of clouds outside the usual range of the labelled ones.
         never_predicted: classes.
         trust: what to make of it all, of the teacher's answers if there is one: a student was
-            taught to be sure of the target. None of a net that has diverged, of few clouds, and in
-            files of older versions.
+            taught to be sure of the target. With the norms that the net was trained with: the
+            target's statistics make it surer, too. None of a net that has diverged, of few clouds,
+            and in files of older versions.
+        trust_without_norms: whether that differs from the evaluated net, see `Evaluated.norms`.
+            False in files of older versions, whose verdict is of the adapted net.
     """
 
     clouds: int
@@ -225,6 +228,7 @@ class AccuracyEstimates(Estimates):
     unlike_source: float
     never_predicted: list[str]
     trust: Trust | None = None
+    trust_without_norms: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
 
+TRAINED = "trained"
 ADAPTERS = {"adabn": adapt_norms, "alpha_bn": alpha_norms, "tent": minimise_entropy}
 """Values of `evaluation.norms` (`qs3.training.command.NORMS`), beside "trained"."""
 
@@ -98,11 +99,17 @@ class SavedNets:
         """As it is evaluated: with norms of the target if `evaluation.norms` says so."""
         return self._net(file, self.run.cfg.evaluation.norms)
 
-    def of_test(self, file: Path, turn: float = 0.0) -> Float[np.ndarray, "n c"]:
-        """Probabilities of the evaluated clouds, rotated about the up axis by `turn` in radians."""
-        key = self._weights_in(file), "test", turn
+    def of_test(
+        self, file: Path, turn: float = 0.0, norms: str | None = None
+    ) -> Float[np.ndarray, "n c"]:
+        """Probabilities of the evaluated clouds, rotated about the up axis by `turn` in radians.
+
+        `norms`: other ones than `evaluation.norms`.
+        """
+        norms = norms or self.run.cfg.evaluation.norms
+        key = self._weights_in(file), f"test, {norms}", turn
         if key not in self._predicted:
-            more = self(file), self.test.points
+            more = self._net(file, norms), self.test.points
             how: Any = self.run.cfg.data.eval_batch_size, self.device
             found = predict_rotated(*more, turn, *how) if turn else predict(*more, *how)
             self._predicted[key] = found
@@ -116,14 +123,17 @@ class SavedNets:
             self._predicted[key] = predict(self(file), clouds, size, self.device)
         return self._predicted[key]
 
-    def of_validation(self, file: Path) -> Float[np.ndarray, "v c"]:
-        """Probabilities of the labelled validation clouds, with the norms for their domain."""
-        key = self._weights_in(file), "validation", 0.0
+    def of_validation(self, file: Path, norms: str | None = None) -> Float[np.ndarray, "v c"]:
+        """Probabilities of the labelled validation clouds, with the norms for their domain.
+
+        `norms`: of clouds of the target other ones than `evaluation.norms`.
+        """
+        of_source, clouds = self.data.owner == "source", self.data.validation.clouds
+        norms = "trained" if of_source else norms or self.run.cfg.evaluation.norms
+        key = self._weights_in(file), f"validation, {norms}", 0.0
         if key not in self._predicted:
-            of_source, clouds = self.data.owner == "source", self.data.validation.clouds
-            net = self._net(file, "trained" if of_source else self.run.cfg.evaluation.norms)
             self._predicted[key] = predict(
-                net,
+                self._net(file, norms),
                 clouds.all(),
                 self.run.cfg.data.eval_batch_size,
                 self.device,
@@ -136,7 +146,7 @@ class SavedNets:
         if key not in self._nets:
             net = self.classifier.fresh_net(phase=0).to(self.device)
             net.load_state_dict(load(file, self.device))
-            if norms != "trained":
+            if norms != TRAINED:
                 adapt = ADAPTERS[norms]
                 size, seed = self.run.cfg.protocol.batch_size, derive(self.run.seed, norms)
                 adapt(net, self.data.target.points, size, seed, self.device)
@@ -203,20 +213,27 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
 def _quality(
     run: Run, loaded: Loaded, nets: SavedNets, file: Path
 ) -> tuple[AccuracyEstimates, Known | None]:
-    def said(weights: Path) -> Said:
-        return Said(validation=nets.of_validation(weights), target=nets.of_test(weights))
+    def said(weights: Path, norms: str = run.cfg.evaluation.norms) -> Said:
+        return Said(
+            validation=nets.of_validation(weights, norms),
+            target=nets.of_test(weights, norms=norms),
+        )
 
-    data = loaded.data
-    return estimate_accuracy(
+    data, rounds = loaded.data, run.scheme.rounds
+    first = run.folder / WARMUP_SELECTED if rounds else file
+    adapted = run.cfg.evaluation.norms != TRAINED
+    quality, held_out = estimate_accuracy(
         said(file),
         data.validation.labels.numpy(),
         loaded.evaluation.test.clouds,
         data.all_labelled,
         owner=data.owner,
         classes=loaded.evaluation.classes,
-        teacher=said(run.folder / WARMUP_SELECTED) if run.scheme.rounds else None,
+        teacher=said(first) if rounds else None,
+        asked=said(first, TRAINED) if rounds or adapted else None,
         turned=partial(nets.of_test, file) if run.target.gravity == "z" else None,
     )
+    return replace(quality, trust_without_norms=adapted and quality.trust is not None), held_out
 
 
 def without_labels(

@@ -8,6 +8,7 @@ import torch
 from qs3.config import hashing
 from qs3.data.store import open_pointset
 from qs3.datamodules.splits import load_clouds
+from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.metrics import adapt_norms
 from qs3.methods.source_only import SourceOnly
 from qs3.runs.checkpoints import load
@@ -15,7 +16,7 @@ from qs3.training.command import NORMS, train
 from qs3.training.evaluate import ADAPTERS
 from tests.methods import shapes
 from tests.methods.test_learning import POINTS, aside
-from tests.training.toy import TinyNet
+from tests.training.toy import TinyNet, write_domain
 
 
 def test_statistics_are_the_targets_and_weights_the_sources(toy, toy_data):
@@ -51,6 +52,43 @@ def test_alpha_bn_holds_half_of_each(toy):
             torch.testing.assert_close(halves, (before + target) / 2, rtol=1e-5, atol=1e-6)
         elif not name.endswith("num_batches_tracked"):
             torch.testing.assert_close(halves, before, rtol=0, atol=0)
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Domains with as many test clouds as a verdict takes."""
+    data = tmp_path_factory.mktemp("judged")
+    write_domain(data, "specklenet10", noise=0.1)
+    write_domain(data, "kinectsim10", noise=0.6, test=12)
+    return f"paths.data_dir={data}"
+
+
+@pytest.mark.parametrize("norms", ["adabn", pytest.param("tent", marks=pytest.mark.slow)])
+def test_whether_to_trust_it_is_asked_of_the_net_as_it_was_trained(toy, judged, norms):
+    """The target's statistics make a net surer than it is right."""
+    changes = ("method=source_only", "selftraining=none", "protocol.epochs=2", judged)
+    plain = train(toy(*changes)).quality
+    adapted = train(toy(*changes, f"evaluation.norms={norms}")).quality
+    assert plain.trust is not None
+    assert adapted.trust == plain.trust
+    assert adapted.mean_confidence != plain.mean_confidence
+    assert adapted.trust_without_norms
+    assert not plain.trust_without_norms
+    before = " (of the net with the norms it was trained with)"
+    assert in_words(adapted) == in_words(plain) + before
+
+
+@pytest.mark.slow
+def test_a_student_s_teacher_is_asked_as_it_was_trained(toy, judged):
+    changes = ("method=source_only", "protocol.epochs=2", judged)
+    plain = train(toy(*changes)).quality
+    adapted = train(toy(*changes, "evaluation.norms=adabn")).quality
+    assert plain.trust is not None
+    assert adapted.trust == plain.trust
+    words = in_words(adapted)
+    assert words.endswith(
+        " (of the net before self-training and with the norms it was trained with)"
+    )
 
 
 def test_all_names_are_known():

@@ -2,7 +2,8 @@
 
 Where runs were kept since: `qs3 report table` of each column and `compare` of R -> A, as asked
 below, with `out=` a folder, whose CSV files go to docs/results/leaderboard; then `page_lines()`
-are the page's.
+are the page's. Likewise of docs/results/leaderboard_second, whose runs learnt from another copy of
+R.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ import pytest
 from tests.commands import ROOT, main
 
 KEPT = ROOT / "docs" / "results" / "leaderboard"
+SECOND = ROOT / "docs" / "results" / "leaderboard_second"
 PAGE = ROOT / "docs" / "how-to" / "leaderboard.md"
-OURS = "Twins (ours)"
-COLUMNS = ("R -> A", "R -> A0", "S -> K", "S -> C")
-SETTINGS = (
-    *("table=leaderboard", f"kept={KEPT}", "overrides=report.pictures=false"),
-    "log_dir=nowhere",
+COLUMNS = (
+    *((KEPT, "R -> A"), (KEPT, "R -> A0"), (KEPT, "S -> K"), (KEPT, "S -> C")),
+    (SECOND, "R -> A"),
 )
+OURS = {KEPT: "Twins (ours)", SECOND: "alpha-BN and estimated shares, batches of 32 (ours)"}
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -32,10 +33,15 @@ def _file(column: str, more: str = "") -> str:
     return f"leaderboard-{column.replace(' -> ', '-')}{more}.csv"
 
 
-def page_lines() -> list[str]:
-    """R → A's table as the page has it: means, and what Twins is above each row."""
-    table = [row for row in _rows(KEPT / _file("R -> A")) if row["column"] == "R → A"]
-    compared = _rows(KEPT / _file("R -> A", "-compared"))
+def _settings(kept: Path) -> list[str]:
+    quiet = ["overrides=report.pictures=false", "log_dir=nowhere"]
+    return ["table=leaderboard", f"kept={kept}", *quiet]
+
+
+def page_lines(kept: Path = KEPT) -> list[str]:
+    """R → A's table as the page has it: means, and what `OURS` is above each row."""
+    table = [row for row in _rows(kept / _file("R -> A")) if row["column"] == "R → A"]
+    compared = _rows(kept / _file("R -> A", "-compared"))
     figures = {(row["row"], row["metric"]): row for row in table}
     above = {
         (row["name"].removesuffix(", R → A"), row["metric"]): row
@@ -65,24 +71,28 @@ def _ours_minus(row: dict[str, str]) -> str:
     return f"{middle:+.1f} [{low:.1f}, {high:.1f}]"
 
 
-def test_the_page_has_the_table_s_figures() -> None:
+@pytest.mark.parametrize(("kept", "mark"), [(KEPT, "R-A"), (SECOND, "R-A-second")])
+def test_the_page_has_the_table_s_figures(kept: Path, mark: str) -> None:
     text = PAGE.read_text("utf-8")
-    shown = text.partition("<!-- R-A -->\n")[2].partition("<!-- /R-A -->")[0]
-    assert shown.splitlines()[2:] == page_lines()
+    shown = text.partition(f"<!-- {mark} -->\n")[2].partition(f"<!-- /{mark} -->")[0]
+    assert shown.splitlines()[2:] == page_lines(kept)
 
 
-@pytest.mark.parametrize("column", COLUMNS)
-def test_a_table_s_figures_are_those_of_the_kept_runs(column: str, tmp_path: Path) -> None:
-    asked = ["table", *SETTINGS, f"columns={column}", f"out={tmp_path}"]
+@pytest.mark.parametrize(("kept", "column"), COLUMNS)
+def test_a_table_s_figures_are_those_of_the_kept_runs(
+    kept: Path, column: str, tmp_path: Path
+) -> None:
+    asked = ["table", *_settings(kept), f"columns={column}", f"out={tmp_path}"]
     assert main(["report", *asked]) == 0
-    assert _figures(tmp_path / _file(column)) == _figures(KEPT / _file(column))
+    assert _figures(tmp_path / _file(column)) == _figures(kept / _file(column))
 
 
-def test_the_differences_are_those_of_the_kept_runs(tmp_path: Path) -> None:
-    asked = ["compare", *SETTINGS, "columns=R -> A", f"base={OURS}", f"out={tmp_path}"]
+@pytest.mark.parametrize("kept", [KEPT, SECOND])
+def test_the_differences_are_those_of_the_kept_runs(kept: Path, tmp_path: Path) -> None:
+    asked = ["compare", *_settings(kept), "columns=R -> A", f"base={OURS[kept]}", f"out={tmp_path}"]
     assert main(["report", *asked]) == 0
     name = _file("R -> A", "-compared")
-    assert _rows(tmp_path / name) == _rows(KEPT / name)
+    assert _rows(tmp_path / name) == _rows(kept / name)
 
 
 def _figures(path: Path) -> list[list[str]]:
