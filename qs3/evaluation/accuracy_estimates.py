@@ -104,11 +104,12 @@ def estimate_accuracy(
             accuracy = agreement(teacher.validation, np.eye(len(classes))[labels])
             found = estimates(teacher.validation, labels, teacher.target)
             about["teacher"] = Estimates(validation_accuracy=accuracy, **found)
-    if asked is not None and asked.finite:
+    if asked is not None:
         # A student was taught to be sure of these clouds, and the target's statistics make a net
         # surer of them: as it was before, it was not.
         before = Known(asked.validation, labels, held_out.measures)
-        about["trust"] = judge(before, Seen(asked.target, measures), read_calibration())
+        seen = Seen(asked.target, measures)
+        about["trust"] = judge(before, seen, read_calibration()) if asked.finite else None
     return AccuracyEstimates(**about), held_out
 
 

@@ -9,7 +9,7 @@ in training and q those where the clouds come from,
 t = 1 is Bayes' rule for classes that look the same in both places (Saerens, Latinne, Decaestecker,
 "Adjusting the Outputs of a Classifier to New a Priori Probabilities", Neural Computation 14, 2002);
 t as a choice is Menon et al., "Long-tail learning via logit adjustment", ICLR 2021. Nothing is
-estimated from the clouds or from their labels.
+estimated here: `qs3.evaluation.share_estimates` does that, from clouds without labels.
 """
 
 from __future__ import annotations
@@ -98,6 +98,12 @@ def read_prior(
         ConfigError: what is given is no such thing, or names a class that the net does not know.
     """
     power = check_float(f"{key}_power", power, ">= 0")
+    if given == ESTIMATED:
+        raise ConfigError(
+            f"{key}={ESTIMATED} is for a run, `evaluation.prior={ESTIMATED}`: there are no clouds "
+            f"to estimate shares from here. Its metrics.json has those that it found, under "
+            f"prior_shares: give them, {_example(key)}"
+        )
     if given == "rooms":
         given = _of_rooms(classes, key)
     if not isinstance(given, str | Mapping):
@@ -146,6 +152,10 @@ def _example(key: str) -> str:
     return f"'{key}={{chair: 4, table: 2}}'" if "." in key else f"{key}=chair:4,table:2"
 
 
+def _or_estimated(key: str) -> str:
+    return f", or {ESTIMATED}" if "." in key else ""
+
+
 def _of_rooms(classes: Sequence[str], key: str) -> dict[str, float]:
     if unknown := [name for name in classes if name not in ROOMS]:
         raise ConfigError(
@@ -162,7 +172,7 @@ def _pairs(words: str, key: str) -> list[tuple[str, float]]:
         if not colon or not name.strip():
             raise ConfigError(
                 f"{key}={words}: {part.strip()!r} should be CLASS:NUMBER, as in "
-                f"{_example(key)}; or say {key}=rooms"
+                f"{_example(key)}; or say {key}=rooms{_or_estimated(key)}"
             )
         try:
             pairs.append((name.strip(), float(value)))

@@ -228,7 +228,8 @@ def adapt_batchnorm(
         batches: of clouds [B, N, 3], of at least two each.
         kept: in [0, 1], the share of the former means and variances in what the norms then hold
             (alpha-BN: You et al., "Test-time Batch Statistics Calibration for Covariate Shift",
-            arXiv 2110.04065, 2021; there with each test batch's, here with these of all).
+            arXiv 2110.04065, 2021; there a batch goes on normalised by the mix, here by its own
+            statistics).
 
     Returns:
         The adapted norms.

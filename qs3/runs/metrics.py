@@ -92,6 +92,7 @@ class Evaluated:
         rotations: rotations about the up axis over which the further scores average; 0: none.
         norms: "trained", "adabn", "alpha_bn" or "tent".
         prior: how common classes counted as, in words; "": as in training.
+        prior_shares: the same as numbers, of sum 1; None without, and in files of older versions.
         final_over_rotations, warmup_over_rotations: those scores.
         tiers: the final scores of the clouds of each tier, for datasets that have tiers ("clean",
             "hard": how much of the object is seen) and labels.
@@ -102,6 +103,7 @@ class Evaluated:
     rotations: int
     norms: str
     prior: str = ""
+    prior_shares: dict[str, float] | None = None
     final_over_rotations: Scores | None = None
     warmup_over_rotations: Scores | None = None
     tiers: dict[str, Scores] | None = None

@@ -79,6 +79,9 @@ def _metrics(run: Run, loaded: Loaded, built: Built, outcome: Outcome) -> RunMet
             rotations=evaluation.rotations,
             norms=cfg.evaluation.norms,
             prior=outcome.prior.words if outcome.prior else "",
+            prior_shares=outcome.prior.told(evaluation.classes)["shares"]
+            if outcome.prior
+            else None,
             final_over_rotations=over,
             warmup_over_rotations=before,
             tiers=evaluation.scores_of_tiers(outcome.predictions.probabilities),

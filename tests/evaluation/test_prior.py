@@ -29,6 +29,13 @@ def test_bayes_rule_by_hand() -> None:
     np.testing.assert_allclose(prior(np.array([[0.6, 0.4]])), [[1 / 3, 2 / 3]])
 
 
+def test_what_only_a_run_can_estimate_is_refused_elsewhere() -> None:
+    with pytest.raises(ConfigError, match=r"prior=estimated is for a run.* prior=chair:4,table:2"):
+        read_prior("estimated", THREE)
+    with pytest.raises(ConfigError, match=r"or say evaluation\.prior=rooms, or estimated"):
+        read_prior("estimate", THREE, key="evaluation.prior")
+
+
 def test_half_of_it_by_hand() -> None:
     """The four times commoner class counts twice."""
     prior = read_prior("chair:4", THREE, power=0.5)

@@ -101,6 +101,21 @@ def test_one_pass_is_exact_in_the_first_norm_and_for_one_batch(name: str) -> Non
         torch.testing.assert_close(a, b, **TIGHT)
 
 
+@pytest.mark.parametrize("name", BUILDERS)
+def test_what_is_kept_of_the_former_statistics(name: str) -> None:
+    """Of every norm that share, and of the new ones, found in the same passes, the rest."""
+    torch.manual_seed(0)
+    net = BUILDERS[name](4).double()
+    net.train()
+    net(_clouds(6))
+    twin = copy.deepcopy(net)
+    before, batches = _running(net), [_clouds(9)[:5], _clouds(9)[5:]]
+    adapt_batchnorm(twin, batches)
+    adapt_batchnorm(net, batches, kept=0.3)
+    for now, old, new in zip(_running(net), before, _running(twin), strict=True):
+        torch.testing.assert_close(now, 0.3 * old + 0.7 * new)
+
+
 def test_only_the_current_domain_is_adapted() -> None:
     net = dgcnn(4, norm="domain").double()
     with use_domain(net, "target"):

@@ -100,7 +100,7 @@ def test_a_method_that_trains_features_is_refused(frozen):
         train(frozen("method=dann", "selftraining=none"))
 
 
-@pytest.mark.parametrize("norms", ["adabn", "tent"])
+@pytest.mark.parametrize("norms", ["adabn", "alpha_bn", "tent"])
 def test_a_linear_probe_has_no_norms_to_adapt(frozen, norms):
     cfg = frozen("model.hidden=[]", "selftraining=none", f"evaluation.norms={norms}")
     with pytest.raises(ConfigError, match=f"evaluation.norms={norms} adapts batch norms, and this"):

@@ -121,8 +121,14 @@ def test_shares_are_estimated_without_a_label(toy, uneven: Path) -> None:
     expected = prior(of_plain.probabilities)
     np.testing.assert_allclose(of_told.probabilities, expected, atol=1e-5)
     assert after.evaluation.prior == prior.words
+    found = after.evaluation.prior_shares
+    assert before.evaluation.prior_shares is None
+    assert found == pytest.approx(dict(zip(CLASSES, shares.tolist(), strict=True)), abs=1e-5)
     assert after.quality == before.quality
     assert after.validators == before.validators
+    again = qs3.load(hashing.run_folder(told), packages=PACKAGES, prior=found, prior_power=0.25)
+    clouds = open_pointset(uneven / "kinectsim10").split("test").points
+    np.testing.assert_allclose(again(list(np.array(clouds))), of_told.probabilities, atol=1e-5)
 
 
 @pytest.mark.slow
