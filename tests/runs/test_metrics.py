@@ -55,7 +55,8 @@ def whole() -> RunMetrics:
         final=judged,
         evaluation=Evaluated(
             split="test", labels=True, rotations=12, norms="adabn",
-            final_over_rotations=judged, warmup_over_rotations=judged, tiers={"hard": judged},
+            prior_shares={"a": 0.4, "b": 0.6}, final_over_rotations=judged,
+            warmup_over_rotations=judged, tiers={"hard": judged},
         ),
         warmup=Warmup(selected=last, last=last),
         rounds=[
@@ -144,7 +145,13 @@ def test_an_unknown_key_is_named_wherever_it_is(document, tmp_path):
     objects = [(), *(p for p in places(document) if isinstance(at(document, p), dict))]
     assert len(objects) > 25
     of_any_name = {"predicted", "per_class_recall", "confident", "selected", "mu", "thresholds"}
-    of_any_name |= {"versions", "validators", "shifts", "lost"}  # of classes, packages, scores
+    of_any_name |= {
+        "prior_shares",
+        "versions",
+        "validators",
+        "shifts",
+        "lost",
+    }  # of classes, packages, scores
     for place in objects:
         if place and place != ("warmup", "selected") and place[-1] in of_any_name:
             continue
