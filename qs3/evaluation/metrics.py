@@ -109,21 +109,6 @@ def adapt_norms(
         adapt_batchnorm(net, (batch.to(device) for batch in batches), kept)
 
 
-def alpha_norms(
-    net: nn.Module,
-    points: Float[Tensor, "n p 3"],
-    batch_size: int,
-    seed: int,
-    device: Any = "cpu",
-) -> None:
-    """Alpha-BN with alpha = 0.5: half the statistics of training, half those that AdaBN takes.
-
-    On real objects they gave up 2 points of accuracy for 4 of balanced accuracy, where AdaBN gave
-    up 7 for 4 (docs/results/twin.md).
-    """
-    adapt_norms(net, points, batch_size, seed, device, kept=0.5)
-
-
 def even_batches(
     points: Float[Tensor, "n p 3"], batch_size: int, seed: int
 ) -> Iterator[Float[Tensor, "b p 3"]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from torch import nn
 
 from qs3.datamodules.splits import Labelled
 from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy
-from qs3.evaluation.metrics import adapt_norms, alpha_norms, predict, predict_rotated
+from qs3.evaluation.metrics import adapt_norms, predict, predict_rotated
 from qs3.evaluation.prior import Prior
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.tent import minimise_entropy
@@ -36,7 +36,11 @@ from qs3.utils.seeding import derive
 log = logging.getLogger(__name__)
 
 TRAINED = "trained"
-ADAPTERS = {"adabn": adapt_norms, "alpha_bn": alpha_norms, "tent": minimise_entropy}
+ADAPTERS: dict[str, Callable[..., None]] = {
+    "adabn": adapt_norms,
+    "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/twin.md
+    "tent": minimise_entropy,
+}
 """Values of `evaluation.norms` (`qs3.training.command.NORMS`), beside "trained"."""
 
 
