@@ -35,7 +35,7 @@ MEANINGS: Mapping[str, str] = {
 def in_words(quality: AccuracyEstimates) -> str:
     """The estimates in short, for the end of a headline; "" without any."""
     if quality.trust is not None:
-        return trust_in_words(quality.trust) + _of_whom(quality)
+        return trust_in_words(quality.trust) + _asked(quality)
     if quality.calibrated is None:
         return ""
     before = f" (before self-training {_range(quality.teacher)})" if quality.teacher else ""
@@ -61,10 +61,17 @@ def trust_in_words(trust: Trust) -> str:
     return f"{DO_NOT_TRUST}: about {trust.expected:.0%} expected to be right{why}"
 
 
-def _of_whom(quality: AccuracyEstimates) -> str:
-    """A net that was adapted is surer than it is right, so it was asked before."""
-    found = ["before self-training"] if quality.teacher else []
-    found += ["with the norms it was trained with"] if quality.trust_without_norms else []
+def _asked(quality: AccuracyEstimates) -> str:
+    return of_whom(rounds=quality.teacher is not None, norms=quality.trust_without_norms)
+
+
+def of_whom(rounds: bool = False, norms: bool = False) -> str:
+    """A net that was adapted is surer than it is right, so it was asked as it was before.
+
+    `rounds`, `norms`: what adapted it. "" if nothing did.
+    """
+    found = ["before self-training"] if rounds else []
+    found += ["with the norms it was trained with"] if norms else []
     return f" (of the net {' and '.join(found)})" if found else ""
 
 
@@ -95,7 +102,7 @@ def table(quality: AccuracyEstimates) -> list[tuple[str, str, str]]:
     """Name, value and meaning of each figure that there is, for people."""
     rows = []
     if quality.trust is not None:
-        words = trust_in_words(quality.trust) + _of_whom(quality)
+        words = trust_in_words(quality.trust) + _asked(quality)
         rows.append(("expected accuracy", f"{quality.trust.expected:.1%}", f"{words}."))
     for key, meaning in MEANINGS.items():
         value = getattr(quality, key)

@@ -144,7 +144,9 @@ def check_told(prior: object, power: float, key: str = "prior") -> None:
         ConfigError: it is not `POWER`, and there is no prior.
     """
     if not prior and power != POWER:
-        raise ConfigError(f"{key}_power= is for {key}=; give {key}=rooms or {_example(key)}")
+        raise ConfigError(
+            f"{key}_power= is for {key}=; give {key}=rooms or {_example(key)}{_or_estimated(key)}"
+        )
 
 
 def _example(key: str) -> str:
@@ -153,6 +155,7 @@ def _example(key: str) -> str:
 
 
 def _or_estimated(key: str) -> str:
+    """In a config, where there are clouds to estimate from."""
     return f", or {ESTIMATED}" if "." in key else ""
 
 

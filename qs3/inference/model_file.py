@@ -10,8 +10,8 @@ import importlib
 import math
 import re
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -116,6 +116,9 @@ class Result:
             judged; see `qs3.inference.held_out`. None in files of older versions.
         learnt: shares of the classes in its training, by which a prior is weighed; see
             `qs3.evaluation.prior`. None in files of older versions.
+        trained_norms: those of the weights that clouds of the target changed after training
+            (`evaluation.norms`), as training left them, by name: `held_out` is of the net with
+            these. None: nothing did, or the file is of an older version.
     """
 
     model: Annotated[dict[str, Any], AfterValidator(_model)]
@@ -131,12 +134,19 @@ class Result:
     worth: Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable)] = ""
     held_out: Annotated[dict[str, Tensor], AfterValidator(checked_tensors)] | None = None
     learnt: tuple[_Share, ...] | None = None
+    trained_norms: Annotated[dict[str, Tensor], Field(min_length=1)] | None = None
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
 
     def __repr__(self) -> str:
         """In a line: its weights, as the dataclass has them, fill a terminal."""
         return f"Result({self.told})"
+
+    @property
+    def before_target(self) -> Result:
+        """The same with the norms it was trained with."""
+        weights = {**self.weights, **(self.trained_norms or {})}
+        return replace(self, weights=weights, trained_norms=None)
 
     @property
     def told(self) -> str:
@@ -263,6 +273,16 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
     return make
 
 
+def _unlike(some: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> bool:
+    """Whether one has no weight of its name, size and type."""
+    return any(
+        name not in weights
+        or (one.shape, one.dtype, one.layout)
+        != (weights[name].shape, weights[name].dtype, weights[name].layout)
+        for name, one in some.items()
+    )
+
+
 def _checked(file: Path, found: Any) -> Result:
     """The file's values as a `Result`.
 
@@ -283,6 +303,8 @@ def _checked(file: Path, found: Any) -> Result:
             place, why = "held_out", "should have a probability for each class"
         elif result.learnt is not None and len(result.learnt) != len(result.classes):
             place, why = "learnt", "should have a share for each class"
+        elif _unlike(result.trained_norms or {}, result.weights):
+            place, why = "trained_norms", "should be some of the weights, of the same sizes"
         else:
             return result
     raise DataError(f"{file} is not a result that qs3 wrote, or damaged: {place}: {why}")

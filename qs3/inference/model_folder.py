@@ -4,6 +4,8 @@
     config.json         what building and using the net takes, and the weights' SHA-256
     README.md           a card for people, with the metadata that hubs read at its top
     held_out.safetensors  what the net says of held-out labelled clouds; not in older folders
+    trained_norms.safetensors  of a net whose norms follow its target those of training, which
+                        held_out.safetensors is of
 
 `config.json` holds plain values by name, as huggingface_hub's `PyTorchModelHubMixin` passes them
 to a class; such a folder can be uploaded as it is (`upload_folder`). It is trusted as little as
@@ -28,7 +30,9 @@ from qs3.utils.version import VERSION
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 HELD_OUT = "held_out.safetensors"
-_HASH, _HELD_OUT_HASH = "weights_sha256", "held_out_sha256"
+_HASH = "weights_sha256"
+_BESIDE = {"held_out": HELD_OUT, "trained_norms": "trained_norms.safetensors"}
+"""Tensors that not every classifier has, each with its hash in config.json, NAME_sha256."""
 _MAX_CONFIG = 1 << 20  # bytes
 
 
@@ -45,11 +49,12 @@ def write_folder(folder: Path, values: Mapping[str, Any], card: str) -> None:
     write_tensors(folder / WEIGHTS, values["weights"], {"format": "pt"})
     write_text(folder / CARD, card)
     hashes = {_HASH: sha256_file(folder / WEIGHTS)}
-    (folder / HELD_OUT).unlink(missing_ok=True)
-    if values["held_out"] is not None:
-        write_tensors(folder / HELD_OUT, values["held_out"], {})
-        hashes[_HELD_OUT_HASH] = sha256_file(folder / HELD_OUT)
-    plain = {name: value for name, value in values.items() if name not in ("weights", "held_out")}
+    for name, file in _BESIDE.items():
+        (folder / file).unlink(missing_ok=True)
+        if values[name] is not None:
+            write_tensors(folder / file, values[name], {})
+            hashes[_hash_of(name)] = sha256_file(folder / file)
+    plain = {name: value for name, value in values.items() if name not in ("weights", *_BESIDE)}
     plain["usual"] = {name: _open(ends) for name, ends in values["usual"].items()}
     about = {"library_name": "qs3", "qs3": VERSION, **hashes}
     write_json(folder / CONFIG, {**about, **plain})
@@ -64,13 +69,20 @@ def read_folder(folder: Path) -> dict[str, Any]:
     """
     values = _config(folder / CONFIG)
     weights = _tensors(folder / WEIGHTS, _HASH, values.pop(_HASH, None))
-    held_out, of_held_out = None, values.pop(_HELD_OUT_HASH, None)
-    if of_held_out is not None and (folder / HELD_OUT).exists():  # hubs may carry weights alone
-        held_out = _tensors(folder / HELD_OUT, _HELD_OUT_HASH, of_held_out)
+    hashes = {name: values.pop(_hash_of(name), None) for name in _BESIDE}
+    named = {name: _BESIDE[name] for name, found in hashes.items() if found is not None}
+    beside: dict[str, Any] = dict.fromkeys(_BESIDE)
+    if all((folder / file).exists() for file in named.values()):  # hubs may carry weights alone
+        for name, file in named.items():
+            beside[name] = _tensors(folder / file, _hash_of(name), hashes[name])
     usual = values.get("usual")
     if isinstance(usual, Mapping):
         values["usual"] = {name: _closed(ends) for name, ends in usual.items()}
-    return {**values, "weights": weights, "held_out": held_out}
+    return {**values, "weights": weights, **beside}
+
+
+def _hash_of(name: str) -> str:
+    return f"{name}_sha256"
 
 
 def _tensors(path: Path, key: str, expected: Any) -> dict[str, Any]:

@@ -107,12 +107,15 @@ class Predictor:
         result: where it comes from, and how its clouds are prepared.
         device: of the net.
         prior: how common classes are where the clouds come from; None: as in training.
+        before_target: of a net whose norms follow its target, the net with those of training, which
+            `held_out` is of; None: it is `net`.
     """
 
     net: nn.Module
     result: Result
     device: torch.device
     prior: Prior | None = None
+    before_target: nn.Module | None = None
 
     def __repr__(self) -> str:
         """In a line: net, classes, points, scale, target, device."""
@@ -132,7 +135,7 @@ class Predictor:
 
     @property
     def held_out(self) -> Known | None:
-        """What the net says of held-out labelled clouds; None: its file does not tell."""
+        """What the net that is `asked` says of held-out labelled clouds; None: nobody knows."""
         return known_of(self.result.held_out) if self.result.held_out else None
 
     @property
@@ -208,7 +211,21 @@ class Predictor:
         self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
     ) -> Float[np.ndarray, "n c"]:
         """The same as the net gives them."""
-        found = predict(self.net, points, batch_size, self.device)
+        return self._said_by(self.net, points, batch_size)
+
+    def asked(
+        self, points: Float[Tensor, "n m 3"], batch_size: int = BATCH
+    ) -> Float[np.ndarray, "n c"]:
+        """The same by the net with the norms it was trained with, for a verdict by `held_out`.
+
+        Norms with the target's statistics make a net surer than it is right.
+        """
+        return self._said_by(self.before_target or self.net, points, batch_size)
+
+    def _said_by(
+        self, net: nn.Module, points: Float[Tensor, "n m 3"], batch_size: int
+    ) -> Float[np.ndarray, "n c"]:
+        found = predict(net, points, batch_size, self.device)
         if found.shape[1] != len(self.classes):
             raise DataError(
                 f"the net tells {found.shape[1]} classes apart, the file names {len(self.classes)}"
@@ -368,7 +385,9 @@ def load(
     if place.type == "cpu":
         keep_freed_memory()
     check_told(prior, prior_power)
-    found = Predictor(build_net(result, packages).to(place), result, place)
+    before = build_net(result.before_target, packages).to(place) if result.trained_norms else None
+    net = build_net(result, packages).to(place)
+    found = Predictor(net, result, place, before_target=before)
     if prior is None:
         return found
     return replace(found, prior=read_prior(prior, found.classes, learnt_of(result), prior_power))

@@ -39,7 +39,8 @@ class Row(NamedTuple):
         up: how the vertical is known: "z" or another axis of the file, "given", "planes", "level".
         second: the class that another classifier names; "" if none was asked.
         measures: `qs3.evaluation.trust.COMPARED` of the cloud; () if it failed.
-        plain: `probabilities` before a prior; None if it failed.
+        asked: what a verdict is made from: `probabilities` without a prior, and with the norms the
+            net was trained with; None if it failed.
         drawn: whether its points were drawn on the surface of a mesh.
     """
 
@@ -54,7 +55,7 @@ class Row(NamedTuple):
     up: str = ""
     second: str = ""
     measures: tuple[float, ...] = ()
-    plain: Float[np.ndarray, " c"] | None = None
+    asked: Float[np.ndarray, " c"] | None = None
     drawn: bool = False
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from qs3.evaluation.estimates_text import trust_in_words
+from qs3.evaluation.estimates_text import of_whom, trust_in_words
 from qs3.evaluation.trust import FEWEST, Seen, judge
 from qs3.evaluation.trust_file import read_calibration
 from qs3.inference.predictor import Predictor
@@ -25,9 +25,10 @@ def trust_of(rows: Sequence[Row], predictor: Predictor) -> tuple[Trust | None, s
     """The verdict, and it in words; None with the reason where nothing can be told.
 
     Labels that somebody gave play no part. Of answers with a prior it tells what is known of those
-    without it: its weights were fitted to such.
+    without it, and of norms that follow a target what is known of the net before
+    (`Predictor.asked`): its weights were fitted to such.
     """
-    said = [row for row in rows if row.plain is not None]
+    said = [row for row in rows if row.asked is not None]
     known = predictor.held_out
     if known is None:
         return None, (
@@ -37,8 +38,8 @@ def trust_of(rows: Sequence[Row], predictor: Predictor) -> tuple[Trust | None, s
         )
     if len(said) < FEWEST:
         return None, f"how many are right cannot be told of fewer than {FEWEST} clouds"
-    seen = Seen(np.array([row.plain for row in said]), np.array([row.measures for row in said]))
+    seen = Seen(np.array([row.asked for row in said]), np.array([row.measures for row in said]))
     trust = judge(known, seen, read_calibration())
     assert trust is not None
-    words = trust_in_words(trust)
+    words = trust_in_words(trust) + of_whom(norms=predictor.before_target is not None)
     return trust, f"{words}; told of the answers without prior=" if predictor.prior else words

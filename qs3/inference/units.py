@@ -96,15 +96,16 @@ def _judged(
         points = torch.stack([each.points for _, each in prepared.values()])
         plain = predictor.without_prior(points, len(points))
         found = predictor.prior(plain) if predictor.prior else plain
+        asked = predictor.asked(points, len(points)) if predictor.before_target else plain
         others = _said(second, [item for item, _ in prepared.values()], floor)
-        for (i, (item, each)), probabilities, before, other in zip(
-            prepared.items(), found, plain, others, strict=True
+        for (i, (item, each)), probabilities, judged, other in zip(
+            prepared.items(), found, asked, others, strict=True
         ):
             if np.isnan(probabilities).any():
                 rows[i] = item.row(_DIVERGED, None), None
                 continue
             row = item.row("; ".join(each.strange), probabilities)
-            rows[i] = row._replace(second=other, measures=each.measures, plain=before), item
+            rows[i] = row._replace(second=other, measures=each.measures, asked=judged), item
     return [rows[i] for i in range(len(batch))]
 
 

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
-from torch import nn
+from torch import Tensor, nn
 
 from qs3.datamodules.splits import Labelled
 from qs3.evaluation.accuracy_estimates import Said, estimate_accuracy
@@ -22,7 +23,7 @@ from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.tent import minimise_entropy
 from qs3.evaluation.trust import Known
 from qs3.evaluation.validators import LABEL_FREE
-from qs3.runs.checkpoints import load, weights_sha256
+from qs3.runs.checkpoints import copy_weights, load, weights_sha256
 from qs3.runs.metrics import AccuracyEstimates, Scores, TrainingAccuracy
 from qs3.runs.predictions import Predictions
 from qs3.selftraining.callback import WARMUP_LAST, WARMUP_SELECTED
@@ -59,7 +60,9 @@ class Outcome:
         rotated: scores of the reported net and of "selected", averaged over rotations.
         validators: its label-free scores.
         quality: estimates of its accuracy.
-        held_out: what it says of held-out labelled clouds; None of one that has diverged.
+        held_out: what it says of held-out labelled clouds, with the norms it was trained with; None
+            of one that has diverged.
+        trained_norms: those of its weights that `evaluation.norms` changed, as they were before.
         learnt: shares of the classes in what it learnt from.
         training: its accuracy on training clouds, with `data.clouds_a_class` alone.
     """
@@ -74,6 +77,7 @@ class Outcome:
     validators: dict[str, float | None]
     quality: AccuracyEstimates
     held_out: Known | None
+    trained_norms: dict[str, Tensor] | None
     learnt: class_shares.Shares
     training: TrainingAccuracy | None
 
@@ -145,6 +149,12 @@ class SavedNets:
             )
         return self._predicted[key]
 
+    def trained_norms(self, file: Path) -> dict[str, Tensor] | None:
+        """Those of the file's weights that `evaluation.norms` changes; None: no one."""
+        now, before = copy_weights(self(file)), copy_weights(self._net(file, TRAINED))
+        same = partial(torch.allclose, rtol=0, atol=0, equal_nan=True)
+        return {name: one for name, one in before.items() if not same(one, now[name])} or None
+
     def _net(self, file: Path, norms: str) -> nn.Module:
         key = self._weights_in(file), norms
         if key not in self._nets:
@@ -205,6 +215,7 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
         validators=without_labels(nets.of_target(file), choice),
         quality=quality,
         held_out=held_out,
+        trained_norms=nets.trained_norms(file),
         learnt=learnt,
         training=(
             training_accuracy(net, data.labelled, data.owner, batch_size, device)
@@ -237,6 +248,9 @@ def _quality(
         asked=said(first, TRAINED) if rounds or adapted else None,
         turned=partial(nets.of_test, file) if run.target.gravity == "z" else None,
     )
+    if adapted and held_out is not None:  # `Predictor.asked`
+        trained = nets.of_validation(file, TRAINED)
+        held_out = replace(held_out, probabilities=trained) if np.isfinite(trained).all() else None
     return replace(quality, trust_without_norms=adapted and quality.trust is not None), held_out
 
 

@@ -153,6 +153,7 @@ def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
         floor_m=_floor(run),
         held_out=tensors_of(outcome.held_out) if outcome.held_out else None,
         learnt=tuple(outcome.learnt.tolist()),
+        trained_norms=outcome.trained_norms,
     )
 
 

@@ -99,8 +99,9 @@ def _result() -> Any:
         "labels": torch.tensor([0, 1, 1]),
         "measures": torch.ones(5, 4),
     }
-    weights = {"w": torch.ones(2, 3)}
-    return Result(model, TWO, 8, 16, "made", "z", "unit_ball", usual, weights, held_out=held_out)
+    weights, norms = {"w": torch.ones(2, 3), "mean": torch.ones(2)}, {"mean": torch.zeros(2)}
+    more: Any = {"held_out": held_out, "trained_norms": norms}
+    return Result(model, TWO, 8, 16, "made", "z", "unit_ball", usual, weights, **more)
 
 
 def _results(folder: Path) -> list[bytes]:
@@ -117,6 +118,7 @@ def _read_result(path: Path) -> None:
     result = read_result(path)
     if result.held_out:
         _judge(result.held_out)
+    assert result.before_target.weights.keys() == result.weights.keys()
     with contextlib.suppress(Qs3Error):  # these weights are not those of the net
         build_net(result)
 
@@ -148,8 +150,9 @@ def _read_model(path: Path) -> None:
         try:
             about = json.loads(config.read_bytes())
             about["weights_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
-            if (held_out := folder / "held_out.safetensors").is_file():
-                about["held_out_sha256"] = hashlib.sha256(held_out.read_bytes()).hexdigest()
+            for name in ("held_out", "trained_norms"):
+                if (beside := folder / f"{name}.safetensors").is_file():
+                    about[f"{name}_sha256"] = hashlib.sha256(beside.read_bytes()).hexdigest()
             config.write_text(json.dumps(about))
         except (ValueError, TypeError, RecursionError):
             pass

@@ -35,6 +35,12 @@ def metric_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return _trained(data_dir, tmp_path_factory.mktemp("metric"), *metres)
 
 
+@pytest.fixture(scope="session")
+def adapted_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The net of `run` with the norms' statistics of its target."""
+    return _trained(data_dir, tmp_path_factory.mktemp("adapted"), "evaluation.norms=adabn")
+
+
 @pytest.fixture
 def high_net(metric_run: Path, tmp_path: Path) -> Path:
     """That net in a file that says it knows heights; see `over_the_floor`."""

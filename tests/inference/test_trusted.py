@@ -94,6 +94,58 @@ def test_an_exported_folder_keeps_it_and_another_one_s_is_refused(run, tmp_path)
     assert load(damaged).held_out is None
 
 
+def test_of_norms_that_follow_the_target_it_tells_by_those_of_training(
+    run, adapted_run, data_dir, tmp_path, capsys
+):
+    """They make a net surer than it is right."""
+    before, after = load(run), load(adapted_run)
+    target = np.array(open_pointset(data_dir / "kinectsim10").points)
+    target = np.concatenate([target] * 3)[:90]
+    points = torch.stack([before.prepare(cloud).points for cloud in target])
+    np.testing.assert_array_equal(after.asked(points), before.without_prior(points))
+    assert np.abs(after.without_prior(points) - before.without_prior(points)).max() > 0.01
+    np.testing.assert_array_equal(after.held_out.probabilities, before.held_out.probabilities)
+    assert before.before_target is None
+
+    _, plain, _ = predict(run, target, tmp_path, capsys)
+    export_folder(adapted_run, tmp_path / "model")
+    for file in (adapted_run, tmp_path / "model"):
+        text, said, page = predict(file, target, tmp_path, capsys)
+        assert said["trust"] == plain["trust"]
+        assert said["clouds"] != plain["clouds"]
+        line = next(line for line in text.splitlines() if "expected to be right" in line)
+        assert line.endswith(" (of the net with the norms it was trained with)")
+        assert "norms it was trained with" in page
+    (tmp_path / "model" / "trained_norms.safetensors").unlink()  # then nobody can be asked
+    _, said, _ = predict(tmp_path / "model", target, tmp_path, capsys)
+    assert said["trust"] is None
+
+    older = replace(read_result(adapted_run), trained_norms=None)
+    write_result(tmp_path / "older.pt", older)
+    text, said, _ = predict(tmp_path / "older.pt", target, tmp_path, capsys)
+    assert said["trust"] != plain["trust"]
+    assert "norms it was trained with" not in text
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"more": torch.ones(1)},
+        {"name": torch.ones(2)},
+        {"name": torch.ones(3, dtype=torch.float64)},
+        {},
+    ],
+)
+def test_norms_of_training_are_some_of_the_weights(run, tmp_path, changes):
+    result = read_result(run)
+    name = next(name for name in result.weights if name.endswith("running_mean"))
+    weights = {**result.weights, name: torch.zeros(3)}
+    norms = {name if key == "name" else key: one for key, one in changes.items()}
+    write_result(tmp_path / "result.pt", replace(result, weights=weights, trained_norms=norms))
+    with pytest.raises(DataError, match="trained_norms: "):
+        read_result(tmp_path / "result.pt")
+
+
 def tensors(**changes) -> dict[str, torch.Tensor]:
     whole = {
         "probabilities": torch.full((6, 3), 1 / 3),

@@ -158,9 +158,11 @@ def test_runs_without_it_have_the_hash_that_they_had(toy) -> None:
     assert len(set(hashes)) == 4
 
 
-@pytest.mark.parametrize("power", ["1.0", "abc"])
-def test_a_power_without_a_prior_is_refused(toy, power: str) -> None:
-    with pytest.raises(ConfigError, match="prior_power"):
+@pytest.mark.parametrize(
+    ("power", "why"), [("1.0", "= is for .*, or estimated$"), ("abc", " must be a number")]
+)
+def test_a_power_without_a_prior_is_refused(toy, power: str, why: str) -> None:
+    with pytest.raises(ConfigError, match=f"prior_power{why}"):
         train(toy(*WORDS, f"evaluation.prior_power={power}"))
 
 
