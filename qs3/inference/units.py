@@ -42,6 +42,7 @@ def predict_units(
     pool = ThreadPoolExecutor(settings.threads, initializer=torch.set_num_threads, initargs=(1,))
     running: deque[Future[list[tuple[Row, Sample | None]]]] = deque()
     nets = [one.net for one in (predictor, second) if one]
+    nets += [predictor.before_target] if predictor.before_target else []
     floor = settings.floor if settings.camera_height is None else -settings.camera_height
     try:
         # Once for all: threads that change and restore a net's domain would do it to one another.
