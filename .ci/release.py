@@ -87,7 +87,7 @@ def without_card(weights: Path) -> str:
     if missing := [key for key in CARD if not (about or {}).get(key)]:
         return f"{weights}: no model card beside it, {card.name}, with {', '.join(missing)}"
     said = json.loads(config.read_text("utf-8")) if config.is_file() else {}
-    key = "held_out_sha256" if weights.stem == "held_out" else "weights_sha256"
+    key = "weights_sha256" if weights.stem == "model" else f"{weights.stem}_sha256"
     if said.get(key) != hashlib.sha256(weights.read_bytes()).hexdigest():
         return f"{weights}: {config.name} beside it names other tensors, or none"
     return ""

@@ -147,7 +147,11 @@ def test_models_with_a_card_and_their_own_weights_are_let_through(release, root,
     without_card(root)
     digest = hashlib.sha256(b"weights").hexdigest()
     (root / "model" / "README.md").write_text(CARD)
-    (root / "model" / "config.json").write_text(json.dumps({"weights_sha256": digest}))
+    hashes = {"weights_sha256": digest}
+    for name in ("held_out", "trained_norms"):
+        (root / "model" / f"{name}.safetensors").write_bytes(name.encode())
+        hashes[f"{name}_sha256"] = hashlib.sha256(name.encode()).hexdigest()
+    (root / "model" / "config.json").write_text(json.dumps(hashes))
     commit(root)
     assert release.main(root, "version=0.1.0") == 0, capsys.readouterr().err
 

@@ -60,7 +60,7 @@ def estimate_accuracy(
     asked: Said | None = None,
     turned: Callable[[float], Float[np.ndarray, "n c"]] | None = None,
 ) -> tuple[AccuracyEstimates, Known | None]:
-    """What `metrics.json` has under `quality`, and what the net knows of its labelled clouds.
+    """What `metrics.json` has under `quality`, and what `said` knows of the labelled clouds.
 
     `qs3.evaluation.estimates_text` says it as text; the other is for the net's file.
 

@@ -35,7 +35,7 @@ MEANINGS: Mapping[str, str] = {
 def in_words(quality: AccuracyEstimates) -> str:
     """The estimates in short, for the end of a headline; "" without any."""
     if quality.trust is not None:
-        return trust_in_words(quality.trust) + _asked(quality)
+        return trust_in_words(quality.trust) + _of_whom(quality)
     if quality.calibrated is None:
         return ""
     before = f" (before self-training {_range(quality.teacher)})" if quality.teacher else ""
@@ -61,7 +61,7 @@ def trust_in_words(trust: Trust) -> str:
     return f"{DO_NOT_TRUST}: about {trust.expected:.0%} expected to be right{why}"
 
 
-def _asked(quality: AccuracyEstimates) -> str:
+def _of_whom(quality: AccuracyEstimates) -> str:
     return of_whom(rounds=quality.teacher is not None, norms=quality.trust_without_norms)
 
 
@@ -102,7 +102,7 @@ def table(quality: AccuracyEstimates) -> list[tuple[str, str, str]]:
     """Name, value and meaning of each figure that there is, for people."""
     rows = []
     if quality.trust is not None:
-        words = trust_in_words(quality.trust) + _asked(quality)
+        words = trust_in_words(quality.trust) + _of_whom(quality)
         rows.append(("expected accuracy", f"{quality.trust.expected:.1%}", f"{words}."))
     for key, meaning in MEANINGS.items():
         value = getattr(quality, key)

@@ -84,7 +84,8 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
         lines += [f"what it is worth: {worth}"] * bool(worth)
     if out.suffix.lower() == ".json":
-        text = as_json(records, classes, predictor.result.target, trust, predictor.prior)
+        about = (trust, predictor.prior, trust is not None and predictor.before_target is not None)
+        text = as_json(records, classes, predictor.result.target, *about)
     else:
         text = as_csv(records, classes)
     lines.append(_save(out, text))

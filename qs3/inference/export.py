@@ -164,11 +164,12 @@ def export_folder(
         text = card(result, metrics, _command(file.parent), judgement)
     write_folder(folder, values_of(result), text)
     again = read_result(folder)
-    same = again.weights.keys() == result.weights.keys() and all(
-        torch.equal(value, again.weights[name]) for name, value in result.weights.items()
-    )
-    if not same:
-        raise Qs3Error(f"{folder} does not hold the weights that were written; is the disk sound?")
+    for name in ("weights", "held_out", "trained_norms"):
+        ours, theirs = getattr(result, name) or {}, getattr(again, name) or {}
+        if ours.keys() != theirs.keys() or not all(
+            torch.equal(one, theirs[key]) for key, one in ours.items()
+        ):
+            raise Qs3Error(f"{folder} does not hold the {name} as written; is the disk sound?")
     build_net(again)
     return (
         f"saved {folder}: {WEIGHTS} ({(folder / WEIGHTS).stat().st_size / 1e6:.1f} MB), {CONFIG} "

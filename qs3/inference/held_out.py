@@ -53,11 +53,12 @@ def checked_tensors(found: dict[str, Tensor]) -> dict[str, Tensor]:
     kinds = [said.dtype, labels.dtype, measures.dtype, turns.dtype]
     if kinds != [torch.float32, torch.int64, torch.float32, torch.float32]:
         raise ValueError("should be float32, and int64 labels")
-    plain = all(one.layout == torch.strided for one in (said, labels, measures, turns))
+    if not all(map(is_plain, (said, labels, measures, turns))):
+        raise ValueError("should be plain tensors")
     columns = len(COMPARED)
     whole = labels.ndim == 1 and said.ndim == 2 and said.shape[0] == (v := labels.shape[0])
     shapes = whole and measures.ndim == 2 and measures.shape[1] == columns and turns.shape == (1,)
-    if not (plain and shapes):
+    if not shapes:
         raise ValueError(f"should be [v, C], [v], [m, {columns}] and [1]")
     if not (0 < v <= MOST and 0 < len(measures) <= MOST):
         raise ValueError(f"should be 1 to {MOST} clouds")
@@ -67,6 +68,11 @@ def checked_tensors(found: dict[str, Tensor]) -> dict[str, Tensor]:
     if not (bool(((shares >= 0) & (shares <= 1.001)).all()) and bool(measures.isfinite().all())):
         raise ValueError("should be shares in [0, 1], and finite measures")
     return found
+
+
+def is_plain(one: Tensor) -> bool:
+    """Neither sparse nor nested, which has no shape to be asked for."""
+    return one.layout == torch.strided and not one.is_nested
 
 
 def _even(count: int) -> np.ndarray:

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.ood import ALL as MEASURES_OF_CLOUDS
 from qs3.inference import pretrained
-from qs3.inference.held_out import checked_tensors
+from qs3.inference.held_out import checked_tensors, is_plain
 from qs3.inference.model_folder import CONFIG, WEIGHTS, read_folder
 from qs3.runs.checkpoints import load, save
 from qs3.utils.memory import check_memory
@@ -274,13 +274,14 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
 
 
 def _unlike(some: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> bool:
-    """Whether one has no weight of its name, size and type."""
-    return any(
-        name not in weights
-        or (one.shape, one.dtype, one.layout)
-        != (weights[name].shape, weights[name].dtype, weights[name].layout)
-        for name, one in some.items()
-    )
+    """Whether one has no weight of its name, size and type, or is no plain tensor."""
+    for name, one in some.items():
+        other = weights.get(name)
+        if other is None or one.dtype != other.dtype:
+            return True
+        if not (is_plain(one) and is_plain(other) and one.shape == other.shape):
+            return True
+    return False
 
 
 def _checked(file: Path, found: Any) -> Result:

@@ -4,8 +4,8 @@
     config.json         what building and using the net takes, and the weights' SHA-256
     README.md           a card for people, with the metadata that hubs read at its top
     held_out.safetensors  what the net says of held-out labelled clouds; not in older folders
-    trained_norms.safetensors  of a net whose norms follow its target those of training, which
-                        held_out.safetensors is of
+    trained_norms.safetensors  the norms of training, if those of the net follow its target: it is
+                        the net with these that held_out.safetensors tells of
 
 `config.json` holds plain values by name, as huggingface_hub's `PyTorchModelHubMixin` passes them
 to a class; such a folder can be uploaded as it is (`upload_folder`). It is trusted as little as
@@ -72,7 +72,8 @@ def read_folder(folder: Path) -> dict[str, Any]:
     hashes = {name: values.pop(_hash_of(name), None) for name in _BESIDE}
     named = {name: _BESIDE[name] for name, found in hashes.items() if found is not None}
     beside: dict[str, Any] = dict.fromkeys(_BESIDE)
-    if all((folder / file).exists() for file in named.values()):  # hubs may carry weights alone
+    # Hubs may carry the weights alone; and held_out without its norms would judge another net.
+    if all((folder / file).exists() for file in named.values()):
         for name, file in named.items():
             beside[name] = _tensors(folder / file, _hash_of(name), hashes[name])
     usual = values.get("usual")

@@ -385,8 +385,10 @@ def load(
     if place.type == "cpu":
         keep_freed_memory()
     check_told(prior, prior_power)
-    before = build_net(result.before_target, packages).to(place) if result.trained_norms else None
     net = build_net(result, packages).to(place)
+    before = None
+    if result.trained_norms and result.held_out:  # else there is nothing to judge by
+        before = build_net(result.before_target, packages).to(place)
     found = Predictor(net, result, place, before_target=before)
     if prior is None:
         return found

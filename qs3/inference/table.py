@@ -104,6 +104,7 @@ def as_json(
     target: str,
     trust: Trust | None,
     prior: Prior | None,
+    trust_without_norms: bool = False,
 ) -> str:
     """One document.
 
@@ -113,12 +114,14 @@ def as_json(
         target: the domain that the net was adapted to.
         trust: how many answers are expected to be right; None: cannot be told.
         prior: how common classes counted as; None: as in training.
+        trust_without_norms: whether `trust` is of the net before its norms were its target's.
     """
     document = {
         "qs3": VERSION,
         "target": target,
         "classes": list(classes),
         "trust": None if trust is None else dataclasses.asdict(trust),
+        "trust_without_norms": trust_without_norms,
         "prior": None if prior is None else prior.told(classes),
         "clouds": records,
     }

@@ -33,12 +33,19 @@ def trust_of(rows: Sequence[Row], predictor: Predictor) -> tuple[Trust | None, s
     if known is None:
         return None, (
             "how many are right cannot be told: the classifier's file does not say what it makes "
-            "of held-out labelled clouds, as those of older versions; delete metrics.json in its "
-            "run's folder and repeat the run's command, which trains nothing again"
+            "of held-out labelled clouds, as those of older versions, and folders of which not all "
+            "was fetched; fetch all of it, or delete metrics.json in its run's folder and repeat "
+            "the run's command, which trains nothing again"
         )
     if len(said) < FEWEST:
         return None, f"how many are right cannot be told of fewer than {FEWEST} clouds"
-    seen = Seen(np.array([row.asked for row in said]), np.array([row.measures for row in said]))
+    asked = np.array([row.asked for row in said])
+    if not np.isfinite(asked).all():
+        return (
+            None,
+            "how many are right cannot be told: before its norms were the target's it diverged",
+        )
+    seen = Seen(asked, np.array([row.measures for row in said]))
     trust = judge(known, seen, read_calibration())
     assert trust is not None
     words = trust_in_words(trust) + of_whom(norms=predictor.before_target is not None)

@@ -150,7 +150,9 @@ class SavedNets:
         return self._predicted[key]
 
     def trained_norms(self, file: Path) -> dict[str, Tensor] | None:
-        """Those of the file's weights that `evaluation.norms` changes; None: no one."""
+        """Those of the file's weights that `evaluation.norms` changes; None: it changes none."""
+        if self.run.cfg.evaluation.norms == TRAINED:
+            return None
         now, before = copy_weights(self(file)), copy_weights(self._net(file, TRAINED))
         same = partial(torch.allclose, rtol=0, atol=0, equal_nan=True)
         return {name: one for name, one in before.items() if not same(one, now[name])} or None
@@ -248,7 +250,7 @@ def _quality(
         asked=said(first, TRAINED) if rounds or adapted else None,
         turned=partial(nets.of_test, file) if run.target.gravity == "z" else None,
     )
-    if adapted and held_out is not None:  # `Predictor.asked`
+    if adapted and held_out is not None:  # the verdict by the file is asked of that net
         trained = nets.of_validation(file, TRAINED)
         held_out = replace(held_out, probabilities=trained) if np.isfinite(trained).all() else None
     return replace(quality, trust_without_norms=adapted and quality.trust is not None), held_out

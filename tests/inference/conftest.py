@@ -25,20 +25,20 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a finished run: DGCNN, three classes, 32 of 64 points, called from Python."""
-    return _trained(data_dir, tmp_path_factory.mktemp("logs"))
+    return trained(data_dir, tmp_path_factory.mktemp("logs"))
 
 
 @pytest.fixture(scope="session")
 def metric_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same on clouds that keep their size."""
     metres = ("data.scale=metres", "data.source.unit=metres")
-    return _trained(data_dir, tmp_path_factory.mktemp("metric"), *metres)
+    return trained(data_dir, tmp_path_factory.mktemp("metric"), *metres)
 
 
 @pytest.fixture(scope="session")
 def adapted_run(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The net of `run` with the norms' statistics of its target."""
-    return _trained(data_dir, tmp_path_factory.mktemp("adapted"), "evaluation.norms=adabn")
+    return trained(data_dir, tmp_path_factory.mktemp("adapted"), "evaluation.norms=adabn")
 
 
 @pytest.fixture
@@ -67,7 +67,8 @@ def overrides_of(data_dir: Path, log_dir: Path) -> list[str]:
     ]
 
 
-def _trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
+def trained(data_dir: Path, log_dir: Path, *more: str) -> Path:
+    """Folder of a run with these settings beside `overrides_of`."""
     cfg = compose("train", [*overrides_of(data_dir, log_dir), *more])
     train(cfg)
     return hashing.run_folder(cfg)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import torch
 from qs3.data.store import open_pointset
 from qs3.errors import DataError
 from qs3.evaluation.estimates_text import DO_NOT_TRUST
+from qs3.evaluation.trust import Seen, judge
+from qs3.evaluation.trust_file import read_calibration
 from qs3.inference.export import export_folder
 from qs3.inference.held_out import MOST, checked_tensors, known_of, tensors_of
 from qs3.inference.model_file import read_result, write_result
@@ -22,6 +25,14 @@ from qs3.inference.model_folder import HELD_OUT
 from qs3.inference.predictor import load
 from qs3.runs.metrics import read_metrics
 from tests.commands import main
+from tests.inference.conftest import trained
+
+
+def nested(one: torch.Tensor) -> torch.Tensor:
+    """A tensor that has no shape."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they are a prototype
+        return torch.nested.nested_tensor([one])
 
 
 def predict(net: Path, clouds: np.ndarray, folder: Path, capsys) -> tuple[str, dict, str]:
@@ -127,12 +138,49 @@ def test_of_norms_that_follow_the_target_it_tells_by_those_of_training(
     assert "norms it was trained with" not in text
 
 
+def test_norms_of_each_domain_are_the_target_s_in_all_threads(data_dir, tmp_path, capsys):
+    more = ("method=dann", "model.norm=domain", "evaluation.norms=alpha_bn")
+    run = trained(data_dir, tmp_path / "logs", *more)
+    target = np.concatenate([np.array(open_pointset(data_dir / "kinectsim10").points)] * 6)
+    net = load(run)
+    ready = [net.prepare(cloud) for cloud in target]
+    asked = net.asked(torch.stack([each.points for each in ready]))
+    seen = Seen(asked, np.array([each.measures for each in ready]))
+    expected = judge(net.held_out, seen, read_calibration())
+    _, said, _ = predict(run, target, tmp_path, capsys)
+    assert said["trust_without_norms"] is True
+    assert said["trust"]["shifts"] == pytest.approx(expected.shifts, abs=1e-4)
+    assert said["trust"]["expected"] == pytest.approx(expected.expected, abs=1e-4)
+
+
+def test_norms_that_diverged_cost_the_verdict_and_nothing_else(adapted_run, tmp_path, capsys):
+    result = read_result(adapted_run)
+    norms = {name: torch.full_like(one, -1) for name, one in result.trained_norms.items()}
+    write_result(tmp_path / "result.pt", replace(result, trained_norms=norms))
+    clouds = np.random.default_rng(0).normal(size=(40, 64, 3))
+    text, said, _ = predict(tmp_path / "result.pt", clouds, tmp_path, capsys)
+    assert said["trust"] is None
+    assert "before its norms were the target's it diverged" in text
+    assert [one["status"] for one in said["clouds"]] == ["ok"] * 40
+
+
+def test_another_net_s_norms_do_not_stay_in_a_folder(run, adapted_run, tmp_path):
+    norms = tmp_path / "model" / "trained_norms.safetensors"
+    export_folder(adapted_run, tmp_path / "model")
+    assert norms.exists()
+    assert load(tmp_path / "model").before_target is not None
+    export_folder(run, tmp_path / "model")
+    assert not norms.exists()
+
+
 @pytest.mark.parametrize(
     "changes",
     [
         {"more": torch.ones(1)},
         {"name": torch.ones(2)},
         {"name": torch.ones(3, dtype=torch.float64)},
+        {"name": torch.ones(3).to_sparse()},
+        {"name": nested(torch.ones(3))},
         {},
     ],
 )
@@ -173,9 +221,10 @@ def test_statistics_survive_their_file(tmp_path):
         ({"labels": torch.arange(5) % 3}, "should be .v, C"),
         ({"labels": torch.tensor(1)}, "should be .v, C"),
         ({"probabilities": torch.tensor(0.5)}, "should be .v, C"),
-        ({"probabilities": torch.full((6, 3), 0.3).to_sparse()}, "should be .v, C"),
-        ({"labels": (torch.arange(6) % 3).to_sparse()}, "should be .v, C"),
-        ({"measures": torch.ones(9, 4).to_sparse()}, "should be .v, C"),
+        ({"probabilities": torch.full((6, 3), 0.3).to_sparse()}, "plain tensors"),
+        ({"labels": (torch.arange(6) % 3).to_sparse()}, "plain tensors"),
+        ({"measures": torch.ones(9, 4).to_sparse()}, "plain tensors"),
+        ({"measures": nested(torch.ones(9, 4))}, "plain tensors"),
         ({"measures": torch.ones(9, 3)}, "should be .v, C"),
         ({"measures": torch.full((9, 4), torch.inf)}, "finite"),
         ({"measures": torch.ones(0, 4)}, "1 to 4096"),
