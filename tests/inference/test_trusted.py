@@ -18,11 +18,13 @@ from qs3.errors import DataError
 from qs3.evaluation.estimates_text import DO_NOT_TRUST
 from qs3.evaluation.trust import Seen, judge
 from qs3.evaluation.trust_file import read_calibration
+from qs3.inference import units
 from qs3.inference.export import export_folder
 from qs3.inference.held_out import MOST, checked_tensors, known_of, tensors_of
 from qs3.inference.model_file import read_result, write_result
 from qs3.inference.model_folder import HELD_OUT
 from qs3.inference.predictor import load
+from qs3.models.norms import DomainNorm
 from qs3.runs.metrics import read_metrics
 from tests.commands import main
 from tests.inference.conftest import trained
@@ -138,7 +140,9 @@ def test_of_norms_that_follow_the_target_it_tells_by_those_of_training(
     assert "norms it was trained with" not in text
 
 
-def test_norms_of_each_domain_are_the_target_s_in_all_threads(data_dir, tmp_path, capsys):
+def test_norms_of_each_domain_are_the_target_s_in_all_threads(
+    data_dir, tmp_path, capsys, monkeypatch
+):
     more = ("method=dann", "model.norm=domain", "evaluation.norms=alpha_bn")
     run = trained(data_dir, tmp_path / "logs", *more)
     target = np.concatenate([np.array(open_pointset(data_dir / "kinectsim10").points)] * 6)
@@ -147,7 +151,19 @@ def test_norms_of_each_domain_are_the_target_s_in_all_threads(data_dir, tmp_path
     asked = net.asked(torch.stack([each.points for each in ready]))
     seen = Seen(asked, np.array([each.measures for each in ready]))
     expected = judge(net.held_out, seen, read_calibration())
+    used = []
+
+    def judged(predictor, *more):
+        nets = (predictor.net, predictor.before_target)
+        norms = [m for one in nets for m in one.modules() if isinstance(m, DomainNorm)]
+        used.append({norm.domain for norm in norms})  # before any thread changes them
+        return of_batch(predictor, *more)
+
+    of_batch = units._judged
+    monkeypatch.setattr(units, "_judged", judged)
     _, said, _ = predict(run, target, tmp_path, capsys)
+    assert len(used) > 1
+    assert all(each == {"target"} for each in used)
     assert said["trust_without_norms"] is True
     assert said["trust"]["shifts"] == pytest.approx(expected.shifts, abs=1e-4)
     assert said["trust"]["expected"] == pytest.approx(expected.expected, abs=1e-4)
