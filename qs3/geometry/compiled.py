@@ -14,11 +14,11 @@ from functools import cache
 from importlib.util import find_spec
 from itertools import pairwise
 
-import numpy as np
 import torch
 from torch import Tensor
 
 _ALONE = 1 << 16  # values that are too few to be shared by threads
+_BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
 
 
 def usable(x: Tensor) -> bool:
@@ -105,7 +105,7 @@ def _(x: Tensor, weight: Tensor, grad: Tensor, where: Tensor) -> tuple[Tensor, T
 def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     """Columns of the k smallest values of each row after `more` was added to them, smallest first.
 
-    As `qs3.geometry.neighbours` finds them by numpy, to the same columns where values are equal.
+    As `qs3.geometry.neighbours` finds them by numpy, of equal values the first columns.
 
     Args:
         values: [r, n] contiguous; the sums afterwards.
@@ -118,24 +118,32 @@ def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     (r, n), groups = values.shape, groups_for(k)
     minima = values.new_empty(r, groups)
     _shared("add_and_minima", r, values.numel(), values, more, minima)
-    bound = torch.from_numpy(np.sort(minima.numpy(), axis=1)[:, k - 1].copy())
+    bound = _kth_smallest(minima, k)
     count = torch.empty(r, dtype=torch.int64)
     for places in (2 * k + 8, n):  # where many values are equal more of them may be in
         few = values.new_empty(r, places + groups)
         column = torch.empty(few.shape, dtype=torch.int32)
         _shared("collect_below", r, values.numel(), values, minima, bound, few, column, count)
-        width = max(int(count.max()), k)
-        if width <= places:
+        if int(count.max()) <= places:
             break
-    order = torch.from_numpy(np.argsort(few.numpy()[:, :width], axis=1))
     out = torch.empty(r, k, dtype=torch.int64)
-    _shared("take_in_order", r, values.numel(), column, order, out)
+    _shared("take_in_order", r, values.numel(), few, column, count, out)
     return out
 
 
 @smallest_sums.register_fake
 def _(values: Tensor, more: Tensor, k: int) -> Tensor:
     return values.new_empty(len(values), k, dtype=torch.int64)
+
+
+def _kth_smallest(x: Tensor, k: int) -> Tensor:
+    """The k-th smallest of each row of x [r, n], [r]; NaN is above all."""
+    kind, infinite = _BITS[x.dtype], torch.tensor(torch.inf, dtype=x.dtype)
+    top = torch.iinfo(kind).max
+    limits = torch.tensor([top, int(infinite.view(kind)), k], dtype=kind)
+    bound = x.new_empty(len(x))
+    _shared("kth_smallest", len(x), x.numel(), x.view(kind), limits, bound.view(kind))
+    return bound
 
 
 def groups_for(k: int) -> int:

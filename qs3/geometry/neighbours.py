@@ -91,7 +91,8 @@ def _smallest_on_cpu(values: Tensor, k: int) -> Tensor:
 
     Columns are dealt to groups; the k-th smallest of the groups' minima is no less than the
     k-th smallest of the row, so everything above it is out. That leaves hardly more than k.
-    numpy's sort and argsort are vectorised (AVX-512), its partition and torch's topk are not.
+    numpy's sort is vectorised, with AVX-512 well; its partition and torch's topk are not. Of equal
+    values the first columns come first, on all processors.
     """
     r, n = values.shape
     groups = compiled.groups_for(k)
@@ -110,7 +111,7 @@ def _smallest_on_cpu(values: Tensor, k: int) -> Tensor:
     column = np.zeros(r * width, dtype=np.int64)
     few[slot] = array.ravel()[flat]
     column[slot] = flat - row * n
-    order = np.argsort(few.reshape(r, width), axis=1)[:, :k]
+    order = np.argsort(few.reshape(r, width), axis=1, kind="stable")[:, :k]
     return torch.from_numpy(np.take_along_axis(column.reshape(r, width), order, axis=1))
 
 

@@ -25,22 +25,34 @@ def _compiled(kernel: Callable[..., None]) -> Any:
 
 @_compiled
 def neighbour_max(x: Any, index: Any, best: Any, where: Any, begin: int, end: int) -> None:
-    """Maxima of x[index[i]] a channel and the first rows that have them; NaN is above all."""
+    """Maxima of x[index[i]] a channel and the first rows that have them; NaN is above all.
+
+    Four rows at a time: what is best so far is then read and written a quarter as often. The last
+    row may come again, which changes nothing.
+    """
     k, channels = index.shape[1], x.shape[1]
     for i in range(begin, end):
-        most, at = best[i], where[i]
-        row = index[i, 0]
-        for c in range(channels):
-            most[c] = x[row, c]
-            at[c] = row
-        for j in range(1, k):
-            row = index[i, j]
-            values = x[row]
-            for c in range(channels):
-                value = values[c]
-                above = value > most[c] or value != value
-                most[c] = value if above else most[c]
-                at[c] = row if above else at[c]
+        most, at, first = best[i], where[i], x[index[i, 0]]
+        for channel in range(channels):
+            most[channel] = first[channel]
+            at[channel] = index[i, 0]
+        for j in range(1, k, 4):
+            row_a = np.int32(index[i, j])
+            row_b = np.int32(index[i, min(j + 1, k - 1)])
+            row_c = np.int32(index[i, min(j + 2, k - 1)])
+            row_d = np.int32(index[i, min(j + 3, k - 1)])
+            a, b, c, d = x[row_a], x[row_b], x[row_c], x[row_d]
+            for channel in range(channels):
+                value, row = most[channel], at[channel]
+                above = (a[channel] > value) | (a[channel] != a[channel])
+                value, row = (a[channel], row_a) if above else (value, row)
+                above = (b[channel] > value) | (b[channel] != b[channel])
+                value, row = (b[channel], row_b) if above else (value, row)
+                above = (c[channel] > value) | (c[channel] != c[channel])
+                value, row = (c[channel], row_c) if above else (value, row)
+                above = (d[channel] > value) | (d[channel] != d[channel])
+                value, row = (d[channel], row_d) if above else (value, row)
+                most[channel], at[channel] = value, row
 
 
 @_compiled
@@ -64,6 +76,46 @@ def add_and_minima(values: Any, more: Any, minima: Any, begin: int, end: int) ->
                 least[g] = value if value < least[g] or value != value else least[g]
         for j in range(turns * groups, values.shape[1]):
             values[i, j] += other[j]
+
+
+@_compiled
+def kth_smallest(bits: Any, limits: Any, bound: Any, begin: int, end: int) -> None:
+    """The k-th smallest number of each row, by halving the range that it lies in; NaN is above all.
+
+    As whole numbers the bits of floats have their order once those of negative ones are turned.
+    Counting how many are at most so large is done in vectors; sorting well so takes AVX-512.
+
+    Args:
+        bits: [r, n] int32 or int64, those of float32 or float64.
+        limits: [3] of that type: its largest number, the bits of infinity, and k.
+        bound: [r] likewise, gets the bits of what is found.
+    """
+    kind = bits.dtype.type  # each result is cast: else numbers, and with them vectors, are of int64
+    top, infinite, k = limits[0], limits[1], limits[2]
+    zero, one = kind(0), kind(1)
+    keys = np.empty_like(bits[0])
+    for i in range(begin, end):
+        row = bits[i]
+        low, high = top, kind(~top)
+        for g in range(len(row)):
+            key = row[g] if row[g] >= zero else kind(row[g] ^ top)
+            keys[g] = key if kind(row[g] & top) <= infinite else top
+            low, high = min(low, keys[g]), max(high, keys[g])
+        while low < high:
+            middle = kind((low & high) + ((low ^ high) >> 1))  # rounded down, and never too large
+            number = zero
+            for g in range(len(row)):
+                number = kind(number + (keys[g] <= middle))
+            if number == k:
+                high = low
+                for g in range(len(row)):
+                    high = max(high, keys[g] if keys[g] <= middle else low)
+                low = high
+            elif number > k:
+                high = middle
+            else:
+                low = kind(middle + one)
+        bound[i] = low if low >= zero else kind(low ^ top)
 
 
 @_compiled
@@ -106,11 +158,32 @@ def collect_below(
 
 
 @_compiled
-def take_in_order(column: Any, order: Any, out: Any, begin: int, end: int) -> None:
-    """out[i, j] = column[i, order[i, j]]."""
+def take_in_order(few: Any, column: Any, count: Any, out: Any, begin: int, end: int) -> None:
+    """Columns of the smallest of count[i] values, smallest first, and of equal ones the first.
+
+    Of fewer than there are places for what follows them is taken, too. None is NaN. A value's place
+    is how many are below it: of so few all comparisons take less time than a sort.
+    """
+    k = out.shape[1]
+    width = k
     for i in range(begin, end):
-        for j in range(out.shape[1]):
-            out[i, j] = column[i, order[i, j]]
+        width = max(width, count[i])
+    place = np.empty(width, np.int32)
+    rank = np.empty(width, np.int32)
+    for a in range(width):
+        place[a] = a
+    for i in range(begin, end):
+        values = few[i]
+        for a in range(width):
+            rank[a] = 0
+        for b in range(max(count[i], k)):
+            value, at = values[b], np.int32(b)
+            for a in range(width):
+                is_before = (value < values[a]) | ((value == values[a]) & (at < place[a]))
+                rank[a] = np.int32(rank[a] + is_before)
+        for a in range(max(count[i], k)):
+            if rank[a] < k:
+                out[i, rank[a]] = column[i, a]
 
 
 @_compiled

@@ -41,6 +41,22 @@ def test_maxima_and_who_has_them_first(points, rows, k, channels, dtype, seed):
                 assert where[i, c] == index[i, first]
 
 
+@settings(max_examples=200, deadline=None)
+@given(data=st.data(), width=st.sampled_from([32, 64]), rows=st.integers(0, 3))
+def test_the_kth_smallest_is_that_of_sorted_rows(data, width, rows):
+    kind = np.dtype(f"float{width}").type
+    tiny, huge = np.finfo(kind).smallest_subnormal, np.finfo(kind).max
+    some = st.sampled_from([0.0, -0.0, np.nan, -np.nan, np.inf, -np.inf, tiny, -tiny, huge, -huge])
+    number = st.one_of(some, st.floats(width=width), st.integers(-2, 2))
+    groups = data.draw(st.integers(1, 9))
+    row = st.lists(number, min_size=groups, max_size=groups)
+    drawn = data.draw(st.lists(row, min_size=rows, max_size=rows))
+    x = np.array(drawn, dtype=kind).reshape(rows, groups)
+    k = data.draw(st.integers(1, groups))
+    found = compiled._kth_smallest(torch.from_numpy(x), k).numpy()
+    np.testing.assert_array_equal(found, np.sort(x, axis=1)[:, k - 1])
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_values_are_torchs_whatever_the_threads_and_the_layout(monkeypatch, threads, dtype):
