@@ -162,26 +162,35 @@ def take_in_order(few: Any, column: Any, count: Any, out: Any, begin: int, end: 
     """Columns of the smallest of count[i] values, smallest first, and of equal ones the first.
 
     Of fewer than there are places for what follows them is taken, too. None is NaN. A value's place
-    is how many are below it: of so few all comparisons take less time than a sort.
+    is how many are below it: of a few all comparisons take less time than a sort.
     """
     k = out.shape[1]
-    width = k
-    for i in range(begin, end):
-        width = max(width, count[i])
-    place = np.empty(width, np.int32)
-    rank = np.empty(width, np.int32)
-    for a in range(width):
+    a_few = 4 * k
+    place, rank = np.empty(a_few, np.int32), np.empty(a_few, np.int32)
+    best = np.empty(k, few.dtype)
+    for a in range(a_few):
         place[a] = a
     for i in range(begin, end):
-        values = few[i]
+        values, width = few[i], max(count[i], k)
+        if width > a_few:  # many that are equal: each goes where it belongs, mostly nowhere
+            for a in range(width):
+                j = min(a, k - 1)
+                if a < k or values[a] < best[j]:
+                    while j > 0 and values[a] < best[j - 1]:
+                        best[j] = best[j - 1]
+                        out[i, j] = out[i, j - 1]
+                        j -= 1
+                    best[j] = values[a]
+                    out[i, j] = column[i, a]
+            continue
         for a in range(width):
             rank[a] = 0
-        for b in range(max(count[i], k)):
+        for b in range(width):
             value, at = values[b], np.int32(b)
             for a in range(width):
                 is_before = (value < values[a]) | ((value == values[a]) & (at < place[a]))
                 rank[a] = np.int32(rank[a] + is_before)
-        for a in range(max(count[i], k)):
+        for a in range(width):
             if rank[a] < k:
                 out[i, rank[a]] = column[i, a]
 
