@@ -25,7 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from qs3.geometry import ball_query, neighbours
-from qs3.models import fast
+from qs3.models import dgcnn, fast
 from qs3.models.fast import edgeconv
 
 
@@ -144,6 +144,7 @@ def as_on_gpu() -> Iterator[None]:
         as_on_device(),
         patch.object(edgeconv, "takes_triton", lambda x: True),
         patch.object(neighbours, "takes_triton", lambda x: True),
+        patch.object(dgcnn, "takes_triton", lambda x: True),
     ):
         yield
 

@@ -148,6 +148,8 @@ class Classifier(LightningModule):
 
     def on_train_end(self) -> None:
         """Graphs keep memory."""
+        if self._graphs is not None:
+            self._graphs.forget()
         self._graphs = None
 
     def _optimizer(self) -> torch.optim.Optimizer:

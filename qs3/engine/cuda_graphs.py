@@ -8,6 +8,7 @@ dropout's included.
 from __future__ import annotations
 
 import copy
+import gc
 import logging
 import warnings
 from collections import Counter
@@ -74,9 +75,14 @@ class Graphs:
 
     def forget(self) -> None:
         """Give the graphs' memory back: other shapes come."""
+        had = bool(self.whole.graphs or self.backbone.graphs)
         for passes in (self.whole, self.backbone):
             for kept in (passes.seen, passes.lately, passes.graphs):
                 kept.clear()
+        if had:
+            gc.collect()  # what torch makes of a pass is a class, which refers to itself
+            if torch.cuda.is_available():
+                torch.cuda.empty_cache()  # a graph's memory serves no other
 
     def give_up(self, error: Exception) -> None:
         """Go on without graphs, also those there are: they know torch's generator as it was."""

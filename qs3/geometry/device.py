@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 ROWS = 16  # that a program of such a kernel adds up, where sums over all rows are taken
@@ -37,3 +38,28 @@ def exact_products() -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+def lists_of(
+    index: Int[Tensor, "*b m"], rows: int
+) -> tuple[Int[Tensor, "*b rows+1"], Int[Tensor, "*b m"]]:
+    """Which entries of `index` name each row, in their order.
+
+    Args:
+        index: numbers of rows.
+        rows: how many rows there are.
+
+    Returns:
+        first: where in `order` the list of each row begins, and the last one ends.
+        order: int64, the entries row by row.
+    """
+    if rows >= 1 << 16:
+        kind, least = torch.int32, 0
+    else:  # half as many passes of a radix sort
+        kind, least = torch.int16, 0 if rows < 1 << 15 else -(1 << 15)
+    shifted = index if least == 0 else index + least
+    # A stable sort, so that the order in which a list is summed never changes.
+    named, order = shifted.to(kind).sort(dim=-1, stable=True)
+    points = torch.arange(least, least + rows + 1, dtype=kind, device=index.device)
+    points = points.expand(*index.shape[:-1], -1).contiguous()
+    return torch.searchsorted(named, points), order

@@ -9,11 +9,22 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+_FEW = 64  # values of a row that are sorted
+
 
 @triton.jit
 @no_type_check
-def _kernel(values, more, out, r, n, k, BLOCK: tl.constexpr):
-    """One row a program: it stays in registers, and its least value is taken k times."""
+def _kernel(
+    values, more, few, out, r, n, k,
+    BLOCK: tl.constexpr, BOUNDED: tl.constexpr, FEW: tl.constexpr,
+):  # fmt: skip
+    """One row a program: it stays in registers.
+
+    Columns are dealt to 32 groups, and the k-th smallest of their least values is no less than the
+    k-th smallest of the row, so only what is no more than that is sorted: hardly more than k
+    values. Where there are too many, equal ones, or groups are not enough, the least one is taken
+    k times.
+    """
     row = tl.program_id(0).to(tl.int64)
     at = tl.arange(0, BLOCK)
     here = at < n
@@ -22,10 +33,32 @@ def _kernel(values, more, out, r, n, k, BLOCK: tl.constexpr):
     # Below infinity, which is for what was taken and for what is no column; NaN among the last.
     v = tl.where(v < 3.0e38, v, 3.0e38)
     v = tl.where(here, v, float("inf"))
-    for i in range(k):
-        least = tl.argmin(v, axis=0)
-        tl.store(out + row * k + i, least.to(tl.int64))
-        v = tl.where(at == least, float("inf"), v)
+    left = k
+    if BOUNDED:
+        least = tl.min(tl.min(tl.reshape(v, [BLOCK // 128, 32, 4]), axis=2), axis=0)
+        bound = tl.sum(tl.where(tl.arange(0, 32) == k - 1, tl.sort(least), 0.0), axis=0)
+        within = (v <= bound).to(tl.int32)
+        count = tl.sum(within, axis=0)
+        if count <= FEW:
+            slot = tl.cumsum(within, axis=0) - 1
+            mine = few + row * FEW
+            tl.store(mine + slot, at, mask=within != 0)
+            tl.debug_barrier()
+            place = tl.arange(0, FEW)
+            column = tl.load(mine + place, mask=place < count, other=0)
+            s = tl.load(values + row * n + column)
+            s += tl.load(more + row // r * n + column)
+            s = tl.where(s < 3.0e38, s, 3.0e38)
+            bits = s.to(tl.int32, bitcast=True)
+            bits = bits ^ ((bits >> 31) & 0x7FFFFFFF)  # in the order of the values
+            key = (bits.to(tl.int64) << 32) | column.to(tl.int64)
+            key = tl.where(place < count, key, 0x7FFFFFFFFFFFFFFF)
+            tl.store(out + row * k + place, tl.sort(key) & 0xFFFFFFFF, mask=place < k)
+            left = 0
+    for i in range(left):
+        first = tl.argmin(v, axis=0)
+        tl.store(out + row * k + i, first.to(tl.int64))
+        v = tl.where(at == first, float("inf"), v)
 
 
 def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
@@ -33,7 +66,10 @@ def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     b, r, n = values.shape
     out = torch.empty(b, r, k, dtype=torch.int64, device=values.device)
     block = triton.next_power_of_2(n)
-    settings: dict[str, Any] = {"BLOCK": block, "num_warps": max(1, block // 1024)}
+    bounded = k <= 32 and n >= 128  # then each group has a column
+    few = out.new_empty(b * r if bounded else 1, _FEW, dtype=torch.int32)
+    settings: dict[str, Any] = {"BLOCK": block, "BOUNDED": bounded, "FEW": _FEW}
+    settings["num_warps"] = max(1, block // 1024)
     with torch.cuda.device_of(values):
-        _kernel[(b * r,)](values.contiguous(), more.contiguous(), out, r, n, k, **settings)
+        _kernel[(b * r,)](values.contiguous(), more.contiguous(), few, out, r, n, k, **settings)
     return out

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
-from qs3.geometry.device import exact_products
+from qs3.geometry.device import exact_products, takes_triton
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import gather, knn
 from qs3.models import fast
@@ -158,7 +158,7 @@ class DGCNN(Backbone):
             x = layer(x, knn(x, k))
             levels.append(x)
         per_point = torch.cat(levels, dim=2)  # [B, N, 512]
-        if self.norm5 is None and fast.usable(x):
+        if self.norm5 is None and fast.usable(x, anywhere=takes_triton(x)):
             return Features(pooled_linear(per_point, self.conv5.weight), per_point)
         y = linear(per_point, self.conv5.weight)  # [B, N, 1024]
         if self.norm5 is not None:

@@ -7,6 +7,7 @@ gradients for all calls, each written over by the next.
 from __future__ import annotations
 
 import copy
+import weakref
 from typing import Any
 
 import pytest
@@ -219,6 +220,46 @@ def test_whatever_a_graph_depends_on_has_its_own() -> None:
     assert made() == 0
     graphs.forget()
     assert made() == 1
+
+
+@pytest.mark.usefixtures("at_once")
+def test_forgotten_graphs_are_gone_at_once() -> None:
+    """Though what torch makes of a pass refers to itself."""
+    made: list[Any] = []
+
+    def capture(module: nn.Module, points: Tensor) -> Any:
+        played: Any = Played(module, points)
+        played.itself = played
+        made.append(weakref.ref(played))
+        return played
+
+    plain, points = tiny_net(), torch.randn(4, 16, 3)
+    graphs = Graphs(plain, capture)
+    for _ in range(2):
+        graphs.begin_step()
+        graphs.stand_in(points).sum().backward()
+    assert [one() is None for one in made] == [False]
+    graphs.forget()
+    assert [one() is None for one in made] == [True]
+
+
+@GPU
+def test_forgotten_graphs_give_their_memory_back() -> None:
+    net, points = build("dgcnn").float().cuda().train(), torch.rand(16, 512, 3).cuda()
+
+    def reserved(steps: int) -> int:
+        for _ in range(steps):
+            graphs.begin_step()
+            net.zero_grad()
+            graphs.stand_in(points).sum().backward()
+        torch.cuda.empty_cache()
+        return torch.cuda.memory_reserved()
+
+    graphs = Graphs(net)
+    before = reserved(1)
+    kept = reserved(EAGER + 2)
+    graphs.forget()
+    assert torch.cuda.memory_reserved() - before < (kept - before) / 2
 
 
 @pytest.mark.usefixtures("at_once")

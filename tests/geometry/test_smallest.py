@@ -20,11 +20,11 @@ def test_as_torch_wants_operations() -> None:
     torch.library.opcheck(smallest_sums, (torch.rand(2, 5, 9), torch.rand(2, 9), 4))
 
 
-# Rows that fill no block; infinities, and NaN, which come last and never out of range.
+# Rows that fill no block, as many groups as are asked for and more; infinities, and NaN, which come last and never out of range.
 COMPARE = """
 import torch
 from qs3.geometry import smallest, triton_smallest
-for n, k in ((50, 7), (70, 70), (1, 1), (200, 20)):
+for n, k in ((50, 7), (70, 70), (1, 1), (200, 20), (128, 32), (150, 33)):
     torch.manual_seed(0)
     values, more = torch.randn(2, 6, n), torch.randn(2, n)
     values[0, 1, : n // 3] = torch.inf
@@ -44,7 +44,7 @@ for n, k in ((50, 7), (70, 70), (1, 1), (200, 20)):
 
 @needs_triton
 def test_the_kernel_is_the_operation() -> None:
-    assert in_interpreter(COMPARE) == ["same"] * 4
+    assert in_interpreter(COMPARE) == ["same"] * 6
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from qs3.geometry import neighbours
 from qs3.geometry.farthest_points import farthest_points
-from qs3.models import fast
+from qs3.models import dgcnn, fast
 from qs3.models.base import PointClassifier
 from qs3.models.fast import edgeconv
 from qs3.models.norms import KINDS, use_domain
@@ -49,7 +49,7 @@ def test_kernels_of_a_step(name: str) -> None:
 
 
 def test_kernels_of_dgcnn_without_triton(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (edgeconv, neighbours):
+    for module in (edgeconv, neighbours, dgcnn):
         monkeypatch.setattr(module, "takes_triton", lambda x: False)
     watch = _step(
         build("dgcnn").float().train().to("meta"), torch.empty(16, 1024, 3, device="meta")
@@ -107,6 +107,20 @@ def test_the_way_of_a_device_is_that_of_the_cpu(name: str, training: bool) -> No
     for mine, theirs, by_triton in zip(*found, strict=True):
         torch.testing.assert_close(mine, by_triton, rtol=1e-7, atol=1e-9)
         torch.testing.assert_close(mine, theirs, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("negative", [False, True])
+def test_dgcnn_s_answers_without_a_way_back_are_the_cpu_s(negative: bool) -> None:
+    net, points = build("dgcnn").eval(), clouds(2, 40)
+    for norm in (part for part in net.modules() if isinstance(part, torch.nn.BatchNorm1d)):
+        torch.nn.init.normal_(norm.running_mean)
+        torch.nn.init.uniform_(norm.weight, *((-2.0, -0.5) if negative else (-1.0, 2.0)))
+    with torch.no_grad():
+        expected = net(points)
+        with as_on_gpu(), Watch() as watch:
+            found = net(points)
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
+    assert watch.counts["qs3.edge_extremes.default"] == 4
 
 
 def test_kernels_are_of_the_cpu() -> None:

@@ -15,7 +15,7 @@ those that name j, by lists of them. So nothing of the edges' size reaches memor
 added up in an order that changes: the result is the same in each run.
 
 Each operation is a kernel in Triton (`triton_edge_norm`); elsewhere it takes the edges itself, and
-so says what the kernel computes. All are about `pivot`, the mean of R, which is near that of z,
+so says what the kernel computes. All are about `pivot`, a mean of R, which is near that of z,
 lest squares of deviations from it cancel.
 """
 
@@ -30,9 +30,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from qs3.geometry.device import ROWS, takes_triton
+from qs3.geometry.device import ROWS, lists_of, takes_triton
 
 MOST_NEIGHBOURS = 256  # which was taken is kept in a byte
+_SHARE = 16
 
 _op = torch.library.custom_op
 
@@ -229,7 +230,9 @@ class _EdgeNorm(torch.autograd.Function):
         slope: float,
     ) -> tuple[Tensor, Tensor, Tensor]:
         at = _implementation(pr)
-        pivot = pr[:, len(gamma) :].mean(0)
+        # Of some points, which decide nothing but the rounding: of a share s of all their mean is
+        # off by at most sqrt((1 - s) / s) deviations.
+        pivot = pr[: -(-len(pr) // _SHARE), len(gamma) :].mean(0)
         best, taken, sums, own, parts = at.edge_extremes(pr, index, gamma, pivot)
         y, t, constants = at.edge_output(
             best, parts.sum(1), pivot, gamma, beta, index.numel(), eps, slope
@@ -247,10 +250,7 @@ class _EdgeNorm(torch.autograd.Function):
         at = _implementation(pr)
         du, parts = at.edge_output_gradient(grad.contiguous(), y, t, constants, ctx.slope)
         of_norm = parts.sum(1)
-        # A stable sort, so that the order in which a point's list is summed never changes.
-        named, order = index.flatten().int().sort(stable=True)
-        points = torch.arange(len(pr) + 1, dtype=named.dtype, device=pr.device)
-        first = torch.searchsorted(named, points)
+        first, order = lists_of(index.flatten(), len(pr))
         dpr = at.edge_gradient(pr, own, du, taken, sums, first, order, constants, of_norm)
         return dpr, None, of_norm[1], of_norm[0], None, None
 
@@ -272,6 +272,19 @@ def edge_norm(
         negative_slope: of LeakyReLU, at least 0.
     """
     return _EdgeNorm.apply(pr.contiguous(), index.contiguous(), gamma, beta, eps, negative_slope)
+
+
+def edge_maximum(pr: Float[Tensor, "r 2*d"], index: Int[Tensor, "r k"]) -> Float[Tensor, "r d"]:
+    """The greatest z of each point; without a way back.
+
+    Args:
+        pr: P and R of all points.
+        index: rows of each point's neighbours, at most `MOST_NEIGHBOURS`.
+    """
+    d = pr.shape[1] // 2
+    at = _implementation(pr)
+    best = at.edge_extremes(pr, index.contiguous(), pr.new_ones(d), pr.new_zeros(d))[0]
+    return best
 
 
 def _implementation(x: Tensor) -> Any:

@@ -37,7 +37,7 @@ from qs3.geometry.device import takes_triton
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import exporting
 from qs3.models import fast
-from qs3.models.fast.edge_norm import MOST_NEIGHBOURS, edge_norm
+from qs3.models.fast.edge_norm import MOST_NEIGHBOURS, edge_maximum, edge_norm
 from qs3.models.fast.pointwise_max import max_over_members, max_over_rows
 from qs3.models.norms import active, normed, track, uses_batch
 
@@ -183,6 +183,10 @@ def edge_conv(
         mean, var = norm.running_mean[None], norm.running_var[None]
     h = norm.weight * torch.rsqrt(var + norm.eps)
     shift = norm.bias - h * mean
+    if not uses_batch(norm) and _takes_maximum(x, weight, h, k):
+        both = torch.cat([h[0, :, None] * w1, h[0, :, None] * w2])  # P, and R = P + Q
+        pr = torch.addmm(F.pad(shift[0], (len(w1), 0)), x.reshape(b * n, c), both.T)
+        return F.leaky_relu(edge_maximum(pr, flat), negative_slope).view(b, n, -1)
     p = _product(rows, h[:, :, None] * w1)  # [g, r, d]
     q = _product(rows, h[:, :, None] * e) + shift[:, None]
     best = neighbour_max(p.flatten(0, 1), flat).view_as(q)
@@ -192,6 +196,12 @@ def edge_conv(
 def _takes_edge_norm(x: Tensor, norm: nn.Module, k: int, negative_slope: float) -> bool:
     batch_norm = isinstance(norm, nn.BatchNorm1d) and norm.affine
     return takes_triton(x) and batch_norm and k <= MOST_NEIGHBOURS and negative_slope >= 0
+
+
+def _takes_maximum(x: Tensor, weight: Tensor, h: Tensor, k: int) -> bool:
+    """Whether no way back is asked for, which the kernel has not."""
+    trained = any(t.requires_grad for t in (x, weight, h)) and torch.is_grad_enabled()
+    return takes_triton(x) and k <= MOST_NEIGHBOURS and not trained and not exporting()
 
 
 def _statistics(x: Tensor, flat: Tensor, w1: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,6 +24,7 @@ from qs3.geometry import compiled
 from qs3.geometry.matmul import matmul_t
 from qs3.geometry.neighbours import exporting
 from qs3.models import fast
+from qs3.models.fast import linear_max
 from qs3.models.norms import active, statistics, uses_batch
 
 _AT_ONCE = 1 << 20  # values of z worked on at once: 4 MB in float32
@@ -181,4 +182,4 @@ def pooled_linear(
     x: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]
 ) -> Float[Tensor, "b 2*d"]:
     """Maximum and mean over the points of a linear map without bias."""
-    return _PooledLinear.apply(x, weight)
+    return _PooledLinear.apply(x, weight) if fast.on_cpu(x) else linear_max.pooled(x, weight)

@@ -15,7 +15,8 @@ from torch import Tensor
 from qs3.geometry.device import ROWS
 
 _CHANNELS = 64  # of a program
-_EDGES = 8  # at a time, of a program that goes over them
+_FEW_CHANNELS = 32  # of one whose points take their neighbours' from the cache
+_EDGES = 4  # at a time, of a program that goes over them
 
 
 @triton.jit
@@ -68,8 +69,8 @@ def edge_extremes(
     best, sums, own = pr.new_empty(3, rows, d).unbind(0)
     taken = torch.empty(rows, d, dtype=torch.uint8, device=pr.device)
     parts = pr.new_empty(2, blocks, d)
-    grid = (blocks, triton.cdiv(d, _CHANNELS))
-    settings: dict[str, Any] = {"ROWS": ROWS, "CHANNELS": _CHANNELS, "num_warps": 4}
+    grid = (blocks, triton.cdiv(d, _FEW_CHANNELS))
+    settings: dict[str, Any] = {"ROWS": ROWS, "CHANNELS": _FEW_CHANNELS, "num_warps": 4}
     with torch.cuda.device_of(pr):
         _extremes[grid](
             pr, index, gamma, pivot, best, taken, sums, own, parts, rows, d, k, **settings
@@ -230,7 +231,7 @@ def edge_gradient(
     rows, d = du.shape
     out = torch.empty_like(pr)
     grid = (rows, triton.cdiv(d, _CHANNELS))
-    settings: dict[str, Any] = {"EDGES": _EDGES, "CHANNELS": _CHANNELS, "num_warps": 2}
+    settings: dict[str, Any] = {"EDGES": _EDGES, "CHANNELS": _CHANNELS, "num_warps": 1}
     with torch.cuda.device_of(pr):
         _gradient[grid](
             pr, own, du, taken, sums, first, order, constants, of_norm, out,
