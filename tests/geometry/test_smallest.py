@@ -20,7 +20,8 @@ def test_as_torch_wants_operations() -> None:
     torch.library.opcheck(smallest_sums, (torch.rand(2, 5, 9), torch.rand(2, 9), 4))
 
 
-# Rows that fill no block, as many groups as are asked for and more; infinities, and NaN, which come last and never out of range.
+# Rows that fill no block, as many as there are groups and more; infinities, and NaN, which come
+# last and never out of range.
 COMPARE = """
 import torch
 from qs3.geometry import smallest, triton_smallest
