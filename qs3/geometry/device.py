@@ -42,7 +42,7 @@ def exact_products() -> Iterator[None]:
 
 def lists_of(
     index: Int[Tensor, "*b m"], rows: int
-) -> tuple[Int[Tensor, "*b rows+1"], Int[Tensor, "*b m"]]:
+) -> tuple[Int[Tensor, "*b {rows}+1"], Int[Tensor, "*b m"]]:
     """Which entries of `index` name each row, in their order.
 
     Args:

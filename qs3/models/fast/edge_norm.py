@@ -19,8 +19,8 @@ so says what the kernel computes. All are about `pivot`, a mean of R, which is n
 lest squares of deviations from it cancel.
 """
 
-from __future__ import annotations
-
+# No `from __future__ import annotations`: torch reads the operations' annotations, and where shapes
+# are checked (`make test-all`) it would look their words up in another module.
 import sys
 from typing import Any
 
@@ -256,7 +256,7 @@ class _EdgeNorm(torch.autograd.Function):
 
 
 def edge_norm(
-    pr: Float[Tensor, "r 2*d"],
+    pr: Float[Tensor, "r c"],
     index: Int[Tensor, "r k"],
     gamma: Float[Tensor, " d"],
     beta: Float[Tensor, " d"],
@@ -274,7 +274,7 @@ def edge_norm(
     return _EdgeNorm.apply(pr.contiguous(), index.contiguous(), gamma, beta, eps, negative_slope)
 
 
-def edge_maximum(pr: Float[Tensor, "r 2*d"], index: Int[Tensor, "r k"]) -> Float[Tensor, "r d"]:
+def edge_maximum(pr: Float[Tensor, "r c"], index: Int[Tensor, "r k"]) -> Float[Tensor, "r d"]:
     """The greatest z of each point; without a way back.
 
     Args:

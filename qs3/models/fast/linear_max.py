@@ -11,8 +11,8 @@ kernel in Triton (`triton_linear_max`), which adds up in an order that never cha
 takes torch's operations, and so says what the kernel computes.
 """
 
-from __future__ import annotations
-
+# No `from __future__ import annotations`: torch reads the operations' annotations, and where shapes
+# are checked (`make test-all`) it would look their words up in another module.
 import sys
 from typing import Any
 

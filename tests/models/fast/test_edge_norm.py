@@ -11,6 +11,7 @@ from torch import Tensor
 
 from qs3.models.fast import edge_norm
 from tests.triton import in_interpreter, needs_triton
+from tests.unchecked import unchecked
 
 
 def _inputs(r: int, d: int, k: int, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -69,7 +70,7 @@ def test_operations_are_as_torch_wants_them() -> None:
             )
 
 
-@pytest.mark.slow
+@unchecked
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")  # torch's own
 def test_torchs_compiler_takes_them() -> None:
     """As one graph, without its code generator, which has nothing to add to operations."""

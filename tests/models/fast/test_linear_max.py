@@ -12,6 +12,7 @@ from torch import Tensor
 from qs3.geometry.device import lists_of
 from qs3.models.fast import linear_max
 from tests.triton import in_interpreter, needs_triton
+from tests.unchecked import unchecked
 
 
 def _inputs(b: int, n: int, c: int, d: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -62,7 +63,7 @@ def test_operations_are_as_torch_wants_them() -> None:
     torch.library.opcheck(linear_max.weight_gradient, (grad, x, where, weight))
 
 
-@pytest.mark.slow
+@unchecked
 @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")  # torch's own
 def test_torchs_compiler_takes_them() -> None:
     leaves = [t.requires_grad_() for t in _inputs(2, 9, 4, 6, torch.float32)]
