@@ -76,8 +76,12 @@ class Method(nn.Module):
         raise NotImplementedError
 
 
-def total_loss(method: nn.Module, terms: dict[str, Tensor]) -> Float[Tensor, ""]:
+def total_loss(method: nn.Module, terms: Any) -> Float[Tensor, ""]:
     """The sum of the terms of a method's loss.
+
+    Args:
+        method: whose loss it is, perhaps a user's.
+        terms: what it returned, a dict of scalar tensors by name if it keeps to the rule.
 
     Raises:
         ConfigError: they are not scalar tensors by name (a loss of each cloud would be summed, not
