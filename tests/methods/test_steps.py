@@ -100,7 +100,7 @@ ABOVE = {
     **{"gast": 250, "gast_no_rotation": 70, "gast_pcm": 250, "cpcm": 200, "mlsp": 400},
     **{"sd": 400, "sd_cut_both": 400},
     **{"twin": 30, "twin_everything": 506, "twin_shared": 90, "twin_of_the_source": 280},
-    "twin_own": 260,  # a pass of the other net among them
+    "twin_own": 250,
     **{"pcfea": 0, "pcfea_styled": 130, "pcfea_averaged": 150},
     **{"student": 0, "student_pcm": 40, "student_source": 30, "student_source_pcm": 100},
     **{"student_mrkld": 30, "student_lrent": 30},
