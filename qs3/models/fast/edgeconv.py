@@ -33,7 +33,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3.geometry import compiled
-from qs3.geometry.device import takes_triton
+from qs3.geometry.device import lists_of, takes_triton
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import exporting
 from qs3.models import fast
@@ -115,9 +115,8 @@ def _added_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
     By lists of who names each row: `embedding_bag` sums them without laying their rows out, where
     `index_add_` takes one pass over x and the sums for each of the k columns.
     """
-    row, order = index.flatten().int().sort(stable=True)
-    first = torch.searchsorted(row, torch.arange(len(x), dtype=row.dtype, device=x.device))
-    return F.embedding_bag(order // index.shape[1], x, first, mode="sum")
+    first, order = lists_of(index.flatten(), len(x))
+    return F.embedding_bag(order // index.shape[1], x, first[:-1], mode="sum")
 
 
 def neighbour_max(x: Float[Tensor, "p c"], index: Int[Tensor, "q k"]) -> Float[Tensor, "q c"]:
