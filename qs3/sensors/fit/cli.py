@@ -73,9 +73,11 @@ def fit(
         ConfigError, DataError: say which argument or file is to blame.
     """
     from qs3.geometry.cameras import Intrinsics
+    from qs3.sensors.fit.bias import find_bias
     from qs3.sensors.fit.doubts import check_walls
+    from qs3.sensors.fit.fill import find_fill
     from qs3.sensors.fit.frames import read_camera, read_frame
-    from qs3.sensors.fit.laws import find_bias, find_fill, find_noise
+    from qs3.sensors.fit.noise import find_noise
     from qs3.sensors.fit.planes import find_wall
     from qs3.sensors.fit.preset import FittedPreset
     from qs3.sensors.fit.steps import find_steps

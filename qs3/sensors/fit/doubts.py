@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from qs3.errors import DataError
-from qs3.sensors.fit.laws import Noise
-from qs3.sensors.fit.planes import Wall
-from qs3.sensors.fit.rounded import PATCH_PX
+from qs3.sensors.fit.noise import Noise
+from qs3.sensors.fit.planes import PATCH_PX, Wall
 from qs3.sensors.fit.steps import Steps
 
 _MOST_TOGETHER = 0.4  # real Kinect frames of a table have 0.17 to 0.33

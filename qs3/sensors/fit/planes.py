@@ -19,6 +19,9 @@ _RIM = 40  # the rim left out is this part of the image's width
 _SHADOW = 12  # a shadow is narrower than this part of the image
 _WIDE = 0.02  # of 1 / Z, relative: what the first fit takes for the wall
 _LARGEST_ERROR = 0.08  # of 1 / Z, relative: no depth camera is as bad, and boxes of noise are
+_BEND_SURE = 2.0  # standard errors from which the middle of a wall is not on its plane
+PATCH_PX = 24
+"""Side of the patches that errors are averaged over: noise is smooth over a few pixels at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,7 @@ class Wall:
         tilt_deg: [h, w] angle of incidence on it.
         region: [h, w] bool: where the wall is seen, holes included.
         centre_m: its measured distance at the principal point.
+        centre_error_m: standard error of that, from noise alone.
         gap_per_m: usual gap between the levels of 1 / Z that are seen on it; 0 without levels.
     """
 
@@ -41,6 +45,7 @@ class Wall:
     tilt_deg: np.ndarray
     region: np.ndarray
     centre_m: float
+    centre_error_m: float
     gap_per_m: float
 
     @property
@@ -91,8 +96,12 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
         )
     measured = np.where(mask > 0, depth_m, np.nan)
     plane, tilt = _view(fit.normal, camera, depth_m.shape)
-    centre = 1 / float(fit.normal[0]) + _error_around(measured - plane, camera)
-    return Wall(name, measured, plane, tilt, _region(mask > 0, seen), centre, fit.gap_per_m)
+    distance = 1 / float(fit.normal[0])
+    # The mean of 1 / Z is that of a depth a little smaller than the mean.
+    distance_of_mean = distance + float(np.nanvar(1 / measured - 1 / plane)) * distance**3
+    more, error = _centre(measured - plane - (distance_of_mean - distance), camera)
+    centre = distance_of_mean + more
+    return Wall(name, measured, plane, tilt, _region(mask > 0, seen), centre, error, fit.gap_per_m)
 
 
 class _Fit(NamedTuple):
@@ -167,11 +176,14 @@ def level_gap(inverse: np.ndarray) -> float:
     return float(np.median(np.diff(levels))) if len(levels) > 1 else 0.0
 
 
-def _error_around(error_m: np.ndarray, camera: Intrinsics) -> float:
-    """Mean of [h, w] errors around the principal point; 0 without any.
+def _centre(error_m: np.ndarray, camera: Intrinsics) -> tuple[float, float]:
+    """What to add to a plane's distance at the principal point, and the sum's standard error.
 
     A camera with a bias, or a lens that bends, sees a plane bent: the plane alone is not what it
-    measured in the middle. Symmetric about that point, or a slant would count as an error.
+    measured in the middle. That is the mean of [h, w] errors around that point (symmetric, or a
+    slant would count as an error), which has few pixels: of noise that is smooth over many it holds
+    more than the plane itself. So it counts from two standard errors on, and the more the larger it
+    is (a garrote, Breiman 1995).
     """
     height, width = error_m.shape
     reach_v, reach_u = height // 10, width // 10
@@ -179,7 +191,45 @@ def _error_around(error_m: np.ndarray, camera: Intrinsics) -> float:
     cols = np.abs(np.arange(width) - camera.cx_px) <= reach_u
     part = error_m[np.ix_(rows, cols)]
     part = part[np.isfinite(part)]
-    return float(part.mean()) if part.size else 0.0
+    alone = _smooth_variance(error_m)
+    plane = alone / max(int(np.isfinite(error_m).sum()), 1)
+    if not part.size:
+        return 0.0, float(np.sqrt(plane))
+    mean, variance = float(part.mean()), alone / part.size
+    counts = 1 - _BEND_SURE**2 * variance / mean**2 if mean else 0.0
+    if counts <= 0:
+        return 0.0, float(np.sqrt(plane))
+    return counts * mean, float(np.sqrt(plane + variance))
+
+
+def _smooth_variance(error_m: np.ndarray) -> float:
+    """Variance of a mean over [h, w] errors with NaN, times their number.
+
+    From second differences of means over patches in a row or a column, in which bends of the whole
+    image are hardly seen. Where there are too few patches, that of single pixels.
+    """
+    parts = patches(error_m)
+    count = np.isfinite(parts).sum(axis=(1, 3)).astype(float)
+    means = np.nansum(parts, axis=(1, 3)) / np.maximum(count, 1)
+    squares = []
+    for m, n in ((means, count), (means.T, count.T)):
+        least = np.minimum(np.minimum(n[:-2], n[1:-1]), n[2:])
+        full = least > PATCH_PX**2 / 2
+        second = m[:-2] - 2 * m[1:-1] + m[2:]
+        # 1 + 4 + 1 variances of means over so many pixels each.
+        of_one = 1 / n[:-2][full] + 4 / n[1:-1][full] + 1 / n[2:][full]
+        squares.append(second[full] ** 2 / of_one)
+    found = np.concatenate(squares)
+    if len(found) < 10:
+        return float(np.nanvar(error_m)) if np.isfinite(error_m).any() else 0.0
+    return float(found.mean())
+
+
+def patches(image: np.ndarray, side_px: int = PATCH_PX) -> np.ndarray:
+    """[rows, side_px, columns, side_px] view of the patches that lie wholly in [h, w]."""
+    rows, columns = (n // side_px for n in image.shape)
+    part = image[: rows * side_px, : columns * side_px]
+    return part.reshape(rows, side_px, columns, side_px)
 
 
 def between(mask: np.ndarray) -> np.ndarray:

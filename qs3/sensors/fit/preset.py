@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from qs3.geometry.cameras import Intrinsics
-from qs3.sensors.fit.laws import Fill, Noise
+from qs3.sensors.fit.fill import Fill
+from qs3.sensors.fit.noise import Noise
 from qs3.sensors.fit.planes import Wall
 from qs3.sensors.fit.steps import Steps
 from qs3.utils.files import write_text
@@ -26,7 +27,7 @@ class FittedPreset:
 
     Attributes:
         camera: of the frames.
-        noise, steps, fill: see qs3.sensors.fit.laws.
+        noise, steps, fill: see the modules that find them.
         bias_m: coefficients, see FittedDepth.
         baseline_m: as given; None if it was not.
         walls: the data.
@@ -165,9 +166,14 @@ baseline_m: {baseline}
         figure.colorbar(picture, ax=ax, label="mm (grey: no depth, or not on the wall)")
 
     def _plot_fill(self, ax: Any) -> None:
-        ax.plot(self.fill.tilts_deg, 100 * np.array(self.fill.rates), "o-")
+        fill = self.fill
+        ax.plot(fill.seen_deg, 100 * np.array(fill.seen_rates), "o", ms=4, label="data")
+        tilt = np.linspace(0, 90, 181)
+        rate = np.interp(tilt, fill.tilts_deg, fill.rates)
+        ax.plot(tilt, 100 * rate, label="model")
         ax.set(xlabel="angle of incidence (degrees)", ylabel="valid pixels (%)", title="Fill rate")
-        ax.set_ylim(min(90, 100 * min(self.fill.rates) - 5), 101)
+        ax.set_ylim(min(90, 100 * min((*fill.rates, *fill.seen_rates)) - 5), 101)
+        ax.legend(fontsize=8)
 
 
 def _numbers(values: Sequence[float]) -> str:

@@ -6,13 +6,11 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import ndtr
 
-from qs3.sensors.fit.planes import Wall
+from qs3.sensors.fit.planes import PATCH_PX, Wall, patches
 from qs3.sensors.fit.steps import Steps
 
 _MAX_PIXELS = 12_000
 _OUTLIERS = 1e-4  # share of pixels that lie anywhere, so that a single one decides nothing
-PATCH_PX = 24
-"""Side of the patches that errors are averaged over: noise is smooth over a few pixels at most."""
 _COARSE = 0.5  # steps a standard deviation from which rounding is not a small extra error
 
 
@@ -66,14 +64,12 @@ def share_together(wall: Wall, surface: np.ndarray, steps: Steps) -> float:
     whole = float(np.nanvar(error))
     if whole == 0 or np.sqrt(whole) < 0.5 * float(np.nanmedian(high - low)):
         return 0.0
-    size = PATCH_PX
-    rows, columns = (n // size for n in error.shape)
-    blocks = error[: rows * size, : columns * size].reshape(rows, size, columns, size)
-    count = np.isfinite(blocks).sum(axis=(1, 3))
-    full = count > size * size / 2
+    parts = patches(error)
+    count = np.isfinite(parts).sum(axis=(1, 3))
+    full = count > PATCH_PX**2 / 2
     if full.sum() < 10:
         return 0.0
-    means = np.nansum(blocks, axis=(1, 3))[full] / count[full]
+    means = np.nansum(parts, axis=(1, 3))[full] / count[full]
     centre = np.average(means, weights=count[full])
     return min(1.0, float(np.average((means - centre) ** 2, weights=count[full])) / whole)
 

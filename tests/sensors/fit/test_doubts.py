@@ -5,7 +5,7 @@ import pytest
 
 from qs3.errors import DataError
 from qs3.sensors.fit.doubts import check_walls
-from qs3.sensors.fit.laws import Noise
+from qs3.sensors.fit.noise import Noise
 from qs3.sensors.fit.planes import Wall
 from qs3.sensors.fit.rounded import PATCH_PX, share_together
 from qs3.sensors.fit.steps import Steps
@@ -17,7 +17,7 @@ PLANE = np.full(SHAPE, 2.0)
 
 def wall(name, error_m):
     region = np.ones(SHAPE, dtype=bool)
-    return Wall(name, PLANE + error_m, PLANE, 0 * PLANE, region, 2.0, 0.0)
+    return Wall(name, PLANE + error_m, PLANE, 0 * PLANE, region, 2.0, 0.0, 0.0)
 
 
 def checked(sigma_mm, together=(0.1, 0.1, 0.1)):

@@ -1,4 +1,4 @@
-"""What walls say about a camera: noise, step, bias, fill."""
+"""What walls say of a camera's noise: how it grows with the distance."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
 
 from qs3.errors import DataError
-from qs3.sensors.devices.fitted import FittedDepth, neighbour_correlation
+from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.fit.planes import Wall
 from qs3.sensors.fit.rounded import inner_spread, share_together, smooth_wall, spread_between
 from qs3.sensors.fit.steps import Steps
@@ -52,20 +51,6 @@ class Noise:
     def law_m(self, depth_m: np.ndarray) -> np.ndarray:
         """sigma(Z)."""
         return self.floor_m + self.factor * depth_m**self.power
-
-
-@dataclass(frozen=True)
-class Fill:
-    """Share of valid pixels against the angle of incidence.
-
-    Attributes:
-        tilts_deg, rates: see FittedDepth.
-        hole_px: size of the holes.
-    """
-
-    tilts_deg: tuple[float, ...]
-    rates: tuple[float, ...]
-    hole_px: float
 
 
 def find_noise(walls: Sequence[Wall], steps: Steps, power: float | None = None) -> Noise:
@@ -221,72 +206,3 @@ def _law(
     design = np.stack([np.ones_like(z), z**power], axis=1) * (weight / sigma)[:, None]
     (floor, factor), misfit = nnls(design, weight)
     return float(misfit), float(floor), float(factor), power
-
-
-def find_fill(walls: Sequence[Wall]) -> Fill:
-    """Share of the wall's pixels that have a depth, by angle of incidence in bins of 5 degrees."""
-    tilt = np.concatenate([wall.tilt_deg[wall.region] for wall in walls])
-    valid = np.concatenate([np.isfinite(wall.depth_m[wall.region]) for wall in walls])
-    bins = np.floor(tilt / 5).astype(int)
-    tilts, rates = [], []
-    for number in np.unique(bins):
-        inside = bins == number
-        if inside.sum() >= 2000:
-            tilts.append(float(tilt[inside].mean()))
-            rates.append(float(valid[inside].mean()))
-    if not tilts:
-        tilts, rates = [float(tilt.mean())], [float(valid.mean())]
-    return Fill(tuple(tilts), tuple(rates), _hole_size(walls))
-
-
-def _hole_size(walls: Sequence[Wall]) -> float:
-    """The Gaussian that explains how often horizontal neighbours are both without a depth.
-
-    Holes are where a smooth normal field exceeds what the fill rate allows.
-    """
-    # Correlations of neighbours from 0 to nearly 1, and the probability that both exceed.
-    grid = np.concatenate([np.linspace(0, 0.95, 96), 1 - np.geomspace(0.045, 1e-4, 60)])
-    wanted, expected = [], []
-    for wall in walls:
-        hole = wall.region & ~np.isfinite(wall.depth_m)
-        pair = wall.region[:, 1:] & wall.region[:, :-1]
-        share = float(hole.sum() / max(wall.region.sum(), 1))
-        if hole.sum() < _LEAST_IN_BIN or share > 0.95:
-            continue
-        wanted.append(float((hole[:, 1:] & hole[:, :-1])[pair].mean()))
-        density = np.exp(-(ndtri(share) ** 2) / (1 + grid)) / np.sqrt(1 - grid**2) / (2 * np.pi)
-        steps = np.diff(grid) * (density[1:] + density[:-1]) / 2
-        expected.append(share**2 + np.concatenate([[0], np.cumsum(steps)]))
-    if not wanted:
-        return 0.0
-    misfit = np.abs(np.mean(expected, axis=0) - np.mean(wanted))
-    correlation = float(grid[int(np.argmin(misfit))])
-    if correlation < 0.1:
-        return 0.0
-    sizes = np.linspace(0.2, 20, 397)
-    found = np.array([neighbour_correlation(size) for size in sizes])
-    return float(np.interp(min(correlation, found[-1]), found, sizes))
-
-
-def find_bias(walls: Sequence[Wall], distances_m: Sequence[float] | None) -> tuple[float, ...]:
-    """Polynomial of the error of the wall's distance at the principal point, the constant first.
-
-    A constant, a line or a parabola: a higher power must lower the corrected RMS error by a fifth,
-    and there must be more distances than coefficients. A slanted wall counts less: an error of its
-    tilt is one of its distance. (0,) without references.
-    """
-    if distances_m is None:
-        return (0.0,)
-    true = np.array(distances_m)
-    error = np.array([wall.centre_m for wall in walls]) - true
-    tilt = np.deg2rad([float(np.median(wall.tilt_deg[wall.region])) for wall in walls])
-    weight = np.cos(tilt) ** 2 / true  # errors grow with the distance and more
-    best, least = np.zeros(1), np.inf
-    for degree in range(min(len(np.unique(true)) - 1, 2) + 1):
-        found = np.polynomial.polynomial.polyfit(true, error, degree, w=weight)
-        off = weight * (error - np.polynomial.polynomial.polyval(true, found))
-        free = len(true) - degree - 1
-        rms = float(np.sqrt((off**2).sum() / free)) if free else np.inf
-        if degree == 0 or rms < 0.8 * least:
-            best, least = found, rms
-    return tuple(float(c) for c in best)
