@@ -23,7 +23,7 @@ from qs3.config.checks import check_choice, check_float
 from qs3.datamodules.beside import SOURCE_TWINS
 from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
-from qs3.methods.base import check_taught, class_loss, weight
+from qs3.methods.base import check_taught, class_loss, weight, weighted
 from qs3.methods.mean_teacher import MeanTeacher
 from qs3.models.norms import use_domain
 
@@ -149,9 +149,9 @@ class Twin(MeanTeacher):
             again = net(source["again"])
         if self.again_weight:
             ce = class_loss(again, source["y_source"], self.smoothing)
-            terms["again"] = self.again_weight * ce
+            terms["again"] = weighted(self.again_weight, ce)
         if self.view_weight:
-            terms["views"] = self.view_weight * jensen_shannon(logits, again)
+            terms["views"] = weighted(self.view_weight, jensen_shannon(logits, again))
         if self.target_weight:
             ramp = self.target_weight * math.exp(-5 * (1 - batch["progress"]) ** 2)
             terms["target"] = ramp * self._of_the_target(net, batch["target"])
@@ -172,7 +172,7 @@ class Twin(MeanTeacher):
             classes = learner.head(own)
         if self.twin_weight:
             ce = class_loss(classes, source["y_source"], self.smoothing)
-            terms["twin"] = self.twin_weight * ce
+            terms["twin"] = weighted(self.twin_weight, ce)
         if not self._distils:
             return terms
         if self.taught_by == "mean":
@@ -180,10 +180,10 @@ class Twin(MeanTeacher):
             classes = self.teacher.head(own)
         if self.logit_weight:
             distance = distillation(classes.detach(), logits, self.temperature)
-            terms["logits"] = self.logit_weight * distance
+            terms["logits"] = weighted(self.logit_weight, distance)
         if self.feature_weight:
             cosine = F.cosine_similarity(own.detach().float(), features.float(), dim=1)
-            terms["features"] = self.feature_weight * (1 - cosine).mean()
+            terms["features"] = weighted(self.feature_weight, (1 - cosine).mean())
         return terms
 
     def _of_the_target(self, net: Any, target: dict[str, Tensor]) -> Float[Tensor, ""]:
@@ -205,7 +205,7 @@ def distillation(
     """
     q = (teacher.float() / temperature).log_softmax(dim=1)
     p = (student.float() / temperature).log_softmax(dim=1)
-    return temperature**2 * F.kl_div(p, q, log_target=True, reduction="batchmean")
+    return F.kl_div(p, q, log_target=True, reduction="sum") * (temperature**2 / len(p))
 
 
 def jensen_shannon(first: Float[Tensor, "b c"], second: Float[Tensor, "b c"]) -> Float[Tensor, ""]:
