@@ -422,11 +422,13 @@ def test_written_is_read(tmp_path_factory, run, points, gravity, classes, low):
         classes=tuple(classes),
         usual={"height": [low, float("inf")]},
         held_out=None,  # it has a number for each class
+        learnt=(1 / len(classes),) * len(classes),
     )
     file = tmp_path_factory.mktemp("written") / "result.pt"
     write_result(file, result)
     again = read_result(file)
-    for field in ("points", "stored_points", "gravity", "classes", "usual", "model", "target"):
+    fields = ("points", "stored_points", "gravity", "classes", "usual", "model", "target", "learnt")
+    for field in fields:
         assert getattr(again, field) == getattr(result, field)
     assert all(torch.equal(again.weights[k], v) for k, v in result.weights.items())
 
