@@ -67,9 +67,12 @@ def png_header(data: bytes, where: str) -> tuple[int, int, int, int]:
         raise DataError(f"{where}: not a PNG")
     if not (1 <= width <= _MAX_SIDE_PX and 1 <= height <= _MAX_SIDE_PX):
         raise DataError(f"{where}: a PNG of {width} x {height} px; refused")
-    at = len(_SIGNATURE)
+    at, headers = len(_SIGNATURE), 0
     while at < len(data):  # part by part: whatever length one names, memory would be taken for it
+        headers += data[at + 4 : at + 8] == b"IHDR"
         at += 12 + int.from_bytes(data[at : at + 4], "big")
+    if headers > 1:  # a reader may take the last one's size
+        raise DataError(f"{where}: the PNG has several headers; refused")
     if at > len(data) or not data.endswith(_END):
         raise DataError(f"{where}: the PNG is broken off")
     return width, height, bits, colour

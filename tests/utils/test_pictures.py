@@ -68,6 +68,7 @@ def test_a_picture_too_large_is_refused_by_its_header(size):
         (b"GIF89a" + bytes(100), "not a PNG"),
         (png(4, 4, 3), "grey with 8 or 16 bits"),
         (png(4, 4)[:-5], "broken off"),
+        (png(4, 4)[:33] + tiny_png(60_000, 60_000)[8:], "several headers"),
     ],
 )
 def test_what_is_no_grey_png_is_refused(data, message):
