@@ -127,11 +127,6 @@ def weight(key: str, value: float) -> float:
     return float(check_float(f"method.{key}", value, ">= 0"))
 
 
-def weighted(factor: float, loss: Tensor) -> Tensor:
-    """`factor` times a loss; as it is at 1, which saves a GPU a kernel there and one back."""
-    return loss if factor == 1 else factor * loss
-
-
 @torch.no_grad()
 def feature_dims(net: Any) -> tuple[int, int | None]:
     """Widths of a net's features: of a cloud, and of a point (None: it has none per point).

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _LEAST_DISTANCES = 3  # of walls: two tell no law from chance
 _APART = 1.05  # times as far is another distance
+_MOST_BIAS = 0.3  # of a distance: a larger one is of other units or another frame
 _LONGEST_M = 2.0  # baseline of a depth camera: a longer one is in another unit
 
 
@@ -111,6 +112,13 @@ def fit(
     distances = None if distances is None else [distances[i] for i in kept]
     steps = find_steps(frames)
     walls = [find_wall(frame.name, frame.depth_m, camera) for frame in frames]
+    for wall, given in zip(walls, distances or [], strict=False):
+        if not abs(given - wall.centre_m) < _MOST_BIAS * wall.centre_m:
+            raise ConfigError(
+                f"distances= says {given:g} m for {wall.name}, where the camera sees the wall "
+                f"{wall.centre_m:.2f} m away: give metres, in the order of the frames, along the "
+                "optical axis"
+            )
     noise = find_noise(walls, steps, float(power) if power else None)
     doubts = check_walls(walls, noise, steps)
     if not few:

@@ -15,6 +15,7 @@ _SPAN_DEG = 5.0  # between the knots that are tried
 _LEAST_IN_SPAN = 2000
 _LEAST_HOLES = 400
 _PATCH_HOLES = 12  # holes' sizes that a patch is wide, or holes would lie in several
+_ROUNDS = 3  # of weights: the last two lead to the same knots
 _CERTAIN = (0.01, 0.99)  # no pixel counts more than one at these rates
 
 
@@ -39,26 +40,23 @@ def find_fill(walls: Sequence[Wall]) -> Fill:
     """Share of the wall's pixels that have a depth, by angle of incidence.
 
     Lines between knots at multiples of 5 degrees, by least squares, of which as few are kept as the
-    data allow (Schwarz 1978; holes count, not pixels, see `_together`): a mean over 5 degrees is
+    data ask for (Schwarz 1978; holes count, not pixels, see `_together`): a mean over 5 degrees is
     too low or too high at a bend, and a knot that chance alone moves says nothing of the camera.
     """
     tilt = np.concatenate([wall.tilt_deg[wall.region] for wall in walls])
     valid = np.concatenate([np.isfinite(wall.depth_m[wall.region]) for wall in walls]).astype(float)
-    spans = np.floor(tilt / _SPAN_DEG).astype(int)
-    pixels = np.bincount(spans)
+    pixels = np.bincount(_span(tilt))
     covered = np.flatnonzero(pixels >= _LEAST_IN_SPAN)
     hole_px = _hole_size(walls)
-    inside = np.isin(spans, covered)
-    edges = np.union1d(covered, covered + 1) * _SPAN_DEG
-    if not inside.any() or np.ptp(tilt[inside]) == 0:
+    inside = np.isin(_span(tilt), covered)
+    if not inside.any():
         return Fill((float(tilt.mean()),), (float(valid.mean()),), hole_px)
     seen_deg, seen_rates = (
-        tuple(float(x) for x in np.bincount(spans, values)[covered] / pixels[covered])
+        tuple(float(x) for x in np.bincount(_span(tilt), values)[covered] / pixels[covered])
         for values in (tilt, valid)
     )
-    tilt, valid = tilt[inside], valid[inside]
-    lines = _Lines(np.unique(np.clip(edges, tilt.min(), tilt.max())), tilt, valid)
-    kept, rates = lines.fewest(_together(walls, lines, hole_px))
+    lines = _Lines(_knots(tilt[inside], covered), tilt[inside], valid[inside])
+    kept, rates = lines.fewest(_together(walls, lines, covered, hole_px))
     return Fill(
         tuple(map(float, kept)),
         tuple(map(float, np.clip(rates, 0, 1))),
@@ -68,11 +66,28 @@ def find_fill(walls: Sequence[Wall]) -> Fill:
     )
 
 
+def _span(tilt: np.ndarray) -> np.ndarray:
+    """Number of the span of 5 degrees that angles lie in."""
+    return np.floor(tilt / _SPAN_DEG).astype(int)
+
+
+def _knots(tilt: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """[K] degrees: where spans meet, and the first and last angle of each row of spans.
+
+    No knot lies where nothing was seen: its rate would be a line drawn on into the blue.
+    """
+    found = []
+    for row in np.split(covered, np.flatnonzero(np.diff(covered) > 1) + 1):
+        own = tilt[np.isin(_span(tilt), row)]
+        found.append(np.clip(np.append(row, row[-1] + 1) * _SPAN_DEG, own.min(), own.max()))
+    return np.unique(np.concatenate(found))
+
+
 class _Lines:
     """Weighted least squares of lines between knots, for any of the knots.
 
     A pixel weighs as the inverse of its variance. Lines between some of the knots are sums of
-    those between all, so the pixels are looked at once.
+    those between all, so the pixels are looked at once for all of them.
 
     Args:
         knots: [K] degrees, ascending, around all of `tilt`.
@@ -80,16 +95,34 @@ class _Lines:
     """
 
     def __init__(self, knots: np.ndarray, tilt: np.ndarray, valid: np.ndarray) -> None:
-        self.knots, self.pixels = knots, len(tilt)
-        self.weight = np.ones_like(tilt)
-        for _ in range(2):  # all alike first: the variance is that of the rates found
-            self._sum(tilt, valid)
-            self.rates = self._solved(np.eye(len(knots)))[0]
-            self.weight = 1 / self.variance(tilt)
-        self._sum(tilt, valid)
+        self.knots, self.tilt, self.valid = knots, tilt, valid
+        count = len(knots)
+        self.left = np.clip(np.searchsorted(knots, tilt, side="right") - 1, 0, max(count - 2, 0))
+        widths = np.diff(knots) if count > 1 else np.ones(1)
+        self.share = (tilt - knots[self.left]) / widths[self.left]
+        self._sum(np.ones_like(tilt))
+        self.rates, _ = self._solved(np.eye(count))
+
+    def fewest(self, together: float) -> tuple[np.ndarray, np.ndarray]:
+        """Knots that are kept, and rates there; a single one is at the mean angle.
+
+        The knot that is needed least goes, down to none, and of these laws the one counts whose
+        misfit and price are least; the price of a knot is the logarithm of how many holes there
+        might be, which is `together` times less than pixels. Pixels weigh by the law that the round
+        before found, the first by none: weights of rates that chance made would favour it.
+        """
+        pixels = len(self.tilt)
+        price = together * np.log(max(pixels / together, 2.0))
+        rates: np.ndarray = np.full(len(self.tilt), self.valid.mean())
+        for _ in range(_ROUNDS):
+            rate = np.clip(rates, *_CERTAIN)
+            self._sum(1 / (rate * (1 - rate)))
+            kept, found = self._cheapest(price)
+            rates = np.interp(self.tilt, kept, found)
+        return kept, found
 
     def variance(self, tilt: np.ndarray) -> np.ndarray:
-        """Of one pixel at an angle."""
+        """Of one pixel at an angle, by the rates of all knots."""
         rate = np.clip(self.at(tilt), *_CERTAIN)
         return np.asarray(rate * (1 - rate))
 
@@ -97,47 +130,34 @@ class _Lines:
         """Rates with all knots."""
         return np.interp(tilt, self.knots, self.rates)
 
-    def fewest(self, together: float) -> tuple[np.ndarray, np.ndarray]:
-        """Knots that are kept, and rates there; a single one is the mean of all pixels.
-
-        The knot that is needed least goes, as long as the misfit grows by less than the logarithm
-        of the number of holes that may be or not, which is `together` times smaller than that of
-        the pixels.
-        """
-        price = together * np.log(max(self.pixels / together, 2.0))
+    def _cheapest(self, price: float) -> tuple[np.ndarray, np.ndarray]:
+        mean, misfit = self._solved(np.ones((len(self.knots), 1)))
+        best, least = (np.array([self.middle]), mean), misfit + price
         kept = np.arange(len(self.knots))
-        rates, misfit = self._solved(self._between(kept))
-        while len(kept) > 2:
-            tried = [
-                (self._solved(self._between(np.delete(kept, i))), i)
-                for i in range(1, len(kept) - 1)
-            ]
-            (fewer, more), i = min(tried, key=lambda one: one[0][1])
-            if more - misfit > price:
+        while len(kept) > 1:
+            rates, misfit = self._solved(self._between(kept))
+            if misfit + price * len(kept) < least:
+                best, least = (self.knots[kept], rates), misfit + price * len(kept)
+            fewer = [np.delete(kept, i) for i in range(1, len(kept) - 1)]
+            if not fewer:
                 break
-            kept, rates, misfit = np.delete(kept, i), fewer, more
-        if len(kept) == 2:
-            mean, more = self._solved(np.ones((len(self.knots), 1)))
-            if more - misfit <= price:
-                return np.array([self.middle]), mean
-        return self.knots[kept], rates
+            kept = min(fewer, key=lambda some: self._solved(self._between(some))[1])
+        return best
 
-    def _sum(self, tilt: np.ndarray, valid: np.ndarray) -> None:
+    def _sum(self, weight: np.ndarray) -> None:
         """The normal equations' matrix [K, K], right-hand side [K] and constant."""
-        count = len(self.knots)
-        left = np.clip(np.searchsorted(self.knots, tilt, side="right") - 1, 0, count - 2)
-        share = (tilt - self.knots[left]) / np.diff(self.knots)[left]
-        sums = [
-            np.bincount(left, self.weight * values, minlength=count)
-            for values in ((1 - share) ** 2, share**2, share * (1 - share))
-        ]
-        self.matrix = np.diag(sums[0] + np.roll(sums[1], 1))
-        off = np.diag(sums[2][:-1], 1)
-        self.matrix += off + off.T
-        self.side = np.bincount(left, self.weight * (1 - share) * valid, minlength=count)
-        self.side += np.bincount(left + 1, self.weight * share * valid, minlength=count)
-        self.constant = float((self.weight * valid**2).sum())
-        self.middle = float((self.weight * tilt).sum() / self.weight.sum())
+        count, left, share, valid = len(self.knots), self.left, self.share, self.valid
+
+        def summed(values: np.ndarray) -> np.ndarray:
+            return np.bincount(left, weight * values, minlength=count)
+
+        # What a pixel gives the knot on its left, and, one on, the knot on its right.
+        own = summed((1 - share) ** 2) + np.roll(summed(share**2), 1)
+        beside = np.diag(summed(share * (1 - share))[:-1], 1)
+        self.matrix = np.diag(own) + beside + beside.T
+        self.side = summed((1 - share) * valid) + np.roll(summed(share * valid), 1)
+        self.constant = float((weight * valid**2).sum())
+        self.middle = float((weight * self.tilt).sum() / weight.sum())
 
     def _between(self, kept: np.ndarray) -> np.ndarray:
         """[K, k] values at all knots of lines between those that are kept."""
@@ -152,17 +172,19 @@ class _Lines:
         return found, self.constant - float(side @ found)
 
 
-def _together(walls: Sequence[Wall], lines: _Lines, hole_px: float) -> float:
+def _together(walls: Sequence[Wall], lines: _Lines, covered: np.ndarray, hole_px: float) -> float:
     """How many pixels are a hole or not as one: 1 or more.
 
     By how much the number of holes in patches of the image varies, over by how much it would if
-    pixels were independent.
+    pixels were independent. Patches are at most a third of an image: holes of more than a 40th of
+    it reach beyond them, and are taken for more than they are.
     """
     varied = expected = 0.0
     for wall in walls:
         side = min(max(PATCH_PX, round(_PATCH_HOLES * hole_px)), min(wall.region.shape) // 3)
-        error = np.where(wall.region, np.isfinite(wall.depth_m) - lines.at(wall.tilt_deg), 0.0)
-        alone = np.where(wall.region, lines.variance(wall.tilt_deg), 0.0)
+        inside = wall.region & np.isin(_span(wall.tilt_deg), covered)
+        error = np.where(inside, np.isfinite(wall.depth_m) - lines.at(wall.tilt_deg), 0.0)
+        alone = np.where(inside, lines.variance(wall.tilt_deg), 0.0)
         varied += float((patches(error, side).sum(axis=(1, 3)) ** 2).sum())
         expected += float(patches(alone, side).sum())
     return max(1.0, varied / expected) if expected else 1.0

@@ -14,6 +14,7 @@ from qs3.geometry.cameras import Intrinsics
 _TRIES = 300
 _LEAST_PURE = 0.6  # share of the depths within the outline of the wall that lie on it
 _LEAST_PIXELS = 2000
+_LEAST_INSIDE = 400  # of its pixels within the rim
 _LEAST_THING = 50  # pixels that lie together off the wall and are not its noise
 _RIM = 40  # the rim left out is this part of the image's width
 _SHADOW = 12  # a shadow is narrower than this part of the image
@@ -96,12 +97,16 @@ def find_wall(name: str, depth_m: np.ndarray, camera: Intrinsics, seed: int = 0)
         )
     measured = np.where(mask > 0, depth_m, np.nan)
     plane, tilt = _view(fit.normal, camera, depth_m.shape)
-    distance = 1 / float(fit.normal[0])
-    # The mean of 1 / Z is that of a depth a little smaller than the mean.
-    distance_of_mean = distance + float(np.nanvar(1 / measured - 1 / plane)) * distance**3
-    more, error = _centre(measured - plane - (distance_of_mean - distance), camera)
-    centre = distance_of_mean + more
-    return Wall(name, measured, plane, tilt, _region(mask > 0, seen), centre, error, fit.gap_per_m)
+    region = _region(mask > 0, seen)
+    inside = int((region & (mask > 0)).sum())
+    if inside < _LEAST_INSIDE:
+        raise DataError(
+            f"{name}: only {inside} pixels of the wall are further from its edges than a "
+            f"{_RIM}th of the image; let it fill more of the view"
+        )
+    with np.errstate(divide="ignore"):
+        found, error = _centre(fit, design[fit.near], 1 / measured - 1 / plane, camera)
+    return Wall(name, measured, plane, tilt, region, found, error, fit.gap_per_m)
 
 
 class _Fit(NamedTuple):
@@ -176,39 +181,51 @@ def level_gap(inverse: np.ndarray) -> float:
     return float(np.median(np.diff(levels))) if len(levels) > 1 else 0.0
 
 
-def _centre(error_m: np.ndarray, camera: Intrinsics) -> tuple[float, float]:
-    """What to add to a plane's distance at the principal point, and the sum's standard error.
+def _centre(
+    fit: _Fit, design: np.ndarray, error_per_m: np.ndarray, camera: Intrinsics
+) -> tuple[float, float]:
+    """Distance that is measured at the principal point on average, and its standard error.
 
     A camera with a bias, or a lens that bends, sees a plane bent: the plane alone is not what it
-    measured in the middle. That is the mean of [h, w] errors around that point (symmetric, or a
-    slant would count as an error), which has few pixels: of noise that is smooth over many it holds
-    more than the plane itself. So it counts from two standard errors on, and the more the larger it
-    is (a garrote, Breiman 1995).
+    measured in the middle. That is the mean of errors around that point (symmetric, or a slant
+    would count as an error), which has few pixels: of noise that is smooth over many it holds more
+    than the plane itself. So it counts from two standard errors on, and the more the larger it is
+    (a garrote, Breiman 1995).
+
+    Args:
+        fit: the plane; its first coefficient is 1 / Z there.
+        design: [N, 3] of the pixels that it was fitted to.
+        error_per_m: [h, w] of 1 / Z from the plane, NaN where nothing was measured.
     """
-    height, width = error_m.shape
-    reach_v, reach_u = height // 10, width // 10
-    rows = np.abs(np.arange(height) - camera.cy_px) <= reach_v
-    cols = np.abs(np.arange(width) - camera.cx_px) <= reach_u
-    part = error_m[np.ix_(rows, cols)]
+    alone = _smooth_variance(error_per_m)
+    of_plane = float(np.linalg.inv(design.T @ design)[0, 0])
+    height, width = error_per_m.shape
+    rows = np.abs(np.arange(height) - camera.cy_px) <= height // 10
+    cols = np.abs(np.arange(width) - camera.cx_px) <= width // 10
+    part = error_per_m[np.ix_(rows, cols)]
     part = part[np.isfinite(part)]
-    alone = _smooth_variance(error_m)
-    plane = alone / max(int(np.isfinite(error_m).sum()), 1)
-    if not part.size:
-        return 0.0, float(np.sqrt(plane))
-    mean, variance = float(part.mean()), alone / part.size
-    counts = 1 - _BEND_SURE**2 * variance / mean**2 if mean else 0.0
-    if counts <= 0:
-        return 0.0, float(np.sqrt(plane))
-    return counts * mean, float(np.sqrt(plane + variance))
+    inverse, variance = float(fit.normal[0]), alone * of_plane
+    if part.size:
+        mean, of_mean = float(part.mean()), 1 / part.size
+        # The plane was fitted to these pixels, too: their errors from it are smaller by its own.
+        own = alone * max(of_mean - of_plane, 0.0)
+        counts = 1 - _BEND_SURE**2 * own / mean**2 if mean else 0.0
+        if counts > 0:
+            inverse += counts * mean
+            variance = alone * max(of_mean, of_plane)
+    distance = 1 / inverse
+    # The mean of 1 / Z is that of a depth a little smaller than the mean.
+    distance += float(np.nanvar(error_per_m)) * distance**3
+    return distance, float(np.sqrt(variance)) * distance**2
 
 
-def _smooth_variance(error_m: np.ndarray) -> float:
+def _smooth_variance(error: np.ndarray) -> float:
     """Variance of a mean over [h, w] errors with NaN, times their number.
 
     From second differences of means over patches in a row or a column, in which bends of the whole
     image are hardly seen. Where there are too few patches, that of single pixels.
     """
-    parts = patches(error_m)
+    parts = patches(error)
     count = np.isfinite(parts).sum(axis=(1, 3)).astype(float)
     means = np.nansum(parts, axis=(1, 3)) / np.maximum(count, 1)
     squares = []
@@ -221,7 +238,7 @@ def _smooth_variance(error_m: np.ndarray) -> float:
         squares.append(second[full] ** 2 / of_one)
     found = np.concatenate(squares)
     if len(found) < 10:
-        return float(np.nanvar(error_m)) if np.isfinite(error_m).any() else 0.0
+        return float(np.nanvar(error))
     return float(found.mean())
 
 

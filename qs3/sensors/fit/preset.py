@@ -28,7 +28,7 @@ class FittedPreset:
     Attributes:
         camera: of the frames.
         noise, steps, fill: see the modules that find them.
-        bias_m: coefficients, see FittedDepth.
+        bias_m: coefficients, see FittedDepth; None where no distances were given.
         baseline_m: as given; None if it was not.
         walls: the data.
         doubts: see qs3.sensors.fit.doubts; printed, and written into the preset.
@@ -38,7 +38,7 @@ class FittedPreset:
     noise: Noise
     steps: Steps
     fill: Fill
-    bias_m: tuple[float, ...]
+    bias_m: tuple[float, ...] | None
     baseline_m: float | None
     walls: Sequence[Wall]
     doubts: Sequence[str] = ()
@@ -69,7 +69,7 @@ noise_power: {noise.power:g}{assumed}
 correlation_px: {noise.correlation_px:.3g}
 inverse_step_per_m: {self.steps.inverse_per_m:.8g}
 depth_step_m: {self.steps.depth_m:.6g}
-bias_m: {_numbers(self.bias_m)}
+bias_m: {_numbers(self.bias_m or (0.0,))}
 tilts_deg: {_numbers(self.fill.tilts_deg)}
 fill_rates: {_numbers(self.fill.rates)}
 hole_px: {self.fill.hole_px:.3g}
@@ -103,9 +103,8 @@ baseline_m: {baseline}
             for tilt, rate in zip(self.fill.tilts_deg, self.fill.rates, strict=True)
         )
         lines.append(f"fill      {rates}")
-        known = any(self.bias_m)
         lines.append(
-            "bias      " + (f"{_numbers(self.bias_m)} m (constant first)" if known else
+            "bias      " + (f"{_numbers(self.bias_m)} m (constant first)" if self.bias_m else
             "unknown, taken as 0: give the true distances with distances=")
         )  # fmt: skip
         return lines + [f"doubtful  {doubt}" for doubt in self.doubts]
