@@ -170,7 +170,7 @@ def test_what_is_published_alone_is_never_run(pointda, tmp_path):
     without_any = {
         "source only", "source only, instance norm", "DANN", "PointDAN", "GAST", "GAST+SPST",
         "MLSP+SPST", "Self-Distillation", "PCFEA", "PCM+QBST", "CPCM", "PCM+CBST",
-        "PCM+CRST (LRENT)", "PCM+CRST (MRKLD)", "PCM+SPST", "AdaBN", "TENT",
+        "PCM+CRST (LRENT)", "PCM+CRST (MRKLD)", "PCM+SPST", "AdaBN", "TENT", "Twins (ours)",
     }  # fmt: skip
     named = {job.name.rsplit(", ", 2)[0] for job in jobs}
     assert named == without_any | {"DefRec+PCM"}
