@@ -11,11 +11,12 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from importlib.util import find_spec
 from itertools import pairwise
 
 import torch
 from torch import Tensor
+
+from qs3.utils.jit import has_numba
 
 _ALONE = 1 << 16  # values that are too few to be shared by threads
 _BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
@@ -23,7 +24,7 @@ _BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
 
 def usable(x: Tensor) -> bool:
     """Whether the operations of this module may be called for `x`."""
-    return x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and _has_numba()
+    return x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and has_numba()
 
 
 @torch.library.custom_op("qs3::neighbour_max", mutates_args=())
@@ -172,8 +173,3 @@ def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:
 def _threads(number: int, process: int) -> ThreadPoolExecutor:
     """Threads of this process: a fork has none of its parent's."""
     return ThreadPoolExecutor(number, thread_name_prefix="qs3-kernels")
-
-
-@cache
-def _has_numba() -> bool:
-    return find_spec("numba") is not None

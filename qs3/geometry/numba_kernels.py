@@ -6,24 +6,14 @@ Inner loops begin at 0: an index that may be negative keeps LLVM from using vect
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
-_SETTINGS: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": "numpy"}
+from qs3.utils.jit import compiled
 
 
-def _compiled(kernel: Callable[..., None]) -> Any:
-    """At the first call for each type; kept beside this file, or in the user's cache."""
-    try:
-        return numba.njit(cache=True, **_SETTINGS)(kernel)
-    except RuntimeError:  # neither folder can be written
-        return numba.njit(**_SETTINGS)(kernel)
-
-
-@_compiled
+@compiled
 def neighbour_max(x: Any, index: Any, best: Any, where: Any, begin: int, end: int) -> None:
     """Maxima of x[index[i]] a channel and the first rows that have them; NaN is above all.
 
@@ -55,7 +45,7 @@ def neighbour_max(x: Any, index: Any, best: Any, where: Any, begin: int, end: in
                 most[channel], at[channel] = value, row
 
 
-@_compiled
+@compiled
 def add_and_minima(values: Any, more: Any, minima: Any, begin: int, end: int) -> None:
     """values[i] += more[i // r], r rows a cloud; and the least of each group of columns.
 
@@ -78,7 +68,7 @@ def add_and_minima(values: Any, more: Any, minima: Any, begin: int, end: int) ->
             values[i, j] += other[j]
 
 
-@_compiled
+@compiled
 def kth_smallest(bits: Any, limits: Any, bound: Any, begin: int, end: int) -> None:
     """The k-th smallest number of each row, by halving the range that it lies in; NaN is above all.
 
@@ -118,7 +108,7 @@ def kth_smallest(bits: Any, limits: Any, bound: Any, begin: int, end: int) -> No
         bound[i] = low if low >= zero else kind(low ^ top)
 
 
-@_compiled
+@compiled
 def collect_below(
     values: Any, minima: Any, bound: Any, few: Any, column: Any, count: Any, begin: int, end: int
 ) -> None:
@@ -157,7 +147,7 @@ def collect_below(
             where[j] = 0
 
 
-@_compiled
+@compiled
 def take_in_order(few: Any, column: Any, count: Any, out: Any, begin: int, end: int) -> None:
     """Columns of the smallest of count[i] values, smallest first, and of equal ones the first.
 
@@ -195,7 +185,7 @@ def take_in_order(few: Any, column: Any, count: Any, out: Any, begin: int, end: 
                 out[i, rank[a]] = column[i, a]
 
 
-@_compiled
+@compiled
 def add_where(grad: Any, where: Any, out: Any, begin: int, end: int) -> None:
     """out[where[i, c], c] += grad[i, c], of these channels."""
     for i in range(grad.shape[0]):
@@ -204,7 +194,7 @@ def add_where(grad: Any, where: Any, out: Any, begin: int, end: int) -> None:
             out[rows[c], begin + c] += values[c]
 
 
-@_compiled
+@compiled
 def add_to_neighbours(x: Any, index: Any, out: Any, begin: int, end: int) -> None:
     """out[index[i, j]] += x[i], of these channels."""
     k = index.shape[1]
@@ -216,7 +206,7 @@ def add_to_neighbours(x: Any, index: Any, out: Any, begin: int, end: int) -> Non
                 row[c] += values[c]
 
 
-@_compiled
+@compiled
 def add_products(
     x: Any, weight: Any, grad: Any, where: Any, dx: Any, dweight: Any, begin: int, end: int
 ) -> None:

@@ -63,26 +63,28 @@ def _position_in_tree(cloud: np.ndarray, height: int, start: int) -> int:
     large value from the left changes places with the i-th small one from the right.
     """
     position, offset = start, 0
+    axes = np.ascontiguousarray(cloud.T)
     for _ in range(height):
-        if len(cloud) == 1:
+        count = axes.shape[1]
+        if count == 1:
             break
-        values = cloud[:, np.argmax(np.ptp(cloud, axis=0))]
-        mean = np.cumsum(values, dtype=np.float32)[-1] / np.float32(len(values))  # added in order
+        values = axes[np.argmax(np.ptp(axes, axis=1))]
+        mean = np.cumsum(values, dtype=np.float32)[-1] / np.float32(count)  # added in order
         small = values < mean
         split = np.count_nonzero(small)
-        order = np.arange(len(values))
         left = np.flatnonzero(~small[:split])
         right = split + np.flatnonzero(small[split:])[::-1]
-        order[left], order[right] = right, left
         if position < split and not small[position]:
             position = right[np.searchsorted(left, position)]
         elif position >= split and small[position]:
             position = left[len(right) - 1 - np.searchsorted(right[::-1], position)]
-        split = min(max(split, 1), len(values) - 1)
-        half = slice(0, split) if position < split else slice(split, None)
-        cloud = cloud[order[half]]
-        if position >= split:
-            position, offset = position - split, offset + split
+        swapped = axes.copy()
+        swapped[:, left], swapped[:, right] = axes[:, right], axes[:, left]
+        split = min(max(split, 1), count - 1)
+        if position < split:
+            axes = swapped[:, :split]
+        else:
+            axes, position, offset = swapped[:, split:], position - split, offset + split
     return int(offset + position)
 
 

@@ -20,6 +20,7 @@ from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.placement import UnitCube
 from qs3.sensors.base import DepthFrame, window_of
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.matching import ReferenceMatcher, scores
 from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene
 from qs3.sensors.renderers.blender import BlenderRenderer
 from qs3.sensors.renderers.gloss import Gloss
@@ -131,6 +132,21 @@ def test_back_projection_against_the_released_loop(benchmark, capsys):
         report(
             benchmark, capsys, "3,600 pixels to points", benchmark.stats.stats.min, "loop", theirs
         )
+
+
+def test_correlation_against_numpy(benchmark, capsys, monkeypatch):
+    """A view of K's: 64 disparities, by compiled loops and by numpy's operations."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (400, 480), dtype=np.uint8)
+    reference = rng.integers(0, 256, (400, 640)).astype(np.float32)
+    matcher = ReferenceMatcher()
+    found = benchmark.pedantic(matcher.match, (image, reference, 90), rounds=8, warmup_rounds=1)
+    monkeypatch.setattr(scores, "has_numba", lambda: False)
+    plain = matcher.match(image, reference, 90)
+    np.testing.assert_array_equal(found.disparity, plain.disparity)
+    if benchmark.enabled:
+        theirs = best_s(lambda: matcher.match(image, reference, 90), 8)
+        report(benchmark, capsys, "correlation", benchmark.stats.stats.min, "numpy", theirs)
 
 
 class Recorded:

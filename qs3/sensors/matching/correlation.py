@@ -9,6 +9,7 @@ import numpy as np
 
 from qs3.config.checks import check_ranges
 from qs3.sensors.matching.base import Match
+from qs3.sensors.matching.scores import correlation, winner
 from qs3.sensors.matching.subpixel import linearised
 from qs3.sensors.pixel_status import Reason, first_reason
 
@@ -54,20 +55,11 @@ class NormalisedCorrelation:
         """Disparities; see `Matcher.match`."""
         scores = self._scores(image, other.astype(np.float32, copy=False), first)
         last = len(scores) - 1
-        best = scores.argmax(axis=0)
-
-        def score_at(index: np.ndarray) -> np.ndarray:
-            return np.take_along_axis(scores, index[None], axis=0)[0]
-
-        top = score_at(best)
-        lower, upper = score_at(np.maximum(best - 1, 0)), score_at(np.minimum(best + 1, last))
+        found = winner(scores)
+        best, top, lower, upper = found.place, found.top, found.lower, found.upper
         consistent = self._agrees(scores, best)
-        # The runner-up: blank the winner's neighbourhood and look again.
-        for near in range(-2, 3):
-            np.put_along_axis(scores, np.clip(best + near, 0, last)[None], -1, axis=0)
-        second = scores.max(axis=0)
         inner = (best > 0) & (best < last)
-        unique = top - second >= self.uniqueness
+        unique = top - found.second >= self.uniqueness
         valid = inner & (top >= self.min_score) & unique & consistent
 
         curvature = np.maximum(2 * top - lower - upper, np.float32(1e-6))
@@ -119,18 +111,20 @@ class NormalisedCorrelation:
         mean_r = mean(reference)
         spread_r = spread(reference, mean_r)
 
-        scores = np.full((self.num_disparities, height, width), -1, dtype=np.float32)
-        for k in range(self.num_disparities):
+        scores = np.empty((self.num_disparities, height, width), dtype=np.float32)
+        for k, score in enumerate(scores):
             # Column c meets column first + c - disparity of the other image.
             start = first - (self.min_disparity + k)
             low, high = max(0, -start), min(width, whole - start)
             if high - low < self.window_px:
+                score[:] = -1
                 continue
-            here = slice(low, high)
-            there = slice(start + low, start + high)
+            score[:, :low], score[:, high:] = -1, -1
+            here, there = slice(low, high), slice(start + low, start + high)
             product = mean(grey[:, here] * reference[:, there])
-            covariance = product - mean_i[:, here] * mean_r[:, there]
-            scores[k, :, here] = covariance / (spread_i[:, here] * spread_r[:, there])
+            means = mean_i[:, here], mean_r[:, there]
+            spreads = spread_i[:, here], spread_r[:, there]
+            correlation(product, means, spreads, score[:, here])
         return scores
 
 
