@@ -29,6 +29,7 @@ from qs3.data.store import (
     write_pointset,
 )
 from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.generation.checks import check, check_recipe
 from qs3.generation.code_fingerprint import code_fingerprint
 from qs3.generation.contact_sheets import OBJECTS, clouds_picture, infrared_picture
 from qs3.generation.disk import check_folder, disk_errors_explained
@@ -36,19 +37,8 @@ from qs3.generation.made_of import made_of
 from qs3.generation.materials import DRAWN
 from qs3.generation.mesh_sizes import warn_of_sizes
 from qs3.generation.object_parts import InParts, Parts
-from qs3.generation.plan import (
-    benchmark,
-    check,
-    check_recipe,
-    describe,
-    keep,
-    left_alone,
-    mesh_folder,
-    mesh_items,
-    mesh_root,
-    stated_hash,
-    stored_config,
-)
+from qs3.generation.objects import left_alone, mesh_folder, mesh_items, mesh_root
+from qs3.generation.plan import benchmark, describe, keep, stated_hash, stored_config
 from qs3.generation.provenance import PROVENANCE
 from qs3.generation.recipe_fingerprint import recipe_fingerprint
 from qs3.generation.travel import software

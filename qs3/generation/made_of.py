@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.compose import choices, composed
 from qs3.data.made_of import MadeOf
-from qs3.generation.plan import known_classes, mesh_root
+from qs3.generation.objects import known_classes, mesh_root
 
 
 def made_of(

@@ -11,10 +11,10 @@ import numpy as np
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError, DataError
+from qs3.generation.checks import check, check_recipe
 from qs3.generation.materials import MixedMaterials
 from qs3.generation.materials_file import with_materials
 from qs3.generation.mesh_sizes import warn_of_lost
-from qs3.generation.plan import check, check_recipe
 from qs3.generation.provenance import Keep
 from qs3.generation.recipes import Cloud
 from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP

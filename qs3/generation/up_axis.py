@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from qs3.classes import CLASSES, known_as
 from qs3.data.inspection.gravity import POINTS, UPS, catalogue_model, prefers
 from qs3.errors import MeshError
-from qs3.generation.plan import mesh_folder
+from qs3.generation.objects import mesh_folder
 from qs3.geometry.sampling import surface_sample
 from qs3.meshes.io import DECLARE_UP
 from qs3.meshes.mesh import Mesh

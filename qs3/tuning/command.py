@@ -16,7 +16,8 @@ from torch import Tensor
 from qs3.config.hydra import build
 from qs3.data.store import open_pointset
 from qs3.errors import ConfigError, DataError
-from qs3.generation.plan import check, mesh_items
+from qs3.generation.checks import check
+from qs3.generation.objects import mesh_items
 from qs3.generation.plan import settings as plan_settings
 from qs3.generation.recipes import Mesh2Point
 from qs3.generation.scan import composed_recipe

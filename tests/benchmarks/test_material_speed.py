@@ -17,7 +17,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from qs3.config.compose import composed
 from qs3.config.hydra import build
-from qs3.generation.plan import mesh_items
+from qs3.generation.objects import mesh_items
 from qs3.generation.workers import Job, scan_one
 from qs3.meshes.source import MeshItem
 from qs3.sensors.renderers.base import Renderer

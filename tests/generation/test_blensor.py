@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 from qs3.config.hydra import build
 from qs3.errors import MissingDataError
 from qs3.generation.command import generate
-from qs3.generation.plan import mesh_items
+from qs3.generation.objects import mesh_items
 from qs3.sensors.devices.blensor_kinect import DotMask
 from qs3.sensors.devices.fringe import FringeProjection
 from qs3.sensors.devices.gaussian_time_of_flight import GaussianTimeOfFlight

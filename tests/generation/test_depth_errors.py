@@ -12,8 +12,8 @@ import yaml
 import qs3
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
+from qs3.generation.checks import check
 from qs3.generation.depth_errors import DepthErrors
-from qs3.generation.plan import check
 from qs3.generation.plan import settings as plan_settings
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.meshes.mesh import merge

@@ -15,15 +15,9 @@ from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.errors import ConfigError, MissingDataError
 from qs3.generation.camera_poses import AnchoredViews
-from qs3.generation.plan import (
-    KEYS,
-    benchmark,
-    check,
-    describe,
-    mesh_items,
-    settings,
-    stored_config,
-)
+from qs3.generation.checks import KEYS, check
+from qs3.generation.objects import mesh_items
+from qs3.generation.plan import benchmark, describe, settings, stored_config
 from qs3.generation.scenes import Alone, Room
 from qs3.tools import quickstart
 from tests.generation.generating import ROOT

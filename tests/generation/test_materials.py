@@ -11,11 +11,11 @@ import qs3
 from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.errors import ConfigError
+from qs3.generation.checks import check, check_recipe
 from qs3.generation.command import generate
 from qs3.generation.lights import LightAbove
 from qs3.generation.made_of import _sensor
 from qs3.generation.materials import Kind, MixedMaterials, parts_of
-from qs3.generation.plan import check, check_recipe
 from qs3.generation.plan import settings as plan_settings
 from qs3.geometry.cameras import Camera, Intrinsics, look_at
 from qs3.meshes.mesh import Mesh, merge

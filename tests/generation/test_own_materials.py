@@ -11,7 +11,8 @@ from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from qs3.generation.command import generate
 from qs3.generation.materials import INFRARED_ALBEDO, surface_of
-from qs3.generation.plan import describe, mesh_items
+from qs3.generation.objects import mesh_items
+from qs3.generation.plan import describe
 from qs3.generation.travel import sent
 from qs3.geometry.cameras import Camera, Intrinsics, look_at
 from qs3.meshes.finishes import Finish, linear

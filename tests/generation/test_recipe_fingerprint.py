@@ -11,7 +11,8 @@ import qs3
 from qs3.data.store import open_pointset
 from qs3.generation.code_fingerprint import HARMLESS, MAKES_CLOUDS, code_fingerprint
 from qs3.generation.command import generate
-from qs3.generation.plan import describe, mesh_items
+from qs3.generation.objects import mesh_items
+from qs3.generation.plan import describe
 from qs3.generation.recipe_fingerprint import recipe_fingerprint
 from tests.generation.generating import config
 

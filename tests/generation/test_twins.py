@@ -8,8 +8,8 @@ from trimesh.proximity import closest_point_naive
 from qs3.config.hydra import build
 from qs3.data.store import open_pointset, open_table, read_meta
 from qs3.errors import ConfigError, DataError
+from qs3.generation.checks import check
 from qs3.generation.command import generate
-from qs3.generation.plan import check
 from qs3.generation.provenance import NO_RESIDUAL_M, Keep
 from qs3.generation.twins import fused_twins, true_points, whole_surface
 from qs3.geometry.cameras import Camera, Intrinsics

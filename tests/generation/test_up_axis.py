@@ -12,8 +12,9 @@ from qs3.data.inspection.gravity import UPS, catalogue_model
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.errors import ConfigError
+from qs3.generation.checks import check
 from qs3.generation.command import generate
-from qs3.generation.plan import check, mesh_items
+from qs3.generation.objects import mesh_items
 from qs3.generation.up_axis import Evidence, _said, evidence, up_direction, with_up_axis
 from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.folder import MeshFolder

@@ -11,7 +11,7 @@ from qs3.config.compose import composed
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from qs3.generation.command import generate
-from qs3.generation.plan import mesh_items
+from qs3.generation.objects import mesh_items
 from qs3.generation.scan import composed_recipe
 from qs3.inference.model_file import read_result, write_result
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo

@@ -210,7 +210,7 @@ def kept_object(
 
 
 def _item(cfg: Any, object_id: str | None) -> MeshItem:
-    from qs3.generation.plan import mesh_items
+    from qs3.generation.objects import mesh_items
     from qs3.generation.up_axis import with_up_axis
 
     items = {item.id: item for item in mesh_items(with_up_axis(cfg))}

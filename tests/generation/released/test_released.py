@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
-from qs3.generation.plan import check
+from qs3.generation.checks import check
 from qs3.generation.released.views import GrowingJitterViews, box_of_corners, euler_xyz
 from qs3.geometry.cameras import look_at, project, rotation_xyz
 from qs3.meshes.mesh import Mesh
