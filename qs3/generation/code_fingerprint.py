@@ -1,7 +1,8 @@
 """A hash of the code that makes clouds: the same for the same code, whatever its words.
 
-Of the packages that make them and of what these take from others; what only checks, reads
-settings, shows or stores is left out (`HARMLESS`, which a test compares with the imports).
+Of the packages and modules that make them and of what these take from others; what only checks,
+reads settings, shows or stores is left out (`HARMLESS`, which a test compares with the imports), as
+are nets' geometry and what measures, fits or differentiates sensors.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[1]
 MAKES_CLOUDS = (
-    *("clouds", "generation", "geometry", "meshes", "sensors"),
-    *("classes.py", "data/frames", "utils/seeding.py"),
+    *("clouds", "generation", "meshes", "classes.py", "data/frames", "utils/seeding.py"),
+    *("geometry/cameras.py", "geometry/orthographic.py", "geometry/sampling.py"),
+    *("sensors/base.py", "sensors/pixel_status.py", "sensors/devices", "sensors/matching"),
+    *("sensors/optics", "sensors/renderers"),
 )
 HARMLESS = ("cluster", "config", "data", "errors", "utils")
 

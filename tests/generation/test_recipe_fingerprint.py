@@ -52,8 +52,8 @@ def test_settings_objects_and_libraries_do(recipe):
 def code(tmp_path):
     """A copy of the packages, in which a test may change a file."""
     root = Path(qs3.__file__).parent
-    (tmp_path / "utils").mkdir()
     for name in MAKES_CLOUDS:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         if name.endswith(".py"):
             shutil.copy(root / name, tmp_path / name)
         else:
@@ -90,6 +90,28 @@ def test_all_that_makes_clouds_is_in_it():
                 assert module.startswith((*covered, *harmless)), f"{path}: {module}"
     # Of what is harmless, these decide something, and are in it by name.
     assert {"qs3.utils.seeding", "qs3.data.frames"} <= set(covered)
+
+
+def test_all_that_a_config_of_generation_names_is_in_it():
+    """A class that no module imports makes clouds by its name in a config."""
+    conf = Path(qs3.__file__).parents[1] / "conf"
+    groups = (
+        *("synthesis", "sensor", "renderer", "scene", "tracking", "crop", "materials", "light"),
+        *("depth_errors", "released", "cutting", "counts"),
+    )
+    files = [file for group in groups for file in (conf / group).rglob("*.yaml")]
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    named = set(re.findall(r"_target_: (qs3\.[\w.]+)", text))
+    assert len(named) > 20
+    covered = tuple(f"qs3.{name.removesuffix('.py').replace('/', '.')}." for name in MAKES_CLOUDS)
+    assert [name for name in sorted(named) if not name.startswith(covered)] == []
+
+
+def test_what_makes_no_cloud_is_not_in_it():
+    """Else a faster net, or a better fit, would keep runs of the same clouds apart."""
+    covered = tuple(f"qs3.{name.removesuffix('.py').replace('/', '.')}" for name in MAKES_CLOUDS)
+    others = ("geometry.neighbours", "geometry.numba_kernels", "sensors.fit", "sensors.bench")
+    assert not [name for name in others if f"qs3.{name}".startswith(covered)]
 
 
 def test_a_dataset_holds_them(meshes, tmp_path):
