@@ -1,9 +1,13 @@
 """Variance of a mean of errors that are clustered two ways, and Student's quantiles for it.
 
-Cameron, Gelbach, Miller, "Robust Inference with Multiway Clustering", J. Business & Economic
-Statistics 2011, eq. 2.11. The two ways are seeds, and what objects share: the scans of a mesh, or
-the frames of a room. Few clusters say little about their variance, so each way has its own
-quantile: half width² = t²(S - 1) V_seeds + t²(M - 1) V_clusters.
+The two ways are seeds, and what objects share: the scans of a mesh, or the frames of a room. They
+are crossed, e_sc = a_s + b_c + r_sc, so each way's own clusters hold what is left, r, as well. It
+is taken off one of them, as Cameron, Gelbach, Miller, "Robust Inference with Multiway Clustering",
+J. Business & Economic Statistics 2011, eq. 2.11 take off the cells' variance; but theirs holds b,
+too, and with few seeds that is much of it: with two seeds that agree in all, half. So r is what is
+left of the cells without the means of both ways (two-way analysis of variance). Few clusters say
+little about their variance, so each way has its own quantile:
+half width² = t²(S - 1) V_seeds + t²(M - 1) V_clusters.
 """
 
 from __future__ import annotations
@@ -26,24 +30,30 @@ def weights(labels: Int[np.ndarray, " n"], balanced: bool) -> Float[np.ndarray, 
 
 
 def variances(
-    errors: Float[np.ndarray, "s n"], cluster: Int[np.ndarray, " n"]
+    errors: Float[np.ndarray, "s n"],
+    weight: Float[np.ndarray, " n"],
+    cluster: Int[np.ndarray, " n"],
 ) -> tuple[float, float]:
-    """V_seeds, and V_clusters less what is in both, or 0 if that is more.
+    """V_seeds, and V_clusters less what no way has of its own, or 0 if that is more.
 
     Args:
-        errors: what each seed and object adds to the sum over objects, of mean 0; the mean is over
-            seeds. Of one seed V_seeds is 0, and V_clusters is whole.
+        errors: of each seed and object, of mean 0; the mean whose variance it is has `weight` over
+            objects and 1/S over seeds. Of one seed V_seeds is 0, and V_clusters is whole.
+        weight: of each object, of sum 1.
         cluster: of each object, 0 ... M - 1, M >= 2.
     """
-    seeds = len(errors)
-    cells = np.zeros((seeds, int(cluster.max()) + 1))
-    np.add.at(cells.T, cluster, errors.T)
+    seeds, clusters = len(errors), int(cluster.max()) + 1
+    cells = np.zeros((seeds, clusters))
+    np.add.at(cells.T, cluster, (errors * weight).T)
     cells /= seeds
     of_clusters = _variance(cells.sum(axis=0))
     if seeds == 1:
         return 0.0, of_clusters
-    both = float((cells**2).sum())
-    return _variance(cells.sum(axis=1)), max(0.0, of_clusters - both)
+    of_seed = cells.sum(axis=1)
+    of_seed -= of_seed.mean()
+    rest = cells - cells.mean(axis=0) - of_seed[:, None] * np.bincount(cluster, weight, clusters)
+    left = float((rest**2).sum()) * seeds / (seeds - 1) * clusters / (clusters - 1)
+    return _variance(of_seed), max(0.0, of_clusters - left)
 
 
 def t2(clusters: Any) -> Any:

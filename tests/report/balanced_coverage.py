@@ -93,7 +93,7 @@ def ends(values: np.ndarray, label: np.ndarray, room: np.ndarray) -> list[tuple[
     about = values - recall[label]
     found = []
     for errors in (values - mean, about, about / np.sqrt(left)):
-        of_seeds, of_rooms = variances(errors * weight, room)
+        of_seeds, of_rooms = variances(errors, weight, room)
         half = math.sqrt(t2(int(room.max()) + 1) * of_rooms + t2(len(values)) * of_seeds)
         found.append((mean - half, mean + half))
     return found

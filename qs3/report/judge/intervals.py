@@ -119,7 +119,7 @@ def _over(
     m = int(block.max()) + 1
     if m < 2:
         return Share(mean, sem, None, None)
-    of_seeds, of_blocks = variances(errors * weight, block)
+    of_seeds, of_blocks = variances(errors, weight, block)
     half2 = t2(m) * of_blocks + (t2(seeds) * of_seeds if seeds > 1 else 0.0)
     half = math.sqrt(half2)
     return Share(mean, sem, max(ends[0], mean - half), min(ends[1], mean + half))

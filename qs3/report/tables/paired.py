@@ -114,7 +114,7 @@ def interval(
     if meshes < 2:
         raise DataError("a comparison needs test clouds of at least two meshes")
     mean = float((differences @ weight).mean())
-    of_seeds, of_meshes = variances((differences - mean) * weight, mesh)
+    of_seeds, of_meshes = variances(differences - mean, weight, mesh)
     half = math.sqrt(t2(seeds) * of_seeds + t2(meshes) * of_meshes)
     # with other numbers of seeds, each of which varies as these do
     halves = np.sqrt(_T2_OF_SEEDS * of_seeds * seeds / _SEEDS + t2(meshes) * of_meshes)

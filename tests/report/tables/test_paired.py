@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import t as student_t
 
 from qs3.errors import DataError
+from qs3.report.clustered import variances
 from qs3.report.tables.paired import compare, compare_on_average, interval
 from qs3.runs.predictions import Predictions
 
@@ -36,7 +37,8 @@ def test_by_hand():
     cells = np.array([[1.25, -0.75], [0.25, -0.75]]) / 8
     of_seeds = 2 * np.sum(cells.sum(1) ** 2)
     of_meshes = 2 * np.sum(cells.sum(0) ** 2)
-    of_meshes = max(0, of_meshes - np.sum(cells**2))
+    left = np.array([[0.25, -0.25], [-0.25, 0.25]]) / 8  # without means of both ways
+    of_meshes = max(0, of_meshes - 4 * np.sum(left**2))
     half = student_t.ppf(0.975, 1) * np.sqrt(of_seeds + of_meshes)
     np.testing.assert_allclose([found.low, found.high], [3 / 8 - half, 3 / 8 + half])
     assert not found.clear
@@ -88,6 +90,47 @@ def test_intervals_cover_as_often_as_they_say(seeds, of_seed, of_mesh):
     found = [simulated(rng, seeds, 40, 3, of_seed, of_mesh) for _ in range(500)]
     covered = np.mean([one.low <= 0.1 <= one.high for one in found])
     assert 0.92 <= covered <= 0.995
+
+
+@pytest.mark.parametrize("alike", [1.0, 0.95, 0.5])
+@pytest.mark.parametrize("seeds", [2, 3, 5])
+def test_intervals_cover_where_seeds_agree(seeds, alike):
+    """A share `alike` of the meshes has one answer in all seeds, as right answers mostly do."""
+    rng = np.random.default_rng(5)
+    chance = [0.1, 0.75, 0.15]
+    inside = []
+    for _ in range(400):
+        one = rng.choice([-1.0, 0.0, 1.0], 100, p=chance)
+        other = rng.choice([-1.0, 0.0, 1.0], (seeds, 100), p=chance)
+        d = np.where(rng.random(100) < alike, one, other)
+        found = interval(d, np.full(100, 1 / 100), np.arange(100))
+        inside.append(found.low <= 0.05 <= found.high)
+    assert np.mean(inside) >= 0.92
+
+
+@pytest.mark.parametrize("seeds", [2, 3, 10])
+def test_copies_of_a_seed_say_nothing_new(seeds):
+    rng = np.random.default_rng(6)
+    d, mesh = rng.normal(size=(1, 60)), np.repeat(np.arange(20), 3)
+    weight = np.full(60, 1 / 60)
+    none, once = variances(d - d.mean(), weight, mesh)
+    np.testing.assert_allclose(
+        variances(np.repeat(d - d.mean(), seeds, axis=0), weight, mesh), (none, once), atol=1e-18
+    )
+
+
+@pytest.mark.parametrize("seeds", [2, 4, 12])
+def test_what_no_way_has_of_its_own_is_taken_off(seeds):
+    """On average V_clusters is b's variance whatever the seeds, which `seeds_needed` relies on."""
+    rng = np.random.default_rng(7)
+    found = []
+    for _ in range(1000):
+        a, b, left = (rng.normal(size=size) for size in ((seeds, 1), (1, 30), (seeds, 30)))
+        e = 0.1 * a + 0.3 * b + 0.3 * left
+        found.append(variances(e - e.mean(), np.full(30, 1 / 30), np.arange(30)))
+    of_seeds, of_clusters = np.mean(found, axis=0)
+    assert of_seeds == pytest.approx(0.1**2 / seeds + 0.3**2 / (30 * seeds), rel=0.15)
+    assert of_clusters == pytest.approx(0.3**2 / 30, rel=0.1)
 
 
 def test_scans_of_a_mesh_are_not_counted_as_independent():
