@@ -1,7 +1,7 @@
 """Clouds as text: a row a point, in the dialects that programs write.
 
 Columns are x y z and perhaps more, by blanks, commas or semicolons, with decimal points or commas;
-# and // begin a comment. A first row of names, x y z and perhaps more, is passed over.
+# and // begin a comment. A first row of names says which columns are x, y and z, also as a comment.
 """
 
 from __future__ import annotations
@@ -19,11 +19,18 @@ from qs3.utils.memory import check_memory
 from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
 
+_XYZ = [b"x", b"y", b"z"]
+_USUAL = frozenset(  # of columns in comments, which may be about anything
+    b"x y z r g b a rgb rgba red green blue alpha i intensity reflectance id index point label "
+    b"class t time timestamp ring nx ny nz normal_x normal_y normal_z curvature confidence".split()
+)
+_HEAD = 65_536  # bytes of comments in which names are looked for
+_WORD = re.compile(rb"[^,;\s]+")
 _FIRST = re.compile(rb"^[ \t]*[^\s#][^\r\n]*", re.MULTILINE)  # row that is not empty
 
 
 def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Coordinates of all rows, float64.
+    """Coordinates of all rows, float64: the columns named x, y and z, else the first three.
 
     Raises:
         DataError: no rows of three numbers or more; names the line. Or a table that is no cloud.
@@ -31,7 +38,7 @@ def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
     data = path.read_bytes()
     # Copies and numbers, eight bytes from two letters; and each line is an object.
     check_memory(8 * len(data) + 48 * (data.count(b"\n") + data.count(b"\r")), path)
-    rows = _without_names(data.removeprefix(b"\xef\xbb\xbf").replace(b"//", b"#"))
+    rows, names = _named(data.removeprefix(b"\xef\xbb\xbf").replace(b"//", b"#"))
     if _decimal_commas(rows):
         rows = rows.replace(b",", b".").replace(b";", b" ")
     elif b"," in rows or b";" in rows:
@@ -48,17 +55,43 @@ def read_text(path: Path) -> Float[np.ndarray, "n 3"]:
     if table.size == 0:
         raise DataError(f"{path}: there are no points")
     check_shape(path, table.shape)
-    return table[:, :3]
+    return table[:, _columns(path, names, table.shape[1])]
 
 
-def _without_names(rows: bytes) -> bytes:
-    """The same with an empty line in place of a first row "x y z ..."."""
+def _columns(path: Path, names: list[bytes], count: int) -> list[int]:
+    """Of x, y and z among `count` columns of the file."""
+    if len(names) == count:
+        return [names.index(name) for name in _XYZ]
+    if names and names[:3] != _XYZ:  # x would be an id, or a colour
+        shown = printable(" ".join(name.decode("latin-1") for name in names[:8]))
+        raise DataError(
+            f"{path}: the first row names {len(names)} columns ({shown}), the others have {count}: "
+            "which are x, y and z?"
+        )
+    return [0, 1, 2]
+
+
+def _named(rows: bytes) -> tuple[bytes, list[bytes]]:
+    """With an empty line in place of a first row of names; and the names, if there are any.
+
+    A comment before all rows may have them as well, if it has no other words.
+    """
     first = _FIRST.search(rows)
     if first is None:
-        return rows
-    words = re.split(rb"[,;\s]+", first[0].split(b"#")[0].strip())[:3]
-    names = [word.strip(b'"').lower() for word in words]
-    return rows[: first.start()] + rows[first.end() :] if names == [b"x", b"y", b"z"] else rows
+        return rows, []
+    if names := _names(first[0].split(b"#")[0]):
+        return rows[: first.start()] + rows[first.end() :], names
+    for line in rows[: min(first.start(), _HEAD)].splitlines():
+        names = _names(line.strip().lstrip(b"#"))
+        if names and _USUAL.issuperset(names):
+            return rows, names
+    return rows, []
+
+
+def _names(line: bytes) -> list[bytes]:
+    """The words, in small letters, if x, y and z are each among them once; else none."""
+    words = [word.strip(b'"').lower() for word in _WORD.findall(line)]
+    return words if all(words.count(name) == 1 for name in _XYZ) else []
 
 
 def _decimal_commas(rows: bytes) -> bool:

@@ -68,6 +68,13 @@ class PartFiles:
                 f"{path} cannot be read ({error}): use force=true to start over"
             ) from error
         found = _differences(there, json.loads(json.dumps(recipe)))
+        if [key for key, _, _ in found] == ["objects"]:
+            raise ConfigError(
+                f"{self.folder} was made from other objects: {found[0][1]} there, {found[0][2]} "
+                "now. A dataset is of one set of meshes, and one that was repaired, added or "
+                f"removed makes another set: give another {self._elsewhere}, or force=true to make "
+                "all of it again."
+            )
         if found:
             lines = [f"  {key}: {old} there, {new} now" for key, old, new in found]
             raise ConfigError(

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from qs3.config.hydra import build
 from qs3.data.dataset_folder import CLOUDS, CONFIG, COSTS, INFRARED, check_ours, delete_dataset
 from qs3.data.domain import Domain
+from qs3.data.manifest import MANIFEST
 from qs3.data.store import (
     ManifestRow,
     PointSet,
@@ -104,6 +105,7 @@ def generate(cfg: DictConfig) -> PointSet:
             parts.clear()  # a kill after the last write leaves them
             log.info("%s is already there: %s", domain.label, folder)
             pointset = open_pointset(folder, domain.variant)
+            _warn_of_failed(pointset, items, folder)
             _check_strict(cfg, pointset, items, folder)
             return pointset
         start = time.perf_counter()
@@ -156,6 +158,19 @@ def _check_place(domain: Domain, force: bool) -> None:
             f"{domain.name} is part of the dataset in {domain.folder}, and force=true would "
             "replace all of it: generate that domain with force=true"
         )
+
+
+def _warn_of_failed(pointset: PointSet, items: list[MeshItem], folder: Path) -> None:
+    """Of a dataset that is there already: what it lacks, which its first run said."""
+    failed = len(items) - len(pointset.ids)
+    if not failed:
+        return
+    there = {pointset.classes[label] for label in pointset.labels}
+    none = sorted({item.cls for item in items} - there)
+    has = f"; no object of {', '.join(none)} is in it" * bool(none)
+    log.warning(
+        "%d of %d objects had failed (%s says why)%s", failed, len(items), folder / MANIFEST, has
+    )
 
 
 def _check_strict(cfg: DictConfig, pointset: PointSet, items: list[MeshItem], folder: Path) -> None:
@@ -255,7 +270,7 @@ def _write(
     good = [outcome.cloud for outcome in outcomes if outcome.cloud is not None]
     made = made_of(
         cfg,
-        (item.cls for item in items),
+        (item.cls for item, o in zip(items, outcomes, strict=True) if o.cloud is not None),
         (outcome.mesh_sha256 for outcome in outcomes),
         benchmark(cfg, recipe),
         recipe_fingerprint(recipe, (o.item_id for o in outcomes if o.cloud is not None)),

@@ -187,7 +187,7 @@ def _archive(path: Path, settings: Settings) -> Source:
     chosen, part = archive_part(archive, settings.part)
 
     def find(predictor: Predictor) -> Inputs:
-        return Inputs(archive_units(archive, chosen, predictor.classes), 0, "objects", part)
+        return Inputs(archive_units(archive, chosen, predictor.classes), {}, "objects", part)
 
     given = settings.floor is not None
     floor = None if given else floor_under(archive.cloud(i, True) for i in chosen)

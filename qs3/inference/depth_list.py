@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -63,7 +64,7 @@ class Shown:
     wrong: str = ""
 
 
-def find_shown(depth: str, mask: str, common: Shown) -> tuple[list[Shown], int]:
+def find_shown(depth: str, mask: str, common: Shown) -> tuple[list[Shown], Counter[str]]:
     """The pictures, and how many files of other kinds were passed over.
 
     Args:
@@ -79,7 +80,7 @@ def find_shown(depth: str, mask: str, common: Shown) -> tuple[list[Shown], int]:
     if place.suffix.lower() in LISTS and place.is_file():
         if mask or common.box:
             raise ConfigError(f"depth={depth} is a list; it says itself which mask or box is meant")
-        return _of_list(place, common), 0
+        return _of_list(place, common), Counter()
     if place.is_dir():
         return _of_folder(place, mask, common)
     if not place.is_file():
@@ -88,7 +89,7 @@ def find_shown(depth: str, mask: str, common: Shown) -> tuple[list[Shown], int]:
     if mask and not Path(mask).expanduser().is_file():
         raise MissingDataError(f"mask={mask} is not there, or no file")
     shown = replace(common, name=place.name, depth=place)
-    return [replace(shown, mask=Path(mask).expanduser()) if mask else shown], 0
+    return [replace(shown, mask=Path(mask).expanduser()) if mask else shown], Counter()
 
 
 def numbers(words: Any, count: int, what: str) -> tuple[float, ...]:
@@ -124,7 +125,7 @@ def _one_of(mask: str, box: Sequence[float] | None) -> None:
         )
 
 
-def _of_folder(place: Path, mask: str, common: Shown) -> tuple[list[Shown], int]:
+def _of_folder(place: Path, mask: str, common: Shown) -> tuple[list[Shown], Counter[str]]:
     masks = Path(mask).expanduser()
     if not mask or not masks.is_dir() or common.box:
         raise ConfigError(
@@ -132,12 +133,13 @@ def _of_folder(place: Path, mask: str, common: Shown) -> tuple[list[Shown], int]
             "depth=objects.csv with the columns depth and box or mask"
         )
     by_stem = {path.stem: path for path in sorted(masks.iterdir()) if path.suffix.lower() in IMAGES}
-    found, others = [], 0
+    found: list[Shown] = []
+    others: Counter[str] = Counter()
     for path in sorted(place.iterdir()):
         if path.name.startswith("."):
             continue
         if not path.is_file() or path.suffix.lower() not in IMAGES:
-            others += 1
+            others[path.suffix.lower()] += 1
             continue
         of = by_stem.get(path.stem)
         wrong = "" if of else f"no mask of its name in {mask}"

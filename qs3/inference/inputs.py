@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -88,8 +89,8 @@ Unit = Callable[[], Iterator[Sample | Row]]
 
 def find_files(
     place: str | Path, key: str = "input=", suffixes: Sequence[str] = SUFFIXES
-) -> tuple[list[Path], Path, int]:
-    """The files to read, what their names are relative to, and how many files are passed over.
+) -> tuple[list[Path], Path, Counter[str]]:
+    """The files to read, what their names are relative to, and how many of which ending it left.
 
     In a folder: all files of known formats at any depth, in order of their names; hidden ones and
     links to folders are left out. `key` stands before the place in messages; `suffixes` are those
@@ -104,19 +105,20 @@ def find_files(
         if place.suffix.lower() not in suffixes:
             hint = _instead(place.suffix.lower()) if key == "input=" else ""
             raise DataError(f"{key}{place}: unknown format; known are {', '.join(suffixes)}{hint}")
-        return [place], place.parent, 0
+        return [place], place.parent, Counter()
     if not place.is_dir():
         raise MissingDataError(f"{key}{place} is not there")
-    found, others = [], 0
+    found: list[Path] = []
+    others: Counter[str] = Counter()
     for folder, folders, names in os.walk(place):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
         for name in sorted(names):
             if name.startswith("."):
                 continue
-            if os.path.splitext(name)[1].lower() in suffixes:
+            if (suffix := os.path.splitext(name)[1].lower()) in suffixes:
                 found.append(Path(folder) / name)
             else:
-                others += 1
+                others[suffix] += 1
     if not found:
         raise MissingDataError(f"{key}{place} holds no file of {' '.join(suffixes)}")
     return sorted(found), place, others

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -86,14 +86,14 @@ class Settings:
 
 
 class Inputs(NamedTuple):
-    """What there is to read, how many files are passed over, and what a unit is called.
+    """What there is to read, how many files of which ending are passed over, what a unit is called.
 
     `part` says which part of an archive they are, if it has parts; `sizes` counts the objects of
     each unit, None: each is one.
     """
 
     units: Sequence[Unit]
-    others: int
+    others: Mapping[str, int]
     kind: str
     part: str = ""
     sizes: Callable[[], Sequence[int]] | None = None

@@ -14,6 +14,7 @@ from qs3.inference.pretrained import HEIGHTS
 from qs3.inference.scores import Count, disputed, right, scores
 from qs3.inference.settings import Inputs, Settings, Source
 from qs3.inference.table import Row
+from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.utils.plural import counted
 
 _SHOWN = 10  # failures in the text for the terminal
@@ -74,8 +75,7 @@ def told(
     if predictor.result.gravity == "none" and inputs.kind != "depth images":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
     if inputs.others:
-        others = counted(inputs.others, "file of another kind", "files of other kinds")
-        lines.append(f"{others} passed over")
+        lines.append(_passed_over(inputs.others))
     if failed:
         lines.append(f"{len(failed)} failed:")
         lines += [f"  {one['file']}: {one['reason']}" for one in failed[:_SHOWN]]
@@ -106,8 +106,18 @@ def _other_units(good: Sequence[Mapping[str, Any]]) -> list[str]:
     they = "it was" if count == 1 else "they were"
     return [
         f"{count} of them as large as if {they} not in metres, so these answers mean nothing: "
-        "divide millimetres by 1000"
+        "divide millimetres by 1000 and centimetres by 100, or leave out points far from the object"
     ]
+
+
+def _passed_over(others: Mapping[str, int]) -> str:
+    """Files of kinds that are not read, by their endings; meshes with what to do."""
+    most = Counter(others).most_common()
+    shown = ", ".join(f"{suffix or 'without ending'} {n}" for suffix, n in most[:_SHOWN])
+    shown += ", ..." * (len(most) > _SHOWN)
+    files = counted(sum(others.values()), "file of another kind", "files of other kinds")
+    scan = "; meshes are scanned first: qs3-generate meshes=FOLDER"
+    return f"{files} passed over: {shown}" + scan * any(suffix in MESHES for suffix in others)
 
 
 def _several(rows: Sequence[Row], inputs: Inputs) -> list[str]:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 from qs3.errors import ConfigError, Qs3Error
 from qs3.utils.threads import let_waiting_threads_sleep
+from qs3.utils.version import VERSION
 
 # Exit status, as shells say it.
 INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
@@ -244,7 +245,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Group:
-    """Commands below a word.
+    """Commands below a word, and `--version`.
 
     Attributes:
         name: as it is typed: "qs3 report".
@@ -271,6 +272,9 @@ class Group:
             return self.command(first)(rest)
         if first in (*_HELP, "help"):
             print(self.help())
+            return 0
+        if first in ("--version", "version"):
+            print(f"qs3 {VERSION}")
             return 0
         if self.default and "=" in first:
             return self.command(self.default)(argv)

@@ -219,10 +219,33 @@ def test_a_row_of_names_is_passed_over(head, row, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("head", "row", "expected"),
+    [
+        ("id x y z", "7 0.5 1.25 2.75", [0.5, 1.25, 2.75]),
+        ("# id x y z", "7 0.5 1.25 2.75", [0.5, 1.25, 2.75]),
+        ("//R G B X Y Z", "7 8 9 0.5 1.25 2.75", [0.5, 1.25, 2.75]),
+        ("# scanned today\n# z;y;x", "0,5;1,25;2,75", [2.75, 1.25, 0.5]),
+        ("time,z,y,x,", "7,2.75,1.25,0.5", [0.5, 1.25, 2.75]),
+        ("# offset x y z", "7 0.5 1.25 2.75", [7, 0.5, 1.25]),  # may be of anything
+        ("# x y z id", "0.5 1.25 2.75", [0.5, 1.25, 2.75]),
+    ],
+)
+def test_columns_go_by_their_names(head, row, expected, tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text(f"{head}\n{row}\n{row}\n")
+    np.testing.assert_array_equal(parse_cloud(path), [expected] * 2)
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("x y\n1 2 3\n", "line 1: 'x y' is not a row of numbers"),
-        ("t x y z\n1 2 3 4\n", "line 1: 't x y z' is not a row of numbers"),
+        ("# t x y z\n1 2 3\n", r"names 4 columns"),
+        (
+            "t x y z\n1 2 3\n",
+            r"4 columns \(t x y z\), the others have 3: which are x, y and z",
+        ),
+        ("x y z x\n1 2 3 4\n", "line 1: 'x y z x' is not a row of numbers"),
         ("x y z\nx y z\n1 2 3\n", "line 2: 'x y z' is not a row of numbers"),
         ("x y z\n", "there are no points"),
     ],

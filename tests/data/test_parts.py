@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import zipfile
 
 import numpy as np
@@ -90,20 +91,31 @@ def test_what_differs_is_named_by_its_key(tmp_path):
         '  settings.views: 5 there, "nothing" now',
         '  settings.more: "nothing" there, 1 now',
     ]
-    assert refusal(tmp_path, {**BEGUN, "objects": ["a", "e", "d"]}) == [
-        "  objects: 3, among them 'b' there, 3, among them 'd' now"
-    ]
-    assert refusal(tmp_path, {**BEGUN, "objects": ["a"]}) == [
-        "  objects: 3, among them 'b' there, 1 now"
-    ]
-    assert refusal(tmp_path, {**BEGUN, "objects": "all"}) == [
-        '  objects: ["a", "b", "c"] there, "all" now'
+    changed = {**BEGUN, "poses": [2], "objects": ["a"]}
+    assert refusal(tmp_path, changed) == [
+        "  objects: 3, among them 'b' there, 1 now",
+        "  poses: [1, 2] there, [2] now",
     ]
     for key in ("poses", "looks"):  # before and after "objects"
         assert refusal(tmp_path, {**BEGUN, key: [2, 1]}) == [f"  {key}: [1, 2] there, [2, 1] now"]
     short, long = "y" * 78, "y" * 79  # of which the quotes make 80 and 81 letters
     assert refusal(tmp_path, {**BEGUN, "note": short}) == [f'  note: "x" there, "{short}" now']
     assert refusal(tmp_path, {**BEGUN, "note": long}) == [f'  note: "x" there, "{long[:76]}... now']
+
+
+@pytest.mark.parametrize(
+    ("now", "said"),
+    [
+        (["a", "e", "d"], "3, among them 'b' there, 3, among them 'd' now"),
+        (["a"], "3, among them 'b' there, 1 now"),
+        ("all", '["a", "b", "c"] there, "all" now'),
+    ],
+)
+def test_other_objects_are_not_other_settings(tmp_path, now, said):
+    PartFiles(tmp_path, "out").begin(BEGUN)
+    message = f"made from other objects: {said}. A dataset is of one set of meshes"
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        PartFiles(tmp_path, "out").check({**BEGUN, "objects": now})
 
 
 def test_a_dozen_differences_are_enough(tmp_path):

@@ -197,9 +197,28 @@ def test_a_repaired_mesh_is_noticed(meshes, tmp_path):
     row = read_manifest(tmp_path / "modelnet10", first.classes)
     assert str(tmp_path) not in "".join(r.reason for r in row)
     (mine / "c0.ply").write_bytes(good)
-    with pytest.raises(ConfigError, match=r"objects: 4, among them 'chair/train/c0"):
+    with pytest.raises(ConfigError, match=r"other objects: 4, among them 'chair/train/c0"):
         made()
     assert len(made("force=true").ids) == 4
+
+
+def test_what_a_finished_dataset_lacks_is_said_again(meshes, tmp_path, caplog):
+    """A class of which all failed is missing in the line on its data, too."""
+    good = (meshes / "chair/train/chair_0.ply").read_bytes()
+    for cls in ("chair", "lamp"):
+        folder = tmp_path / "meshes" / cls / "train"
+        folder.mkdir(parents=True)
+        for i in range(2):
+            (folder / f"{cls}{i}.ply").write_bytes(good[:200] if cls == "lamp" or i else good)
+    settings = ("workers=0", "classes=[chair,lamp]", "splits=[train]")
+    made = generate(config(tmp_path, tmp_path / "meshes", *settings, domain="modelnet10"))
+    assert len(made.ids) == 1
+    assert "lamp" in made.made_of.without
+    assert "chair" not in made.made_of.without
+    caplog.clear()
+    generate(config(tmp_path, tmp_path / "meshes", *settings, domain="modelnet10"))
+    assert "3 of 4 objects had failed" in caplog.text
+    assert "manifest.csv says why); no object of lamp is in it" in caplog.text
 
 
 def test_if_all_fail_nothing_is_left_in_the_way(meshes, tmp_path):

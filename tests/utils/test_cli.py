@@ -31,6 +31,7 @@ from qs3.utils.cli import (
     text,
     whole,
 )
+from qs3.utils.version import VERSION
 
 ROOT = Path(__file__).parents[2]
 GIVEN: dict = {}
@@ -163,6 +164,12 @@ def test_help_of_every_command(words, ask, capsys):
     assert len(page.splitlines()) < 60
     assert run(QS3, ["help", *words]) == 0
     assert capsys.readouterr().out == page
+
+
+@pytest.mark.parametrize("word", ["--version", "version"])
+def test_version(word, capsys):
+    assert run(QS3, [word]) == 0
+    assert capsys.readouterr().out == f"qs3 {VERSION}\n"
 
 
 def test_help_shows_defaults_and_choices():

@@ -30,6 +30,7 @@ _TRIM = 3.0  # median absolute deviations
 _LEAST_SHARE = 0.5  # of the floor's pixels that must lie in the plane
 _LEAST_FRAMES = 10  # with readings and a floor, for the mounting
 _STEP_PX, _REACH_PX = 4, 8  # every how many pixels a normal, and from how far
+_FOCAL_PX = 525.0  # of the cameras for which that is so; smaller pictures have smaller windows
 _SPAN_SHARE = 0.15  # of the depth, that a window's depths may span
 _STEEP_UP = np.array([0.0, -0.5, -np.sqrt(0.75)])  # of a camera that looks down by 60 degrees
 _LEAST_LEVEL = 0.05  # share of the normals that a level surface has
@@ -161,7 +162,8 @@ def _normals(depth_m: np.ndarray, camera: Pinhole) -> np.ndarray:
 
     1/z is linear in a plane's pixels, so a normal is the slopes of 1/z over the window.
     """
-    r = _REACH_PX
+    scale = min(1.0, camera.fx_px / _FOCAL_PX)  # else a floor's depths span too much in a window
+    r, step = max(2, round(scale * _REACH_PX)), max(1, round(scale * _STEP_PX))
     width = 2 * r + 1
     window = np.ones((width, width), np.uint8)
     holes = cv2.dilate((depth_m <= 0).astype(np.uint8), window, borderValue=(1,)) > 0
@@ -174,8 +176,8 @@ def _normals(depth_m: np.ndarray, camera: Pinhole) -> np.ndarray:
     along_u = cv2.sepFilter2D(inverse, cv2.CV_64F, slope, mean)
     along_v = cv2.sepFilter2D(inverse, cv2.CV_64F, mean, slope)
     level = cv2.sepFilter2D(inverse, cv2.CV_64F, mean, mean)
-    v, u = np.nonzero(smooth[::_STEP_PX, ::_STEP_PX])
-    at = (v * _STEP_PX, u * _STEP_PX)
+    v, u = np.nonzero(smooth[::step, ::step])
+    at = (v * step, u * step)
     x, y = (at[1] - camera.cx_px) / camera.fx_px, (at[0] - camera.cy_px) / camera.fy_px
     nx, ny = along_u[at] * camera.fx_px, along_v[at] * camera.fy_px
     normal = np.stack([nx, ny, level[at] - nx * x - ny * y], axis=1)

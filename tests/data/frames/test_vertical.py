@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from qs3.data.frames.images import Pinhole
-from qs3.data.frames.vertical import angle_deg, floor_up, mounting, planes_up
+from qs3.data.frames.vertical import angle_deg, floor_up, mounting, planes_up, planes_up_steep
 from tests.fixtures.frame_files import SENSOR_FROM_CAMERA, Shot, Thing, kinect
 
 TILTS = [(5, 0), (14, 3), (25, -4), (-3, 6)]
@@ -53,3 +53,21 @@ def test_accelerometer_of_any_mounting():
     assert noise.error_deg > 5  # which the importer does not use
     assert mounting(readings[:4], ups[:4]) is None
     assert found.up(np.zeros(3)) is None
+
+
+@pytest.mark.parametrize("pitch", [10, 20, 30])
+@pytest.mark.parametrize("noise_m", [0.0, 0.005])
+@pytest.mark.parametrize("width", [640, 320, 224, 160])
+def test_planes_of_small_pictures(width, noise_m, pitch):
+    """A floor 1.2 m below the camera and a wall 4.5 m before it, by a camera of 63 degrees."""
+    height, focal = width * 3 // 4, 525 * width / 640
+    camera = Pinhole(focal, focal, (width - 1) / 2, (height - 1) / 2)
+    angle = np.deg2rad(pitch)
+    up, ahead = np.array([0, -np.cos(angle), -np.sin(angle)]), [0, -np.sin(angle), np.cos(angle)]
+    rays = camera.rays(height, width)
+    floor, wall = 1.2 / np.maximum(-(rays @ up), 1e-9), 4.5 / np.maximum(rays @ ahead, 1e-9)
+    depth = np.minimum(floor, wall)
+    depth += noise_m * np.random.default_rng(0).normal(size=depth.shape)
+    found, sure = planes_up_steep(depth, camera)
+    assert sure
+    assert angle_deg(found, up) < 1
