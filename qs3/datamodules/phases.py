@@ -186,6 +186,11 @@ class SelfTrainingConfig:
             return "raise selftraining.share"
         return getattr(self.selector, "more_labels", None) or LOWER_THETA
 
+    @property
+    def instead_of_mu(self) -> str | None:
+        """What selects more where one class alone is confident; None: the selector has no mu."""
+        return getattr(self.selector, "instead_of_mu", None)
+
     def theta_of(self, round_: int, confidence: Float[np.ndarray, " n"] | None = None) -> float:
         """Threshold of a round, in decimal arithmetic: 0.8 + 9 * 0.005 is 0.845 exactly.
 

@@ -17,7 +17,7 @@ from qs3.engine.schedules import Plateau, cosine
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, total_loss
 from qs3.models.base import Backbone, PointClassifier
-from qs3.models.norms import norms_for, use_domain
+from qs3.models.norms import use_trained
 from qs3.utils.seeding import derive
 
 # `qs3.engine.loggers.EpochRows` hands the figures on, before the checkpoint is written.
@@ -225,7 +225,7 @@ class Classifier(LightningModule):
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Count the hits on held-out labelled clouds."""
         labels = batch["source"][f"y_{self.method.labels}"]
-        with use_domain(self.net, norms_for(self.net, "source")):
+        with use_trained(self.net, "source"):
             self._hits.append(self(batch["source"]["points"]).argmax(dim=1) == labels)
 
     def on_validation_epoch_end(self) -> None:

@@ -19,7 +19,7 @@ from qs3.datamodules.augment import rotate_z
 from qs3.datamodules.splits import Unlabelled
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.calibration import calibration_error
-from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
+from qs3.models.norms import adapt_batchnorm, use_trained
 from qs3.runs.metrics import PseudoLabelScores, Scores
 from qs3.runs.predictions import Predictions
 from qs3.runs.pseudo_labels import read_pseudo_labels
@@ -73,13 +73,13 @@ def said_of(
 ) -> tuple[Float[Tensor, "n d"], ...]:
     """What `of_batch` makes of all clouds, by a net in eval mode, unaugmented, in the order given.
 
-    Nothing is random. A net with norms for each domain uses those of `domain`, the clouds' own, if
-    it was trained on that domain at all. Float64, on the CPU.
+    Nothing is random. A net with norms for each domain uses those of `domain`, the clouds' own,
+    where they were trained (`use_trained`). Float64, on the CPU.
     """
     training = net.training
     net.eval()
     try:
-        with use_domain(net, norms_for(net, domain)):
+        with use_trained(net, domain):
             parts = [
                 tuple(x.double().cpu() for x in of_batch(batch.to(device)))
                 for batch in points.split(batch_size)
@@ -105,7 +105,7 @@ def adapt_norms(
     share of the statistics of training in the new ones, above 0 for alpha-BN.
     """
     batches = even_batches(points, batch_size, seed)
-    with use_domain(net, norms_for(net, "target")):
+    with use_trained(net, "target"):
         adapt_batchnorm(net, (batch.to(device) for batch in batches), kept)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.evaluation.metrics import adapt_norms, even_batches
-from qs3.models.norms import check_has_norms, norms_for, running_norms, use_domain
+from qs3.models.norms import check_has_norms, running_norms, use_trained
 
 RATE = 1e-3
 """Adam's learning rate, as in the paper; without weight decay."""
@@ -46,7 +46,7 @@ def minimise_entropy(
     net.requires_grad_(False)
     net.eval()  # no dropout
     try:
-        with use_domain(net, norms_for(net, "target")), torch.enable_grad():
+        with use_trained(net, "target"), torch.enable_grad():
             check_has_norms(net, "tent")
             norms = running_norms(net)
             for norm in norms:

@@ -28,7 +28,7 @@ from qs3.inference.model_file import build_net, find_result, read_result, values
 from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
 from qs3.inference.predictor import Predictor, load
 from qs3.models.base import PointClassifier
-from qs3.models.norms import norms_for, use_domain
+from qs3.models.norms import use_trained
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import atomic_path, make_folder
 from qs3.utils.memory import YAML_PEAK, read_whole
@@ -233,7 +233,7 @@ def export(
     make_folder(out.parent)
     # What torch compiled for another net's loops, whose sizes would become limits of this one's.
     torch.compiler.reset()
-    with _quiet(), torch.no_grad(), use_domain(net, norms_for(net, "target")):
+    with _quiet(), torch.no_grad(), use_trained(net, "target"):
         write: Callable[..., Any] = _write_onnx if out.suffix == ".onnx" else _write_pt2
         with atomic_path(out) as temporary:
             try:

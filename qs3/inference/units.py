@@ -19,7 +19,7 @@ from qs3.inference.inputs import (
 from qs3.inference.predictor import Predictor, Prepared
 from qs3.inference.settings import Settings
 from qs3.inference.table import Row
-from qs3.models.norms import norms_for, use_domain
+from qs3.models.norms import use_trained
 
 _DIVERGED = "the classifier's answer is no number: its training has diverged"
 
@@ -48,7 +48,7 @@ def predict_units(
         # Once for all: threads that change and restore a net's domain would do it to one another.
         with contextlib.ExitStack() as using:
             for net in nets:
-                using.enter_context(use_domain(net, norms_for(net, "target")))
+                using.enter_context(use_trained(net, "target"))
             for batch in _batches(units, settings.batch_size, advance):
                 running.append(pool.submit(_judged, predictor, second, batch, floor))
                 if len(running) > 2 * settings.threads:

@@ -26,7 +26,7 @@ def masked_chamfer(
     float32 at least, also under autocast. Nearest points are found without gradient; the
     gradient is that of the distances to them, as that of the minimum.
     """
-    with torch.autocast(a.device.type, enabled=False), exact_products():
+    with torch.autocast(a.device.type, enabled=False):
         a, b = (x.float() if x.dtype in (torch.float16, torch.bfloat16) else x for x in (a, b))
         to_b, to_a = nearest(a.detach(), b.detach(), mask_a, mask_b)
         forth = (a - gather(b, to_b)).square().sum(2)  # [b, n]
@@ -36,8 +36,12 @@ def masked_chamfer(
 
 
 def nearest(a: Tensor, b: Tensor, mask_a: Tensor, mask_b: Tensor) -> tuple[Tensor, Tensor]:
-    """For each a the nearest marked b [b, n], for each b the nearest marked a [b, m]."""
-    squares = -2 * a @ b.transpose(1, 2)  # [b, n, m]
+    """For each a the nearest marked b [b, n], for each b the nearest marked a [b, m].
+
+    By distances in the dtype of a and b, also under autocast.
+    """
+    with torch.autocast(a.device.type, enabled=False), exact_products():
+        squares = -2 * a @ b.transpose(1, 2)  # [b, n, m]
     squares += a.square().sum(2)[:, :, None]
     squares += b.square().sum(2)[:, None]
     squares.masked_fill_(~(mask_a[:, :, None] & mask_b[:, None]), torch.inf)

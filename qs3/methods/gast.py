@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.config.checks import check_int
+from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.methods.base import Method, check_taught, feature_dims, weight
 from qs3.methods.deform import VOXELS, cloud_size, deform
@@ -120,7 +121,8 @@ def turn_parts(
     0, 90, 180 or 270 degrees for each cloud; all in random order.
 
     Returns:
-        Mixed clouds, quarter turns about x [B], quarter turns about y [B], λ.
+        Mixed clouds in the dtype of `points`, also under autocast; quarter turns about x [B];
+        quarter turns about y [B]; λ.
     """
     b, n, _ = points.shape
     own, device = generator.device, points.device
@@ -130,8 +132,9 @@ def turn_parts(
     shuffle = torch.randperm(n, generator=generator, device=own).to(device)
     twice = torch.cat([points, points])  # both samplings at once
     first, second = gather(twice, farthest_point_sampling(twice, n, start)).chunk(2)
-    first = first @ quarter_turns(turns[0], "x").to(points.dtype)
-    second = second @ quarter_turns(turns[1], "y").to(points.dtype)
+    with torch.autocast(device.type, enabled=False), exact_products():
+        first = first @ quarter_turns(turns[0], "x").to(points.dtype)
+        second = second @ quarter_turns(turns[1], "y").to(points.dtype)
     mixed = join(first, second, lam)[:, shuffle]
     return mixed, turns[0], turns[1], lam
 

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_float, check_int
 from qs3.errors import ConfigError
+from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import gather, knn
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.chamfer import masked_mean, nearest
@@ -144,11 +145,15 @@ def _each(logits: Float[Tensor, "b n k"], labels: Int[Tensor, "b n"]) -> Float[T
 
 
 def normals_of(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
-    """Unit normal of the plane through a point's `NEIGHBOURS` nearest (itself included), ± n."""
+    """Unit normal of the plane through a point's `NEIGHBOURS` nearest (itself included), ± n.
+
+    float32, also under autocast.
+    """
     b, n, _ = points.shape
     around = gather(points, knn(points, NEIGHBOURS))  # [b, n, k, 3]
     around = (around - around.mean(dim=2, keepdim=True)).flatten(0, 1).float()
-    return thinnest(around.transpose(1, 2) @ around).view(b, n, 3)
+    with torch.autocast(points.device.type, enabled=False), exact_products():
+        return thinnest(around.transpose(1, 2) @ around).view(b, n, 3)
 
 
 def thinnest(scatter: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3"]:
@@ -175,5 +180,6 @@ def cardinalities(points: Float[Tensor, "b n 3"]) -> Int[Tensor, "b n"]:
     A cloud of another size is counted as if each point were 1024 / N.
     """
     n = points.shape[1]
-    within = (torch.cdist(points.float(), points.float()) <= RADIUS).sum(dim=2)
+    with exact_products():
+        within = (torch.cdist(points.float(), points.float()) <= RADIUS).sum(dim=2)
     return (within * 512 // n).clamp_max(CARDINALITIES - 1)

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from qs3.geometry.device import exact_products
+
 
 def mmd2(
     x: Float[Tensor, "m d"], y: Float[Tensor, "n d"], sigmas: Sequence[float]
@@ -20,7 +22,7 @@ def mmd2(
     k(a, b) = sum over sigmas of exp(-|a - b|^2 / (2 sigma^2)). In [0, 2 len(sigmas)]; 0 for equal
     samples. float32 at least, also under autocast.
     """
-    with torch.autocast(x.device.type, enabled=False):
+    with torch.autocast(x.device.type, enabled=False), exact_products():
         x, y = (z.float() if z.dtype in (torch.float16, torch.bfloat16) else z for z in (x, y))
         both = torch.cat([x, y])
         both = both - both.mean(0).detach()  # nearer to 0: squares lose fewer digits

@@ -6,7 +6,8 @@
 - "domain": a whole batch norm for each domain, statistics and affine, as in DSBN (Chang et al.,
   "Domain-Specific Batch Normalization for Unsupervised Domain Adaptation", CVPR 2019, eq. 3).
 
-Which domain a pass is on is said around it: `with use_domain(net, "target"): net(points)`.
+Which domain a pass is on is said around it: `with use_domain(net, "target"): net(points)`; in
+evaluation `use_trained` instead.
 """
 
 from __future__ import annotations
@@ -141,43 +142,69 @@ def use_domain(net: nn.Module, domain: str) -> Iterator[None]:
     Raises:
         ConfigError: no such domain.
     """
-    if domain not in DOMAINS:
-        raise ConfigError(f"domain must be 'source' or 'target', got {domain!r}")
-    norms = [m for m in net.modules() if isinstance(m, DomainNorm)]
-    before = [norm.domain for norm in norms]
-    for norm in norms:
+    _check_domain(domain)
+    with _using({norm: domain for norm in _domain_norms(net)}):
+        yield
+
+
+@contextmanager
+def use_trained(net: nn.Module, domain: str) -> Iterator[None]:
+    """As `use_domain`, for clouds of `domain` in evaluation: each layer by a norm that was trained.
+
+    That of `domain`, or the other one where that never saw a cloud; the source's if neither did.
+    So a net that has only seen the source serves the target with the source's norms, a student
+    that has only seen the target the source with the target's, and a net whose backbone alone has
+    seen the target serves it with the backbone's norms of the target and the head's of the source.
+
+    Raises:
+        ConfigError: no such domain.
+    """
+    _check_domain(domain)
+    with _using({norm: _trained(norm, domain) for norm in _domain_norms(net)}):
+        yield
+
+
+@contextmanager
+def _using(domains: dict[DomainNorm, str]) -> Iterator[None]:
+    before = {norm: norm.domain for norm in domains}
+    for norm, domain in domains.items():
         norm.domain = domain
     try:
         yield
     finally:
-        for norm, old in zip(norms, before, strict=True):
-            norm.domain = old
+        for norm, domain in before.items():
+            norm.domain = domain
 
 
-def norms_for(net: nn.Module, domain: str) -> str:
-    """The domain whose norms clouds of `domain` should use: the other one if it was never trained.
+def _check_domain(domain: str) -> None:
+    if domain not in DOMAINS:
+        raise ConfigError(f"domain must be 'source' or 'target', got {domain!r}")
 
-    So a net with domain-specific norms that has only seen the source serves the target with those,
-    and a student that has only seen the target the source. The source's if neither was trained.
-    """
-    norms = [m for m in net.modules() if isinstance(m, DomainNorm)]
 
-    def seen(one: str) -> bool:
-        return all(int(getattr(norm, one).num_batches_tracked) > 0 for norm in norms)
+def _domain_norms(net: nn.Module) -> list[DomainNorm]:
+    return [module for module in net.modules() if isinstance(module, DomainNorm)]
 
-    other = "target" if domain == "source" else "source"
-    return domain if seen(domain) else other if seen(other) else "source"
+
+def _trained(norm: DomainNorm, domain: str) -> str:
+    """The domain whose norm a layer uses for clouds of `domain` in evaluation."""
+    for one in (domain, *DOMAINS):
+        if int(getattr(norm, one).num_batches_tracked):
+            return one
+    return "source"
 
 
 def begin_target_norms(net: nn.Module) -> None:
     """Give target norms that were never trained the source's weights and statistics.
 
     A student that goes on with a teacher which never saw the target would otherwise leave it in
-    its first step: the teacher spoke with the source's norms (`norms_for`).
+    its first step: the teacher spoke with the source's norms (`use_trained`). They count as never
+    trained until a pass: one may not follow, and the source's change.
     """
-    for norm in net.modules():
-        if isinstance(norm, DomainNorm) and not norm.target.num_batches_tracked:
+    for norm in _domain_norms(net):
+        if not norm.target.num_batches_tracked:
             norm.target.load_state_dict(norm.source.state_dict())
+            assert norm.target.num_batches_tracked is not None
+            norm.target.num_batches_tracked.zero_()
 
 
 class _Pooled:

@@ -43,7 +43,12 @@ class Random:
     @property
     def more_labels(self) -> str | None:
         """What would make the other selector keep more; None: a lower theta."""
-        return getattr(self.of, "more_labels", None)
+        return _of_the_other(getattr(self.of, "more_labels", None))
+
+    @property
+    def instead_of_mu(self) -> str | None:
+        """What the other selector has instead of its mu; None: it has none."""
+        return _of_the_other(getattr(self.of, "instead_of_mu", None))
 
     @property
     def needs_features(self) -> bool:
@@ -64,3 +69,9 @@ class Random:
             of_class = drawn[allowed[drawn] & (teacher.predicted[drawn] == k)]
             selected[of_class[: given.kept[k]]] = True
         return replace(given, selected=selected)
+
+
+def _of_the_other(advice: str | None) -> str | None:
+    """The same with the keys where the other selector's settings are."""
+    key = "selftraining.selector."
+    return None if advice is None else advice.replace(key, f"{key}of.")

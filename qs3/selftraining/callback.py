@@ -42,6 +42,7 @@ from qs3.selftraining.selectors import (
     Selection,
     TeacherPredictions,
     check_selection,
+    check_teacher,
     keep_all,
 )
 
@@ -160,6 +161,7 @@ class SelfTraining(Callback):
         data = trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(data, AdaptationData)
         said = self._predictions(trainer, pl_module, data, round_)
+        check_teacher(said, round_, trainable=not self._given)
         theta = self.scheme.theta_of(round_, said.confidence)
         selection = self.scheme.selector.select(said, theta, round_)
         if selection.labels is not None:  # a selector may name another class than the most probable
@@ -182,6 +184,7 @@ class SelfTraining(Callback):
             self.scheme.missing_class,
             more=self.scheme.more_labels,
             trainable=not self._given,
+            instead_of_mu=self.scheme.instead_of_mu,
         )
 
         labels = torch.from_numpy(said.predicted)

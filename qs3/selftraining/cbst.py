@@ -104,7 +104,10 @@ class Cbst:
             powers = np.exp(logs - top)
             total = powers.sum(axis=1, keepdims=True)
             soft = powers / total
-            keep = (top + np.log(total))[:, 0] > 0
+            # By the other terms alone, which are lost beside a largest of 1. A quotient of 1, as of
+            # the sample that sets a threshold, is enough: no softmax says 0 of the other classes.
+            others = np.sort(powers, axis=1)[:, :-1].sum(axis=1)
+            keep |= top[:, 0] + np.log1p(others) > 0
         selected = keep & (teacher.relabelled(labels).confidence > theta)
         confident = teacher.predicted[teacher.confidence > theta]
         return Selection(

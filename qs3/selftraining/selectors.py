@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,6 +18,8 @@ from qs3.config.checks import check_choice
 from qs3.datamodules.phases import LOWER_THETA
 from qs3.errors import SelectionError
 from qs3.utils.plural import counted
+
+_KEEP_ALL = "set selftraining.selector.mu=one"
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +116,8 @@ class Qbst:
             can exceed n, so mu_k is clamped at 0 there.
     """
 
+    instead_of_mu: ClassVar[str] = _KEEP_ALL
+
     mu: str = "balanced"
     order: str = "descending"
     counts: str = "confident"
@@ -190,6 +194,30 @@ def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:
     return replace(selection, selected=np.ones(len(labels), dtype=bool), kept=kept)
 
 
+def check_teacher(teacher: TeacherPredictions, round_: int, trainable: bool = True) -> None:
+    """Refuse a teacher whose probabilities are not numbers, before a selector is asked.
+
+    Args:
+        teacher: the predictions that round `round_` would choose from.
+        round_: for the message; in round 0 the warm-up's net made them, later the round before's.
+        trainable: whether the warm-up's net was trained in this run.
+
+    Raises:
+        SelectionError: a probability is NaN: the net has diverged.
+    """
+    lost = int(np.isnan(teacher.confidence).sum())
+    if not lost:
+        return
+    net = f"round {round_ - 1}'s student" if round_ else "the warm-up's net"
+    way = "lower protocol.optimizer.lr"
+    if not round_ and not trainable:
+        net, way = "the net of weights=", "choose another one"
+    raise SelectionError(
+        f"{net} has diverged: its probabilities of {lost} of {len(teacher.ids)} target clouds are "
+        f"not numbers, so that round {round_} has no pseudo-labels; {way}"
+    )
+
+
 def check_selection(
     selection: Selection,
     class_names: Sequence[str],
@@ -197,6 +225,7 @@ def check_selection(
     missing_class: str,
     more: str = LOWER_THETA,
     trainable: bool = True,
+    instead_of_mu: str | None = _KEEP_ALL,
 ) -> list[str]:
     """Names of the classes without a pseudo-label, after checking that training is possible.
 
@@ -207,6 +236,8 @@ def check_selection(
         missing_class: "warn" or "error".
         more: what would select more, for messages; see `SelfTrainingConfig.more_labels`.
         trainable: whether the teacher could have been trained for longer.
+        instead_of_mu: what selects more where only one class is confident; None where the selector
+            has no mu for it; see `SelfTrainingConfig.instead_of_mu`.
 
     Raises:
         SelectionError: fewer than two samples were selected (batch normalisation needs two), or
@@ -224,9 +255,9 @@ def check_selection(
     if total < 2:
         own_mu = selection.mu[selection.confident > 0]
         longer = ["train the teacher longer (protocol.epochs)"] * trainable
-        if len(own_mu) == 1 and own_mu[0] == 0:
+        if instead_of_mu and len(own_mu) == 1 and own_mu[0] == 0:
             why = "all confident samples are of one class, so its mu is 0; "
-            ways = [more, *longer, "set selftraining.selector.mu=one"]
+            ways = [more, *longer, instead_of_mu]
         else:
             why, ways = "", [more, *longer]
         raise SelectionError(

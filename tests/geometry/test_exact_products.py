@@ -17,12 +17,15 @@ from torch.utils._pytree import tree_leaves
 from qs3.config.hashing import config_sha256
 from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import knn
-from qs3.methods.chamfer import masked_chamfer
+from qs3.methods.chamfer import masked_chamfer, nearest
+from qs3.methods.gast import turn_parts
+from qs3.methods.mlsp import cardinalities, normals_of
+from qs3.methods.mmd import mmd2
 from tests.composing import compose
 from tests.device import as_on_device
 from tests.models.test_all_nets import NETS, build
 
-PRODUCTS = ("mm", "bmm", "addmm", "baddbmm", "mv", "dot")
+PRODUCTS = ("mm", "bmm", "addmm", "baddbmm", "mv", "dot", "_euclidean_dist")
 
 
 class Told(TorchDispatchMode):
@@ -61,13 +64,18 @@ def test_afterwards_it_is_as_before() -> None:
     assert torch.get_float32_matmul_precision() == "high"
 
 
-def test_distances_are_exact() -> None:
+def test_distances_and_turns_of_methods_are_exact() -> None:
     points, features = torch.randn(3, 40, 3), torch.randn(3, 40, 9)
     mask = torch.ones(3, 40, dtype=torch.bool)
     for ask in (
         lambda: knn(points, 5),
         lambda: knn(features, 5),
         lambda: masked_chamfer(points, points + 1, mask, mask),
+        lambda: nearest(points, points + 1, mask, mask),
+        lambda: normals_of(points),
+        lambda: cardinalities(points),
+        lambda: turn_parts(points, torch.Generator()),
+        lambda: mmd2(features[0], features[1], (1.0,)),
     ):
         with as_on_device(), Told() as told:
             ask()

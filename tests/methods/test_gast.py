@@ -44,6 +44,15 @@ def test_parts_are_turned_as_their_labels_say(seed: int) -> None:
             assert near_second.sum() == 40 - own
 
 
+def test_autocast_keeps_coordinates() -> None:
+    points = torch.rand(3, 50, 3, generator=torch.Generator().manual_seed(0))
+    full, *_ = turn_parts(points, torch.Generator().manual_seed(1))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half, *_ = turn_parts(points, torch.Generator().manual_seed(1))
+    assert half.dtype == torch.float32
+    assert torch.equal(full, half)
+
+
 def test_the_two_labels_are_independent() -> None:
     """The released code keeps both in one tensor: there they are always equal."""
     points = torch.rand(64, 8, 3)

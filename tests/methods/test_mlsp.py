@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from qs3.errors import ConfigError
+from qs3.methods.chamfer import nearest
 from qs3.methods.deform import deform
 from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of, thinnest
 from qs3.models.base import Features
@@ -57,6 +58,24 @@ def test_normals_of_a_plane() -> None:
     torch.testing.assert_close(
         (normals_of(points) @ expected).abs(), torch.ones(1, 200), rtol=1e-3, atol=1e-3
     )
+
+
+def test_autocast_keeps_surfaces_and_neighbours() -> None:
+    """In bfloat16 every second nearest point was another one."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(2, 300, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.02])
+    told = points + 0.02 * torch.randn(2, 300, 3, generator=generator)
+    mask = torch.ones(2, 300, dtype=torch.bool)
+
+    def found() -> tuple[Tensor, ...]:
+        return normals_of(points), cardinalities(points), *nearest(told, points, mask, mask)
+
+    full = found()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = found()
+    for a, b in zip(full, half, strict=True):
+        assert a.dtype == b.dtype
+        assert torch.equal(a, b)
 
 
 def _clouds(b: int = 3, n: int = 64) -> Tensor:

@@ -11,7 +11,7 @@ from qs3.errors import ConfigError
 from qs3.models import pointnet2, rscnn
 from qs3.models.base import PointClassifier
 from qs3.models.fast import plain
-from qs3.models.norms import adapt_batchnorm, norms_for, use_domain
+from qs3.models.norms import DomainNorm, adapt_batchnorm, use_domain, use_trained
 from tests.models.test_all_nets import NETS, build, clouds
 
 SMALL = {
@@ -85,7 +85,8 @@ def test_domains(name: str) -> None:
         assert torch.equal(value, before[key]) == (".source." in key), key
     for key, parameter in net.named_parameters():
         assert (parameter.grad is None) == (".source." in key), key
-    assert norms_for(net, "target") == "target"
+    with use_trained(net, "target"):
+        assert {m.domain for m in net.modules() if isinstance(m, DomainNorm)} == {"target"}
     net.eval()
     with use_domain(net, "target"):
         as_target = net(points)

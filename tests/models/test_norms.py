@@ -6,16 +6,16 @@ import torch
 from torch import nn
 
 from qs3.errors import ConfigError, DataError
-from qs3.evaluation.metrics import predict
+from qs3.evaluation.metrics import adapt_norms, predict
 from qs3.models.dgcnn import dgcnn
 from qs3.models.norms import (
     DomainNorm,
     active,
     adapt_batchnorm,
     begin_target_norms,
-    norms_for,
     track,
     use_domain,
+    use_trained,
 )
 from qs3.models.pointnet import pointnet
 
@@ -30,6 +30,12 @@ def _clouds(b: int, seed: int = 0, n: int = 40) -> torch.Tensor:
 
 def _running(net: nn.Module) -> list[torch.Tensor]:
     return [b.clone() for n, b in net.named_buffers() if "running" in n]
+
+
+def _used(net: nn.Module, domain: str) -> set[str]:
+    """Whose norms clouds of `domain` are served with."""
+    with use_trained(net, domain):
+        return {m.domain for m in net.modules() if isinstance(m, DomainNorm)}
 
 
 def test_domain_comes_back_after_an_error_and_nested() -> None:
@@ -51,8 +57,13 @@ def test_target_norms_begin_with_the_source_s_once() -> None:
         net(_clouds(6, seed))
     before = torch.from_numpy(predict(net, _clouds(5, 9), 5))  # target norms: never trained
     begin_target_norms(net)
-    assert norms_for(net, "target") == "target"
     assert torch.equal(torch.from_numpy(predict(net, _clouds(5, 9), 5)), before)
+    with torch.no_grad(), use_domain(net.eval(), "target"):
+        said = net(_clouds(5, 9)).softmax(1)
+    torch.testing.assert_close(said, before)
+    net.train()(_clouds(6, 8))  # a pass on the source alone: the target's are behind
+    assert _used(net, "target") == {"source"}
+    begin_target_norms(net)
     with use_domain(net, "target"):
         net(_clouds(6, 7))
     trained = copy.deepcopy(net.state_dict())
@@ -143,26 +154,47 @@ def test_predictions_of_the_target_use_its_norms_once_it_was_trained_on() -> Non
     net = pointnet(3, norm="domain")
     points = torch.randn(4, 20, 3)
     net(points)  # a pass on the source alone
-    assert norms_for(net, "target") == "source"
+    assert _used(net, "target") == {"source"}
     as_source = predict(net, points, 4)
     with use_domain(net, "target"):
         net(points * 3 + 1)
-    assert norms_for(net, "target") == "target"
+    assert _used(net, "target") == {"target"}
     as_target = predict(net, points, 4)
     assert np.abs(as_source - as_target).max() > 1e-3
     with torch.no_grad(), use_domain(net.eval(), "target"):
         np.testing.assert_allclose(as_target, net(points).double().softmax(1).numpy(), atol=1e-6)
-    plain = pointnet(3)
-    assert norms_for(plain, "target") == "target"  # nothing to choose
-    assert norms_for(plain, "source") == "source"
+    assert _used(pointnet(3), "target") == set()  # nothing to choose
+    with pytest.raises(ConfigError, match="'source' or 'target'"), use_trained(net, "s"):
+        pass
 
 
 def test_a_student_of_the_target_alone_says_of_the_source_what_its_norms_say() -> None:
     net = pointnet(3, norm="domain")
-    assert norms_for(net, "target") == norms_for(net, "source") == "source"  # neither is trained
+    assert _used(net, "target") == _used(net, "source") == {"source"}  # neither is trained
     points = torch.randn(4, 20, 3)
     with use_domain(net, "target"):
         net(points * 3 + 1)
-    assert norms_for(net, "source") == "target"
+    assert _used(net, "source") == {"target"}
     of_target = predict(net, points, 4)
     np.testing.assert_array_equal(predict(net, points, 4, domain="source"), of_target)
+
+
+def test_each_layer_is_served_by_the_norm_that_was_trained() -> None:
+    """As methods train them that show their target to the backbone alone; AdaBN is of the same."""
+    torch.manual_seed(0)
+    net = pointnet(3, norm="domain").double()
+    points = _clouds(6)
+    net(points)
+    with use_domain(net, "target"):
+        net.features(3 * points + 1)
+    parts = (net.backbone, net.head)
+    assert [_used(part, "target") for part in parts] == [{"target"}, {"source"}]
+    assert _used(net, "source") == {"source"}
+    with torch.no_grad(), use_domain(net.eval().backbone, "target"):
+        expected = net(points).softmax(1).numpy()
+    np.testing.assert_array_equal(predict(net, points, 6), expected)
+    before = copy.deepcopy(net.state_dict())
+    adapt_norms(net, points, 6, seed=0)
+    changed = {k for k, value in net.state_dict().items() if not torch.equal(value, before[k])}
+    trained = {k for k in before if ("target" if k.startswith("backbone") else "source") in k}
+    assert changed == {k for k in trained if "running" in k or "num_batches" in k}

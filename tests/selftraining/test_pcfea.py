@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.errors import ConfigError
+from qs3.evaluation.metrics import predict
 from qs3.methods.base import Method
 from qs3.models.base import PointClassifier
 from qs3.models.norms import DomainNorm
@@ -198,6 +199,23 @@ def test_a_running_mean_of_domain_norms_knows_the_target() -> None:
     for norm in norms:
         torch.testing.assert_close(norm.target.running_mean, norm.source.running_mean)
         torch.testing.assert_close(norm.target.running_var, norm.source.running_var)
+
+
+@pytest.mark.parametrize("momentum", [0.0, 0.9])
+def test_without_alignment_the_target_has_the_source_s_norms(momentum: float) -> None:
+    """No pass on the target follows the first pool: those of then would be behind."""
+    net, data = pointnet(CLASSES, norm="domain"), _data()
+    method = Pcfea(align_weight=0.0, momentum=momentum)
+    method.prepare(net)
+    clouds, labels = data.labelled.clouds.all(), data.labelled.labels
+    batch = {"source": {"points": clouds, "y_source": labels}, "progress": 0.5}
+    method.loss(net, batch, torch.Generator())
+    method.start_epoch(net, data, 10, 100)
+    for _ in range(3):
+        method.loss(net, batch, torch.Generator())
+    for one in (net, method.teacher) if momentum else (net,):
+        said = predict(one, data.target.points, 16)
+        np.testing.assert_array_equal(said, predict(one, data.target.points, 16, domain="source"))
 
 
 @pytest.mark.parametrize(("epoch", "t"), [(10, 0.05), (55, 0.5), (95, 0.9)])

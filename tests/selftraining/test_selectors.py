@@ -11,12 +11,14 @@ from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.errors import ConfigError, SelectionError
 from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
+from qs3.selftraining.sd import GraphRefined
 from qs3.selftraining.selectors import (
     Qbst,
     Selection,
     Spst,
     TeacherPredictions,
     check_selection,
+    check_teacher,
     most_confident,
 )
 
@@ -124,12 +126,16 @@ def test_advice_is_about_the_selector_in_use():
         (Qbst(mu="one"), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
         (Spst(), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
         (Cbst(), 0.0, r"b 0/0; raise selftraining.selector.portion, or train"),
-        (Random(of=Cbst()), 0.0, r"b 0/0; raise selftraining.selector.portion, or train"),
+        (Random(of=Cbst()), 0.0, r"b 0/0; raise selftraining\.selector\.of\.portion, or train"),
+        (Random(of=Qbst()), 0.8, r"so its mu is 0; .*set selftraining\.selector\.of\.mu=one$"),
+        (Random(of=Random(of=Qbst())), 0.8, r"set selftraining\.selector\.of\.of\.mu=one$"),
+        (GraphRefined(), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
     ):
-        more = SelfTrainingConfig(selector, rounds=1, theta=theta).more_labels
+        scheme = SelfTrainingConfig(selector, rounds=1, theta=theta)
+        more, other = scheme.more_labels, scheme.instead_of_mu
         selection = selector.select(teacher, theta)
         with pytest.raises(SelectionError, match=advice):
-            check_selection(selection, ("a", "b"), 0, "warn", more)
+            check_selection(selection, ("a", "b"), 0, "warn", more, instead_of_mu=other)
     more = SelfTrainingConfig(Qbst(), rounds=1, share=0.2).more_labels
     selection = Qbst().select(teacher, 0.8)
     with pytest.raises(SelectionError, match=r"its mu is 0; raise selftraining.share, or set .*mu"):
@@ -140,6 +146,26 @@ def test_advice_is_about_the_selector_in_use():
         SelectionError, match=r"no pseudo-label for b .*; raise selftraining.share,"
     ):
         check_selection(selection, ("a", "b"), 0, "error", more)
+
+
+@pytest.mark.parametrize(
+    ("round_", "trainable", "message"),
+    [
+        (
+            0,
+            True,
+            r"the warm-up's net has diverged: .* of 1 of 2 target .*lower protocol\.optimizer",
+        ),
+        (0, False, r"the net of weights= has diverged: .*; choose another one$"),
+        (2, False, r"round 1's student has diverged: .*round 2 has no .*lower protocol\.optimizer"),
+    ],
+)
+def test_a_teacher_that_diverged_is_said_to_have(round_, trainable, message):
+    sure = np.array([[0.9, 0.1], [0.2, 0.8]])
+    check_teacher(TeacherPredictions.of(sure, ["a", "b"]), round_, trainable)
+    sure[1] = np.nan
+    with pytest.raises(SelectionError, match=message):
+        check_teacher(TeacherPredictions.of(sure, ["a", "b"]), round_, trainable)
 
 
 def test_predictions_selections_and_rules_cannot_be_changed():

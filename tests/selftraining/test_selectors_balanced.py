@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -89,6 +90,31 @@ def test_lrent_at_a_tie_of_its_condition() -> None:
     assert selection.thresholds.tolist() == [1.0, 1.0]
     assert selection.soft.tolist() == table
     assert kept == ""
+
+
+@pytest.mark.parametrize("gap", [4, 8, 10, 12, 20, 200])
+def test_lrent_keeps_what_exact_sums_keep(gap: int) -> None:
+    """Five clouds a class, so that one of each sets its threshold; of teachers ever surer."""
+    rng = np.random.default_rng(gap)
+    logits = rng.normal(size=(50, 10))
+    logits[np.arange(50), np.repeat(np.arange(10), 5)] += gap
+    p = np.exp(logits - logits.max(axis=1, keepdims=True))
+    p /= p.sum(axis=1, keepdims=True)
+    ids = [f"{i:02d}" for i in range(50)]
+    selection, _ = select(Cbst(labels="lrent"), p, ids=ids)
+    theta = [Fraction(t) for t in selection.thresholds.tolist()]
+    exact = [
+        sum((Fraction(x) / t) ** 4 for x, t in zip(row, theta, strict=True)) > 1
+        for row in p.tolist()
+    ]
+    assert selection.selected.tolist() == exact
+    assert (selection.kept > 0).all()
+
+
+def test_lrent_of_a_teacher_whose_doubt_is_below_float64() -> None:
+    """No softmax says 0, but one that was rounded; CBST keeps those, too."""
+    _, kept = select(Cbst(portion=0.5, labels="lrent"), [[1, 0], [1, 0], [0, 1], [0.1, 0.9]])
+    assert kept == "a0 b0 c1"
 
 
 def test_the_round_is_the_first_unless_one_is_named() -> None:

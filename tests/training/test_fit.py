@@ -256,6 +256,12 @@ def test_empty_selection(toy):
         train(toy("selftraining.theta=0.9999", "selftraining.epsilon=0"))
 
 
+@pytest.mark.parametrize("words", ["selftraining.share=null", "selftraining.share=0.5"])
+def test_a_diverged_teacher_labels_nothing(toy, words):
+    with pytest.raises(SelectionError, match=r"warm-up's net has diverged.*72 of 72 .*lower proto"):
+        train(toy("protocol.optimizer.lr=1e30", "protocol.epochs=1", words))
+
+
 def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
     def only_two(net, points, batch_size, device="cpu"):
         table = np.full((len(points), 3), 0.02)
