@@ -37,6 +37,8 @@ class DepthFrame:
             if the scan was asked to `explain`.
         images: intermediate pictures by name ("left", "right", "disparity", ...), for looking at,
             of the size of the rendered window.
+        true_lens: the intrinsics with which it was taken, where those of `camera` are what the
+            device believes; None: they are the same.
     """
 
     camera: Camera
@@ -49,17 +51,21 @@ class DepthFrame:
     cosine: np.ndarray
     reason: np.ndarray
     images: dict[str, np.ndarray] = field(default_factory=dict)
+    true_lens: Intrinsics | None = None
 
-    def points(self, depth_m: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
+    def points(
+        self, depth_m: np.ndarray, world_from_camera: np.ndarray, lens: Intrinsics | None = None
+    ) -> np.ndarray:
         """Back-project `depth_m` [h, w] (self.depth_m or self.clean_m, possibly masked).
 
         `world_from_camera` [4, 4] is the pose that is believed: a drifting one or the true.
+        Likewise `lens`; None: the one that the device believes.
 
         Returns:
             [M, 3] float64 points in the world, row-major, of the pixels that are finite.
         """
         rows, cols = np.nonzero(np.isfinite(depth_m))
-        k = self.camera.intrinsics
+        k = lens or self.camera.intrinsics
         z = depth_m[rows, cols].astype(np.float64)
         x = (self.left + cols * self.step_px - k.cx_px) / k.focal_px * z
         y = (self.top + rows * self.step_px - k.cy_px) / k.focal_px * z
@@ -200,6 +206,7 @@ class Shot:
             at.of(image.cosine),
             reason,
             pictures,
+            self.camera.intrinsics if intrinsics else None,
         )
 
 
