@@ -11,7 +11,7 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window, project
-from qs3.sensors.matching import Match
+from qs3.sensors.matching import Match, StereoBlockMatcher
 from qs3.sensors.matching.filters import PostFilter, Quantiser
 from qs3.sensors.matching.triangulation import Triangulation
 from qs3.sensors.optics.visibility import explained, reached_from
@@ -296,6 +296,20 @@ class TriangulatingSensor(DepthSensor):
     def __post_init__(self) -> None:
         check_ranges(self, "sensor.", baseline_m="> 0")
         check_depths(self)
+        matcher, steps = self._matcher, self.quantiser.steps_per_px
+        unbiased = isinstance(matcher, StereoBlockMatcher) and matcher.remove_bias
+        # k / 16 less nearly half a step would be rounded straight back to k / 16.
+        if unbiased and steps == matcher.steps_per_px:
+            raise ConfigError(
+                f"sensor.quantiser.steps_per_px={steps} are StereoBM's own steps, and rounding to "
+                "them again undoes sensor.matcher.remove_bias: set it to 0, to another number such "
+                "as 8 or 32, or set sensor.matcher.remove_bias=false"
+            )
+
+    @property
+    def _matcher(self) -> Any:
+        """Of a kind that matches images, or None."""
+        return getattr(self, "matcher", None)
 
     @property
     def zero_disparity_px(self) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Matcher, ReferenceMatcher
+from qs3.sensors.matching.base import found_px
 from qs3.sensors.matching.texture import for_picture
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Slide, Speckle
@@ -52,12 +53,11 @@ class ReferenceSpeckle(TriangulatingSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = (self.disparity(z) for z in (self.max_depth_m, self.min_depth_m))
-        first = self.matcher.min_disparity
-        last = first + self.matcher.num_disparities - 1
-        if low < first or high > last:
+        least, most = found_px(self.matcher)
+        if low < least or high > most:
             raise ConfigError(
                 f"depths {self.min_depth_m} to {self.max_depth_m} m need disparities "
-                f"{low:.1f} to {high:.1f} px, but the matcher searches {first} to {last}: "
+                f"{low:.1f} to {high:.1f} px, but the matcher finds {least:g} to {most:g}: "
                 "change sensor.reference_m or the matcher's range"
             )
 
