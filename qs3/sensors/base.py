@@ -318,8 +318,16 @@ class TriangulatingSensor(DepthSensor):
 
     @property
     def steps_per_px(self) -> int:
-        """Steps of the disparity; 0 where it is not quantised."""
-        return self.quantiser.steps_per_px
+        """Even steps of the disparity that its values have; 0 where there are none.
+
+        A quantiser finer than the matcher's own steps adds none to them, unless a filter between
+        the two makes other values.
+        """
+        steps: int = self.quantiser.steps_per_px
+        if not all(getattr(post, "keeps_steps", False) for post in self.filters):
+            return steps
+        own: int = getattr(self._matcher, "steps_per_px", 0)
+        return min(steps, own) if steps and own else steps or own
 
     def depth_step_m(self, depth_m: float) -> float:
         """Depth that one step of the disparity makes: Z^2 / (steps f b); 0 without steps."""

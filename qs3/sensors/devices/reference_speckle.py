@@ -36,7 +36,7 @@ class ReferenceSpeckle(TriangulatingSensor):
         tan_half_width: half the width of the slide at distance 1.
         ambient: as in SpeckleStereo, relative to the pattern on white at `reference_m`.
         pattern, matcher, infrared: as in SpeckleStereo; ReferenceMatcher has a quantiser of its
-            own.
+            own, beside which a finer one of the sensor changes nothing.
     """
 
     reference_m: float = 1.6
@@ -64,11 +64,6 @@ class ReferenceSpeckle(TriangulatingSensor):
     def disparity(self, depth_m: float) -> float:
         """Disparity in px of a plane at `depth_m`."""
         return self.focal_px * self.baseline_m * (1 / depth_m - 1 / self.reference_m)
-
-    @property
-    def steps_per_px(self) -> int:
-        """Steps of the disparity, the sensor's or the matcher's; 0 where it is not quantised."""
-        return self.quantiser.steps_per_px or getattr(self.matcher, "steps_per_px", 0)
 
     @property
     def zero_disparity_px(self) -> float:

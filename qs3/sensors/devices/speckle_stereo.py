@@ -108,11 +108,6 @@ class SpeckleStereo(TriangulatingSensor):
             )
 
     @property
-    def steps_per_px(self) -> int:
-        """Steps of the disparity; OpenCV's own are 1/16 px."""
-        return self.quantiser.steps_per_px or 16
-
-    @property
     def margin_px(self) -> int:
         """Fattening puts values up to half a block outside the silhouette; misalignment more."""
         return self.matcher.reach_px + self.misalignment.reach_px(self.intrinsics)
