@@ -8,8 +8,11 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
+from qs3.config.hydra import build
 from qs3.errors import ConfigError
+from qs3.generation.camera_poses import Drift
 from qs3.generation.objects import known_classes
+from qs3.generation.room_scans import RoomScan
 from qs3.generation.twins import TWINS, VIEWS
 from qs3.meshes.folder import SPLITS
 
@@ -106,7 +109,7 @@ def check_recipe(recipe: Any, cfg: DictConfig) -> None:
     And if something is asked for that a domain without views cannot give.
     """
     if not recipe.needs_renderer:
-        for key in (*_OF_LOOKING, "provenance", "keep_views", "twins"):
+        for key in (*_OF_LOOKING, "views", "provenance", "keep_views", "twins"):
             if cfg.get(key):
                 raise ConfigError(
                     f"domain {cfg.domain.name} looks at nothing, so {key}= says nothing to it: "
@@ -119,6 +122,11 @@ def check_recipe(recipe: Any, cfg: DictConfig) -> None:
             raise ConfigError(
                 f"domain {cfg.domain.name} looks at meshes: {key}=none does not do, choose another"
             )
+    if isinstance(recipe, RoomScan) and cfg.get("tracking") and build(cfg.tracking) != Drift():
+        raise ConfigError(
+            "a scan of a room is one view, whose pose is known, so tracking= says nothing to it: "
+            "leave it out, or take a domain of several views such as kinectsim10"
+        )
     if VIEWS in cfg.twins and getattr(recipe.views, "count", recipe.views) == 1:
         raise ConfigError(
             "twins=[views]: with one view it is the cloud itself; leave it out, or take a domain "

@@ -91,6 +91,9 @@ class BoxCrop:
 
     margin_m: float = 0.03
 
+    def __post_init__(self) -> None:
+        check_ranges(self, "crop.", margin_m=">= 0")
+
     def keep(self, frame: DepthFrame, rng: np.random.Generator) -> np.ndarray | None:
         """[h, w] bool in the image; None: the box alone decides, after back-projection."""
         return None
@@ -125,6 +128,7 @@ class MaskCrop(BoxCrop):
     max_shift_px: int = 2
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_ranges(self, "crop.", max_shift_px=">= 0")
         check_order(self, "crop.", "grow_px")
 

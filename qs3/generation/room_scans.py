@@ -118,7 +118,7 @@ class RoomScan:
         camera: where it is looked from.
         fronts: by class the probability that it stands with its back to a wall or away from people:
             its front is seen, which is -y of a mesh as made. Empty if nobody knows where yours is.
-        mask: how carelessly the mask is drawn.
+        mask: how carelessly the mask is drawn; its box is not used, nor its `margin_m`.
         rules: by which it is cut, and when it is refused.
         points: of the final cloud; a smaller one repeats points.
         torn: probability that of an object which depth edges tear apart only one piece is cut: who
@@ -160,6 +160,11 @@ class RoomScan:
         if not isinstance(self.mask, MaskCrop):
             raise ConfigError(
                 "a scan of a room is cut by a mask: leave crop out, or take crop=mask"
+            )
+        if self.mask.margin_m != MaskCrop().margin_m:
+            raise ConfigError(
+                f"crop.margin_m={self.mask.margin_m} says nothing to a scan of a room, which is "
+                "cut by its mask and not by a box: leave it out"
             )
         if not isinstance(self.scene, Room):
             raise ConfigError(

@@ -54,6 +54,9 @@ def true_points(
 ) -> Float[np.ndarray, "m 3"]:
     """Where the points `measured` of the pixels `depth_m` would be without error, in metres.
 
+    That is the true depth along the pixel's true ray: neither the pose nor the principal point that
+    were believed enter.
+
     A pixel behind which the object is not (its surroundings, or nothing, where a matcher's patch
     reached over an edge) has no truth of this object: its point stays as it was measured.
 
@@ -66,7 +69,7 @@ def true_points(
     used = np.isfinite(depth_m)
     known = used & (frame.label == 1) & np.isfinite(frame.clean_m)
     depth = np.where(known, frame.clean_m, np.where(used, 1.0, np.nan))
-    true = frame.points(depth, world_from_camera)
+    true = frame.points(depth, world_from_camera, frame.true_lens)
     return np.where(known[used][:, None], true, measured)
 
 

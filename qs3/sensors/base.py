@@ -11,7 +11,7 @@ import numpy as np
 from qs3.config.checks import check_ranges
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window, project
-from qs3.sensors.matching import Match
+from qs3.sensors.matching import Match, StereoBlockMatcher
 from qs3.sensors.matching.filters import PostFilter, Quantiser
 from qs3.sensors.matching.triangulation import Triangulation
 from qs3.sensors.optics.visibility import explained, reached_from
@@ -37,6 +37,8 @@ class DepthFrame:
             if the scan was asked to `explain`.
         images: intermediate pictures by name ("left", "right", "disparity", ...), for looking at,
             of the size of the rendered window.
+        true_lens: the intrinsics with which it was taken, where those of `camera` are what the
+            device believes; None: they are the same.
     """
 
     camera: Camera
@@ -49,17 +51,21 @@ class DepthFrame:
     cosine: np.ndarray
     reason: np.ndarray
     images: dict[str, np.ndarray] = field(default_factory=dict)
+    true_lens: Intrinsics | None = None
 
-    def points(self, depth_m: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
+    def points(
+        self, depth_m: np.ndarray, world_from_camera: np.ndarray, lens: Intrinsics | None = None
+    ) -> np.ndarray:
         """Back-project `depth_m` [h, w] (self.depth_m or self.clean_m, possibly masked).
 
         `world_from_camera` [4, 4] is the pose that is believed: a drifting one or the true.
+        Likewise `lens`; None: the one that the device believes.
 
         Returns:
             [M, 3] float64 points in the world, row-major, of the pixels that are finite.
         """
         rows, cols = np.nonzero(np.isfinite(depth_m))
-        k = self.camera.intrinsics
+        k = lens or self.camera.intrinsics
         z = depth_m[rows, cols].astype(np.float64)
         x = (self.left + cols * self.step_px - k.cx_px) / k.focal_px * z
         y = (self.top + rows * self.step_px - k.cy_px) / k.focal_px * z
@@ -200,6 +206,7 @@ class Shot:
             at.of(image.cosine),
             reason,
             pictures,
+            self.camera.intrinsics if intrinsics else None,
         )
 
 
@@ -289,6 +296,20 @@ class TriangulatingSensor(DepthSensor):
     def __post_init__(self) -> None:
         check_ranges(self, "sensor.", baseline_m="> 0")
         check_depths(self)
+        matcher, steps = self._matcher, self.quantiser.steps_per_px
+        unbiased = isinstance(matcher, StereoBlockMatcher) and matcher.remove_bias
+        # k / 16 less nearly half a step would be rounded straight back to k / 16.
+        if unbiased and steps == matcher.steps_per_px:
+            raise ConfigError(
+                f"sensor.quantiser.steps_per_px={steps} are StereoBM's own steps, and rounding to "
+                "them again undoes sensor.matcher.remove_bias: set it to 0, to another number such "
+                "as 8 or 32, or set sensor.matcher.remove_bias=false"
+            )
+
+    @property
+    def _matcher(self) -> Any:
+        """Of a kind that matches images, or None."""
+        return getattr(self, "matcher", None)
 
     @property
     def zero_disparity_px(self) -> float:
@@ -297,8 +318,16 @@ class TriangulatingSensor(DepthSensor):
 
     @property
     def steps_per_px(self) -> int:
-        """Steps of the disparity; 0 where it is not quantised."""
-        return self.quantiser.steps_per_px
+        """Even steps of the disparity that its values have; 0 where there are none.
+
+        A quantiser finer than the matcher's own steps adds none to them, unless a filter between
+        the two makes other values.
+        """
+        steps: int = self.quantiser.steps_per_px
+        if not all(getattr(post, "keeps_steps", False) for post in self.filters):
+            return steps
+        own: int = getattr(self._matcher, "steps_per_px", 0)
+        return min(steps, own) if steps and own else steps or own
 
     def depth_step_m(self, depth_m: float) -> float:
         """Depth that one step of the disparity makes: Z^2 / (steps f b); 0 without steps."""

@@ -239,7 +239,9 @@ def test_a_frame_without_photograph_or_depth_can_be_kept(tmp_path):
         load_views(tmp_path, "a/b")
 
 
-@pytest.mark.parametrize("key", ["provenance=true", "keep_views=true", "scene=room", "crop=mask"])
+@pytest.mark.parametrize(
+    "key", ["provenance=true", "keep_views=true", "scene=room", "crop=mask", "views=7"]
+)
 def test_a_domain_that_looks_at_nothing_cannot_keep_or_place_anything(meshes, tmp_path, key):
     with pytest.raises(ConfigError, match=f"looks at nothing, so {key.split('=')[0]}= says"):
         generate(two_classes(tmp_path, meshes, key, domain="modelnet10"))

@@ -19,8 +19,9 @@ from qs3.data.inspection.surface import surfaces_of
 from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
+from qs3.generation.checks import check, check_recipe
 from qs3.generation.provenance import Keep
-from qs3.generation.recipes import TooFewPointsError
+from qs3.generation.recipes import BoxCrop, MaskCrop, TooFewPointsError
 from qs3.generation.room_scans import RoomCamera, one_piece, yaw_between
 from qs3.generation.scenes import Room, Support
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
@@ -239,6 +240,28 @@ def test_things_stand_on_others_as_often_as_is_said(made, lamp):
 def test_wrong_furniture_names_its_key(make, message):
     with pytest.raises(ConfigError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["crop.margin_m=0"], "crop.margin_m=0 says nothing to a scan of a room"),
+        (["crop.margin_m=-0.5"], r"crop\.margin_m must be >= 0"),
+        (["tracking=drifting"], "tracking= says nothing to it"),
+        (["tracking=drifting", "tracking.turn_rad=0"], "tracking= says nothing to it"),
+    ],
+)
+def test_settings_that_do_nothing_to_a_room_are_refused(words, message):
+    cfg = composed("domain=roomscan10", *words)
+    check(cfg)
+    with pytest.raises(ConfigError, match=message):
+        check_recipe(build(cfg.recipe), cfg)
+
+
+def test_a_negative_margin_is_refused():
+    for crop in (BoxCrop, MaskCrop):
+        with pytest.raises(ConfigError, match=r"crop\.margin_m must be >= 0"):
+            crop(margin_m=-0.01)
 
 
 @pytest.mark.parametrize("block", [0.0, 1.0])

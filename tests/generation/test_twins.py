@@ -12,9 +12,13 @@ from qs3.generation.checks import check
 from qs3.generation.command import generate
 from qs3.generation.provenance import NO_RESIDUAL_M, Keep
 from qs3.generation.twins import fused_twins, true_points, whole_surface
-from qs3.geometry.cameras import Camera, Intrinsics
+from qs3.geometry.cameras import Camera, Intrinsics, look_at
 from qs3.meshes.catalogue import Catalogue
+from qs3.meshes.mesh import Mesh
 from qs3.sensors.base import DepthFrame
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.renderers.base import Body
+from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from qs3.utils.seeding import object_rng
 from tests.generation.generating import composed, config, fingerprint
 
@@ -150,6 +154,23 @@ def test_only_pixels_of_the_object_have_a_truth():
     ideal = frame.points(np.ones((2, 3)), np.eye(4))
     np.testing.assert_allclose(true[[0, 1, 4]], ideal[[0, 1, 5]])
     np.testing.assert_array_equal(true[[2, 3]], measured[[2, 3]])
+
+
+def test_the_truth_is_on_the_pixels_true_ray_where_the_device_believes_another():
+    """With the released code's half a pixel, a sphere's exact points lie on the sphere."""
+    solid = trimesh.creation.icosphere(5, 0.5)
+    mesh = Mesh.from_trimesh(solid)
+    pose = look_at(np.array([3.0, 0.0, 0.0]), np.zeros(3))
+    sensor = SpeckleStereo(centre_error_px=4.0)
+    rng = np.random.default_rng(0)
+    frame = sensor.scan((Body(mesh),), np.array(mesh.bounds), pose, MitsubaRenderer(4), rng)
+    measured = frame.points(frame.depth_m, pose)
+    true = true_points(frame, frame.depth_m, measured, pose)
+    known = (frame.label == 1)[np.isfinite(frame.depth_m)]
+    assert known.mean() > 0.9
+    off = np.linalg.norm(true[known], axis=1) - 0.5
+    assert np.abs(off).max() < 1e-3  # 4 px are 7 mm there
+    assert np.abs(np.median(measured[known][:, 1])) > 5e-3  # as it is measured
 
 
 def test_a_view_without_points_repeats_the_one_before_or_the_first():

@@ -293,7 +293,7 @@ def _note(one: Cut) -> dict[str, Any]:
     return {
         "cls": one.cls,
         "origin": one.origin,
-        "pixels": piece.pixels,
+        "pixels": piece.pixels if piece.refused else len(piece.points_m),
         "reason": piece.why if piece.refused else "",
         "more": more,
     }

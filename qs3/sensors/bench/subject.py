@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics
 from qs3.sensors.base import DepthSensor
-from qs3.sensors.matching import STEREOBM_BIAS_PX
+from qs3.sensors.matching import STEREOBM_BIAS_PX, StereoBlockMatcher
 
 DEPTHS_M = (0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 
@@ -63,9 +65,8 @@ class Subject:
 
     @property
     def steps_per_px(self) -> int:
-        """Steps of the disparity a pixel; 0 where it is not quantised (or nothing is known)."""
-        own = getattr(self.matcher, "steps_per_px", 0)
-        return getattr(self._get("quantiser"), "steps_per_px", 0) or own
+        """Even steps of the disparity a pixel; 0 where there are none (or nothing is known)."""
+        return int(self._get("steps_per_px", 0))
 
     @property
     def whole_px(self) -> float:
@@ -76,9 +77,8 @@ class Subject:
     @property
     def level_offset_px(self) -> float:
         """Disparity (f B / Z) of one of the levels of the quantiser."""
-        quantised = getattr(self._get("quantiser"), "steps_per_px", 0)
-        if getattr(self.matcher, "remove_bias", False) and not quantised:
-            return -STEREOBM_BIAS_PX
+        if isinstance(self.matcher, StereoBlockMatcher) and self.matcher.remove_bias:
+            return float(self._get("quantiser").apply(np.float32(-STEREOBM_BIAS_PX)))
         return self.whole_px
 
     def source_m(self, cameras: int) -> float | None:

@@ -17,6 +17,7 @@ import numpy as np
 from qs3.errors import ConfigError
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor
 from qs3.sensors.matching import Matcher, ReferenceMatcher
+from qs3.sensors.matching.base import found_px
 from qs3.sensors.matching.texture import for_picture
 from qs3.sensors.optics.infrared import InfraredCamera
 from qs3.sensors.optics.patterns import Slide, Speckle
@@ -35,7 +36,7 @@ class ReferenceSpeckle(TriangulatingSensor):
         tan_half_width: half the width of the slide at distance 1.
         ambient: as in SpeckleStereo, relative to the pattern on white at `reference_m`.
         pattern, matcher, infrared: as in SpeckleStereo; ReferenceMatcher has a quantiser of its
-            own.
+            own, beside which a finer one of the sensor changes nothing.
     """
 
     reference_m: float = 1.6
@@ -52,23 +53,17 @@ class ReferenceSpeckle(TriangulatingSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = (self.disparity(z) for z in (self.max_depth_m, self.min_depth_m))
-        first = self.matcher.min_disparity
-        last = first + self.matcher.num_disparities - 1
-        if low < first or high > last:
+        least, most = found_px(self.matcher)
+        if low < least or high > most:
             raise ConfigError(
                 f"depths {self.min_depth_m} to {self.max_depth_m} m need disparities "
-                f"{low:.1f} to {high:.1f} px, but the matcher searches {first} to {last}: "
+                f"{low:.1f} to {high:.1f} px, but the matcher finds {least:g} to {most:g}: "
                 "change sensor.reference_m or the matcher's range"
             )
 
     def disparity(self, depth_m: float) -> float:
         """Disparity in px of a plane at `depth_m`."""
         return self.focal_px * self.baseline_m * (1 / depth_m - 1 / self.reference_m)
-
-    @property
-    def steps_per_px(self) -> int:
-        """Steps of the disparity, the sensor's or the matcher's; 0 where it is not quantised."""
-        return self.quantiser.steps_per_px or getattr(self.matcher, "steps_per_px", 0)
 
     @property
     def zero_disparity_px(self) -> float:

@@ -11,6 +11,7 @@ after its down-sampling, by up to two), and StereoBM's bias of 0.029 px.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -21,6 +22,7 @@ from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window
 from qs3.sensors.base import DepthFrame, Shot, TriangulatingSensor, window_of
 from qs3.sensors.matching import Match, Matcher, StereoBlockMatcher
+from qs3.sensors.matching.base import found_px
 from qs3.sensors.matching.texture import for_picture
 from qs3.sensors.optics.blender_filmic import FilmicCamera
 from qs3.sensors.optics.infrared import InfraredCamera
@@ -89,18 +91,21 @@ class SpeckleStereo(TriangulatingSensor):
                 f"sensor.sample_offset_px must be null or in 0..{self.step_px - 1} (step_px is "
                 f"{self.step_px}), got {self.sample_offset_px}"
             )
-        end = self.matcher.min_disparity + self.matcher.num_disparities
-        if self.focal_px * self.baseline_m / self.min_depth_m > end:
-            nearest = self.focal_px * self.baseline_m / end
+        scale, (least, most) = self.focal_px * self.baseline_m, found_px(self.matcher)
+        if scale / self.min_depth_m > most:
             raise ConfigError(
                 f"sensor.min_depth_m {self.min_depth_m} is nearer than the matcher reaches: "
-                f"with disparities up to {end} it is {nearest:.2f} m"
+                f"it finds disparities up to {most:g} px, from "
+                f"{math.ceil(100 * scale / most) / 100:g} m on; set that, or a larger "
+                "sensor.matcher.num_disparities"
             )
-
-    @property
-    def steps_per_px(self) -> int:
-        """Steps of the disparity; OpenCV's own are 1/16 px."""
-        return self.quantiser.steps_per_px or 16
+        if scale / self.max_depth_m < least:
+            raise ConfigError(
+                f"sensor.max_depth_m {self.max_depth_m} is farther than the matcher reaches: "
+                f"it finds disparities from {least:g} px on, up to "
+                f"{math.floor(100 * scale / least) / 100:g} m; set that, or a smaller "
+                "sensor.matcher.min_disparity"
+            )
 
     @property
     def margin_px(self) -> int:

@@ -62,6 +62,16 @@ class Matcher(Protocol):
         """
 
 
+def found_px(matcher: Matcher) -> tuple[float, float]:
+    """Smallest and largest disparity in px that a matcher finds.
+
+    A place at an end of the search has a neighbour on one side only, and so no sub-pixels; most
+    matchers drop it. The places between reach half a pixel to either side.
+    """
+    first = matcher.min_disparity
+    return first + 0.5, first + matcher.num_disparities - 1.5
+
+
 def side_by_side(
     image: np.ndarray, other: np.ndarray, first: int, low: int, high: int, margin: int
 ) -> tuple[np.ndarray, np.ndarray, int]:

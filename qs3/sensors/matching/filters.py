@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import cv2
 import numpy as np
@@ -33,7 +33,11 @@ class Quantiser:
 
 
 class PostFilter(Protocol):
-    """Changes or drops disparities."""
+    """Changes or drops disparities.
+
+    One whose class has `keeps_steps = True` gives no value that was not there before, so that the
+    matcher's own steps stay.
+    """
 
     def apply(self, disparity: np.ndarray) -> np.ndarray:
         """[h, w] float32 px with NaN -> the same, changed; dropped values are NaN."""
@@ -48,6 +52,7 @@ class SmallRegions:
         max_step_px: neighbours (of 4) belong together if they differ by at most this.
     """
 
+    keeps_steps: ClassVar[bool] = True
     max_size_px: int = 50
     max_step_px: float = 1.0
 
@@ -102,6 +107,7 @@ class NeighbourCheck:
         min_share: share of the window's other pixels that must agree; missing ones do not.
     """
 
+    keeps_steps: ClassVar[bool] = True
     size_px: int = 5
     max_step_px: float = 1.0
     min_share: float = 0.4
@@ -168,6 +174,7 @@ class FillHoles:
         max_width_px: gaps of a row that are wider stay.
     """
 
+    keeps_steps: ClassVar[bool] = True
     max_width_px: int = 5
 
     def __post_init__(self) -> None:

@@ -73,6 +73,11 @@ class SemiGlobalMatcher:
         return (8 * area if self.p1 is None else self.p1, 32 * area if self.p2 is None else self.p2)
 
     @property
+    def steps_per_px(self) -> int:
+        """OpenCV's own steps; 0 with `remove_bias`, which makes them uneven."""
+        return 0 if self.remove_bias else 16
+
+    @property
     def reach_px(self) -> int:
         """Half a block and a pixel of the Sobel filter; the paths carry little beyond."""
         return self.block_size // 2 + 8

@@ -55,6 +55,7 @@ class Speckle:
             self,
             "pattern.",
             brightness_spread="[0, 1]",
+            spacing=">= 0",
             **dict.fromkeys(("columns", "rows", "tiles", "dot_px"), ">= 1"),
         )
         densest = 1 / (1 + self.spacing) ** 2
@@ -63,12 +64,39 @@ class Speckle:
                 f"pattern.fill {self.fill} cannot be reached with spacing {self.spacing}: "
                 f"it must be in (0, {0.6 * densest:.3f}]"
             )
+        places = self.rows * self.columns
+        if not self._wanted:
+            raise ConfigError(
+                f"pattern.fill {self.fill} lights none of the {places} positions of a tile: it "
+                f"must be above {0.5 / places:.2g}, or take more pattern.columns and rows"
+            )
+        if (self._wanted - 1) * (2 * self.spacing + 1) ** 2 >= places:
+            self._dots(self._rng())  # with fewer there is always room for one more
+
+    @property
+    def _wanted(self) -> int:
+        """Lit positions of a tile."""
+        return round(self.fill * self.rows * self.columns)
+
+    def _rng(self) -> np.random.Generator:
+        return np.random.default_rng([0x5BEC, self.seed])
+
+    def _dots(self, rng: np.random.Generator) -> np.ndarray:
+        """[rows, columns] bool of a tile; ConfigError if so many dots find no room."""
+        tile = _spaced_dots(self.rows, self.columns, self._wanted, self.spacing, rng)
+        if (placed := int(tile.sum())) < self._wanted:
+            raise ConfigError(
+                f"pattern.fill {self.fill} cannot be reached with spacing {self.spacing}: of "
+                f"{self._wanted} dots of a tile {placed} found room, so that it must be at most "
+                f"{placed / tile.size:.3g}"
+            )
+        return tile
 
     @cached_property
     def slide(self) -> np.ndarray:
         """[rows * tiles * dot_px, columns * tiles * dot_px] float32, 0 dark or 1 lit."""
-        rng = np.random.default_rng([0x5BEC, self.seed])
-        tile = _spaced_dots(self.rows, self.columns, self.fill, self.spacing, rng)
+        rng = self._rng()
+        tile = self._dots(rng)
         if self.brightness_spread:
             tile = tile * (1 - self.brightness_spread * rng.random(tile.shape))
         image = np.tile(tile, (self.tiles, self.tiles))
@@ -79,12 +107,14 @@ class Speckle:
 
 
 def _spaced_dots(
-    rows: int, columns: int, fill: float, spacing: int, rng: np.random.Generator
+    rows: int, columns: int, wanted: int, spacing: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Random sequential placement on a torus, so that tiles join without a seam."""
+    """Random sequential placement on a torus, so that tiles join without a seam.
+
+    Where no room is left for a dot it ends with fewer than the `wanted`, which are at least 1.
+    """
     lit = np.zeros(rows * columns, dtype=bool)
     blocked = bytearray(rows * columns)  # single elements of arrays are slow
-    wanted = round(fill * rows * columns)
     placed = 0
     offsets = range(-spacing, spacing + 1)
     near = [[(column + i) % columns for i in offsets] for column in range(columns)]

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from qs3.config.checks import check_ranges
+from qs3.errors import ConfigError
 from qs3.sensors.optics.patterns import Speckle
 
 
@@ -24,6 +25,7 @@ class ReleasedSlide(Speckle):
 
     Attributes:
         detail: pixels of the slide for each of the picture, after interpolation.
+        brightness_spread: 0, for the picture's dots are all white.
     """
 
     columns: int = 211
@@ -34,6 +36,11 @@ class ReleasedSlide(Speckle):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_ranges(self, "pattern.", detail=">= 1")
+        if self.brightness_spread:
+            raise ConfigError(
+                "the released slide's dots are equally bright: leave pattern.brightness_spread at "
+                f"0, got {self.brightness_spread}, or take optics.patterns.Speckle as the pattern"
+            )
 
     @cached_property
     def slide(self) -> np.ndarray:

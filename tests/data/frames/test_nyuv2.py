@@ -107,6 +107,21 @@ def test_the_same_again_and_only_clean(opened, nyuv2, tmp_path):
     assert clean.open().made_of.objects.startswith("real objects")
 
 
+def test_points_are_counted_after_stray_ones_are_dropped(nyuv2, tmp_path):
+    """A cloud that is not full repeats points: it has as many different ones as are counted."""
+    counts = {}
+    for drop in ("false", "true"):
+        keys = {"paths.data_dir": str(nyuv2), "path": str(tmp_path / drop)}
+        more = {"published.points": "20000", "published.rules.drop_outliers": drop}
+        domain = compose_domain("nyuv2", {**keys, **more})
+        data = domain.open()
+        rows = [row for row in read_manifest(domain.folder, data.classes) if row.status == "ok"]
+        for row, cloud in zip(rows, data.points, strict=True):
+            assert len(np.unique(cloud, axis=0)) == row.valid_points, row.id
+        counts[drop] = sum(row.valid_points for row in rows)
+    assert counts["true"] < counts["false"]
+
+
 def test_an_interrupted_import_goes_on(opened, nyuv2, tmp_path, monkeypatch):
     keys = {"paths.data_dir": str(nyuv2), "path": str(tmp_path / "store")}
     reads, armed, depth_m = [], [True], reader.LabelledFrames.depth_m

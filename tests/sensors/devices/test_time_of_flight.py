@@ -96,6 +96,41 @@ def test_unwrapping_finds_every_distance_in_range(frequencies, shares, amplitude
     assert disagreement.max() < 1e-6
 
 
+def test_of_very_many_periods_those_in_range_are_tried():
+    """Frequencies whose common divisor is 1 kHz or 1 Hz, as which nobody would write them."""
+    true = np.linspace(0.1, 7.9, 40)[None]
+    for other in (33.333e6, 33_333_333.0):
+        frequencies = (100e6, other)
+        f = np.array(frequencies)[:, None, None]
+        phase = (4 * np.pi * f * true / SPEED_OF_LIGHT) % (2 * np.pi)
+        found, worst = unwrapped(phase, np.ones_like(phase), frequencies, farthest_m=8.0)
+        np.testing.assert_allclose(found, true, atol=1e-6)
+        assert worst.max() < 1e-6
+    # Of few periods all: what is out of range is not taken for something in it.
+    f = np.array([80e6, 16e6])[:, None, None]
+    phase = (4 * np.pi * f * 9.0 / SPEED_OF_LIGHT) % (2 * np.pi)
+    found, _ = unwrapped(phase, np.ones_like(phase), (80e6, 16e6), farthest_m=6.0)
+    assert found == pytest.approx(9.0)
+
+
+def test_a_limited_search_finds_what_the_whole_one_does():
+    frequencies, rng = (100e6, 33.3e6), np.random.default_rng(0)  # 1000 periods
+    true = np.linspace(0.3, 7.5, 200)[None]
+    f = np.array(frequencies)[:, None, None]
+    noise = 2e-4 * rng.standard_normal((2, 1, 200))
+    phase = (4 * np.pi * f * true / SPEED_OF_LIGHT + noise) % (2 * np.pi)
+    amplitude = np.ones_like(phase)
+    whole, limited = (unwrapped(phase, amplitude, frequencies, far) for far in (np.inf, 8.0))
+    np.testing.assert_array_equal(limited, whole)
+    assert np.abs(limited[0] - true).max() < 0.01
+
+
+def test_a_camera_of_frequencies_without_a_large_divisor_measures(renderer):
+    camera = replace(QUIET, frequencies_hz=(100e6, 17_345_678.0))
+    frame = scan(camera, [square(2.0, 0.6)], renderer)
+    np.testing.assert_allclose(middle(frame.depth_m), 2.0, atol=1e-3)
+
+
 def edge_scene(camera, near, far, share_of_pixel):
     """A near rectangle that ends inside pixels of one column, before a far one."""
     column = 170

@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 
 from qs3.sensors.matching import (
+    STEREOBM_BIAS_PX,
     CensusMatcher,
     NormalisedCorrelation,
     SemiGlobalMatcher,
     StereoBlockMatcher,
 )
+from qs3.sensors.matching.base import found_px
+from qs3.sensors.matching.filters import Quantiser
 from qs3.sensors.pixel_status import Reason
 from tests.sensors.matching.textures import FINE, dots, seen
 
@@ -44,6 +47,36 @@ def test_all_sub_pixel_phases_come_back(name):
         assert good.std() < spread
         medians.append(np.median(good))
     assert abs(np.mean(medians)) < pooled
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_a_search_finds_to_half_a_pixel_within_its_ends(name):
+    make = {
+        "block": StereoBlockMatcher(32, 19, min_disparity=8),
+        "semi-global": SemiGlobalMatcher(32, 8),
+        "correlation": NormalisedCorrelation(9, 8, 32),
+        "census": CensusMatcher(32, 8),
+    }
+    matcher, texture = make[name], dots(80, 300, 4)
+    least, most = found_px(matcher)
+    assert (least, most) == (8.5, 38.5)
+
+    def right(true):
+        """Share of the pixels that come back within 0.15 px."""
+        image, other = seen(texture, true, seed=1), seen(texture, 0, seed=2)
+        error = (matcher.match(image, other).disparity - true)[12:-12, 90:-20]
+        return (np.abs(error) < 0.15).mean()
+
+    assert min(right(least + 0.4), right(most - 0.4)) > 0.85
+    assert max(right(least - 0.25), right(most + 0.25)) < 0.25
+
+
+def test_steps_as_the_block_matchers_own_undo_what_removes_its_bias():
+    """A matcher's k / 16 is k / 16 - 0.029 in the mean; refused by every sensor."""
+    own = np.arange(1600, dtype=np.float32) / 16 - np.float32(STEREOBM_BIAS_PX)
+    moved = {n: (Quantiser(n).apply(own) - own).mean() for n in (4, 8, 16, 32)}
+    assert moved.pop(16) == pytest.approx(STEREOBM_BIAS_PX, rel=1e-3)
+    assert max(map(abs, moved.values())) < 0.01
 
 
 @pytest.mark.parametrize("name", MATCHERS)
