@@ -15,6 +15,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
 from qs3.config.hydra import build, component_names, in_multirun
 from qs3.data.ensure_source import check_or_make
+from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.prior import check_told
@@ -68,6 +69,7 @@ STILL = {
 
 _ONNX = "model=features needs an ONNX file"
 _FEATURES = "qs3.models.features.features"
+_PCFEA = "qs3.selftraining.pcfea.Pcfea"
 
 
 def train(cfg: DictConfig) -> RunMetrics:
@@ -78,6 +80,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     _check_settings(cfg)
     run = run_of(cfg)
     _check_rounds(run)
+    _check_pools(run)
     _check_scale(run)
     _check_frozen(run)
     check_objective(cfg.objective)
@@ -298,6 +301,13 @@ def _check_rounds(run: Run) -> None:
             "has no rounds: selection.teacher decides what is reported; set "
             f"selection.student={LAST}, or a selftraining with rounds"
         )
+
+
+def _check_pools(run: Run) -> None:
+    """Refuse PCFEA that would make no pool in any epoch."""
+    method = run.cfg.method
+    if method.get("_target_") == _PCFEA and "plain" in method:
+        plain_epochs(check_float("method.plain", method.plain, "[0, 1)"), run.phases.warmup)
 
 
 def _check_scale(run: Run) -> None:

@@ -107,6 +107,7 @@ def test_help_imports_nothing_heavy(tmp_path):
             ("ConfigError: trainer.float32_matmul=high rounds a GPU's products", "trainer=gpu"),
         ),
         (("trainer.limit_val_batches=0",), ("ConfigError: trainer.limit_val_batches must",)),
+        (("method=pcfea", "protocol.epochs=1"), ("method.plain=0.1 of protocol.epochs=1, rounded",)),
         (("selection.best=1",), ("keys of selection are teacher, student",)),
         (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),
         (
