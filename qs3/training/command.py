@@ -67,6 +67,21 @@ STILL = {
 }
 """Settings of `protocol.augment` that leave clouds as they are."""
 
+NOT_TAKEN = {
+    **dict.fromkeys(
+        ("max_epochs", "min_epochs", "max_steps", "min_steps", "max_time"),
+        "a run is its warm-up and its rounds; set protocol.epochs and protocol.steps, and "
+        "selftraining.rounds, .epochs and .steps",
+    ),
+    **dict.fromkeys(
+        ("check_val_every_n_epoch", "val_check_interval"),
+        "each epoch is judged once, at its end, and teachers are chosen by that; set "
+        "trainer.limit_val_batches where it takes long",
+    ),
+    "fast_dev_run": "nothing of it would be saved; set debug=fast",
+}
+"""Arguments of Lightning's trainer that no run can have, and what to set instead."""
+
 _ONNX = "model=features needs an ONNX file"
 _FEATURES = "qs3.models.features.features"
 _PCFEA = "qs3.selftraining.pcfea.Pcfea"
@@ -235,11 +250,7 @@ def _check_settings(cfg: DictConfig) -> None:
     _check_products(cfg.trainer)
     if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
         check_bool("trainer.deterministic", exactly)
-    if cfg.trainer.get("limit_val_batches") == 0:
-        raise ConfigError(
-            "trainer.limit_val_batches must leave a batch: held-out labelled clouds say what the "
-            "net is worth; null takes all of them"
-        )
+    _check_limits(cfg.trainer)
     if cfg.report.pictures != "auto":
         check_bool("report.pictures", cfg.report.pictures)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
@@ -274,6 +285,23 @@ def _check_keys(cfg: DictConfig) -> None:
         found: Any = OmegaConf.select(cfg, prefix.rstrip(".")) if prefix else cfg
         keys = [str(key) for key in found if prefix or f"${{{key}" not in text]
         check_keys(prefix, keys, known)
+
+
+def _check_limits(trainer: DictConfig) -> None:
+    """Refuse an epoch of no batches, and what would end or judge a run elsewhere than its phases."""
+    if trainer.get("limit_train_batches") == 0:
+        raise ConfigError(
+            "trainer.limit_train_batches must leave a batch, or nothing is trained; null takes all "
+            "of an epoch's, and protocol.steps says how many there are"
+        )
+    if trainer.get("limit_val_batches") == 0:
+        raise ConfigError(
+            "trainer.limit_val_batches must leave a batch: held-out labelled clouds say what the "
+            "net is worth; null takes all of them"
+        )
+    for key, instead in NOT_TAKEN.items():
+        if (value := trainer.get(key)) is not None:
+            raise ConfigError(f"trainer.{key}={value} cannot be had: {instead}")
 
 
 def _check_products(trainer: DictConfig) -> None:
