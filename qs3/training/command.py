@@ -288,7 +288,7 @@ def _check_keys(cfg: DictConfig) -> None:
 
 
 def _check_limits(trainer: DictConfig) -> None:
-    """Refuse an epoch of no batches, and what would end or judge a run elsewhere than its phases."""
+    """Refuse epochs of no batches, and what ends or judges a run elsewhere than at its phases."""
     if trainer.get("limit_train_batches") == 0:
         raise ConfigError(
             "trainer.limit_train_batches must leave a batch, or nothing is trained; null takes all "
