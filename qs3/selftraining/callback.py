@@ -182,6 +182,7 @@ class SelfTraining(Callback):
             self.scheme.missing_class,
             more=self.scheme.more_labels,
             trainable=not self._given,
+            processes=trainer.world_size,
         )
 
         labels = torch.from_numpy(said.predicted)

@@ -197,6 +197,7 @@ def check_selection(
     missing_class: str,
     more: str = LOWER_THETA,
     trainable: bool = True,
+    processes: int = 1,
 ) -> list[str]:
     """Names of the classes without a pseudo-label, after checking that training is possible.
 
@@ -207,9 +208,10 @@ def check_selection(
         missing_class: "warn" or "error".
         more: what would select more, for messages; see `SelfTrainingConfig.more_labels`.
         trainable: whether the teacher could have been trained for longer.
+        processes: that share the samples out, one of them to two where they come out uneven.
 
     Raises:
-        SelectionError: fewer than two samples were selected (batch normalisation needs two), or
+        SelectionError: a process has fewer than two samples (batch normalisation needs two), or
             a class is missing and `missing_class` is "error".
     """
     missing = [name for name, n in zip(class_names, selection.kept, strict=True) if n == 0]
@@ -221,7 +223,7 @@ def check_selection(
         )
     )
     facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
-    if total < 2:
+    if total <= processes:
         own_mu = selection.mu[selection.confident > 0]
         longer = ["train the teacher longer (protocol.epochs)"] * trainable
         if len(own_mu) == 1 and own_mu[0] == 0:
@@ -229,6 +231,9 @@ def check_selection(
             ways = [more, *longer, "set selftraining.selector.mu=one"]
         else:
             why, ways = "", [more, *longer]
+        if processes > 1:
+            why += f"each of {processes} processes needs two; "
+            ways.append("give fewer trainer.devices")
         raise SelectionError(
             f"only {counted(total, 'pseudo-label')} selected in {facts}; {why}{', or '.join(ways)}"
         )
