@@ -7,10 +7,14 @@ Only what is asked for is read. A part of it (a slice, `at`) copies nothing.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from types import EllipsisType, NoneType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+
+_PLAIN = (slice, int, np.integer, EllipsisType, NoneType)
+"""What a place of a key may be where numpy pairs no arrays."""
 
 
 class ShardedArray:
@@ -52,17 +56,31 @@ class ShardedArray:
     def __getitem__(self, key: Any) -> Any:
         """As of a numpy array: `[i]` [P, C], `[numbers]` [n, P, C] and `[numbers, ...]` a copy.
 
-        But a slice `[a:b]` is another such array, of which nothing has been read.
+        But a slice `[a:b]` is another such array, of which nothing has been read. Behind the first
+        place slices and numbers read what they name; arrays read the chosen clouds whole first.
         """
         first, *rest = key if isinstance(key, tuple) else (key,)
+        if first is Ellipsis:  # as many whole axes as are not named
+            missing = self.ndim - sum(one is not None for one in rest)
+            return self[(*(slice(None),) * missing, *rest)]
+        plain = all(isinstance(one, _PLAIN) for one in rest)
         if isinstance(first, slice):
             part = self.at(first)
-            return part[(np.arange(len(part)), *rest)] if rest else part
+            if not rest:
+                return part
+            if not plain:  # beside the slice, not paired with its numbers
+                return np.asarray(part)[(slice(None), *rest)]
+            return part[(np.arange(len(part)), *rest)]
         if np.ndim(first) == 0:
             row = int(self._rows[first])
             cloud = self._shards[row // self._each][row % self._each]
+            if not plain:  # a number beside arrays is one of them
+                return cloud[None][(0, *rest)]
             return cloud[tuple(rest)] if rest else cloud
         rows = self._rows[np.asarray(first)]
+        if not plain:  # paired: a shard's part of the first would not fit the others
+            whole = self._gathered(rows.ravel(), lambda shard, own, _: shard[own])
+            return whole[(np.arange(rows.size).reshape(rows.shape), *rest)]
         return self._gathered(rows, lambda shard, own, _: shard[(own, *rest)])
 
     def pick(

@@ -92,6 +92,24 @@ class Phases:
         return 0.5 * (1.0 + math.cos(math.pi * (epoch - start) / (stop - start)))
 
 
+def plain_epochs(plain: float, epochs: int) -> int:
+    """The first epoch with a pool (`method=pcfea`): ceil(plain epochs), in decimal arithmetic.
+
+    So 0.07 of 100 epochs are 7, whose product in binary is just above.
+
+    Raises:
+        ConfigError: there is none among the `epochs`.
+    """
+    first = math.ceil(Decimal(repr(float(plain))) * epochs)
+    if first >= epochs:
+        raise ConfigError(
+            f"method.plain={plain} of protocol.epochs={epochs}, rounded up, is all of them: "
+            "method=pcfea would make no pool and be source_only under another name; give more "
+            "protocol.epochs or a lower method.plain, or set method=source_only"
+        )
+    return first
+
+
 def _check_steps(group: str, steps: int | None, epochs: int) -> None:
     if steps is not None and check_int(f"{group}.steps", steps, 1) < epochs:
         raise ConfigError(
@@ -155,6 +173,12 @@ class SelfTrainingConfig:
         check_choice("selftraining.init", self.init, ("scratch", "continue", "persistent"))
         check_choice("selftraining.missing_class", self.missing_class, ("warn", "error"))
         check_float("selftraining.epsilon", self.epsilon)
+        if getattr(self.selector, "begins_weightless", False) and not self.use_source:
+            raise ConfigError(
+                "selftraining.selector.unsure=0 and selftraining.use_source=false: in round 0 no "
+                "label is sure, all weigh nothing, and the next teacher would have learnt nothing; "
+                "set selftraining.use_source=true, or selftraining.selector.unsure above 0"
+            )
         free = bool(getattr(self.selector, "own_thresholds", False)) and self.theta == 0
         check_float("selftraining.theta", self.theta, "" if free else "(0, 1)")
         if self.share is not None:

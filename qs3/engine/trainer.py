@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import Trainer
+from lightning.pytorch.strategies import DDPStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 
@@ -27,6 +28,15 @@ def make_trainer(cfg: DictConfig, **more: Any) -> Trainer:
     except (MisconfigurationException, TypeError, ValueError) as error:
         hint = "" if cfg.trainer.accelerator == "cpu" else "; without a GPU use trainer=cpu"
         raise ConfigError(f"trainer: {error}{hint}") from error
+
+
+def let_weights_rest(trainer: Trainer) -> None:
+    """Of several processes (DDP): a step need not use all weights; the others have no gradient.
+
+    As in one process. Without it DDP waits for all, and 0 in place of none would be decayed.
+    """
+    if isinstance(trainer.strategy, DDPStrategy):
+        trainer.strategy._ddp_kwargs["find_unused_parameters"] = True
 
 
 def _trainer_settings(cfg: DictConfig) -> dict[str, Any]:

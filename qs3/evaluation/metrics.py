@@ -74,14 +74,16 @@ def said_of(
     """What `of_batch` makes of all clouds, by a net in eval mode, unaugmented, in the order given.
 
     Nothing is random. A net with norms for each domain uses those of `domain`, the clouds' own,
-    where they were trained (`use_trained`). Float64, on the CPU.
+    where they were trained (`use_trained`). The net is given clouds of its weights' type
+    (`trainer.precision=64-true`). Float64, on the CPU.
     """
     training = net.training
+    kind = next((p.dtype for p in net.parameters()), points.dtype)
     net.eval()
     try:
         with use_trained(net, domain):
             parts = [
-                tuple(x.double().cpu() for x in of_batch(batch.to(device)))
+                tuple(x.double().cpu() for x in of_batch(batch.to(device, kind)))
                 for batch in points.split(batch_size)
             ]
     finally:

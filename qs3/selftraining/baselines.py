@@ -55,6 +55,11 @@ class Random:
         """Whether the other selector looks at features."""
         return bool(getattr(self.of, "needs_features", False))
 
+    @property
+    def begins_weightless(self) -> bool:
+        """Whether nothing that the other selector selects in round 0 weighs anything."""
+        return bool(getattr(self.of, "begins_weightless", False))
+
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; figures are those of the other selector."""
         given = self.of.select(teacher, theta, round_)

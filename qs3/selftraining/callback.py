@@ -185,6 +185,7 @@ class SelfTraining(Callback):
             more=self.scheme.more_labels,
             trainable=not self._given,
             instead_of_mu=self.scheme.instead_of_mu,
+            processes=trainer.world_size,
         )
 
         labels = torch.from_numpy(said.predicted)

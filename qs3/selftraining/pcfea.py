@@ -9,7 +9,6 @@ of the warm-up that stands among the selectors, as one of them may choose its po
 from __future__ import annotations
 
 import copy
-import math
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
+from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, check_taught, class_loss, weight
@@ -50,7 +50,8 @@ class Pcfea(Method):
         align_weight: w; 1; 0 leaves the alignment out.
         shift: a is "growing", λ, as in the class that the released logs name, "full", 1, as in the
             released one, or "none", 0, as in a third one of its file.
-        plain: e_0 / E, rounded up to whole epochs: 0.1.
+        plain: e_0 / E, rounded up to whole epochs, in [0, 1): 0.1. An epoch must be left, so E >= 2
+            unless it is 0.
         every: epochs between two pools, of E: 0.05.
         selector: which clouds of the target are in the pool: None for the growing share, or a
             selector of `selftraining`, such as QBST; pools count as its rounds.
@@ -91,7 +92,7 @@ class Pcfea(Method):
         self.pool = check_choice("method.pool", pool, ("share", "threshold"))
         self.rank = check_choice("method.rank", rank, ("label", "most"))
         self.momentum = check_float("method.momentum", momentum, "[0, 1)")
-        self.plain = check_float("method.plain", plain, "[0, 1]")
+        self.plain = check_float("method.plain", plain, "[0, 1)")
         self.every = check_float("method.every", every, "(0, 1]")
         self.theta = check_float("method.theta", theta, "[0, 1)")
         if selector is not None and not hasattr(selector, "select"):
@@ -157,8 +158,12 @@ class Pcfea(Method):
         return F.cross_entropy(cosines / 2, labels)
 
     def start_epoch(self, net: nn.Module, data: AdaptationData, epoch: int, epochs: int) -> None:
-        """A new pool, if one is due."""
-        first = math.ceil(self.plain * epochs)
+        """A new pool, if one is due.
+
+        Raises:
+            ConfigError: none would be due in any epoch.
+        """
+        first = plain_epochs(self.plain, epochs)
         self.styled = epoch >= first
         between = max(1, round(self.every * epochs))
         if not self.styled or (epoch - first) % between:

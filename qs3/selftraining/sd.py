@@ -43,7 +43,7 @@ class GraphRefined:
     Attributes:
         graph: False refines nothing: the teacher's own probabilities decide (a control).
         growth: of the share, each round, in (0, 1]; 0.05 for rounds of 5 epochs of 100.
-        unsure: weight in [0, 1].
+        unsure: weight in [0, 1]; 0 needs `selftraining.use_source`, as round 0 has no others.
         correlation: in [-1, 1).
         neighbours: of a cloud, itself not counted.
         steps: of Adam (1e-3, weight decay 5e-4).
@@ -70,6 +70,11 @@ class GraphRefined:
     def needs_features(self) -> bool:
         """Whether the table must have features."""
         return self.graph
+
+    @property
+    def begins_weightless(self) -> bool:
+        """Whether nothing that round 0 selects weighs anything."""
+        return self.unsure == 0
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; chooses all above theta (0 as a rule), with weights in `soft`."""

@@ -226,6 +226,7 @@ def check_selection(
     more: str = LOWER_THETA,
     trainable: bool = True,
     instead_of_mu: str | None = _KEEP_ALL,
+    processes: int = 1,
 ) -> list[str]:
     """Names of the classes without a pseudo-label, after checking that training is possible.
 
@@ -238,9 +239,10 @@ def check_selection(
         trainable: whether the teacher could have been trained for longer.
         instead_of_mu: what selects more where only one class is confident; None where the selector
             has no mu for it; see `SelfTrainingConfig.instead_of_mu`.
+        processes: that share the samples out, one of them to two where they come out uneven.
 
     Raises:
-        SelectionError: fewer than two samples were selected (batch normalisation needs two), or
+        SelectionError: a process has fewer than two samples (batch normalisation needs two), or
             a class is missing and `missing_class` is "error".
     """
     missing = [name for name, n in zip(class_names, selection.kept, strict=True) if n == 0]
@@ -252,7 +254,7 @@ def check_selection(
         )
     )
     facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
-    if total < 2:
+    if total <= processes:
         own_mu = selection.mu[selection.confident > 0]
         longer = ["train the teacher longer (protocol.epochs)"] * trainable
         if instead_of_mu and len(own_mu) == 1 and own_mu[0] == 0:
@@ -260,6 +262,9 @@ def check_selection(
             ways = [more, *longer, instead_of_mu]
         else:
             why, ways = "", [more, *longer]
+        if processes > 1:
+            why += f"each of {processes} processes needs two; "
+            ways.append("give fewer trainer.devices")
         raise SelectionError(
             f"only {counted(total, 'pseudo-label')} selected in {facts}; {why}{', or '.join(ways)}"
         )

@@ -31,6 +31,7 @@ from qs3.evaluation.metrics import predict
 from qs3.evaluation.selection_rules import LAST, PSEUDO_VAL
 from qs3.evaluation.validators import LABEL_FREE, hold_out, is_better
 from qs3.runs.checkpoints import copy_weights, save
+from qs3.utils.plural import counted
 from qs3.utils.seeding import derive
 
 log = logging.getLogger(__name__)
@@ -123,7 +124,7 @@ class StudentSelection(Callback):
         data = trainer.datamodule  # type: ignore[attr-defined]
         assert isinstance(data, AdaptationData)
         if self.rule == PSEUDO_VAL and phase == last_phase - 1 and ends:
-            self._hold_out(data)
+            self._hold_out(data, trainer.world_size)
         if phase != last_phase:
             return
         self._compare(trainer, pl_module, data, epoch)
@@ -156,8 +157,11 @@ class StudentSelection(Callback):
         )
         return float((table.argmax(axis=1) == labels.numpy()).mean())
 
-    def _hold_out(self, data: AdaptationData) -> None:
-        """Move a part of the set that the last round would train on aside."""
+    def _hold_out(self, data: AdaptationData, processes: int = 1) -> None:
+        """Move a part of the set that the last round would train on aside.
+
+        `processes`: that share out the rest, of which each needs two.
+        """
         assert data.pseudo is not None
         index, labels = data.pseudo
         hard, named = labels, torch.ones(len(labels), dtype=torch.bool)
@@ -175,6 +179,13 @@ class StudentSelection(Callback):
             raise SelectionError(
                 f"round {round_}: selection.student={PSEUDO_VAL} holds out a fifth of each class's "
                 f"pseudo-labels, but no class has three ({found}); {self._more}, or set "
+                f"selection.student={LAST}"
+            )
+        if (left := int((~held).sum())) <= processes:
+            raise SelectionError(
+                f"round {round_}: selection.student={PSEUDO_VAL} leaves "
+                f"{counted(left, 'pseudo-label')} to train on, and each of {processes} processes "
+                f"needs two; {self._more}, give fewer trainer.devices, or set "
                 f"selection.student={LAST}"
             )
         mask = torch.from_numpy(held)

@@ -12,9 +12,9 @@ from qs3.config.hydra import build
 from qs3.engine.checkpointing import AtomicCheckpointIO, Clock, SaveLast
 from qs3.engine.classifier import Classifier
 from qs3.engine.loggers import CsvHistory, EpochRows
-from qs3.engine.trainer import build_each, make_trainer
+from qs3.engine.trainer import build_each, let_weights_rest, make_trainer
 from qs3.methods.base import Method
-from qs3.models.norms import check_has_norms
+from qs3.models.norms import DomainNorm, check_has_norms
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.student_loss import Student
 from qs3.selftraining.student_selection import StudentSelection
@@ -75,6 +75,8 @@ def build_training(
         plugins=[AtomicCheckpointIO()],
         default_root_dir=folder,
     )
+    if any(isinstance(module, DomainNorm) for module in classifier.net.modules()):
+        let_weights_rest(trainer)  # an epoch may see one of the domains alone
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     for logger in trainer.loggers:
         logger.log_hyperparams(settings)

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
 from qs3.config.hydra import build, component_names, in_multirun
 from qs3.data.ensure_source import check_or_make
+from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.prior import check_told
@@ -66,8 +67,24 @@ STILL = {
 }
 """Settings of `protocol.augment` that leave clouds as they are."""
 
+NOT_TAKEN = {
+    **dict.fromkeys(
+        ("max_epochs", "min_epochs", "max_steps", "min_steps", "max_time"),
+        "a run is its warm-up and its rounds; set protocol.epochs and protocol.steps, and "
+        "selftraining.rounds, .epochs and .steps",
+    ),
+    **dict.fromkeys(
+        ("check_val_every_n_epoch", "val_check_interval"),
+        "each epoch is judged once, at its end, and teachers are chosen by that; set "
+        "trainer.limit_val_batches where it takes long",
+    ),
+    "fast_dev_run": "nothing of it would be saved; set debug=fast",
+}
+"""Arguments of Lightning's trainer that no run can have, and what to set instead."""
+
 _ONNX = "model=features needs an ONNX file"
 _FEATURES = "qs3.models.features.features"
+_PCFEA = "qs3.selftraining.pcfea.Pcfea"
 
 
 def train(cfg: DictConfig) -> RunMetrics:
@@ -78,6 +95,7 @@ def train(cfg: DictConfig) -> RunMetrics:
     _check_settings(cfg)
     run = run_of(cfg)
     _check_rounds(run)
+    _check_pools(run)
     _check_scale(run)
     _check_frozen(run)
     check_objective(cfg.objective)
@@ -232,11 +250,7 @@ def _check_settings(cfg: DictConfig) -> None:
     _check_products(cfg.trainer)
     if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
         check_bool("trainer.deterministic", exactly)
-    if cfg.trainer.get("limit_val_batches") == 0:
-        raise ConfigError(
-            "trainer.limit_val_batches must leave a batch: held-out labelled clouds say what the "
-            "net is worth; null takes all of them"
-        )
+    _check_limits(cfg.trainer)
     if cfg.report.pictures != "auto":
         check_bool("report.pictures", cfg.report.pictures)
     if cfg.ckpt_path is not None and not isinstance(cfg.ckpt_path, str):
@@ -273,6 +287,23 @@ def _check_keys(cfg: DictConfig) -> None:
         check_keys(prefix, keys, known)
 
 
+def _check_limits(trainer: DictConfig) -> None:
+    """Refuse epochs of no batches, and what ends or judges a run elsewhere than at its phases."""
+    if trainer.get("limit_train_batches") == 0:
+        raise ConfigError(
+            "trainer.limit_train_batches must leave a batch, or nothing is trained; null takes all "
+            "of an epoch's, and protocol.steps says how many there are"
+        )
+    if trainer.get("limit_val_batches") == 0:
+        raise ConfigError(
+            "trainer.limit_val_batches must leave a batch: held-out labelled clouds say what the "
+            "net is worth; null takes all of them"
+        )
+    for key, instead in NOT_TAKEN.items():
+        if (value := trainer.get(key)) is not None:
+            raise ConfigError(f"trainer.{key}={value} cannot be had: {instead}")
+
+
 def _check_products(trainer: DictConfig) -> None:
     """Refuse a rounding that is not one, and one that would be a GPU's on the CPU."""
     key, rounding = "trainer.float32_matmul", trainer.get("float32_matmul", "highest")
@@ -298,6 +329,13 @@ def _check_rounds(run: Run) -> None:
             "has no rounds: selection.teacher decides what is reported; set "
             f"selection.student={LAST}, or a selftraining with rounds"
         )
+
+
+def _check_pools(run: Run) -> None:
+    """Refuse PCFEA that would make no pool in any epoch."""
+    method = run.cfg.method
+    if method.get("_target_") == _PCFEA and "plain" in method:
+        plain_epochs(check_float("method.plain", method.plain, "[0, 1)"), run.phases.warmup)
 
 
 def _check_scale(run: Run) -> None:

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.utilities.exceptions import SIGTERMException
+from lightning.pytorch.utilities.exceptions import MisconfigurationException, SIGTERMException
 
 from qs3.config.hydra import build
 from qs3.engine.trainer import quieten, settle_process
+from qs3.errors import ConfigError
 from qs3.methods.base import Method
 from qs3.models.features import remember
 from qs3.runs.checkpoints import LAST, copy_weights, save
@@ -82,6 +83,9 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
 
     A checkpoint lies between two epochs; a resume repeats an epoch. What comes after it reads saved
     weights alone, so it is the same after any interruption.
+
+    Raises:
+        ConfigError: Lightning cannot do as `trainer` says with these data.
     """
     if not run.cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
         built.shared_warmup.take()
@@ -95,6 +99,8 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
             ckpt_path=last if last.is_file() else None,
             weights_only=True,
         )
+    except MisconfigurationException as error:  # e.g. too small a part of an epoch's batches
+        raise ConfigError(f"trainer: {error}") from error
     except SIGTERMException as error:  # of a worker of a sweep; by itself it would be status 0
         raise SystemExit(TERMINATED) from error
     if built.trainer.is_global_zero:

@@ -79,6 +79,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
+    _check_norms(run, len(data.target.ids))
     learnt = drawn = class_shares.of_labelled(data, len(target.classes))
     if given and run.cfg.selection.teacher == "given" and given.learnt is not None:
         learnt = given.learnt
@@ -116,6 +117,17 @@ def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None
         raise ConfigError(
             f"num_classes is {num_classes}, but {source.name} has {len(source.classes)} classes; "
             f"set num_classes={len(source.classes)}"
+        )
+
+
+def _check_norms(run: Run, clouds: int) -> None:
+    """Refuse statistics of one target cloud: where a cloud is one vector, that has no variance."""
+    norms = run.cfg.evaluation.norms
+    if norms != "trained" and clouds < 2:
+        raise DataError(
+            f"evaluation.norms={norms} takes the statistics of batch norms from the target's "
+            f"training clouds, of which {run.target.name} has {clouds}, and two are needed; set "
+            "evaluation.norms=trained, or give it more clouds"
         )
 
 

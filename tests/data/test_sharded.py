@@ -73,6 +73,35 @@ def test_a_slice_reads_nothing_and_the_rest_cannot_be_written():
         shards[0] = 1
 
 
+@pytest.mark.parametrize("each", [1, 3, 10])
+@pytest.mark.parametrize(
+    "key",
+    [
+        np.s_[:3, [0, 1, 2]],  # as many of either: not paired
+        np.s_[:, [0, 2]],
+        np.s_[::-2, :, [2, 0]],
+        np.s_[1:7, np.arange(7) > 4, 1],
+        np.s_[2:9, [[0, 1], [2, 3]], [0, 2]],
+        np.s_[[0, 9, 4], [1, 1, 6]],  # paired
+        np.s_[[[0], [9]], [1, 1, 6]],
+        np.s_[np.array([8, 1]), :, [0, 2]],
+        np.s_[np.arange(10) % 2 == 0, [0, 1, 2, 3, 4]],
+        np.s_[-2, [1, 2]],
+        np.s_[-2, :, [1, 2]],
+        np.s_[..., 0],
+        np.s_[..., [0, 2]],
+        np.s_[..., 1:3, :],
+        np.s_[3:5, None, 1:3],
+        np.s_[3:5, ..., -1],
+        np.s_[[5, 2], ..., -1],
+    ],
+)
+def test_arrays_behind_the_first_place_are_those_of_numpy(each, key):
+    expected, found = POINTS[key], np.asarray(cut(POINTS, each)[key])
+    assert found.shape == expected.shape
+    np.testing.assert_array_equal(found, expected)
+
+
 @given(each=st.integers(1, 11), seed=st.integers(0, 99), batch=st.integers(0, 6))
 def test_points_of_a_batch_are_picked_as_by_indexing(each, seed, batch):
     rng = np.random.default_rng(seed)

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qs3.datamodules.phases import Phases, SelfTrainingConfig, no_rounds
+from qs3.datamodules.phases import Phases, SelfTrainingConfig, no_rounds, plain_epochs
 from qs3.errors import ConfigError
+from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
+from qs3.selftraining.sd import GraphRefined
 from qs3.selftraining.selectors import Qbst
 
 
@@ -171,6 +173,34 @@ def test_the_weight_of_the_losses_stays_above_0():
 
 def test_none_ignores_what_an_experiment_set_for_rounds():
     assert no_rounds(rounds=3, epochs=2).rounds == 0
+
+
+@pytest.mark.parametrize(
+    ("plain", "epochs", "first"),
+    [(0.07, 100, 7), (0.07, 101, 8), (0.1, 100, 10), (0.1, 3, 1), (0, 1, 0), (0.14, 50, 7)],
+)
+def test_plain_epochs_by_hand(plain, epochs, first):
+    assert plain_epochs(plain, epochs) == first
+
+
+def test_the_default_s_plain_epochs_are_those_of_whole_numbers():
+    for epochs in range(2, 500):
+        assert plain_epochs(0.1, epochs) == -(-epochs // 10) == math.ceil(0.1 * epochs)
+
+
+@pytest.mark.parametrize(("plain", "epochs"), [(0.1, 1), (0.95, 19), (0.7, 3)])
+def test_an_epoch_must_be_left_for_a_pool(plain, epochs):
+    with pytest.raises(ConfigError, match=rf"plain={plain} of protocol\.epochs={epochs}, rounded"):
+        plain_epochs(plain, epochs)
+
+
+@pytest.mark.parametrize("selector", [GraphRefined(unsure=0), Random(GraphRefined(unsure=0.0))])
+def test_a_round_in_which_nothing_weighs_anything_is_refused(selector):
+    kept = SelfTrainingConfig(selector, rounds=1, theta=0, use_source=True)
+    with pytest.raises(ConfigError, match=r"unsure=0 and selftraining\.use_source=false: in round"):
+        replace(kept, use_source=False)
+    with_weight = Random(GraphRefined(unsure=1e-9))
+    assert not replace(kept, use_source=False, selector=with_weight).use_source
 
 
 @pytest.mark.parametrize("epochs", [0, "abc", 1.5])

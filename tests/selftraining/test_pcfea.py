@@ -106,6 +106,18 @@ def test_pools_are_due_every_twentieth_after_a_tenth() -> None:
         assert due == list(expected)
 
 
+def test_pools_of_a_share_that_is_whole_in_decimals_alone() -> None:
+    """0.07 of 100 epochs are 7, though the product of the floats is above; none of one is none."""
+    net, method = tiny_net(), Pcfea(plain=0.07)
+    method.prepare(net)
+    method.start_epoch(net, _data(8), 6, 100)
+    assert not method.styled
+    method.start_epoch(net, _data(8), 7, 100)
+    assert method.styled
+    with pytest.raises(ConfigError, match="would make no pool"):
+        method.start_epoch(net, _data(8), 0, 1)
+
+
 def test_a_pool_by_hand() -> None:
     """From the source alone to nearly the target alone; training mode and norms are left alone."""
     net, data = tiny_net(), _data()
@@ -329,6 +341,7 @@ def test_terms_before_and_with_a_pool() -> None:
         ({"pool": "all"}, "method.pool must be one of"),
         ({"rank": "first"}, "method.rank must be one of"),
         ({"momentum": 1.0}, r"method.momentum must be in \[0, 1\)"),
+        ({"plain": 1.0}, r"method.plain must be in \[0, 1\)"),
         ({"every": 0.0}, r"method.every must be in \(0, 1\]"),
         ({"selector": "qbst"}, "method.selector must be null or a selector"),
         ({"selector": GraphRefined()}, "method.selector chooses by features"),

@@ -7,6 +7,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from qs3.datamodules.batches import Batches, Table
+from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.errors import ConfigError, SelectionError
 from qs3.selftraining.baselines import Random
@@ -115,6 +117,25 @@ def test_two_pseudo_labels_are_the_least(confident, advice):
     one_short = replace(chosen([1, 1, 0]), confident=np.array([1, 1]))
     with pytest.raises(ValueError, match="zip"):
         check_selection(one_short, ("x", "y", "z"), 0, "warn")
+
+
+@pytest.mark.parametrize("processes", [2, 3, 8])
+def test_each_process_needs_two(processes):
+    """One more than processes is enough: what is uneven is drawn twice."""
+    few, enough = (
+        Selection(np.ones(n, bool), 0.8, np.ones(2), np.array([n, 0]), np.array([n, 0]))
+        for n in (processes, processes + 1)
+    )
+    assert check_selection(enough, ("x", "y"), 0, "warn", processes=processes) == ["y"]
+    assert check_selection(few, ("x", "y"), 0, "warn") == ["y"]
+    said = f"only {processes} .*each of {processes} processes needs two; .*fewer trainer.devices$"
+    with pytest.raises(SelectionError, match=said):
+        check_selection(few, ("x", "y"), 0, "warn", processes=processes)
+    for n, each in ((processes, 1), (processes + 1, 2)):
+        table = Table(Clouds.of(np.zeros((n, 4, 3), np.float32)), {})
+        shares = [Batches({"target": table}, 8, seed=0, epoch=0, rank=r, world=processes).sizes
+                  for r in range(processes)]  # fmt: skip
+        assert shares == [[each]] * processes
 
 
 def test_advice_is_about_the_selector_in_use():

@@ -107,6 +107,12 @@ def test_help_imports_nothing_heavy(tmp_path):
             ("ConfigError: trainer.float32_matmul=high rounds a GPU's products", "trainer=gpu"),
         ),
         (("trainer.limit_val_batches=0",), ("ConfigError: trainer.limit_val_batches must",)),
+        (("trainer.limit_train_batches=0.0",), ("limit_train_batches must leave a batch",)),
+        (("+trainer.max_steps=3",), ("trainer.max_steps=3 cannot be had", "set protocol.epochs")),
+        (
+            ("method=pcfea", "protocol.epochs=1"),
+            ("method.plain=0.1 of protocol.epochs=1, rounded",),
+        ),
         (("selection.best=1",), ("keys of selection are teacher, student",)),
         (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),
         (

@@ -149,6 +149,37 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
 
 
 @pytest.mark.slow
+def test_too_few_pseudo_labels_for_two_processes(toy_data: Path, tmp_path: Path) -> None:
+    """Two are enough for one process; of two each would have a batch of one."""
+    few = ("method=source_only", "selftraining=confident", "selftraining.share=0.02")
+    short = ("protocol.epochs=1", "selftraining.rounds=1", "selftraining.epochs=1")
+    done = command(tmp_path, *overrides(tmp_path, f"paths.data_dir={toy_data}", *few, *short, *TWO))
+    assert done.returncode == 1
+    assert "SelectionError: only 2 pseudo-labels selected in round 0" in done.stderr
+    assert "each of 2 processes needs two" in done.stderr
+
+
+@pytest.mark.slow
+def test_norms_of_a_domain_that_is_not_seen_rest(toy_data: Path, tmp_path: Path) -> None:
+    """No gradient and no decay: the target's in the warm-up, the source's in the rounds."""
+    settings = (
+        *("model._target_=tests.training.nets.domained", f"paths.data_dir={toy_data}"),
+        *("method=source_only", "selection.teacher=last", "protocol.optimizer.weight_decay=0.1"),
+        *("selftraining=confident", "selftraining.share=0.5", "selftraining.init=continue"),
+        *("protocol.epochs=2", "selftraining.rounds=1", "selftraining.epochs=2", *TWO),
+    )
+    done = command(tmp_path, *overrides(tmp_path, *settings))
+    assert done.returncode == 0, done.stderr
+    folder = hashing.run_folder(toy_config(tmp_path, *settings))
+    before, after = (load(folder / name) for name in ("warmup_last.pt", "student.pt"))
+    assert (before["norm.target.weight"] == 1).all()
+    assert not (before["norm.source.weight"] == 1).all()
+    for name in ("weight", "bias", "running_mean", "running_var"):
+        assert torch.equal(before[f"norm.source.{name}"], after[f"norm.source.{name}"])
+        assert not torch.equal(before[f"norm.target.{name}"], after[f"norm.target.{name}"])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "epoch"),
     [

@@ -21,7 +21,7 @@ from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, Selec
 from qs3.inference.model_file import read_result
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training import build as built
-from qs3.training.command import CENTRED_ONLY, UNIT_BALL_ONLY, train
+from qs3.training.command import CENTRED_ONLY, NOT_TAKEN, UNIT_BALL_ONLY, train
 from qs3.utils.locks import owned
 from qs3.utils.version import VERSION, commit
 from tests.training.conftest import result_of
@@ -304,6 +304,27 @@ def test_two_runs_in_one_folder(toy):
 def test_gpu_that_is_not_there(toy):
     with pytest.raises(ConfigError, match=r"trainer: .*use trainer=cpu"):
         train(toy("trainer=gpu"))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("trainer.limit_train_batches=0", "limit_train_batches must leave a batch, or nothing"),
+        ("trainer.limit_val_batches=0.0", "limit_val_batches must leave a batch"),
+        (
+            "trainer.limit_train_batches=0.01",
+            r"trainer: .*0\.01.*at least `limit_train_batches=0\.25",
+        ),
+        ("trainer.limit_val_batches=0.01", r"trainer: .*0\.01.*at least `limit_val_batches=1\.0"),
+        *((f"+trainer.{key}=2", f"{key}=2 cannot be had: .* set ") for key in NOT_TAKEN),
+    ],
+)
+def test_what_lightning_cannot_do_for_a_run(toy, words, said):
+    """Before a step is taken."""
+    cfg = toy("selftraining=none", "protocol.epochs=2", words)
+    with pytest.raises(ConfigError, match=said):
+        train(cfg)
+    assert not (hashing.run_folder(cfg) / "last.ckpt").exists()
 
 
 def test_other_config_of_the_same_eight_digits_is_refused(toy):

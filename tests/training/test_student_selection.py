@@ -287,6 +287,21 @@ def test_a_label_of_no_weight_is_not_held_out(tmp_path):
     assert sorted([*index.tolist(), *kept["index"].tolist()]) == list(range(40))
 
 
+def test_each_process_has_two_to_train_on(tmp_path):
+    """Of five of a class one is held out: four are too few for four processes, not for three."""
+    data = SimpleNamespace(
+        pseudo=(torch.arange(5), torch.zeros(5, dtype=torch.int64)),
+        seed=0,
+        target=SimpleNamespace(ids=[str(i) for i in range(5)]),
+        set_pseudo_labels=lambda index, labels: None,
+    )
+    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val", CLASSES)
+    callback._hold_out(data, processes=3)
+    assert len(callback.held_out[0]) == 1
+    with pytest.raises(SelectionError, match=r"leaves 4 pseudo-labels .* each of 4 .*=last"):
+        callback._hold_out(data, processes=4)
+
+
 def test_too_few_to_hold_out(toy, monkeypatch):
     def two_of_each(net, points, batch_size, device="cpu"):
         table = np.full((len(points), 3), 1 / 3)

@@ -20,7 +20,7 @@ from pydantic.dataclasses import dataclass
 
 from qs3.classes import known_as
 from qs3.data.importers.object_archive import Archive
-from qs3.errors import ConfigError, MissingDataError
+from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.prior import POWER
 from qs3.inference.model_file import FILE, find_result
 from qs3.inference.predictor import Predictor, load
@@ -106,7 +106,7 @@ def asked_of(
 def kept_name(part: str, prior: str = "") -> str:
     """The file's name, beside the run's `metrics.json`: such as "judged-adapt.json".
 
-    Answers with a prior, of which one is kept, are in "judged-adapt-prior.json".
+    Answers with a prior, of which a folder keeps one, are in "judged-adapt-prior.json".
     """
     return f"judged-{part or 'all'}{'-prior' * bool(prior)}.json"
 
@@ -176,34 +176,56 @@ def _loaded(files: Sequence[Path], asked: Asked, device: str) -> dict[Path, Pred
     return found
 
 
-def check_keepable(files: Sequence[Path]) -> None:
-    """Before nets are asked: whether each run says what it is.
+def check_keepable(files: Sequence[Path], folder: Path, asked: Asked) -> None:
+    """Before nets are asked: whether their answers can be kept below a folder.
+
+    Answers that lie there to the same are written anew; those to something else stay.
 
     Raises:
-        ConfigError: a run has no `metrics.json`.
+        ConfigError: a run has no `metrics.json`, or answers to something else lie in its place.
+        DataError: what lies there is damaged.
     """
     for file in files:
-        if read_metrics(file.parent) is None:
+        place = _place(file, folder) / kept_name(asked.part, asked.prior)
+        if not place.is_file():
+            continue
+        try:
+            read_answers(place, asked)
+        except ConfigError as error:
             raise ConfigError(
-                f"keep= needs the {METRICS} of a run, which says what it is; none is beside {file}"
-            )
+                f"{error}; they would be lost: give another folder, keep=FOLDER"
+            ) from error
+        except DataError as error:
+            raise DataError(f"{error}; delete it, or give another folder, keep=FOLDER") from error
 
 
 def keep_answers(found: Mapping[Path, Answers], folder: Path) -> None:
-    """Write them below a folder, of runs that `check_keepable` let pass.
+    """Write them below a folder, after `check_keepable`.
 
     Layout: `<folder>/<experiment>/seed<seed>-<hash>/` with the run's `metrics.json`, as below
     `paths.log_dir` and as `qs3 report keep` has it.
     """
     for file, answers in found.items():
-        metrics = read_metrics(file.parent)
-        assert metrics is not None
-        into = folder / metrics.experiment / f"seed{metrics.seed}-{metrics.hash}"
+        check_keepable([file], folder, answers.asked)
+    for file, answers in found.items():
+        into = _place(file, folder)
         if into.resolve() == file.parent.resolve():
             continue  # taken up from there
+        metrics = read_metrics(file.parent)
+        assert metrics is not None
         into.mkdir(parents=True, exist_ok=True)
         write_metrics(into, metrics)
         write_text(into / kept_name(answers.asked.part, answers.asked.prior), _text(answers))
+
+
+def _place(file: Path, folder: Path) -> Path:
+    """The folder below `folder` for what the run of a file answered."""
+    metrics = read_metrics(file.parent)
+    if metrics is None:
+        raise ConfigError(
+            f"keep= needs the {METRICS} of a run, which says what it is; none is beside {file}"
+        )
+    return folder / metrics.experiment / f"seed{metrics.seed}-{metrics.hash}"
 
 
 def _text(answers: Answers) -> str:

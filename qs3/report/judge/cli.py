@@ -68,7 +68,8 @@ Each cloud is thinned to the points that its run was trained with. The archive's
 reference of the data; domain=objects reads the same file.
 
 What keep= kept (a few kilobytes a run, laid out as below log_dir) can be given to runs= on another
-day or machine, beside runs trained there: of the same archive, part and settings alone.
+day or machine, beside runs trained there: of the same archive, part and settings alone. A folder
+keeps one question a part: answers to another are refused, not written over.
 """,
     interrupted="nothing was saved",
 )  # fmt: skip

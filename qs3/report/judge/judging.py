@@ -160,7 +160,8 @@ def judge(
         floor: z of the floor in the archive, minus its camera's height, for nets that know heights;
             None: as in the target of each.
         device: of the nets.
-        keep: a folder that gets what each net called each object, for `runs` of another day.
+        keep: a folder that gets what each net called each object, for `runs` of another day; of
+            each run one archive's and one question's.
         prior, prior_power: how common classes are in the archive's place, and how much of that is
             believed (`qs3.evaluation.prior`): each family is judged without it and with it. "":
             only without, also of runs that were evaluated with a prior.
@@ -168,7 +169,8 @@ def judge(
     Raises:
         MissingDataError: a run or the archive is not there.
         DataError: one is damaged.
-        ConfigError: nothing is left to judge on, or runs that cannot be judged so.
+        ConfigError: nothing is left to judge on, runs cannot be judged so, or `keep` has answers to
+            something else.
     """
     check_told(prior, prior_power)
     archive = read_archive(data)
@@ -177,12 +179,14 @@ def judge(
         asked_of(archive, part, inliers_only, floor, *told)
         for told in [("", POWER), (prior, prior_power)][: 1 + bool(prior)]
     ]
-    found = []
-    for asked in asks:
-        files = find_runs(runs, part, asked.prior)
-        if keep is not None:
-            check_keepable(files)
-        found.append(answers_of(files, archive, chosen, asked, device))
+    files = [find_runs(runs, part, asked.prior) for asked in asks]
+    if keep is not None:
+        for asked, some in zip(asks, files, strict=True):
+            check_keepable(some, keep, asked)
+    found = [
+        answers_of(some, archive, chosen, asked, device)
+        for asked, some in zip(asks, files, strict=True)
+    ]
     if keep is not None:
         for answers in found:
             keep_answers(answers, keep)

@@ -8,11 +8,16 @@ import pytest
 
 from qs3.__main__ import QS3
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.report.judge.answers import find_runs
+from qs3.report.judge.answers import Answers, Asked, find_runs, keep_answers
 from qs3.report.judge.judging import judge
 from tests.fixtures.frame_files import write_archive
 from tests.report.judge.test_judge import add_net
 from tests.report.made_runs import write_run
+
+ASKED = Asked(sha256="0" * 64, part="judge", inliers_only=True, floor=None)
+SAID = Answers(
+    asked=ASKED, classes=("chair",), points=8, target="kinectsim10", objects=(0,), called=(0,)
+)
 
 
 @pytest.fixture(scope="module")
@@ -80,22 +85,23 @@ def test_answers_with_a_prior_are_others_and_kept_apart(archive, logs, tmp_path,
     verdicts = {}
     for prior in ("", "chair:1000000", "chair:0"):
         more = {"prior": prior, "prior_power": 1} if prior else {}
-        told = judge([str(logs / "exp")], archive, keep=tmp_path / "kept", **more)
+        kept = tmp_path / f"kept{len(verdicts)}"  # of each prior its own: one folder keeps one
+        told = judge([str(logs / "exp")], archive, keep=kept, **more)
         verdicts[prior] = told.families[-1].figures[0].predicted
         assert len(told.families) == 1 + bool(prior)
         assert told.families[0].figures[0].predicted == verdicts[""]
     assert verdicts["chair:1000000"]["chair"] == pytest.approx(sum(verdicts[""].values()))
     assert verdicts["chair:0"]["chair"] == 0
-    names = {file.name for file in (tmp_path / "kept").rglob("judged-*")}
+    names = {file.name for file in kept.rglob("judged-*")}
     assert names == {"judged-judge.json", "judged-judge-prior.json"}
-    again = judge([str(tmp_path / "kept")], archive, prior="chair:0", prior_power=1)
+    again = judge([str(kept)], archive, prior="chair:0", prior_power=1)
     assert again.families[1].name == again.families[0].name + ", prior=chair:0"
     assert again.families[1].figures[0].predicted == verdicts["chair:0"]
     assert again.differences == told.differences  # the same seeds, object by object
     with pytest.raises(ConfigError, match="prior_power= is for prior="):
         judge([str(logs / "exp")], archive, prior_power=1)
     with pytest.raises(ConfigError, match=r"prior=chair:0, now sofa:2"):
-        judge([str(tmp_path / "kept")], archive, prior="sofa:2", prior_power=1)
+        judge([str(kept)], archive, prior="sofa:2", prior_power=1)
     assert QS3([*words, "prior=rooms"]) == 0
     assert "beside each run with prior=rooms, power 0.5" in capsys.readouterr().out
 
@@ -119,6 +125,39 @@ def test_another_archive_and_part(archive, kept, tmp_path):
     file = kept / "other" / "seed0-ffff0000" / "judged-judge.json"
     with pytest.raises(ConfigError, match="part=judge, now adapt"):
         judge([str(file)], archive, part="adapt")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"inliers_only": False}, "inliers_only=True, now False"),
+        ({"floor": -1.0}, "floor=None, now -1.0"),
+        ({"data": "other.npz"}, r"sha256=\w+, now \w+"),
+        ({"prior": "sofa:2", "prior_power": 1}, "prior=chair:2, now sofa:2"),
+    ],
+)
+def test_kept_answers_are_not_lost_to_others(archive, logs, kept, tmp_path, change, said):
+    """Nothing is written, not even what is new; the same question is answered anew."""
+    judge([str(logs)], archive, keep=kept, prior="chair:2", prior_power=1)
+    if "data" in change:
+        change = {"data": tmp_path / change["data"]}
+        write_archive(change["data"], {"train": 1, "test": 4}, points=150)
+    before = {path: path.read_bytes() for path in kept.rglob("*.json")}
+    with pytest.raises(ConfigError, match=rf"{said}; they would be lost: .* keep=FOLDER"):
+        judge([str(logs)], **{"data": archive, "keep": kept, **change})
+    assert {path: path.read_bytes() for path in kept.rglob("*.json")} == before
+    judge([str(logs)], archive, keep=kept)
+    assert {path: path.read_bytes() for path in kept.rglob("*.json")} == before
+    asked = dataclasses.replace(ASKED, sha256="1" * 64)
+    with pytest.raises(ConfigError, match="they would be lost"):
+        keep_answers({next(logs.rglob("result.pt")): dataclasses.replace(SAID, asked=asked)}, kept)
+
+
+def test_a_damaged_file_in_the_place_is_named(archive, logs, kept):
+    (file,) = (kept / "other").rglob("judged-judge.json")
+    file.write_text("{}")
+    with pytest.raises(DataError, match=r"judged-judge\.json is damaged.*; delete it, or give"):
+        judge([str(logs)], archive, keep=kept)
 
 
 @pytest.mark.parametrize(
