@@ -71,9 +71,9 @@ class PartFiles:
         if [key for key, _, _ in found] == ["objects"]:
             raise ConfigError(
                 f"{self.folder} was made from other objects: {found[0][1]} there, {found[0][2]} "
-                "now. A dataset is of one set of meshes, and one that was repaired, added or "
-                f"removed makes another set: give another {self._elsewhere}, or force=true to make "
-                "all of it again."
+                "now. A dataset is of one set of objects, and another limit= or splits=, or a mesh "
+                "that was repaired, added or removed, makes another: give another "
+                f"{self._elsewhere}, or force=true to make all of it again."
             )
         if found:
             lines = [f"  {key}: {old} there, {new} now" for key, old, new in found]

@@ -113,7 +113,7 @@ def test_what_differs_is_named_by_its_key(tmp_path):
 )
 def test_other_objects_are_not_other_settings(tmp_path, now, said):
     PartFiles(tmp_path, "out").begin(BEGUN)
-    message = f"made from other objects: {said}. A dataset is of one set of meshes"
+    message = f"made from other objects: {said}. A dataset is of one set of objects"
     with pytest.raises(ConfigError, match=re.escape(message)):
         PartFiles(tmp_path, "out").check({**BEGUN, "objects": now})
 

@@ -98,7 +98,7 @@ def test_asking_for_twins_moves_no_byte_and_workers_and_a_resume_move_none_of_th
     made = tmp_path / "specklenet10"
     generate(two_classes(tmp_path, meshes, *ASKED, "limit=1"))
     (made / "meta.yaml").unlink()  # as if killed before the last objects
-    with pytest.raises(ConfigError, match="other settings"):
+    with pytest.raises(ConfigError, match="made from other objects"):
         generate(two_classes(tmp_path, meshes, *ASKED))
     generate(two_classes(tmp_path, meshes, *ASKED[:2], "workers=2", "force=true"))
     assert fingerprint(made) == fingerprint(folder)
