@@ -72,10 +72,12 @@ class FoundFinishes:
 
     Attributes:
         pictured: see `Finishes`.
+        notes: what a reader left out, for `load_mesh` to say.
     """
 
     def __init__(self) -> None:
         self.pictured = 0
+        self.notes: list[str] = []
         self._kinds: dict[Finish, int] = {}
         self._parts: list[np.ndarray] = [np.zeros(0, np.int32)]
 

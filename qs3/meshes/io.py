@@ -14,6 +14,7 @@ formats the caller says it.
 from __future__ import annotations
 
 import errno
+import logging
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,6 +30,8 @@ from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, check_counts, wit
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.mesh import Mesh
 from qs3.utils.memory import check_memory
+
+log = logging.getLogger(__name__)
 
 _READERS: dict[str, Callable[[bytes, Path, Colliders, FoundFinishes | None], Triangles]] = {
     ".off": lambda data, *_: off.read(data),
@@ -101,6 +104,8 @@ def load_mesh(
             vertices, faces = _read(path, colliders, found)
             if up == "y" and path.suffix.lower() not in DECLARE_UP:
                 vertices = vertices @ Y_UP_TO_Z_UP.T
+            for note in colliders.notes + ([] if found is None else found.notes):
+                log.warning("%s: %s", path, note)
             mesh = _checked(vertices, faces, colliders)
             return mesh if found is None else replace(mesh, finishes=found.of(len(mesh.faces)))
     except (MeshMemoryError, MeshUnavailableError) as error:

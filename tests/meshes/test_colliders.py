@@ -10,6 +10,7 @@ from qs3.errors import MeshError
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh
+from tests.meshes.test_threemf import RESOURCES, with_items
 from tests.meshes.written import PYRAMID, corners, dae, gltf, refused, save
 
 
@@ -67,6 +68,35 @@ def test_collada(tmp_path):
     path = save(tmp_path, "a.dae", dae(nodes=nodes))
     assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (2, 1)
     assert len(load_mesh(path, keep_colliders=True).faces) == 6
+
+
+def test_a_geometry_of_collada_may_be_one(tmp_path):
+    """It hides its instances, and not what hangs below them, as in glTF."""
+    tree = dae(nodes='<node><instance_geometry url="#g"/><node name="leg"/></node>')
+    refused(tmp_path, "a.dae", tree.replace('"g">', '"g" name="UCX_seat">'), "in 1 collider")
+    shape = tree[tree.index("<geometry") : tree.index("</library_geometries>")]
+    hull = shape.replace('"g">', '"h" name="UCX_seat">')
+    for name in ("p", "pa", "v"):
+        hull = hull.replace(f'"{name}"', f'"h{name}"').replace(f'"#{name}"', f'"#h{name}"')
+    nodes = '<node><instance_geometry url="#h"/><node><instance_geometry url="#g"/></node></node>'
+    tree = dae(nodes=nodes).replace(shape, shape + hull)
+    path = save(tmp_path, "b.dae", tree)
+    assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (2, 1)
+    assert len(load_mesh(path, keep_colliders=True).faces) == 4
+
+
+def test_3mf_assemblies_and_part_numbers(tmp_path):
+    """What hangs below a collider goes with it, and is counted once."""
+    named = '<object id="{}" name="{}"><components>{}</components></object>'
+    links = '<component objectid="1"/>' * 2
+    assemblies = named.format(3, "UCX_chair", links) + named.format(4, "b", links)
+    content = with_items(
+        '<item objectid="1"/><item objectid="3"/><item objectid="4" partnumber="b_collider"/>',
+        RESOURCES + assemblies,
+    )
+    path = save(tmp_path, "a.3mf", content)
+    assert (len(load_mesh(path).faces), load_mesh(path).colliders) == (1, 2)
+    assert len(load_mesh(path, keep_colliders=True).faces) == 5
 
 
 @pytest.mark.parametrize("kind", ["glb", "3mf"])

@@ -6,6 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from qs3.meshes.formats.by_trimesh import assembled, loaded
 from qs3.meshes.io import load_mesh
 from tests.meshes.written import corners, refused, save
 
@@ -75,3 +76,68 @@ def test_broken_archives_are_refused_with_the_reason(tmp_path, content, reason):
 def test_archives_that_unpack_to_too_much(tmp_path, monkeypatch):
     monkeypatch.setenv("QS3_MEMORY_GB", "0.0002")
     refused(tmp_path, "a.3mf", archive(model() + " " * 20_000), "GB of memory, more than 0.0002")
+
+
+def placed(x, more=""):
+    return f'<item objectid="1" {more} transform="1 0 0 0 1 0 0 0 1 {x} 0 0"/>'
+
+
+def with_items(items, resources=RESOURCES):
+    text = model(resources, unit='unit="meter"')
+    return archive(text[: text.index("<build>")] + f"<build>{items}</build></model>")
+
+
+def test_items_of_one_object_with_one_part_number(tmp_path):
+    items = "".join(placed(x, 'partnumber="LEG-01"') for x in (0, 5, 7))
+    mesh = load_mesh(save(tmp_path, "a.3mf", with_items(items)))
+    expected = [TRIANGLE + [x, 0, 0] for x in (0, 7, 5)]  # as without the number
+    np.testing.assert_array_equal(corners(mesh), expected)
+
+
+def test_an_assembly_of_assemblies_is_there_to_its_last_screw(tmp_path):
+    """164 instances: trimesh stops at 121 steps."""
+    link = '<component objectid="{}" transform="1 0 0 0 1 0 0 0 1 {} 0 0"/>'
+    resources = f'<object id="1">{MESH}</object>' + "".join(
+        f'<object id="{name}"><components>'
+        + "".join(link.format(name - 1, step * i) for i in range(count))
+        + (link.format(1, -1) if name == 3 else "")
+        + "</components></object>"
+        for name, count, step in ((2, 10, 1), (3, 4, 10), (4, 4, 100))
+    )
+    mesh = load_mesh(save(tmp_path, "a.3mf", with_items('<item objectid="4"/>', resources)))
+    found = sorted(corners(mesh)[:, 0, 0])
+    expected = [100 * a + 10 * b + c for a in range(4) for b in range(4) for c in range(10)]
+    assert found == sorted(expected + [100 * a - 1 for a in range(4)])
+
+
+def test_instances_stand_in_the_order_of_trimesh(tmp_path):
+    """Without part numbers and deep nesting, which it misreads, to the bit."""
+    turn = 'transform="0.36 0.48 -0.8 -0.8 0.6 0 0.48 0.64 0.6 0.1 0.2 0.3"'
+    resources = RESOURCES + (
+        f'<object id="3"><components><component objectid="2" {turn}/><component objectid="1"/>'
+        f'<component objectid="2"/><component objectid="1" {turn}/></components></object>'
+        f'<object id="4"><components><component objectid="3" {turn}/></components></object>'
+    )
+    items = f'{placed(1)}<item objectid="4" {turn}/>{placed(2)}<item objectid="3"/>{placed(3)}'
+    content = with_items(items, resources)
+    mesh = load_mesh(save(tmp_path, "a.3mf", content))
+    vertices, faces = assembled(loaded("3mf", content, postprocess=False))
+    np.testing.assert_array_equal(corners(mesh), vertices[faces])
+    assert len(faces) == 15
+
+
+@pytest.mark.parametrize("kind", ["support", "solidsupport", "other"])
+def test_supports_are_no_furniture(tmp_path, caplog, kind):
+    more = f'<object id="7" type="{kind}">{MESH}</object>'
+    assembly = '<object id="8"><components><component objectid="7"/></components></object>'
+    items = placed(0) + '<item objectid="7"/><item objectid="8"/>'
+    path = save(tmp_path, "a.3mf", with_items(items, RESOURCES + more + assembly))
+    assert len(load_mesh(path).faces) == 1
+    assert f"{path}: 2 objects are left out as no part of the model" in caplog.text
+    refused(tmp_path, "b.3mf", with_items('<item objectid="8"/>', more + assembly), "no faces")
+
+
+def test_an_object_or_a_plate_with_nothing_on_it(tmp_path):
+    refused(tmp_path, "a.3mf", with_items(""), "no items on its build plate")
+    empty = '<object id="1"><components/></object>'
+    refused(tmp_path, "b.3mf", with_items(placed(0), empty), "object '1' without a mesh")

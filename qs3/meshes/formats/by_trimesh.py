@@ -16,7 +16,6 @@ import numpy as np
 
 from qs3.errors import MeshError
 from qs3.meshes.formats.arrays import Triangles, joined, transformed, used_part
-from qs3.meshes.formats.colliders import Colliders
 
 MAX_PARTS = 100_000
 
@@ -36,26 +35,23 @@ def loaded(kind: str, data: bytes, **options: Any) -> dict[str, Any]:
 
 def assembled(
     found: Mapping[str, Any],
-    colliders: Colliders | None = None,
     placed: Callable[[str, int], None] = lambda name, faces: None,
 ) -> Triangles:
     """The mesh of what `loaded` returned: all instances of its parts, put into the world.
 
     `placed` is told the name and the number of faces of each instance, in their order.
     """
-    return joined(_parts(found, colliders or Colliders(skip=False), placed))
+    return joined(_parts(found, placed))
 
 
-def _parts(
-    found: Mapping[str, Any], colliders: Colliders, placed: Callable[[str, int], None]
-) -> Iterator[Triangles]:
+def _parts(found: Mapping[str, Any], placed: Callable[[str, int], None]) -> Iterator[Triangles]:
     shapes = found["geometry"]
     world = {"world": np.eye(4)}
     for edge in found["graph"]:
         name, frame = edge.get("geometry"), str(edge["frame_to"])
         matrix = world[edge.get("frame_from", "world")] @ np.asarray(edge["matrix"], np.float64)
         world[frame] = matrix
-        if name is None or colliders.left_out(frame, name):
+        if name is None:
             continue
         shape = shapes[name]
         if len(shape.get("faces", ())):

@@ -33,11 +33,13 @@ class Colliders:
     Attributes:
         skip: False leaves none out.
         count: nodes left out so far.
+        notes: what else a reader left out, for `load_mesh` to say.
     """
 
     def __init__(self, skip: bool = True) -> None:
         self.skip = skip
         self.count = 0
+        self.notes: list[str] = []
 
     def left_out(self, *names: str | None) -> bool:
         """Whether a node with one of these names is left out; if so, it is counted."""
