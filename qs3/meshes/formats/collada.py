@@ -86,7 +86,11 @@ def _prepare(root: Element, colliders: Colliders) -> None:
         if element is not scene:
             _prepare_node(element, nodes, colliders)
         for link in element.findall("instance_geometry"):
-            used[link.get("url", "")] = _target(link, geometries)
+            geometry = _target(link, geometries)
+            if colliders.left_out(geometry.get("name"), geometry.get("id")):
+                element.remove(link)
+                continue
+            used[link.get("url", "")] = geometry
             link[:] = []  # materials
         inner = element.findall("node")
         parts[str(id(element))] = [str(id(child)) for child in inner]
