@@ -96,10 +96,14 @@ def test_a_thin_and_a_distant_mesh_have_area(tmp_path):
     polygons=st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=7), min_size=1, max_size=6),
     colours=st.booleans(),
 )
-def test_polygons_become_fans(tmp_path_factory, polygons, colours):
+def test_convex_polygons_become_fans(tmp_path_factory, polygons, colours):
     """In OFF, PLY and OBJ alike, vertices unchanged to the last bit."""
     folder = tmp_path_factory.getbasetemp()
-    vertices = np.random.default_rng(len(polygons)).normal(size=(10, 3))
+    rng = np.random.default_rng(len(polygons))
+    angles = np.sort(rng.uniform(0, 2 * np.pi, 10))
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    vertices = circle @ rng.normal(size=(2, 3)) + rng.normal(size=3)
+    polygons = [sorted(corners) for corners in polygons]
     points = [" ".join(map(repr, v)) for v in vertices.tolist()]
     faces = [" ".join(map(str, [len(p), *p])) for p in polygons]
     paint = " 0.1 0.2 0.3" if colours else ""

@@ -90,7 +90,7 @@ def with_items(items, resources=RESOURCES):
 def test_items_of_one_object_with_one_part_number(tmp_path):
     items = "".join(placed(x, 'partnumber="LEG-01"') for x in (0, 5, 7))
     mesh = load_mesh(save(tmp_path, "a.3mf", with_items(items)))
-    expected = [TRIANGLE + [x, 0, 0] for x in (0, 7, 5)]  # as without the number
+    expected = [TRIANGLE + np.array([x, 0, 0]) for x in (0, 7, 5)]  # as without the number
     np.testing.assert_array_equal(corners(mesh), expected)
 
 

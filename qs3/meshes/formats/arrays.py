@@ -61,6 +61,8 @@ def check_counts(vertices: int, faces: int) -> None:
 def fan(sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Cut polygons into triangles around their first corner; exact for convex ones.
 
+    `triangulated` does it of others, too.
+
     Args:
         sizes: [N] number of corners of each polygon; those with fewer than three vanish.
         corners: [sum(sizes)] vertex indices of all polygons.

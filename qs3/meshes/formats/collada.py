@@ -20,9 +20,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles
+from qs3.meshes.formats.arrays import Y_UP_TO_Z_UP, Triangles, fan, numbers, whole
 from qs3.meshes.formats.by_trimesh import assembled, check_instances, loaded
 from qs3.meshes.formats.colliders import Colliders
+from qs3.meshes.formats.polygons import triangulated
 
 Element = ElementTree.Element
 
@@ -145,14 +146,19 @@ def _prepare_mesh(mesh: Element) -> None:
     """Leave positions and polygons, written as pycollada reads them."""
     sources = {source.get("id"): source for source in mesh.findall("source")}
     kept = []
+    positions: dict[str, Element] = {}  # by what primitives call them
     for vertices in mesh.findall("vertices"):
         vertices[:] = [put for put in vertices if put.get("semantic") == "POSITION"]
         source = sources[vertices[0].get("source", "")[1:]]
         _prepare_positions(source)
+        positions[f"#{vertices.get('id')}"] = source
         kept += [source, vertices]
     for primitive in mesh:
         if primitive.tag not in _NO_SURFACE and primitive.find("input") is not None:
-            kept += _prepare_primitive(primitive, str(kept[0].get("id")))
+            made = _prepare_primitive(primitive, str(kept[0].get("id")))
+            for some in made:
+                _cut_concave(some, positions)
+            kept += made
     mesh[:] = kept
 
 
@@ -212,3 +218,38 @@ def _prepare_primitive(primitive: Element, positions: str) -> list[Element]:
     for some in corners:
         ElementTree.SubElement(primitive, "p").text = " ".join(some)
     return [primitive] if sizes else []
+
+
+def _cut_concave(primitive: Element, positions: dict[str, Element]) -> None:
+    """Make triangles of polygons that pycollada, which cuts them as fans, would cut wrongly.
+
+    Where they hold what is not there they stay as they are, and pycollada says it.
+    """
+    if primitive.tag == "triangles":
+        return
+    inputs = primitive.findall("input")
+    vertex = next(put for put in inputs if put.get("semantic") == "VERTEX")
+    width = 1 + max(int(put.get("offset", "0")) for put in inputs)
+    lists = [_whole(p.text) for p in primitive.findall("p")]
+    sizes = np.array([len(some) // width for some in lists])
+    if primitive.tag == "polylist":
+        sizes = _whole(primitive.findtext("vcount"))
+    source = positions.get(vertex.get("source", ""))
+    if source is None or (sizes <= 3).all():
+        return
+    rows = np.concatenate(lists).reshape(-1, width)
+    index = rows[:, int(vertex.get("offset", "0"))]
+    points = numbers((source.findtext("float_array") or "").encode()).reshape(-1, 3)
+    if len(index) != sizes.sum() or index.max() >= len(points):
+        return
+    places = np.arange(len(index))
+    faces = triangulated(points[index], sizes, places)
+    if (faces != fan(sizes, places)).any():
+        primitive.tag = "triangles"
+        primitive[:] = inputs
+        text = " ".join(map(str, rows[faces.ravel()].ravel().tolist()))
+        ElementTree.SubElement(primitive, "p").text = text
+
+
+def _whole(text: str | None) -> np.ndarray:
+    return whole(numbers((text or "").encode()), "a polygon")

@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats.arrays import Triangles, fan, lines, numbers
+from qs3.meshes.formats.arrays import Triangles, lines, numbers
+from qs3.meshes.formats.polygons import triangulated
 from qs3.utils.plural import counted
 
 
@@ -37,8 +38,9 @@ def read(data: bytes) -> Triangles:
     vertices = numbers(b" ".join(coordinates))
     if len(vertices) != len(coordinates):
         raise MeshError("holds text where coordinates are expected")
-    faces = fan(np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64))
-    return vertices.reshape(-1, 3), faces
+    vertices = vertices.reshape(-1, 3)
+    polygons = np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
+    return vertices, triangulated(vertices, *polygons)
 
 
 def _index(corner: bytes, vertices_so_far: int) -> int:

@@ -14,7 +14,8 @@ import re
 import numpy as np
 
 from qs3.errors import MeshError
-from qs3.meshes.formats.arrays import Triangles, check_counts, fan, lines, numbers, whole
+from qs3.meshes.formats.arrays import Triangles, check_counts, lines, numbers, whole
+from qs3.meshes.formats.polygons import triangulated
 from qs3.utils.plural import counted
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?N?)(4?n?)OFF[ \t]*(BINARY)?")
@@ -86,4 +87,5 @@ def _by_lines(body: bytes, vertex_count: int, face_count: int) -> Triangles:
         sizes.append(size)
         corners += tokens[1 : size + 1]
     flat = whole(numbers(b" ".join(corners)), "a vertex index")
-    return coordinates.reshape(vertex_count, 3), fan(np.array(sizes, dtype=np.int64), flat)
+    vertices = coordinates.reshape(vertex_count, 3)
+    return vertices, triangulated(vertices, np.array(sizes, dtype=np.int64), flat)

@@ -15,8 +15,9 @@ import numpy as np
 
 from qs3.errors import MeshError, MeshMemoryError
 from qs3.meshes.finishes import FoundFinishes
-from qs3.meshes.formats.arrays import Triangles, check_counts, fan, numbers, whole
+from qs3.meshes.formats.arrays import Triangles, check_counts, numbers, whole
 from qs3.meshes.formats.ply_colours import add_colours, colours_of
+from qs3.meshes.formats.polygons import triangulated
 from qs3.utils.memory import check_memory
 
 _TYPES = {
@@ -50,7 +51,7 @@ def read(data: bytes, found: FoundFinishes | None = None) -> Triangles:
 
     `found`: also of the faces' colours, or else the mean of their corners'.
     """
-    vertices = faces = None
+    vertices = corners = None
     colours: dict[str, np.ndarray | None] = {}
     for element, columns in _elements(data):
         name = element.name
@@ -62,9 +63,10 @@ def read(data: bytes, found: FoundFinishes | None = None) -> Triangles:
             key = next((n for n in ("vertex_indices", "vertex_index") if n in columns), None)
             if key is None:
                 raise MeshError("has faces without vertex_indices")
-            sizes, corners = columns[key]
-            faces = fan(sizes, whole(corners.astype(np.float64), "a vertex index"))
-        if vertices is not None and faces is not None:
+            sizes, items = columns[key]
+            corners = whole(items.astype(np.float64), "a vertex index")
+        if vertices is not None and corners is not None:
+            faces = triangulated(vertices, sizes, corners)
             if found is not None:
                 per_face = colours.get("face")
                 if per_face is not None:

@@ -1,0 +1,160 @@
+"""Polygons to triangles: around their first corner, and by clipping ears where that is wrong.
+
+An ear is a corner whose triangle lies within the polygon (Meisters, 1975). It is looked for in the
+plane of two axes that the polygon's normal, by Newell's formula, is farthest from.
+
+Triangles that are cut off one by one add up to the polygon, those turned over counted as negative.
+So where none is turned over they cover it exactly once, if its outline does not cross itself. By
+that a fan is judged, and kept where it is right: always of convex polygons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from qs3.meshes.formats.arrays import fan
+
+MAX_TESTS = 20_000_000
+"""Of a point in a triangle, in one mesh; polygons that are left then are fans. Half a minute."""
+
+_CHUNK = 200_000  # triangles that are looked at together
+_TURNED = 1e-6  # doubled area by the square of the polygon's size: more than float32 rounds
+_FLAT = 1e-12  # the same, of a corner that is none
+
+Point = tuple[float, float]
+
+
+def triangulated(vertices: np.ndarray, sizes: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Cut polygons into triangles; also concave ones, and those that touch themselves.
+
+    What crosses itself stays a fan, as all polygons do of which a vertex is not there.
+
+    Args:
+        vertices: [V, 3] float64.
+        sizes: [N] number of corners of each polygon; those with fewer than three vanish.
+        corners: [sum(sizes)] vertex indices of all polygons.
+
+    Returns:
+        [F, 3] int64 triangles in the order of the polygons, for each its corners less two.
+    """
+    faces = fan(sizes, corners)
+    if not len(faces) or not 0 <= corners.min() <= corners.max() < len(vertices):
+        return faces  # the caller says it
+    counts = np.maximum(sizes - 2, 0)
+    starts = np.cumsum(counts) - counts
+    large = np.flatnonzero(counts > 1)
+    tests = MAX_TESTS
+    for polygon in _wrongly_fanned(vertices, faces, starts[large], counts[large]):
+        first, end = starts[large[polygon]], starts[large[polygon]] + counts[large[polygon]]
+        outline = [*faces[first, :2], *faces[first:end, 2]]
+        ears, tests = _clipped(_flat(vertices[outline]), tests)
+        if ears is not None:
+            faces[first:end] = np.array(outline)[ears]
+    return faces
+
+
+def _wrongly_fanned(
+    vertices: np.ndarray, faces: np.ndarray, starts: np.ndarray, counts: np.ndarray
+) -> Iterator[int]:
+    """Which polygons have a triangle that is turned over.
+
+    Args:
+        starts: [N] the first triangle of each polygon.
+        counts: [N] its number of triangles, two or more.
+    """
+    ends = np.cumsum(counts)
+    low = 0
+    while low < len(starts):
+        before = ends[low] - counts[low]
+        high = max(int(np.searchsorted(ends, before + _CHUNK, side="right")), low + 1)
+        count = counts[low:high]
+        within = np.cumsum(count) - count
+        owner = np.repeat(np.arange(high - low), count)
+        triangles = faces[starts[low:high][owner] + np.arange(len(owner)) - within[owner]]
+        with np.errstate(all="ignore"):  # what is not finite is found later
+            one, two = (vertices[triangles[:, i]] - vertices[triangles[:, 0]] for i in (1, 2))
+            cross = np.cross(one, two)
+            normal = np.add.reduceat(cross, within)
+            longest = np.maximum((one**2).sum(axis=1), (two**2).sum(axis=1))
+            limit = _TURNED * np.maximum.reduceat(longest, within)
+            length = np.linalg.norm(normal, axis=1)
+            upright = (cross * normal[owner]).sum(axis=1)
+            turned = upright < -(limit * length)[owner]
+            turned &= (length > limit)[owner]
+        yield from (low + np.unique(owner[turned])).tolist()
+        low = high
+
+
+def _flat(outline: np.ndarray) -> list[Point]:
+    """The outline [n, 3] in a plane, counterclockwise, of size one."""
+    sides = outline - outline[0]
+    normal = np.cross(sides[1:-1], sides[2:]).sum(axis=0)
+    axis = int(np.abs(normal).argmax())
+    x, y = (axis + 1) % 3, (axis + 2) % 3
+    flat = sides[:, [x, y] if normal[axis] > 0 else [y, x]] / np.abs(sides).max()
+    return [(float(u), float(v)) for u, v in flat]
+
+
+def _clipped(points: list[Point], tests: int) -> tuple[list[list[int]] | None, int]:
+    """Triangles [n - 2][3] of a counterclockwise outline, and how many of the `tests` are left.
+
+    None where no ear is found: the outline crosses itself, or there are no tests left.
+    """
+    left, ears = list(range(len(points))), []
+    at = missed = 0
+    strict = True
+    while len(left) > 2:
+        count = len(left)
+        if missed == count:
+            if not strict:
+                return None, tests
+            strict, missed = False, 0  # a corner of no area, or one whose sides are touched
+        at %= count
+        a, b, c = left[at - 1], left[at], left[(at + 1) % count]
+        area = _area(points[a], points[b], points[c])
+        fits = area > _FLAT
+        if fits:
+            tests -= count
+            fits = not _blocked(points, left, (a, b, c), strict)
+        if fits or (not strict and abs(area) <= _FLAT):
+            ears.append([a, b, c])
+            del left[at]
+            at, missed, strict = at - 1, 0, True  # the neighbours have changed
+            if at < 0:
+                at = len(left) - 1
+        else:
+            at, missed = at + 1, missed + 1
+        if tests < 0:
+            return None, tests
+    return ears, tests
+
+
+def _blocked(points: list[Point], left: list[int], ear: tuple[int, int, int], strict: bool) -> bool:
+    """Whether the outline enters the ear; if `strict`, also whether it touches its sides."""
+    a, b, c = (points[i] for i in ear)
+    lowest = min(a[0], b[0], c[0]), min(a[1], b[1], c[1])
+    highest = max(a[0], b[0], c[0]), max(a[1], b[1], c[1])
+    for place, index in enumerate(left):
+        p = points[index]
+        if not (lowest[0] <= p[0] <= highest[0] and lowest[1] <= p[1] <= highest[1]):
+            continue
+        if index in ear:
+            continue
+        if p in (a, b, c):
+            before, behind = points[left[place - 1]], points[left[(place + 1) % len(left)]]
+            one, two = {a: (b, c), b: (c, a), c: (a, b)}[p]
+            for way in (before, behind):
+                if _area(p, one, way) > _FLAT and _area(p, way, two) > _FLAT:
+                    return True
+            continue
+        inside = min(_area(a, b, p), _area(b, c, p), _area(c, a, p))
+        if inside > _FLAT or (strict and inside >= -_FLAT):
+            return True
+    return False
+
+
+def _area(a: Point, b: Point, c: Point) -> float:
+    """Doubled; positive of a left turn."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

@@ -1,0 +1,223 @@
+"""Polygons to triangles: fans stay as they were, concave outlines are covered exactly once."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from qs3.meshes.formats import polygons
+from qs3.meshes.formats.arrays import fan
+from qs3.meshes.formats.polygons import triangulated
+from qs3.meshes.io import load_mesh
+from tests.meshes.written import PRIMITIVES, dae, save
+
+U = [(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
+COMB = [(0, 0), (9, 0)] + [
+    p for x in (8, 6, 4, 2) for p in ((x + 1, 3), (x, 3), (x, 1), (x - 1, 1))
+]
+COMB += [(1, 3), (0, 3)]
+STAR = [
+    (r * math.cos(i * math.pi / 7), r * math.sin(i * math.pi / 7))
+    for i, r in enumerate([3.0, 1.0] * 7)
+]
+KEYHOLE = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)]
+"""A square with a hole, joined by a slit of no width."""
+TWO_HOLES = [
+    *[(0, 0), (8, 0), (8, 4), (0, 4), (0, 0)],
+    *[(1, 1), (1, 3), (3, 3), (3, 1), (5, 1), (5, 3), (7, 3), (7, 1), (5, 1), (3, 1), (1, 1)],
+]
+COLLINEAR = [(0, 0), (1, 0), (2, 0), (3, 0), (3, 2), (2, 2), (2, 1), (1, 1), (1, 2), (0, 2), (0, 1)]
+DOUBLED = [p for p in U for _ in range(2)]
+
+
+def spiral(turns):
+    """An arm of width 1 with gaps of 1, round and round."""
+    outer, inner = [(0.0, 0.0)], [(0.0, 1.0)]
+    x = y = 0.0
+    ways = [(1, 0), (0, 1), (-1, 0), (0, -1)]
+    length = 2.0 * turns + 1
+    for i in range(turns):
+        dx, dy = ways[i % 4]
+        x, y = x + dx * length, y + dy * length
+        nx, ny = ways[(i + 1) % 4]
+        outer.append((x, y))
+        inner.append((x - dx + nx, y - dy + ny))
+        if i % 2:
+            length -= 2
+    return outer + inner[::-1]
+
+
+def area(outline):
+    x, y = np.array(outline, float).T
+    return (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2
+
+
+def areas(points, faces):
+    """Signed, of triangles in the plane."""
+    a, b, c = np.array(points, float)[faces].transpose(1, 0, 2)
+    return np.array([np.linalg.det([q - p, r - p]) / 2 for p, q, r in zip(a, b, c, strict=True)])
+
+
+def cut(points, normal=(0.0, 0.0, 1.0), noise=0.0):
+    """Triangles of one outline that lies in some plane, or nearly."""
+    basis, _ = np.linalg.qr(np.column_stack([normal, np.eye(3)[:, :2]]))
+    if np.linalg.det(basis) < 0:
+        basis[:, 2] *= -1
+    placed = np.array(points, float) @ basis[:, 1:].T + (5, 6, 7)
+    _, which = np.unique(np.array(points, float), axis=0, return_inverse=True)
+    placed += noise * np.random.default_rng(0).normal(size=placed.shape)[which.ravel()]
+    return triangulated(placed, np.array([len(points)]), np.arange(len(points)))
+
+
+@pytest.mark.parametrize(
+    "outline",
+    [U, COMB, STAR, KEYHOLE, TWO_HOLES, COLLINEAR, DOUBLED, spiral(5), spiral(12), spiral(40)],
+)
+@pytest.mark.parametrize("backwards", [False, True])
+def test_concave_outlines_are_covered_once_from_whichever_corner(outline, backwards):
+    outline = outline[::-1] if backwards else outline
+    whole = area(outline)
+    for start in range(0, len(outline), 1 + len(outline) // 12):
+        points = outline[start:] + outline[:start]
+        for normal, noise in (((0.0, 0.0, 1.0), 0.0), ((0.5, -2.0, 1.0), 1e-6)):
+            found = areas(points, cut(points, normal, noise))
+            assert len(found) == len(points) - 2
+            assert abs(found.sum() - whole) < 1e-9
+            # All turned as the outline is: then none is outside, and none covers another.
+            assert abs(np.abs(found).sum() - abs(whole)) < 1e-4
+
+
+@st.composite
+def stars(draw):
+    """Simple polygons: corners in the order of their angles, seen from within."""
+    count = draw(st.integers(4, 14))
+    radii = draw(st.lists(st.floats(0.05, 1), min_size=count, max_size=count))
+    return [
+        (r * math.cos(2 * math.pi * i / count), r * math.sin(2 * math.pi * i / count))
+        for i, r in enumerate(radii)
+    ]
+
+
+@settings(max_examples=60, deadline=None)
+@given(outline=stars())
+def test_any_star_is_covered_once(outline):
+    found = areas(outline, cut(outline, (0.3, 0.4, -0.5)))
+    assert abs(found.sum() - area(outline)) < 1e-9
+    assert abs(np.abs(found).sum() - area(outline)) < 1e-5
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_convex_polygons_and_fans_that_are_right_stay(seed):
+    """Many in one call, rounded to float32, with corners within sides and tilted ones."""
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(0, 9, 200)
+    points = []
+    for size in sizes:
+        angles = np.sort(rng.uniform(0, 2 * np.pi, size))
+        round_ = np.stack([np.cos(angles), np.sin(angles), np.zeros(size)], axis=1)
+        if size > 3:  # one corner within a side
+            round_[1] = round_[0] + rng.uniform() * (round_[2] - round_[0])
+        points.append(round_ @ rng.normal(size=(3, 3)) + rng.normal(size=3))
+    vertices = np.concatenate(points).astype(np.float32).astype(np.float64)
+    corners = np.arange(len(vertices))
+    np.testing.assert_array_equal(triangulated(vertices, sizes, corners), fan(sizes, corners))
+    seen_from_first = np.array([(0, 0, 0), (3, 0, 0), (1, 1, 0), (0, 3, 0)], float)  # concave
+    assert triangulated(seen_from_first, np.array([4]), np.arange(4)).tolist() == [
+        [0, 1, 2],
+        [0, 2, 3],
+    ]
+
+
+def test_only_the_concave_of_many_are_cut_anew(monkeypatch):
+    """Also across the pieces in which they are looked at."""
+    flat = np.array([(x, y, 0) for x, y in U], float)
+    square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], float)
+    parts = [square, flat, square[:3], square, np.roll(flat, 2, axis=0), square[:2], flat]
+    sizes = np.array([len(part) for part in parts])
+    vertices, corners = np.concatenate(parts), np.arange(sizes.sum())
+    found = triangulated(vertices, sizes, corners)
+    owner = np.repeat(np.arange(7), np.maximum(sizes - 2, 0))
+    for i, part in enumerate(parts):
+        triangles = vertices[found[owner == i]][:, :, :2]
+        one, two = (triangles[:, k] - triangles[:, 0] for k in (1, 2))
+        each = (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]) / 2
+        assert (each >= 0).all()
+        assert each.sum() == {8: 7, 4: 1, 3: 0.5, 2: 0}[len(part)]
+    same = owner[(found == fan(sizes, corners)).all(axis=1)]
+    assert {0, 2, 3} <= set(same)
+    monkeypatch.setattr(polygons, "_CHUNK", 3)
+    np.testing.assert_array_equal(triangulated(vertices, sizes, corners), found)
+
+
+@pytest.mark.parametrize(
+    "outline",
+    [
+        [(0, 0), (2, 2), (2, 0), (0, 1)],  # two triangles that meet in a point
+        [(0, 0), (4, 0), (4, 4), (2, -2), (0, 4)],
+        [(0, 0), (1, 0), (2, 0), (1, 0)],
+    ],
+)
+def test_what_crosses_itself_or_has_no_area_is_a_fan(outline):
+    count = len(outline)
+    assert cut(outline).tolist() == fan(np.array([count]), np.arange(count)).tolist()
+
+
+def test_corners_that_are_not_there_or_not_finite_are_left_to_the_caller():
+    vertices = np.array([(x, y, 0) for x, y in U], float)
+    one = np.array([8])
+    for corners in (np.arange(1, 9), np.arange(-1, 7)):
+        np.testing.assert_array_equal(triangulated(vertices, one, corners), fan(one, corners))
+    vertices[3, 1] = np.nan
+    assert triangulated(vertices, one, np.arange(8)).shape == (6, 3)
+    assert triangulated(vertices, np.zeros(0, int), np.zeros(0, int)).shape == (0, 3)
+
+
+def test_a_limit_to_what_concave_polygons_cost(monkeypatch):
+    monkeypatch.setattr(polygons, "MAX_TESTS", 20)
+    np.testing.assert_array_equal(cut(U), fan(np.array([8]), np.arange(8)))
+
+
+def concave_dae(lines, polygons):
+    """Behind a square whose fan is right; with another column beside the corners."""
+    text = dae(primitive=PRIMITIVES["polylist"], up="Y_UP").replace('meter="0.5"', 'meter="1"')
+    start, end = text.index("9 0 0 0 1"), text.index("</float_array>")
+    square = "0 9 0 1 9 0 1 9 1 0 9 1"
+    text = text[:start] + f"9 {square} {' '.join(lines)}" + text[end:]
+    text = text.replace('count="18"', 'count="37"').replace('count="4"', 'count="12"')
+    outlines = "7 0 7 1 7 2 7 3", " ".join(f"7 {i}" for i in range(4, 12))
+    if polygons:
+        first, last = text.index("<vcount>"), text.index("</polylist>")
+        listed = "".join(f"<p>{outline}</p>" for outline in outlines)
+        return (text[:first] + listed + text[last:]).replace("polylist", "polygons")
+    text = text.replace("<vcount>4<", "<vcount>4 8<")
+    return text.replace(outlines[0], " ".join(outlines))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "off", "dae", "polygons.dae"])
+def test_a_concave_face_of_a_file(tmp_path, suffix):
+    for start in range(8):
+        points = U[start:] + U[:start]
+        lines = [f"{x} 5 {y}" for x, y in points]
+        each = " ".join(map(str, range(8)))
+        text = {
+            "obj": "".join(f"v {line}\n" for line in lines) + "f 1 2 3 4 5 6 7 8\n",
+            "off": "OFF\n8 1 0\n" + "\n".join(lines) + f"\n8 {each}\n",
+            "ply": "ply\nformat ascii 1.0\nelement face 1\nproperty list int int vertex_indices\n"
+            "element vertex 8\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+            f"8 {each}\n" + "\n".join(lines) + "\n",
+            "dae": concave_dae(lines, polygons=False),
+            "polygons.dae": concave_dae(lines, polygons=True),
+        }[suffix]
+        mesh = load_mesh(save(tmp_path, f"a.{suffix}", text))
+        one, two = (
+            mesh.vertices[mesh.faces[:, i]] - mesh.vertices[mesh.faces[:, 0]] for i in (1, 2)
+        )
+        each = np.linalg.norm(np.cross(one, two), axis=1) / 2
+        if suffix.endswith("dae"):
+            assert (each[:2] == 0.5).all()
+            each = each[2:]
+        assert len(each) == 6
+        assert abs(each.sum() - 7) < 1e-6
