@@ -108,16 +108,44 @@ def test_a_library_that_is_not_there_says_nothing(tmp_path):
 @pytest.mark.parametrize(
     "name", ["../plates.mtl", "/etc/passwd", "sub/../../plates.mtl", "out.mtl"]
 )
-def test_no_library_outside_of_the_folder_is_opened(name, tmp_path):
+def test_no_library_outside_of_the_folder_is_opened(name, tmp_path, caplog):
     folder = tmp_path / "in"
     folder.mkdir()
     save(tmp_path, "plates.mtl", MTL)
     (folder / "out.mtl").symlink_to(tmp_path / "plates.mtl")
     path = save(folder, "a.obj", obj(library=name))
-    assert load_mesh(path).finishes is None  # nobody asked
-    for read in (lambda: load_mesh(path, materials=True), lambda: libraries(path)):
-        with pytest.raises(MeshError, match="outside of its folder"):
-            read()
+    assert load_mesh(path).finishes is None
+    assert caplog.text == ""  # nobody asked
+    assert load_mesh(path, materials=True).finishes is None
+    assert f"{path}: mtllib {name!r} lies outside of the mesh's folder" in caplog.text
+    assert libraries(path) == []
+
+
+def test_a_library_beside_one_outside_of_the_folder(tmp_path, caplog):
+    path = write_obj(tmp_path, library="/home/me/a.mtl plates.mtl")
+    assert by_side(load_mesh(path, materials=True)) == by_side(
+        load_mesh(write_obj(tmp_path), materials=True)
+    )
+    assert "/home/me/a.mtl" in caplog.text
+    assert [p.name for p in libraries(path)] == ["plates.mtl"]
+
+
+def test_names_with_a_number_sign(tmp_path):
+    """As 3ds Max writes them; a comment has its own line, or stands behind numbers."""
+    names = {"first": "Material #25", "second": "Material #26", "library": "chair#1.mtl"}
+    text = (
+        "# a comment\nnewmtl Material #25\n #newmtl dark\nKd .9 .9 .9 # bright\n"
+        "newmtl Material #26\nKd 0.05 0.05 0.05#dark\n"
+    )
+    save(tmp_path, "chair#1.mtl", text)
+    path = save(tmp_path, "a.obj", "#mtllib b.mtl\n# usemtl b\n" + obj(**names))
+    mesh = load_mesh(path, materials=True)
+    assert by_side(mesh) == [{Finish((0.9,) * 3)}, {Finish((0.05,) * 3)}]
+    assert [p.name for p in libraries(path)] == ["chair#1.mtl"]
+    names["library"] = "chair#1.mtl # of the chair"
+    assert by_side(load_mesh(save(tmp_path, "a.obj", obj(**names)), materials=True)) == by_side(
+        mesh
+    )
 
 
 def test_a_library_as_windows_names_it_and_with_byte_order_marks(tmp_path):

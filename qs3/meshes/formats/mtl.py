@@ -1,8 +1,10 @@
 """Materials of Wavefront OBJ: the .mtl files next to it, and which faces have which.
 
 Of a material Kd, Ks, Ns, d and Tr are read, and Pr and Pm of the physically based extension. Kd is
-linear light, as Blender takes it. A library that is not there is left out: its faces have no
-material. Pictures (map_Kd) are not opened.
+linear light, as Blender takes it. A library that is not there, or not within the mesh's folder, is
+left out: its faces have no material. Pictures (map_Kd) are not opened.
+
+A name is all that follows on its line: many have spaces, and 3ds Max writes "Material #25".
 
 http://paulbourke.net/dataformats/mtl/
 """
@@ -21,25 +23,33 @@ from qs3.meshes.formats.arrays import lines
 MAX_BYTES = 1 << 24
 MAX_LIBRARIES = 64
 
+_NAMED = (b"newmtl", b"usemtl", b"mtllib")
+
 
 def read_finishes(data: bytes, folder: Path, found: FoundFinishes) -> None:
     """The materials of an OBJ file's faces, in their order.
 
     Raises:
-        MeshError: a library lies outside of the folder, is too large, or holds text where numbers
-            are expected.
+        MeshError: a library is too large, or holds text where numbers are expected.
     """
     data = _joined_lines(data)
     known: dict[str, Finish | None] = {}
     pictured: set[str] = set()
-    for path in _libraries(data, folder):
+    there, outside = _libraries(data, folder)
+    if outside:
+        names = ", ".join(f"{name!r:.200}" for name in outside[:3])
+        found.notes.append(
+            f"mtllib {names} lies outside of the mesh's folder and is not opened: its faces have "
+            "no material. Put the file next to the mesh, and its bare name into the line"
+        )
+    for path in there:
         _read_library(path, known, pictured)
     numbers: dict[str, int] = {}
     of_face: list[int] = []
     counts: list[int] = []
     current = NONE
     for line in lines(data):
-        tokens = line.split(b"#", 1)[0].split()
+        tokens = _words(line)
         if not tokens:
             continue
         if tokens[0] == b"usemtl":
@@ -56,47 +66,55 @@ def read_finishes(data: bytes, folder: Path, found: FoundFinishes) -> None:
 
 
 def libraries(path: Path) -> list[Path]:
-    """The .mtl files that an OBJ file names and that are there, each once; empty of other files.
-
-    Raises:
-        MeshError: one of them lies outside of its folder.
-    """
+    """The .mtl files that an OBJ file names and that are there, each once; empty of other files."""
     if path.suffix.lower() != ".obj":
         return []
-    return _libraries(_joined_lines(path.read_bytes()), path.parent)
+    return _libraries(_joined_lines(path.read_bytes()), path.parent)[0]
 
 
-def _libraries(data: bytes, folder: Path) -> list[Path]:
+def _libraries(data: bytes, folder: Path) -> tuple[list[Path], list[str]]:
+    """The files that are there, and the names of such as lie outside of the folder."""
     root = folder.resolve()
+    outside: dict[str, None] = {}
     there: dict[Path, None] = {}
     for line in lines(data):
         if b"mtllib" not in line:
             continue
-        keyword, *words = line.split(b"#", 1)[0].split() or [b""]
+        keyword, *words = _words(line) or [b""]
         if keyword != b"mtllib":
             continue
         # One name that may have spaces, or several without.
-        whole = _inside(root, _name(words))
-        for path in [whole] if whole else [_inside(root, _name([word])) for word in words]:
-            if path is not None:
-                there[path] = None
+        for names in ([_name(words)], [_name([word]) for word in words]):
+            paths = [path for name in names for path in _inside(root, name, outside)]
+            there.update(dict.fromkeys(paths))
+            if paths:
+                break
         if len(there) > MAX_LIBRARIES:
             raise MeshError(f"refers to more than {MAX_LIBRARIES} files of materials")
-    return list(there)
+    return list(there), list(outside)
 
 
-def _inside(root: Path, name: str) -> Path | None:
-    """The file of this name, if it is there; MeshError if it lies outside of the folder."""
+def _inside(root: Path, name: str, outside: dict[str, None]) -> list[Path]:
+    """The file of this name, if it is there; added to `outside` if it is not in the folder."""
     for spelt in (name, name.replace("\\", "/")):  # as Windows writes it
         try:
             path = (root / spelt).resolve()
             if not path.is_relative_to(root):
-                raise MeshError(f"refers to {name!r:.200}, which lies outside of its folder")
-            if path.is_file():
-                return path
+                outside[name] = None
+            elif path.is_file():
+                return [path]
         except (OSError, RuntimeError):  # a name that no file can have, links in a circle
             continue
-    return None
+    return []
+
+
+def _words(line: bytes) -> list[bytes]:
+    """Those of a line, without a comment; a name may have a # in it."""
+    if line.lstrip().startswith(_NAMED):
+        words = line.split()
+        if words[0] in _NAMED:
+            return words
+    return line.split(b"#", 1)[0].split()
 
 
 def _name(words: Sequence[bytes]) -> str:
@@ -114,7 +132,7 @@ def _read_library(path: Path, known: dict[str, Finish | None], pictured: set[str
     entries: dict[str, dict[str, list[bytes]]] = {}
     current: dict[str, list[bytes]] = {}
     for line in lines(path.read_bytes()):
-        tokens = line.split(b"#", 1)[0].split()
+        tokens = _words(line)
         if tokens and tokens[0] == b"newmtl":
             current = entries.setdefault(_name(tokens[1:]), {})
             if len(entries) > MAX_FINISHES:
