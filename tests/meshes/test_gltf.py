@@ -139,3 +139,30 @@ def test_gltf_that_repeats_a_mesh_beyond_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(arrays, "MAX_FACES", 1000)
     tree, _ = gltf(nodes=[{"mesh": 0}] * 500, scenes=[{"nodes": list(range(500))}])
     refused(tmp_path, "a.gltf", json.dumps(tree), "limits")
+
+
+def test_morph_targets_that_move_vertices_are_refused(tmp_path):
+    """A node's weights count before its mesh's; colliders' count for nothing."""
+
+    def text(target="POSITION", mesh=None, node=None, name=""):
+        tree, _ = gltf()
+        for part in tree["meshes"][0]["primitives"]:
+            part["targets"] = [{"NORMAL": 0}, {target: 0}]
+        tree["meshes"][0] |= {"weights": mesh} if mesh else {}
+        tree["meshes"].append({"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]})
+        tree["nodes"][2] |= {"weights": node} if node else {}
+        tree["nodes"][2]["name"] = name
+        return json.dumps(tree)
+
+    plain = len(load_mesh(save(tmp_path, "a.gltf", text())).faces)
+    for fine in (
+        {"mesh": [0, 0]},
+        {"mesh": [1.0, 0]},
+        {"mesh": [1, 1], "target": "NORMAL"},
+        {"node": [0.5]},
+    ):
+        assert len(load_mesh(save(tmp_path, "a.gltf", text(**fine))).faces) == plain
+    refused(tmp_path, "a.gltf", text(mesh=[0, 0.25]), "morph target with the weight 0.25")
+    refused(tmp_path, "a.gltf", text(mesh=[0, 0], node=[0, -1]), "morph target with the weight -1")
+    left_out = save(tmp_path, "b.gltf", text(node=[0, 1], name="UCX_a"))
+    assert 0 < len(load_mesh(left_out).faces) < plain

@@ -190,9 +190,23 @@ def _nodes(tree: dict[str, Any], colliders: Colliders) -> list[dict[str, Any]]:
         if "mesh" in node:
             if "skin" in node:
                 raise MeshError("has a skinned mesh, which is not read: export it unskinned")
-            if not colliders.left_out(tree["meshes"][node["mesh"]].get("name")):
+            mesh = tree["meshes"][node["mesh"]]
+            if not colliders.left_out(mesh.get("name")):
+                _check_targets(mesh, node)
                 prepared[index]["mesh"] = node["mesh"]
     return prepared
+
+
+def _check_targets(mesh: dict[str, Any], node: dict[str, Any]) -> None:
+    """Raise MeshError where morph targets move the vertices: without a node's weights, a mesh's."""
+    weights = node.get("weights", mesh.get("weights", ()))
+    for part in mesh["primitives"]:
+        for weight, target in zip(weights, part.get("targets", ()), strict=False):
+            if weight != 0 and "POSITION" in target:
+                raise MeshError(
+                    f"has a morph target with the weight {weight:g}, which is not read: export it "
+                    "with its shape applied, or with all weights at 0"
+                )
 
 
 class _Surfaces:
