@@ -66,7 +66,11 @@ def read_finishes(data: bytes, folder: Path, found: FoundFinishes) -> None:
 
 
 def libraries(path: Path) -> list[Path]:
-    """The .mtl files that an OBJ file names and that are there, each once; empty of other files."""
+    """The .mtl files that an OBJ file names and that are there, each once; empty of other files.
+
+    Raises:
+        MeshError: it names more than MAX_LIBRARIES that are there.
+    """
     if path.suffix.lower() != ".obj":
         return []
     return _libraries(_joined_lines(path.read_bytes()), path.parent)[0]
