@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from qs3.inference.inputs import (
     cloud_units,
     depth_units,
     find_files,
+    printable_name,
 )
 from qs3.inference.model_file import find_result
 from qs3.inference.page import Gallery, page
@@ -90,12 +92,18 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         text = as_csv(records, classes)
     lines.append(_save(out, text))
     if settings.page:
-        title = f"{Path(settings.input or settings.depth).name}, as {ckpt} sees it"
+        title = f"{_title(settings.input or settings.depth)}, as {printable_name(ckpt)} sees it"
         where = _floor_m(settings, predictor)
         shown = without_labels(verdict, rows, classes)
         html = page(title, rows, gallery, classes, trained_on, worth, taken, shown, where)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _title(place: str) -> str:
+    """Name of a file or folder, also of one that is given as "." or ".."."""
+    whole = os.path.abspath(Path(place).expanduser())
+    return printable_name(os.path.basename(whole) or whole)
 
 
 def _loaded(name: str, settings: Settings) -> Predictor:
@@ -161,7 +169,7 @@ def _save(path: Path, text: str) -> str:
 
 def saved(out: str | Path, replaces: bool) -> str:
     """Says where a file lies now, and that another one lay there."""
-    return f"saved {out}" + " (replaced what was there)" * replaces
+    return f"saved {printable_name(str(out))}" + " (replaced what was there)" * replaces
 
 
 def _clouds(settings: Settings) -> Source:

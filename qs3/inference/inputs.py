@@ -179,7 +179,7 @@ def depth_units(shown: Sequence[Shown], gravity: str, classes: Sequence[str]) ->
 
 
 def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
-    name = _printable(path.relative_to(root).as_posix())
+    name = printable_name(path.relative_to(root).as_posix())
     folders = [known_as(part, classes) for part in path.relative_to(root).parts[:-1]]
     folder = next((cls for cls in reversed(folders) if cls), "")
     mesh = is_mesh(path)
@@ -232,7 +232,7 @@ def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sa
 
 
 def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
-    name, label = _printable(shown.name), _label(shown.label, classes)
+    name, label = printable_name(shown.name), _label(shown.label, classes)
     if shown.wrong:
         yield Row(name, None, None, shown.wrong, None, label)
         return
@@ -286,6 +286,10 @@ def _label(given: object, classes: Sequence[str]) -> str:
     return known_as(words, classes) or printable(words)
 
 
-def _printable(name: str) -> str:
-    """A file's name as UTF-8; bytes that are none become escapes."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+def printable_name(name: str) -> str:
+    """A file's name for tables, pages and terminals: bytes that are no UTF-8 become escapes.
+
+    So does what is not printable: a terminal would obey it.
+    """
+    text = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return printable(text)
