@@ -47,10 +47,12 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     source = _depth_images(settings) if settings.depth else _clouds(settings)
     ckpt = settings.ckpt or pretrained.usual(source.floor_known)
     predictor = _loaded(ckpt, settings)
-    found = _floor(source, settings, predictor)
+    found, given = _floor(source, settings, predictor), settings
     if found:
         settings = replace(settings, floor=found.z)
     second = _second(settings, ckpt, predictor)
+    heights = any(one.needs_floor for one in (predictor, second) if one)
+    _check_heights(given, heights, ckpt)
     classes = predictor.classes
     inputs = source.find(predictor)
     if predictor.needs_floor and inputs.kind == "files" and settings.floor is None:
@@ -73,7 +75,6 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     trained_on, worth = _trained_on(ckpt), predictor.result.worth
     if worth and predictor.prior:
         worth += "; without prior="
-    heights = any(one.needs_floor for one in (predictor, second) if one)
     taken = [found.words] if found and heights else []
     taken += [predictor.prior.words] if predictor.prior else []
     trust, verdict = trust_of(rows, predictor)
@@ -154,6 +155,16 @@ def _second(settings: Settings, ckpt: str, first: Predictor) -> Predictor | None
     if second.needs_floor and settings.floor is None and settings.camera_height is None:
         raise ConfigError(f"second={name} knows heights: give floor= or camera_height=")
     return second
+
+
+def _check_heights(settings: Settings, heights: bool, ckpt: str) -> None:
+    """Raise ConfigError if a height is given that no classifier looks at."""
+    given = [key for key in ("floor", "camera_height") if getattr(settings, key) is not None]
+    if given and not heights:
+        raise ConfigError(
+            f"{given[0]}= would have no effect: ckpt={ckpt} knows no heights; leave it out, or "
+            "take a classifier that does, such as dgcnn-rooms"
+        )
 
 
 def _camera_is_missing(predictor: Predictor, settings: Settings) -> bool:
