@@ -179,7 +179,9 @@ class ObjectArchive(Importer):
 
     def made_of(self) -> MadeOf:
         """See `Importer`."""
-        return MadeOf(objects=f"real objects cut from depth images, archive {printable(self.path.name)}")
+        return MadeOf(
+            objects=f"real objects cut from depth images, archive {printable(self.path.name)}"
+        )
 
     def judges(self) -> str:
         """See `Importer`."""
