@@ -261,8 +261,8 @@ depth; see qs3.sensors.devices.fitted.FittedDepth. The plot shows data and model
 
 images=FOLDER holds rectified pictures of an active stereo camera: SCENE_left.png, and where there
 are any SCENE_right.png, SCENE_off.png (projector off, the same exposure) and SCENE_depth.png (the
-left camera's). Several frames of a still scene, SCENE_left_0.png and so on, tell noise from
-texture. Found, with their errors: ambient light, blur, exposure, noise and speckle; with right
+left camera's). Several frames of a still scene, SCENE_left_0.png and so on (64 at most), tell noise
+from texture. Found, with their errors: ambient light, blur, exposure, noise and speckle; with right
 pictures and a depth image, f B. Electrons at white are those without an amplifier; one that raised
 the pictures has to be said, gain=, for noise does not tell it from fewer electrons. Read-out noise
 is that at this gain. What the pictures do not tell is said, and left as it is in base=. Of each

@@ -18,7 +18,9 @@ log = logging.getLogger(__name__)
 
 NAMES = "SCENE_left.png, SCENE_right.png, SCENE_off.png, SCENE_depth.png or .npy"
 
-_FILE = re.compile(r"(?P<scene>.+?)_(?P<what>left|right|off|depth)(_?\d+)?\.(png|npy)", re.IGNORECASE)
+_FILE = re.compile(
+    r"(?P<scene>.+?)_(?P<what>left|right|off|depth)(_?\d+)?\.(png|npy)", re.IGNORECASE
+)
 _MOST = 2_000  # pictures of a folder
 _FRAMES = 64  # of a scene and kind
 
