@@ -39,6 +39,13 @@ def check_bool(key: str, value: Any) -> bool:
     return value
 
 
+def check_words(key: str, value: Any) -> list[str]:
+    """A list of words; ConfigError for a word where the list is meant, which is one of letters."""
+    if isinstance(value, str):
+        raise ConfigError(f"{key}={value}: give a list, [{value}]")
+    return [str(word) for word in value]
+
+
 def check_choice(key: str, value: Any, allowed: Sequence[str]) -> str:
     """The value; ConfigError unless it is one of the allowed ones."""
     if value not in allowed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from qs3.inference.inputs import (
     cloud_units,
     depth_units,
     find_files,
+    printable_name,
 )
 from qs3.inference.model_file import find_result
 from qs3.inference.page import Gallery, page
@@ -45,10 +47,12 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     source = _depth_images(settings) if settings.depth else _clouds(settings)
     ckpt = settings.ckpt or pretrained.usual(source.floor_known)
     predictor = _loaded(ckpt, settings)
-    found = _floor(source, settings, predictor)
+    found, given = _floor(source, settings, predictor), settings
     if found:
         settings = replace(settings, floor=found.z)
     second = _second(settings, ckpt, predictor)
+    heights = any(one.needs_floor for one in (predictor, second) if one)
+    _check_heights(given, heights, ckpt)
     classes = predictor.classes
     inputs = source.find(predictor)
     if predictor.needs_floor and inputs.kind == "files" and settings.floor is None:
@@ -71,7 +75,6 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     trained_on, worth = _trained_on(ckpt), predictor.result.worth
     if worth and predictor.prior:
         worth += "; without prior="
-    heights = any(one.needs_floor for one in (predictor, second) if one)
     taken = [found.words] if found and heights else []
     taken += [predictor.prior.words] if predictor.prior else []
     trust, verdict = trust_of(rows, predictor)
@@ -90,12 +93,18 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         text = as_csv(records, classes)
     lines.append(_save(out, text))
     if settings.page:
-        title = f"{Path(settings.input or settings.depth).name}, as {ckpt} sees it"
+        title = f"{_title(settings.input or settings.depth)}, as {printable_name(ckpt)} sees it"
         where = _floor_m(settings, predictor)
         shown = without_labels(verdict, rows, classes)
         html = page(title, rows, gallery, classes, trained_on, worth, taken, shown, where)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _title(place: str) -> str:
+    """Name of a file or folder, also of one that is given as "." or ".."."""
+    whole = os.path.abspath(Path(place).expanduser())
+    return printable_name(os.path.basename(whole) or whole)
 
 
 def _loaded(name: str, settings: Settings) -> Predictor:
@@ -148,6 +157,16 @@ def _second(settings: Settings, ckpt: str, first: Predictor) -> Predictor | None
     return second
 
 
+def _check_heights(settings: Settings, heights: bool, ckpt: str) -> None:
+    """Raise ConfigError if a height is given that no classifier looks at."""
+    given = [key for key in ("floor", "camera_height") if getattr(settings, key) is not None]
+    if given and not heights:
+        raise ConfigError(
+            f"{given[0]}= would have no effect: ckpt={ckpt} knows no heights; leave it out, or "
+            "take a classifier that does, such as dgcnn-rooms"
+        )
+
+
 def _camera_is_missing(predictor: Predictor, settings: Settings) -> bool:
     given = settings.floor is not None or settings.camera_height is not None
     return predictor.needs_floor and not given and predictor.camera_height is None
@@ -161,7 +180,7 @@ def _save(path: Path, text: str) -> str:
 
 def saved(out: str | Path, replaces: bool) -> str:
     """Says where a file lies now, and that another one lay there."""
-    return f"saved {out}" + " (replaced what was there)" * replaces
+    return f"saved {printable_name(str(out))}" + " (replaced what was there)" * replaces
 
 
 def _clouds(settings: Settings) -> Source:

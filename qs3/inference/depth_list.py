@@ -6,7 +6,7 @@
     depth=objects.csv                              a row an object or a picture, columns:
 
         depth         file, relative to the list
-        mask, object  file, and the number of the one object that is meant (none: all)
+        mask, object  file, and the number of its one object that is meant (none: all)
         box           left,top,right,bottom; a mask or a box
         intrinsics, up, depth_scale, label         those of the command line where empty
 
@@ -117,6 +117,12 @@ def direction(words: Any) -> tuple[float, ...] | None:
     return numbers(words, 3, "up")
 
 
+def check_scale(metres: float) -> None:
+    """Raise ConfigError if that cannot be the metres of a unit of depth."""
+    if not 0 < metres <= 1:
+        raise ConfigError(f"depth_scale={metres:g}: metres a unit, in (0, 1]")
+
+
 def _one_of(mask: str, box: Sequence[float] | None) -> None:
     if bool(mask) == (box is not None):
         raise ConfigError(
@@ -203,9 +209,13 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
         box = numbers(given["box"], 4, "box") if "box" in given else None
         _one_of(str(given.get("mask", "")), box)
         only = given.get("object")
+        if only is not None and box is not None:
+            raise ConfigError(f"object={only} is the number of one of a mask; here is a box")
         if isinstance(only, bool) or (isinstance(only, float) and not only.is_integer()):
             raise ConfigError(f"object={only}: expected the whole number of an object of the mask")
-        scale = given.get("depth_scale")
+        scale = float(given["depth_scale"]) if "depth_scale" in given else None
+        if scale is not None:
+            check_scale(scale)
         shown = replace(
             common,
             name=name,
@@ -214,7 +224,7 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
             box=box,
             only=None if only is None else int(only),
             up=direction(given["up"]) if "up" in given else common.up,
-            scale_m=common.scale_m if scale is None else float(scale),
+            scale_m=common.scale_m if scale is None else scale,
             label=str(given.get("label", "")),
         )
         if "intrinsics" in given:

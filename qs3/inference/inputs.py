@@ -54,6 +54,8 @@ class Sample(NamedTuple):
         axis: that points up in it.
         picture: the depth image and the object's pixels in it; None if it comes from none.
         drawn: whether its points were drawn on the surface of a mesh.
+        world_from_camera: the rotation to z up of a cloud in the frame of its camera; None: `axis`
+            says which way is up.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Sample(NamedTuple):
     up: str = Z
     picture: tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]] | None = None
     drawn: bool = False
+    world_from_camera: Float[np.ndarray, "3 3"] | None = None
 
     def row(self, reason: str, probabilities: np.ndarray | None) -> Row:
         """Its row of the table, with the net's prediction or the reason why there is none."""
@@ -179,7 +182,7 @@ def depth_units(shown: Sequence[Shown], gravity: str, classes: Sequence[str]) ->
 
 
 def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
-    name = _printable(path.relative_to(root).as_posix())
+    name = printable_name(path.relative_to(root).as_posix())
     folders = [known_as(part, classes) for part in path.relative_to(root).parts[:-1]]
     folder = next((cls for cls in reversed(folders) if cls), "")
     mesh = is_mesh(path)
@@ -232,7 +235,7 @@ def _object(archive: Archive, index: int, classes: Sequence[str]) -> Iterator[Sa
 
 
 def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sample | Row]:
-    name, label = _printable(shown.name), _label(shown.label, classes)
+    name, label = printable_name(shown.name), _label(shown.label, classes)
     if shown.wrong:
         yield Row(name, None, None, shown.wrong, None, label)
         return
@@ -255,6 +258,7 @@ def _pointed(shown: Shown, gravity: str, classes: Sequence[str]) -> Iterator[Sam
             cautions=(*one.cautions, *unsure),
             up=one.up,
             picture=(depth, one.mask),
+            world_from_camera=one.world_from_camera if gravity == "none" else None,
         )
 
 
@@ -262,8 +266,8 @@ def _read_picture(
     shown: Shown,
 ) -> tuple[Float[np.ndarray, "h w"], list[Pointed], tuple[Caution, ...]]:
     """Depth, objects, and what is not sure about the camera."""
-    depth = read_depth(shown.depth, shown.scale_m)
     given = read_intrinsics(shown.intrinsics, shown.folder)
+    depth = read_depth(shown.depth, shown.scale_m, given.depth_scale)
     camera = check_intrinsics(given, depth, str(shown.depth))
     mask = None if shown.mask is None else read_mask(shown.mask)
     found = point_out(depth, camera, mask=mask, box=shown.box, up=shown.up, only=shown.only)
@@ -286,6 +290,10 @@ def _label(given: object, classes: Sequence[str]) -> str:
     return known_as(words, classes) or printable(words)
 
 
-def _printable(name: str) -> str:
-    """A file's name as UTF-8; bytes that are none become escapes."""
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+def printable_name(name: str) -> str:
+    """A file's name for tables, pages and terminals: bytes that are no UTF-8 become escapes.
+
+    So does what is not printable: a terminal would obey it.
+    """
+    text = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return printable(text)

@@ -11,6 +11,7 @@ from qs3.config.checks import check_choice
 from qs3.data.importers.folders import UP_AXES
 from qs3.errors import ConfigError
 from qs3.evaluation.prior import POWER
+from qs3.inference.depth_list import check_scale
 from qs3.inference.floor import Floor, check_camera_height, check_floor
 from qs3.inference.inputs import Unit
 from qs3.inference.predictor import Predictor
@@ -71,8 +72,8 @@ class Settings:
         given = [key for key in of_depth if getattr(self, key) not in ("", None)]
         if given and not self.depth:
             raise ConfigError(f"{given[0]}= is for depth images; give depth=IMAGE, not input=")
-        if self.depth_scale is not None and not 0 < self.depth_scale <= 1:
-            raise ConfigError(f"depth_scale={self.depth_scale:g}: metres a unit, in (0, 1]")
+        if self.depth_scale is not None:
+            check_scale(self.depth_scale)
         if self.depth and self.floor is not None:
             raise ConfigError("floor= is for clouds; of depth images give camera_height=METRES")
         if self.camera_height is not None:

@@ -9,6 +9,7 @@ from typing import Any
 from qs3.config.location import typed
 from qs3.data.frames.pointed import LEVEL, PLANES
 from qs3.evaluation.ood import OTHER_UNITS
+from qs3.inference.inputs import printable_name
 from qs3.inference.predictor import Predictor
 from qs3.inference.pretrained import HEIGHTS
 from qs3.inference.scores import Count, disputed, right, scores
@@ -113,7 +114,9 @@ def _other_units(good: Sequence[Mapping[str, Any]]) -> list[str]:
 def _passed_over(others: Mapping[str, int]) -> str:
     """Files of kinds that are not read, by their endings; meshes with what to do."""
     most = Counter(others).most_common()
-    shown = ", ".join(f"{suffix or 'without ending'} {n}" for suffix, n in most[:_SHOWN])
+    shown = ", ".join(
+        f"{printable_name(suffix) or 'without ending'} {n}" for suffix, n in most[:_SHOWN]
+    )
     shown += ", ..." * (len(most) > _SHOWN)
     files = counted(sum(others.values()), "file of another kind", "files of other kinds")
     scan = "; meshes are scanned first: qs3-generate meshes=FOLDER"

@@ -26,10 +26,12 @@ def _tune(more: Sequence[str], line: str, out: Path, rate: float, **given: Any) 
         raise ConfigError(f"rate must be > 0, got {rate}")
     if given["batch"] > given["objects"]:
         raise ConfigError("batch= is of the objects= that are searched with: it cannot be larger")
+    from qs3.config.compose import check_no_base
     from qs3.tuning.command import Wanted, tune
     from qs3.tuning.report import said, save
 
     base = _base(more)
+    check_no_base(out, "sensor", base[0], more)
     found = tune(Wanted(out=out, rate=rate, **given), more)
     for words in said(found):
         print(words)

@@ -353,3 +353,24 @@ def test_names_that_are_no_utf8(run, clouds, tmp_path):
         pytest.skip("this file system takes no such names")
     assert predict(run, folder, tmp_path / "said.csv") == 0
     assert table(tmp_path / "said.csv")[0]["file"] == r"\xff.xyz"
+
+
+def test_folders_that_are_no_utf8_and_names_with_commands_for_a_terminal(
+    run, clouds, tmp_path, capsys, monkeypatch
+):
+    folder = tmp_path / "m\udcf6bel"
+    try:
+        write(folder / "a.xyz", clouds[0])
+    except OSError:
+        pytest.skip("this file system takes no such names")
+    (folder / "bad\x1b[31mname\n.xyz").write_text("x y\n")
+    (folder / "a.\x1b[31m").write_text("")
+    assert predict(run, folder, folder / "said.csv") == 1  # file that failed
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert r"bad\x1b[31mname\n.xyz: " in said
+    assert rf"{tmp_path}/m\xf6bel/said.html" in said
+    assert r"<title>m\xf6bel, as " in (folder / "said.html").read_text()
+    monkeypatch.chdir(folder)
+    assert predict(run, Path("."), tmp_path / "here.csv") == 1
+    assert r"<title>m\xf6bel, as " in (tmp_path / "here.html").read_text()

@@ -22,7 +22,7 @@ from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import point_out
 from qs3.errors import ConfigError, DataError
 from qs3.inference.depth_list import Shown, find_shown
-from qs3.inference.model_file import write_result
+from qs3.inference.model_file import read_result, write_result
 from qs3.runs.metrics import read_metrics
 from tests.commands import main
 from tests.fixtures.frame_files import Shot, Thing, kinect, write_archive
@@ -154,6 +154,29 @@ def test_the_page_says_how_high_objects_begin_if_the_net_knows_heights(run, high
     assert "above the floor" not in (frame / "said.html").read_text()
 
 
+def test_sizes_on_the_page_are_upright_whatever_frame_the_net_sees(run, frame):
+    """A net of `gravity: none` sees clouds in the camera's frame, whose z is its axis."""
+    up = ",".join(map(str, SHOT.up_in_camera))
+    words = [f"depth={frame}/depth.png", f"mask={frame}/mask.png", f"intrinsics={CAMERA}"]
+    sizes = []
+    for gravity in ("z", "none"):
+        write_result(frame / "net.pt", replace(read_result(run), gravity=gravity))
+        assert predict(frame / "net.pt", frame / "said.csv", *words, f"up={up}") == 0
+        page = (frame / "said.html").read_text()
+        found = re.findall(r"png\[(\d)\].*?<br>([\d.]+) m wide, ([\d.]+) m high", page)
+        sizes.append(np.array(sorted(found), dtype=float))
+    np.testing.assert_allclose(sizes[1], sizes[0], atol=0.011)
+
+
+def test_a_height_that_no_net_looks_at_is_refused(run, frame, capsys):
+    np.save(frame / "a.npy", np.random.default_rng(0).normal(size=(99, 3)))
+    words = [f"depth={frame}/depth.png", f"mask={frame}/mask.png", f"intrinsics={CAMERA}"]
+    for given in ([f"input={frame}/a.npy", "floor=0.4"], [*words, "camera_height=1.2"]):
+        assert predict(run, frame / "said.csv", *given) == 1
+        assert f"{given[-1].partition('=')[0]}= would have no effect" in capsys.readouterr().err
+    assert not (frame / "said.csv").exists()
+
+
 def test_of_nothing_predicted_nothing_is_judged(run, frame, capsys):
     words = [f"depth={frame}/depth.png", f"intrinsics={CAMERA}", "box=900,1,950,40"]
     assert predict(run, frame / "said.csv", *words) == 1
@@ -217,6 +240,16 @@ def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys):
     page = (frame / "said.html").read_text()
     assert "Not predicted: 5" in page
     assert "broken off" in page
+
+
+def test_rows_of_a_list_whose_values_cannot_be_are_told(tmp_path):
+    for value in ("-0.001", "0", "nan", "1000"):
+        (tmp_path / "a.csv").write_text(f"depth,mask,depth_scale\na.png,m.png,{value}\n")
+        ((one,), _) = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+        assert "metres a unit, in (0, 1]" in one.wrong
+    (tmp_path / "a.csv").write_text('depth,box,object\na.png,"60,20,100,100",7\n')
+    ((one,), _) = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+    assert "object=7 is the number of one of a mask; here is a box" in one.wrong
 
 
 @pytest.mark.parametrize("number", ["3.7", "true", "1.0000001"])

@@ -144,6 +144,13 @@ def test_the_command_writes_a_preset_that_composes_and_goes_on(target, tmp_path,
     assert "other settings" in capsys.readouterr().err
 
 
+def test_a_preset_is_not_written_over_the_one_that_it_begins_with(target, tmp_path, capsys):
+    out = tmp_path / "speckle_stereo_small.yaml"
+    assert main(words(target, out, "steps=1")) == 1
+    assert "speckle_stereo_small itself: its values would be lost" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_another_net_under_its_name_is_another_search(target, tmp_path, capsys):
     net, out = tmp_path / "net.pt", tmp_path / "tuned.yaml"
     result = read_result("pointnet-speckle")

@@ -35,6 +35,7 @@ from qs3.utils.plural import counted
 from qs3.utils.yamls import load_yaml
 
 MILLIMETRE = 1e-3
+_MILLIMETRES = (1.0, MILLIMETRE, 1000.0)  # in BOP's, librealsense's and Open3D's words
 MOST_OBJECTS = 1000
 """Limit on the objects of a mask: an image with more numbers is something else."""
 
@@ -46,6 +47,7 @@ _DOCUMENT = re.compile(r"^---\s*$", re.MULTILINE)  # begins one, or ends the one
 _SIZES = (("width", "height"), ("image_width", "image_height"))
 _CENTRES = (("cx", "cy"), ("ppx", "ppy"))
 _BENT = ("D", "d", "coeffs", "distortion_coefficients")
+_SCALE = "depth_scale"
 _OFF = 0.2  # of a side, from the picture's middle
 _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the unit is wrong
 
@@ -57,19 +59,26 @@ class Intrinsics(NamedTuple):
         camera: without distortion.
         size: width and height in pixels, if the file has them.
         bent: the file has distortion coefficients, which are not used.
+        depth_scale: what the file says under that name, in its own unit; see `read_depth`.
     """
 
     camera: Pinhole
     size: tuple[int, int] | None = None
     bent: bool = False
+    depth_scale: float | None = None
 
 
-def read_depth(path: str | Path, scale_m: float | None = None) -> Float[np.ndarray, "h w"]:
+def read_depth(
+    path: str | Path, scale_m: float | None = None, of_camera: float | None = None
+) -> Float[np.ndarray, "h w"]:
     """Depth in metres, float64; 0 where nothing was measured.
 
     Args:
         path: of a .png or .npy.
         scale_m: metres a unit; None: 0.001 for whole numbers, 1 for floats.
+        of_camera: `depth_scale` of the file of intrinsics. Millimetres a unit (BOP), metres a unit
+            (librealsense) and units a metre (Open3D) are called so, so that it is not used, but
+            whole numbers of which it says that they are no millimetres are refused.
 
     Raises:
         MissingDataError: there is no such file.
@@ -86,6 +95,11 @@ def read_depth(path: str | Path, scale_m: float | None = None) -> Float[np.ndarr
     else:
         found = read_npy(path, lambda shape, dtype: _check_image(path, shape, dtype, "fiu"))
     whole = found.dtype.kind in "iu"
+    if whole and scale_m is None and of_camera is not None and not _millimetres(of_camera):
+        raise DataError(
+            f"{path}: the intrinsics' file has depth_scale {of_camera:g}, so these are no "
+            "millimetres; say what they are, depth_scale=METRES of a unit (a thousandth of BOP's)"
+        )
     scale = scale_m if scale_m is not None else MILLIMETRE if whole else 1.0
     depth = found.astype(np.float64) * scale
     depth[~np.isfinite(depth) | (depth < 0)] = 0
@@ -99,6 +113,11 @@ def read_depth(path: str | Path, scale_m: float | None = None) -> Float[np.ndarr
             f"depth_scale= gives the metres of a unit{hint}"
         )
     return depth
+
+
+def _millimetres(depth_scale: float) -> bool:
+    """Whether it means a millimetre a unit in anybody's words; librealsense's are float32."""
+    return any(abs(depth_scale / one - 1) < 1e-3 for one in _MILLIMETRES)
 
 
 def read_mask(path: str | Path) -> Int[np.ndarray, "h w"]:
@@ -326,7 +345,7 @@ def _of_mapping(given: Any, where: str) -> Intrinsics:
         raise DataError(f"{where}: no fx, fy, cx, cy and no matrix K")
     matrix = next((given[key] for key in _MATRICES if key in given), None)
     if isinstance(matrix, Mapping) and "data" not in matrix:
-        beside = {*itertools.chain(*_SIZES), *_BENT}  # may stand within, or about it
+        beside = {*itertools.chain(*_SIZES), *_BENT, _SCALE}  # may stand within, or about it
         return _of_mapping({key: given[key] for key in beside & {*given}} | {**matrix}, where)
     if isinstance(matrix, Mapping):
         matrix = matrix["data"]
@@ -341,7 +360,9 @@ def _of_mapping(given: Any, where: str) -> Intrinsics:
     size = (int(given[sides[0]]), int(given[sides[1]])) if sides else None
     bent = next((given[key] for key in _BENT if key in given), None)
     bent = bent.get("data") if isinstance(bent, Mapping) else bent
-    return Intrinsics(camera_of(values, where), size, bent is not None and any(_flat(bent)))
+    scale = given.get(_SCALE)
+    scale = float(scale) if isinstance(scale, int | float) else None
+    return Intrinsics(camera_of(values, where), size, bent is not None and any(_flat(bent)), scale)
 
 
 def _flat(values: Any) -> list[float]:

@@ -14,6 +14,7 @@ from qs3.data.importers.base import Importer, Item, by_class, class_of, cloud_id
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.errors import DataError
+from qs3.utils.text_table import printable
 
 _KEYS = ("points", "cls", "split", "name")
 
@@ -35,7 +36,7 @@ class NamedArrays(Importer):
 
     def made_of(self) -> MadeOf:
         """See `Importer`."""
-        return MadeOf(objects=f"arrays of {self.path.name}")
+        return MadeOf(objects=f"arrays of {printable(self.path.name)}")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""

@@ -24,6 +24,7 @@ from qs3.errors import DataError
 from qs3.utils.locks import locked
 from qs3.utils.plural import counted
 from qs3.utils.progress import shown
+from qs3.utils.text_table import printable
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +48,8 @@ class Item(NamedTuple):
     """One published cloud before it is read: its row, as far as it is known.
 
     `where` names it in messages (file, or file and number); `load` gives the raw [n, 3] array or
-    raises DataError.
+    raises DataError. A row that knows its `valid_points` keeps them: the array is of a cloud that
+    was thinned before.
     """
 
     row: ManifestRow
@@ -164,7 +166,8 @@ class Importer(abc.ABC):
                 rows.append(dataclasses.replace(row, status="skipped", reason=str(error)))
                 continue
             clouds.append(self.turn(cloud, row.cls))
-            rows.append(dataclasses.replace(row, valid_points=len(raw)))
+            measured = len(raw) if row.valid_points is None else row.valid_points
+            rows.append(dataclasses.replace(row, valid_points=measured))
         _check_complete(rows, classes, self.place, strict=self.complete)
         _report(rows, self.points, self.place)
         return clouds, rows
@@ -172,7 +175,7 @@ class Importer(abc.ABC):
     def settings(self) -> dict[str, Any]:
         """Plain values that decide what `read` gives; kept in the store's meta.yaml."""
         values = dataclasses.asdict(self)
-        values["folder"] = str(self.root)
+        values["folder"] = printable(str(self.root))  # YAML holds no broken characters
         return {"format": type(self).__name__, **values}
 
     def changes(self, origins: Collection[str]) -> str:

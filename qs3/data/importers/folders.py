@@ -3,10 +3,13 @@
     class/split/name.ext     split is train, test, or val (validation)
     split/class/name.ext
     class/name.ext           every `test_every`-th of a class, sorted by name, is for test
+    split/name.ext           no labels
     name.ext, any/where.ext  no labels: all of it is the split "train"
 
 A file may hold several clouds (.npy, .npz, .h5 with an array [m, n, 3]); they are then called
 name_0000, name_0001, ... If it has labels, numbers count the classes from 0 and words are names.
+Such a file may have its split before its name, train_0.h5, where no folder is one; a folder that is
+one decides.
 """
 
 from __future__ import annotations
@@ -45,6 +48,7 @@ from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
 from qs3.errors import ConfigError, DataError
 from qs3.utils.plural import counted
+from qs3.utils.text_table import printable
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +89,7 @@ class CloudFolder(Importer):
 
     def made_of(self) -> MadeOf:
         """See `Importer`."""
-        return MadeOf(objects=f"own clouds of {self.root.name}")
+        return MadeOf(objects=f"own clouds of {printable(self.root.name)}")
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""
@@ -176,10 +180,10 @@ class CloudFolder(Importer):
         return "class/split" if inner and all(_is_split(e.name) for e in inner) else "class"
 
     def _place(self, path: Path, layout: str, classes: Sequence[str]) -> tuple[str, str]:
-        """Class ("" if not known) and split of a file by its folders."""
+        """Class and split of a file by its folders; each "" where they do not say."""
         parts = path.relative_to(self.root).parts[:-1]
         if layout == "none":
-            return "", "train"
+            return "", ""
         wanted = layout.split("/")
         if layout == "split/class" and len(parts) == 1:  # clouds without labels, in splits
             wanted = ["split"]
@@ -208,10 +212,12 @@ class CloudFolder(Importer):
                 file = last.read(path)
                 number, many, labels = len(file.clouds), file.many, file.labels
         except DataError as error:
+            split = split or "train"
             row = ManifestRow(cloud_id(cls, split, stem), cls, split, origin=origin)
             return [Item(row, str(path), functools.partial(_raise, error))]
-        if not cls and (prefix := _SPLIT_PREFIX.match(path.stem)) and many:
-            split = split_of(prefix[1].lower(), path)
+        if not split:
+            prefix = _SPLIT_PREFIX.match(path.stem) if many else None
+            split = split_of(prefix[1].lower(), path) if prefix else "train"
         found = []
         for i in range(number):
             where = f"{path}, cloud {i}" if many else str(path)

@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from qs3.classes import CLASSES
 from qs3.config.checks import check_int
 from qs3.data.frames.cutting import CLEAN, HARD, Piece
 from qs3.data.frames.rules import Rules
@@ -108,7 +109,12 @@ class FrameImporter(Importer):
         object.__setattr__(self, "tiers", list(self.tiers))
         object.__setattr__(self, "names", dict(self.names))
         object.__setattr__(self, "rules", dict(self.rules))
-        Rules.of(self.rules)
+        known = {"default", *CLASSES, *self.names.values()}
+        if unknown := sorted({*Rules.of(self.rules).limits} - known):
+            raise ConfigError(
+                f"published.rules.limits names {', '.join(unknown)}, which is no class; there are "
+                f"{', '.join(sorted(known))}"
+            )
 
     @abc.abstractmethod
     def files(self) -> Mapping[str, Path]:

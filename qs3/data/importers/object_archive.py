@@ -31,13 +31,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from qs3.config.checks import check_bool, check_int
+from qs3.config.checks import check_bool, check_int, check_words
 from qs3.data.importers.arrays import plain_arrays
 from qs3.data.importers.base import Importer, Item, class_of
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.utils.plural import counted
+from qs3.utils.text_table import printable
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +155,8 @@ class ObjectArchive(Importer):
     def __post_init__(self) -> None:
         super().__post_init__()
         for key in ("train_parts", "test_parts", "tiers"):
-            object.__setattr__(self, key, [str(word) for word in getattr(self, key)])
+            words = check_words(f"published.{key}", getattr(self, key))
+            object.__setattr__(self, key, words)
         check_bool("published.inliers_only", self.inliers_only)
         for key, least in (("folds", 2), ("gap", 0), ("block", 1)):
             check_int(f"published.{key}", getattr(self, key), least)
@@ -177,7 +179,9 @@ class ObjectArchive(Importer):
 
     def made_of(self) -> MadeOf:
         """See `Importer`."""
-        return MadeOf(objects=f"real objects cut from depth images, archive {self.path.name}")
+        return MadeOf(
+            objects=f"real objects cut from depth images, archive {printable(self.path.name)}"
+        )
 
     def judges(self) -> str:
         """See `Importer`."""
@@ -213,7 +217,7 @@ class ObjectArchive(Importer):
                 f"{cls}/{split}/{name}",
                 cls,
                 split,
-                origin=f"{self.path.name}[{i}]",
+                origin=f"{printable(self.path.name)}[{i}]",
                 views=1,
                 more=more,
             )
@@ -252,8 +256,15 @@ class ObjectArchive(Importer):
         """The split of each object; "" for those that are left out.
 
         Raises:
+            ConfigError: a part that the file has not; it may be without those of the defaults.
             DataError: the file has no parts to make folds of.
         """
+        for key in ("train_parts", "test_parts"):
+            if unknown := sorted({*getattr(self, key)} - {*archive.parts, ADAPT, JUDGE}):
+                has = f"its parts are {', '.join(archive.parts)}" if archive.parts else "no parts"
+                raise ConfigError(
+                    f"published.{key} names {', '.join(unknown)}, which {self.path} has not: {has}"
+                )
         if self.fold is None:
             if not (archive.dev != "").any():
                 return ["test"] * len(archive)

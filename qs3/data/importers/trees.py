@@ -14,8 +14,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from qs3.classes import CLASSES
 from qs3.clouds.files import parse_cloud
-from qs3.config.checks import check_choice
+from qs3.config.checks import check_choice, check_words
 from qs3.data.importers.base import (
     UP_AXES,
     Importer,
@@ -29,7 +30,7 @@ from qs3.data.importers.base import (
     unique,
 )
 from qs3.data.manifest import SPLITS
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 
 _SCANNET = re.compile(r"/(scene\d{4})_\d{2}(?:_|$)")
 
@@ -53,7 +54,8 @@ class TreeImporter(Importer):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("published.up", self.up, UP_AXES)
-        object.__setattr__(self, "up_z_classes", list(self.up_z_classes))
+        words = check_words("published.up_z_classes", self.up_z_classes)
+        object.__setattr__(self, "up_z_classes", words)
 
     def looks_for(self) -> list[str]:
         """See `Importer`."""
@@ -64,7 +66,17 @@ class TreeImporter(Importer):
         return self.root.is_dir() and any(folders_in(self.root, self.root))
 
     def items(self, classes: Sequence[str]) -> list[Item]:
-        """See `Importer`."""
+        """See `Importer`.
+
+        Raises:
+            ConfigError: `up_z_classes` has a name that is none of the classes, nor of the ten.
+            DataError: a file or folder that does not fit the format.
+        """
+        if unknown := sorted({*self.up_z_classes} - {*classes, *CLASSES}):
+            raise ConfigError(
+                f"published.up_z_classes names {', '.join(unknown)}, but the classes are "
+                f"{', '.join(classes)}"
+            )
         found = list_tree(self.root, self.suffix, lambda name: class_of(name, classes, self.root))
         order = sorted(found, key=lambda f: (SPLITS.index(f[2]), classes.index(f[1]), f[0].name))
         return unique(file_item(path, self.root, c, s, parse_cloud) for path, c, s in order)

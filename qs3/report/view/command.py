@@ -70,7 +70,12 @@ def view_command(settings: Settings) -> tuple[str, int]:
     Raises:
         ConfigError, MissingDataError, DataError: nothing can be shown at all.
     """
-    share = max(1, settings.clouds // len(settings.paths))
+    if len(settings.paths) > settings.clouds:
+        raise ConfigError(
+            f"clouds={settings.clouds} is less than one for each of {len(settings.paths)} paths; "
+            f"give clouds={len(settings.paths)}, or a folder, of which some are drawn"
+        )
+    share = settings.clouds // len(settings.paths)
     parts = [_part(path, share, settings) for path in settings.paths]
     title = ", ".join(_title(Path(path).expanduser().absolute()) for path in settings.paths)
     text = page(title, parts, colour=settings.colour, points=settings.points)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _LEAST_DISTANCES = 3  # of walls: two tell no law from chance
 _APART = 1.05  # times as far is another distance
 _MOST_BIAS = 0.3  # of a distance: a larger one is of other units or another frame
+_OF_FRAMES = ("intrinsics", "focal", "distances", "baseline", "power", "few")
 _LONGEST_M = 2.0  # baseline of a depth camera: a longer one is in another unit
 
 
@@ -32,9 +33,17 @@ def _fit(
     gain: float | None,
     **given: Any,
 ) -> None:
+    if Path(out).suffix != ".yaml":
+        raise ConfigError(f"out={out} must end in .yaml: it is a sensor preset")
     if images is not None:
         if words or plot is not None:
             raise ConfigError("images= fits a stereo preset: leave frames and plot= out")
+        if of_frames := [key for key in _OF_FRAMES if given[key] not in (None, False)]:
+            keys = " and ".join(f"{key}=" for key in of_frames)
+            raise ConfigError(
+                f"{keys} would have no effect beside images=: of frames of a wall; the camera is "
+                "that of base="
+            )
         file, unit = Path(out).expanduser(), given["unit"]
         fit_images(Path(images), base, distance, unit, file, line, 1.0 if gain is None else gain)
         return
@@ -83,6 +92,8 @@ def fit(
     from qs3.sensors.fit.preset import FittedPreset
     from qs3.sensors.fit.steps import find_steps
 
+    if intrinsics is not None and focal is not None:
+        raise ConfigError("intrinsics= has the focal length: leave focal= out, or intrinsics=")
     if not files:
         raise ConfigError("of which frames? Name their files: qs3 fit frames/*.png ...")
     frames = [read_frame(Path(path), unit) for path in files]
@@ -168,7 +179,7 @@ def fit_images(
     Raises:
         ConfigError, DataError: say which argument or file is to blame.
     """
-    from qs3.config.compose import choices, composed
+    from qs3.config.compose import check_no_base, choices, composed
     from qs3.config.hydra import build
     from qs3.sensors.devices.speckle_stereo import SpeckleStereo
     from qs3.sensors.fit.infrared import fit_pictures
@@ -180,6 +191,7 @@ def fit_images(
     known = [choice for choice in choices("sensor") if choice != "none"]
     if name not in known:
         raise ConfigError(f"base={name} is unknown; there are {', '.join(known)}")
+    check_no_base(out, "sensor", name)
     sensor = build(composed(None, f"+sensor={name}").sensor)
     if not isinstance(sensor, SpeckleStereo):
         raise ConfigError(f"base={name} is no active stereo camera with two infrared pictures")
@@ -249,8 +261,8 @@ depth; see qs3.sensors.devices.fitted.FittedDepth. The plot shows data and model
 
 images=FOLDER holds rectified pictures of an active stereo camera: SCENE_left.png, and where there
 are any SCENE_right.png, SCENE_off.png (projector off, the same exposure) and SCENE_depth.png (the
-left camera's). Several frames of a still scene, SCENE_left_0.png and so on, tell noise from
-texture. Found, with their errors: ambient light, blur, exposure, noise and speckle; with right
+left camera's). Several frames of a still scene, SCENE_left_0.png and so on (64 at most), tell noise
+from texture. Found, with their errors: ambient light, blur, exposure, noise and speckle; with right
 pictures and a depth image, f B. Electrons at white are those without an amplifier; one that raised
 the pictures has to be said, gain=, for noise does not tell it from fewer electrons. Read-out noise
 is that at this gain. What the pictures do not tell is said, and left as it is in base=. Of each

@@ -42,14 +42,15 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
     """`fx,fy,cx,cy`, or a JSON file with fx, fy, cx, cy (also ppx, ppy, K or intrinsic_matrix).
 
     Raises:
-        ConfigError: it is neither, pixels are not square, or the principal point lies outside of
-            the picture.
+        ConfigError: it is neither, pixels are not square, the principal point lies outside of the
+            picture, or the file has the width and height of pictures of another size.
         MissingDataError: there is no such file.
         DataError: the file does not hold them.
     """
     if text.lower().endswith(".json"):
         try:
-            values = _four(json.loads(read_whole(Path(text), JSON_PEAK)))
+            found = json.loads(read_whole(Path(text), JSON_PEAK))
+            values = _four(found)
         except OSError as error:
             raise MissingDataError(f"intrinsics={text}: {error.strerror or error}") from error
         except (ValueError, RecursionError) as error:
@@ -58,6 +59,7 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
             raise DataError(
                 f"intrinsics={text} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
             )
+        _check_size(found, width_px, height_px, text)
     else:
         try:
             values = [float(word) for word in text.split(",")]
@@ -79,6 +81,16 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
             f"{width_px} x {height_px} px; are these of another resolution?"
         )
     return Intrinsics(width_px, height_px, (fx + fy) / 2, cx, cy)
+
+
+def _check_size(found: dict[str, object], width_px: int, height_px: int, text: str) -> None:
+    for keys in (("width", "height"), ("image_width", "image_height")):
+        size = [found.get(key) for key in keys]
+        if None not in size and size != [width_px, height_px]:
+            raise ConfigError(
+                f"intrinsics={text} is of pictures of {size[0]} x {size[1]} px, these frames have "
+                f"{width_px} x {height_px}"
+            )
 
 
 def _four(found: object) -> list[float] | None:

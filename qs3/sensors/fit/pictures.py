@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
@@ -11,11 +12,16 @@ from qs3.errors import DataError, MissingDataError
 from qs3.sensors.fit.frames import read_frame
 from qs3.sensors.fit.infrared import Pictures
 from qs3.utils.pictures import png_bytes, read_png
+from qs3.utils.text_table import printable
+
+log = logging.getLogger(__name__)
 
 NAMES = "SCENE_left.png, SCENE_right.png, SCENE_off.png, SCENE_depth.png or .npy"
 
-_FILE = re.compile(r"(?P<scene>.+?)_(?P<what>left|right|off|depth)(_?\d+)?\.(png|npy)")
-_MOST = 2_000  # files of a folder
+_FILE = re.compile(
+    r"(?P<scene>.+?)_(?P<what>left|right|off|depth)(_?\d+)?\.(png|npy)", re.IGNORECASE
+)
+_MOST = 2_000  # pictures of a folder
 _FRAMES = 64  # of a scene and kind
 
 
@@ -24,8 +30,8 @@ def read_pictures(folder: Path, unit: str | None = None) -> list[Pictures]:
 
     Files are called SCENE_left.png, SCENE_right.png, SCENE_off.png (the left camera with the
     projector off, at the same exposure) and SCENE_depth.png or .npy (of the left camera); several
-    frames of a still scene have numbers, SCENE_left_0.png. Pictures have 8 bits, or 16 that are
-    used to the full.
+    frames of a still scene have numbers, SCENE_left_0.png; the first 64 are read. Names may be in
+    any case. Pictures have 8 bits, or 16 that are used to the full.
 
     Args:
         folder: with the files; others in it are left alone.
@@ -33,15 +39,19 @@ def read_pictures(folder: Path, unit: str | None = None) -> list[Pictures]:
 
     Raises:
         MissingDataError: there is no such folder, or no left picture in it.
-        DataError: a file cannot be read, or is of another size than the scene's first.
+        DataError: a file cannot be read, is of another size than the scene's first, or there are
+            more than 2000.
     """
     if not folder.is_dir():
         raise MissingDataError(f"images={folder}: there is no such folder")
     found: dict[str, dict[str, list[Path]]] = {}
-    for path in sorted(folder.iterdir())[:_MOST]:
+    for path in sorted(folder.iterdir()):
         if (match := _FILE.fullmatch(path.name)) is not None:
             kinds = found.setdefault(match["scene"], {})
-            kinds.setdefault(match["what"], []).append(path)
+            kinds.setdefault(match["what"].lower(), []).append(path)
+    count = sum(len(paths) for kinds in found.values() for paths in kinds.values())
+    if count > _MOST:
+        raise DataError(f"images={folder} holds {count} pictures; at most {_MOST} are read")
     scenes = [_scene(name, kinds, unit) for name, kinds in sorted(found.items()) if "left" in kinds]
     if not scenes:
         raise MissingDataError(f"images={folder} holds no SCENE_left.png; files are called {NAMES}")
@@ -49,6 +59,10 @@ def read_pictures(folder: Path, unit: str | None = None) -> list[Pictures]:
 
 
 def _scene(name: str, kinds: dict[str, list[Path]], unit: str | None) -> Pictures:
+    for what, paths in kinds.items():
+        if what != "depth" and len(paths) > _FRAMES:
+            words = "%s_%s has %d frames: the first %d by name are read"
+            log.warning(words, printable(name), what, len(paths), _FRAMES)
     left, right, off = (
         [_grey(path) for path in kinds.get(what, [])[:_FRAMES]] for what in ("left", "right", "off")
     )
@@ -68,7 +82,7 @@ def _scene(name: str, kinds: dict[str, list[Path]], unit: str | None) -> Picture
 
 def _grey(path: Path) -> np.ndarray:
     """[h, w] float64, 0..255."""
-    if path.suffix != ".png":
+    if path.suffix.lower() != ".png":
         raise DataError(f"{path}: pictures are .png files")
     image = read_png(png_bytes(path), str(path))
     return image.astype(np.float64) / (257.0 if image.dtype == np.uint16 else 1.0)

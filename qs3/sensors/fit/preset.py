@@ -20,6 +20,9 @@ from qs3.utils.plotting import blank, save_png
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_NEAREST_M, _FARTHEST_M = 0.3, 8.0  # limits where no wall was seen outside of them
+_AROUND = 1.5  # else times as near or as far as one was seen
+
 
 @dataclass(frozen=True, eq=False)
 class FittedPreset:
@@ -46,6 +49,7 @@ class FittedPreset:
     def save(self, path: Path, command: str) -> None:
         """Write the preset, with the command that made it."""
         k, noise, (nearest, farthest) = self.camera, self.noise, self._range()
+        least, most = self.limits_m()
         assumed = "" if noise.power_known else "   # assumed: all walls are equally far"
         baseline = "null" if self.baseline_m is None else f"{self.baseline_m:.6g}"
         doubts = "".join(f"# doubtful: {doubt}\n" for doubt in self.doubts)
@@ -61,8 +65,8 @@ cy_px: {k.cy_px:.8g}
 step_px: 1
 # The frames show walls from {nearest:.2f} to {farthest:.2f} m; beyond that noise, steps and bias
 # are extrapolated.
-min_depth_m: 0.3
-max_depth_m: 8.0
+min_depth_m: {least:g}
+max_depth_m: {most:g}
 noise_floor_m: {noise.floor_m:.6g}
 noise_factor: {noise.factor:.6g}
 noise_power: {noise.power:g}{assumed}
@@ -118,6 +122,15 @@ baseline_m: {baseline}
         self._plot_residual(figure, axes[1, 0])
         self._plot_fill(axes[1, 1])
         save_png(figure, path)
+
+    def limits_m(self) -> tuple[float, float]:
+        """Depths that the preset keeps: 0.3 to 8 m, and all that a wall was seen at."""
+        z = [wall.depth_m[wall.on_wall] for wall in self.walls]
+        nearest, farthest = min(map(np.min, z)), max(map(np.max, z))
+        # A margin, so that noise about the nearest and farthest pixel is kept, too.
+        least = _NEAREST_M if nearest > _NEAREST_M else float(f"{nearest / _AROUND:.2g}")
+        most = _FARTHEST_M if farthest < _FARTHEST_M else float(f"{farthest * _AROUND:.2g}")
+        return least, most
 
     def _range(self) -> tuple[float, float]:
         z = np.concatenate([wall.depth_m[wall.on_wall] for wall in self.walls])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from qs3.classes import CLASSES
+from qs3.data.domain import compose_domain
 from qs3.data.frames.cutting import Box, box_mask, cut
 from qs3.data.frames.images import DepthImage, Pinhole, upright
 from qs3.data.frames.nyuv2 import AREA
@@ -198,6 +199,12 @@ def test_wrong_rules_and_images():
         Rules.of({"limits": {"chair": {"least_m": 2.0, "most_m": 1.0}}})
     with pytest.raises(ConfigError, match="clean_rim"):
         Rules(clean_rim=0.5)
+    given = compose_domain("nyuv2", {}).importer()
+    rules = {"limits": {"chiar": {"pixels": 5}}}
+    with pytest.raises(ConfigError, match=r"limits names chiar, .*; there are bathtub, bed, "):
+        dataclasses.replace(given, rules=rules)
+    own = dataclasses.replace(given, names={"cup": "mug"}, rules={"limits": {"mug": {"pixels": 5}}})
+    assert own.rules["limits"] == {"mug": {"pixels": 5}}
     with pytest.raises(DataError, match="no camera"):
         Pinhole(0, 1, 0, 0)
     with pytest.raises(DataError, match="z up"):

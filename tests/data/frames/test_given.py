@@ -50,6 +50,25 @@ def test_the_unit_of_depth_is_that_of_its_numbers(tmp_path):
     np.testing.assert_allclose(read_depth(tum, 1 / 5000), DEPTH, atol=1e-4)
 
 
+def test_a_camera_s_scale_of_depth_is_not_passed_over(tmp_path):
+    """BOP's YCB-V: a tenth of a millimetre a unit; 0.8 m were read as 8 m."""
+    tenths = png(tmp_path / "a.png", np.full((480, 640), 8000, np.uint16))
+    camera = {"cx": 312.9, "cy": 241.3, "fx": 1066.7, "fy": 1067.4, "width": 640, "height": 480}
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps({**camera, "depth_scale": 0.1}))
+    scale = read_intrinsics(str(file)).depth_scale
+    assert scale == 0.1
+    with pytest.raises(DataError, match=r"has depth_scale 0\.1, so these are no millimetres"):
+        read_depth(tenths, None, scale)
+    assert read_depth(tenths, 1e-4, scale).max() == pytest.approx(0.8)
+    assert read_depth(npy(tmp_path / "m.npy", np.full((4, 4), 0.8)), None, scale).max() == 0.8
+    for same in (1.0, float(np.float32(0.001)), 1000, None):
+        file.write_text(json.dumps({"intrinsics": camera, "depth_scale": same}))
+        scale = read_intrinsics(str(file)).depth_scale
+        assert scale == same
+        assert read_depth(tenths, None, scale).max() == 8
+
+
 def test_depth_that_is_none_is_told(tmp_path):
     with pytest.raises(DataError, match="8 bits a pixel are a picture of depths"):
         read_depth(png(tmp_path / "a.png", np.full((4, 5), 9, np.uint8)))
@@ -201,7 +220,8 @@ def test_intrinsics_as_drivers_and_libraries_write_them(tmp_path, name, content,
     text = content if isinstance(content, str) else json.dumps(content)
     (tmp_path / name).write_text(text)
     found = read_intrinsics(name, tmp_path)
-    assert found == Intrinsics(Pinhole(525, 526, 319.5, 239.5), size, bent)
+    scale = 1.0 if "depth_scale" in text else None
+    assert found == Intrinsics(Pinhole(525, 526, 319.5, 239.5), size, bent, scale)
     assert read_intrinsics("525,526,319.5,239.5").camera == found.camera
 
 

@@ -137,6 +137,11 @@ def test_npy_axes(tmp_path):
     (chair, plant), _ = importer.read(("chair", "plant"))
     assert chair.tolist() == [[1, -3, 2], [4, -6, 5]]  # y is up in the file
     assert plant.tolist() == cloud.tolist()
+    with pytest.raises(ConfigError, match=r"up_z_classes=plant: give a list, \[plant\]"):
+        NpyTree(tmp_path, points=2, up="y", up_z_classes="plant")
+    misspelt = NpyTree(tmp_path, points=2, up="y", up_z_classes=["plants"])
+    with pytest.raises(ConfigError, match="names plants, but the classes are chair, plant"):
+        misspelt.read(("chair", "plant"))
 
 
 def test_npy_header_damaged_anywhere(tmp_path):

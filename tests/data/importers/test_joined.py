@@ -19,10 +19,10 @@ from tests.fixtures.published import cloud
 CLASSES = ("bed", "chair")
 
 
-def write(folder: Path, ids: list[str], points: int = 32, **more) -> None:
+def write(folder: Path, ids: list[str], points: int = 32, measured: int = 0, **more) -> None:
     """A dataset of these objects, whose clouds depend on the folder's name, too."""
     rows = [
-        ManifestRow(name, name.split("/")[0], name.split("/")[1], valid_points=points, seed=7)
+        ManifestRow(*(name, *name.split("/")[:2]), valid_points=measured or points, seed=7)
         for name in ids
     ]
     rows.append(ManifestRow("bed/train/lost", "bed", "train", status="failed", reason="dark"))
@@ -70,6 +70,13 @@ def test_a_small_cloud_keeps_the_number_of_its_points(tmp_path):
     again = Domain("k", "K", "K", tmp_path / "k", published=importer, classes=CLASSES).open()
     assert read_manifest(tmp_path / "k", CLASSES)[0].valid_points == 32
     np.testing.assert_array_equal(again.points[0][32:], again.points[0][:32])
+
+
+def test_a_cloud_that_was_thinned_keeps_the_number_that_was_measured(tmp_path):
+    write(tmp_path / "a", ["bed/train/1", "bed/train/2"], measured=5000)
+    assert joined(tmp_path, "a").open().points.shape == (2, 48, 3)
+    rows = read_manifest(tmp_path / "joined", CLASSES)
+    assert [row.valid_points for row in rows] == [5000, 5000]
 
 
 def test_no_object_trains_and_validates(tmp_path):

@@ -68,6 +68,17 @@ def test_clean_alone_and_other_parts(file, tmp_path):
     assert (len(gap), set(gap.splits)) == (2, {"test"})
 
 
+def test_parts_that_there_are_not_are_named(file, tmp_path):
+    """A word would be a list of letters, a misspelling would leave a split without a cloud."""
+    path, _ = file
+    for key in ("train_parts", "test_parts", "tiers"):
+        with pytest.raises(ConfigError, match=rf"{key}=clean: give a list, \[clean\]"):
+            domain(path, tmp_path, **{key: "clean"}).importer()
+    for more in ({"train_parts": "[adpat]"}, {"test_parts": "[adpat]"}):
+        with pytest.raises(ConfigError, match=r"names adpat, .*: its parts are adapt, gap, judge"):
+            domain(path, tmp_path, **more).open()
+
+
 def test_folds_part_the_training_part_and_keep_away(file, tmp_path):
     path, arrays = file
     tested = []

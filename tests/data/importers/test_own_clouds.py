@@ -85,6 +85,38 @@ def test_without_labels(tmp_path: Path) -> None:
     assert data.split("train").ids == data.ids
 
 
+def test_the_folder_says_the_split_and_a_name_where_no_folder_does(tmp_path: Path) -> None:
+    """`test/train_station.npy` must not train."""
+    several = np.stack([CLOUD, CLOUD + 1])
+    for place in ("in/test/train_station", "in/train/test_hall", "flat/test_hall", "flat/hall"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / f"{place}.npy", several)
+    _, rows = CloudFolder(tmp_path / "in", points=4).read(TWO)
+    assert [(row.split, row.origin) for row in rows] == [
+        *(("train", f"train/test_hall.npy[{i}]") for i in range(2)),
+        *(("test", f"test/train_station.npy[{i}]") for i in range(2)),
+    ]
+    _, rows = CloudFolder(tmp_path / "flat", points=4).read(TWO)
+    assert [(row.split, row.origin) for row in rows] == [
+        *(("train", f"hall.npy[{i}]") for i in range(2)),
+        *(("test", f"test_hall.npy[{i}]") for i in range(2)),
+    ]
+
+
+def test_a_folder_whose_name_is_no_utf8(tmp_path: Path) -> None:
+    folder = tmp_path / "m\udcf6bel"
+    try:
+        write(folder / "bed" / "train" / "a.xyz")
+    except OSError:
+        pytest.skip("this file system takes no such names")
+    importer = CloudFolder(folder, points=4)
+    import_into(tmp_path / "store", importer, name="mine", classes=TWO)
+    data = open_pointset(tmp_path / "store")
+    assert data.ids == ("bed/train/a",)
+    assert str(data.made_of) == r"own clouds of m\udcf6bel"
+    assert data.meta["imported"] == importer.settings()
+
+
 def test_a_store_is_labelled_or_not(tmp_path: Path) -> None:
     write(tmp_path / "train" / "bed" / "a.xyz")
     write(tmp_path / "train" / "b.xyz")

@@ -203,6 +203,16 @@ def test_runs_that_cannot_be_shown(view, run, tmp_path):
     assert view(failed.parent)[1].endswith("is a run that did not finish; repeat its command\n")
 
 
+def test_fewer_clouds_than_paths_are_refused(view, tmp_path):
+    names = [f"{k}.npy" for k in range(4)]
+    for name in names:
+        np.save(tmp_path / name, RNG.normal(size=(5, 3)))
+    status, said, data = view(*names, "clouds=3")
+    assert (status, data) == (1, None)
+    assert "clouds=3 is less than one for each of 4 paths; give clouds=4, or a folder" in said
+    assert len(view(*names, "clouds=4")[2]["clouds"]) == 4
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

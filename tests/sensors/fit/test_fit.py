@@ -414,6 +414,29 @@ def test_cameras_of_other_words_and_of_another_resolution(tmp_path):
     assert (found.focal_px, found.cx_px, found.cy_px) == (580, 319.5, 239.5)
     with pytest.raises(ConfigError, match="outside of the frames of 320 x 240 px"):
         read_camera(str(path), 320, 240)
+    path.write_text('{"fx": 580, "fy": 580, "cx": 310, "cy": 230, "width": 848, "height": 480}')
+    with pytest.raises(ConfigError, match="of pictures of 848 x 480 px, these frames have 640 x"):
+        read_camera(str(path), 640, 480)
+    assert read_camera(str(path), 848, 480).focal_px == 580
+
+
+def test_a_camera_that_is_given_twice_and_a_preset_of_another_ending(tmp_path, capsys):
+    np.save(tmp_path / "a.npy", np.full((200, 300), 2.0))
+    frame, twice = str(tmp_path / "a.npy"), ["intrinsics=300,300,150,100", "focal=300"]
+    assert main(["fit", frame, *twice, f"out={tmp_path / 'x.yaml'}"]) == 1
+    assert "leave focal= out" in capsys.readouterr().err
+    assert main(["fit", frame, "focal=300", f"out={tmp_path / 'x'}"]) == 1
+    assert "must end in .yaml" in capsys.readouterr().err
+
+
+def test_a_preset_sees_walls_where_it_was_fitted(tmp_path):
+    hidden = replace(SMALL, min_depth_m=0.05, max_depth_m=20.0, noise_factor=0.0015)
+    near, _ = recovered(tmp_path, hidden, [(0.12, 8), (0.16, -6), (0.2, 10), (0.25, 7)])
+    assert np.isfinite(wall(near, 0.12, 8, seed=0)).mean() > 0.99
+    assert near.max_depth_m == 8
+    far, _ = recovered(tmp_path, hidden, [(3.0, 8), (5.0, -6), (7.0, 10), (9.0, 7)])
+    assert np.isfinite(wall(far, 9.0, 7, seed=0)).mean() > 0.99
+    assert far.min_depth_m == 0.3
 
 
 def test_damaged_and_large_arrays_are_refused_by_their_headers(tmp_path, capsys):
