@@ -38,10 +38,13 @@ def train(*overrides: str) -> Path:
     from omegaconf import OmegaConf
 
     from qs3.config.hashing import run_folder
+    from qs3.errors import ConfigError
     from qs3.runs.unbegun import removed_if_unbegun
     from qs3.training.command import train as run_of
     from qs3.utils.files import write_text
 
+    if any(word.lstrip("+").startswith("hparams_search=") for word in overrides):
+        raise ConfigError("hparams_search= is many runs: search with python train.py, or qs3-train")
     with _as_hydra("train", overrides) as cfg:
         folder = run_folder(cfg)
         with removed_if_unbegun(folder):

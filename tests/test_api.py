@@ -74,6 +74,7 @@ def test_wrong_words_are_errors_for_people(word):
         ),
         (train, ["-m", "seed=1"], "one run at a time: call it once for each seed"),
         (train, ["seed=0,1"], "one run at a time: call it once for each seed"),
+        (train, ["hparams_search=optuna"], "is many runs: search with python train.py"),
         (train, ["seed=[1"], "'seed=[1' cannot be read: no viable alternative"),
         (
             generate,

@@ -336,7 +336,7 @@ class RunMetrics:
         name one there that nobody used.
         """
         return {
-            "source": self.data.target if self.source == self.target else self.data.source,
+            "source": self.data.target if self.method == "supervised" else self.data.source,
             "target": self.data.target,
             "beside": self.data.beside,
             "weights": self.versions.get("weights", "").rpartition(" ")[2],
@@ -349,8 +349,14 @@ class RunMetrics:
 
     @property
     def domains(self) -> dict[str, MadeOf]:
-        """By name what each domain is made of, the source first; only one if they are the same."""
-        return {self.source: self.made_of.source, self.target: self.made_of.target}
+        """By name what each domain is made of, the source first; only one if they are the same.
+
+        Two of one name, as of two folders of own clouds, are told apart by what they are for.
+        """
+        source, target = self.made_of.source, self.made_of.target
+        if self.source == self.target and source != target and self.method != "supervised":
+            return {f"{self.source} (source)": source, f"{self.target} (target)": target}
+        return {self.source: source, self.target: target}
 
     @property
     def data_text(self) -> str:

@@ -78,6 +78,21 @@ NOT_TAKEN = {
         "each epoch is judged once, at its end, and teachers are chosen by that; set "
         "trainer.limit_val_batches where it takes long",
     ),
+    **dict.fromkeys(
+        (
+            "log_every_n_steps",
+            "num_sanity_val_steps",
+            "reload_dataloaders_every_n_epochs",
+            "use_distributed_sampler",
+            "enable_progress_bar",
+            "enable_model_summary",
+        ),
+        "a training needs its own, and it would do nothing; leave it out",
+    ),
+    **dict.fromkeys(
+        ("limit_test_batches", "limit_predict_batches"),
+        "all clouds of the target's test are judged; leave it out",
+    ),
     "fast_dev_run": "nothing of it would be saved; set debug=fast",
 }
 """Arguments of Lightning's trainer that no run can have, and what to set instead."""
@@ -225,6 +240,7 @@ def _check_settings(cfg: DictConfig) -> None:
                 f"{key} must be a domain of conf/domain, got {domain!r}; give domain@{key}=NAME"
             )
     _check_keys(cfg)
+    _check_names(cfg)
     check_choice("selection.teacher", cfg.selection.teacher, TEACHERS)
     if cfg.selection.teacher == "given" and cfg.weights is None:
         raise ConfigError(
@@ -283,8 +299,20 @@ def _check_keys(cfg: DictConfig) -> None:
     text = OmegaConf.to_yaml(cfg, resolve=False)
     for prefix, known in KEYS.items():
         found: Any = OmegaConf.select(cfg, prefix.rstrip(".")) if prefix else cfg
-        keys = [str(key) for key in found if prefix or f"${{{key}" not in text]
+        used = [key for key in found if f"${{{key}}}" in text or f"${{{key}." in text]
+        keys = [str(key) for key in found if prefix or key not in used]
         check_keys(prefix, keys, known)
+
+
+def _check_names(cfg: DictConfig) -> None:
+    """Refuse names that YAML reads as something else than text, and such as are no folder's."""
+    for key in ("experiment_name", "data.source.name", "data.target.name"):
+        name = OmegaConf.select(cfg, key)
+        if not isinstance(name, str) or not name:
+            raise ConfigError(f"{key} must be text, got {name!r}; with quotes: {key}=\"'{name}'\"")
+    name = cfg.experiment_name
+    if name in (".", "..") or "/" in name:
+        raise ConfigError(f"experiment_name={name}: it is a folder below paths.log_dir, one name")
 
 
 def _check_limits(trainer: DictConfig) -> None:

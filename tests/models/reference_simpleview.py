@@ -75,7 +75,9 @@ class NaiveSimpleView(nn.Module):
             first, second, short = block.first, block.second, block.shortcut
             y = F.relu(first.norm(first.conv(x)), inplace=True)
             y = second.norm(second.conv(y))
-            y += x if short is None else short.norm(short.conv(x))
+            if short is not None:
+                x = short.norm(F.conv2d(x, short.conv.weight, stride=first.conv.stride))
+            y += x
             x = F.relu(y, inplace=True)
         features = F.adaptive_avg_pool2d(x, 1)
         return self.head(features.view(len(points), -1))

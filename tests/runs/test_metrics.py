@@ -6,6 +6,7 @@ import copy
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,17 @@ def refusal(folder: Path, text: str) -> str:
     )
     assert said is not None, error.value
     return said[1]
+
+
+def test_two_domains_of_one_name_are_two():
+    """Own clouds of two folders, both called so: neither stands for the other."""
+    own = replace(metrics(), source="own", target="own")
+    assert own.seen["source"] == own.data.source
+    made = replace(own.made_of, source=replace(own.made_of.source, objects="others"))
+    assert [*replace(own, made_of=made).domains] == ["own (source)", "own (target)"]
+    taught = replace(own, method="supervised", made_of=made)
+    assert taught.seen["source"] == taught.data.target
+    assert [*taught.domains] == ["own"]
 
 
 @pytest.fixture

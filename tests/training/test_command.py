@@ -113,6 +113,12 @@ def test_help_imports_nothing_heavy(tmp_path):
             ("method=pcfea", "protocol.epochs=1"),
             ("method.plain=0.1 of protocol.epochs=1, rounded",),
         ),
+        (("+trainer.log_every_n_steps=9",), ("log_every_n_steps=9 cannot be had", "leave it out")),
+        (("experiment_name=2024",), ("ConfigError: experiment_name must be text, got 2024",)),
+        (("experiment_name=null",), ("ConfigError: experiment_name must be text, got None",)),
+        (("experiment_name=a/b",), ("experiment_name=a/b: it is a folder below paths.log_dir",)),
+        (("data.target.name=7",), ("ConfigError: data.target.name must be text, got 7",)),
+        (("+path=x",), ("ConfigError", "path")),
         (("selection.best=1",), ("keys of selection are teacher, student",)),
         (("data.scale=metres",), ("ConfigError", "domain specklenet10 are not in metres")),
         (

@@ -124,6 +124,8 @@ def build_table(
         names = [row["name"] for row in spec.rows]
         factors = _factors(spec.rows)
         averages = {row["name"]: float(row["average"]) for row in spec.rows if "average" in row}
+        if len(shown) < len(spec.columns):
+            averages = {}  # published of all of them
     except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
     if twice := [one for one in names if names.count(one) > 1]:

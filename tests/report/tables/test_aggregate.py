@@ -129,7 +129,14 @@ def test_a_source_that_nobody_used_tells_no_runs_apart(tmp_path):
     """The upper bound's, which older files name."""
     for seed, source in enumerate("ac"):
         data = DataHashes(source=source * 64, target="b" * 64)
-        write_run(tmp_path, seed=seed, source="kinectsim10", target="kinectsim10", data=data)
+        write_run(
+            tmp_path,
+            seed=seed,
+            source="kinectsim10",
+            target="kinectsim10",
+            data=data,
+            method="supervised",
+        )
     (found,) = group(load_runs(tmp_path))
     assert found.stat("accuracy").n == 2
     assert found.problems == ()
