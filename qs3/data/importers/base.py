@@ -358,7 +358,7 @@ def _check_complete(
             problem = f"{where}: split {split!r} has no clouds of {', '.join(empty)}"
             if strict:
                 raise DataError(problem)
-            log.warning("%s", problem)
+            log.warning("%s", printable(problem))
 
 
 def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
@@ -367,8 +367,10 @@ def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:
     skipped = sum(row.status != "ok" for row in rows)
     if short:
         have = counted(short, "cloud has", "clouds have")
-        log.warning("%s: %s under %d points: some are repeated", where, have, points)
+        name = printable(str(where))
+        log.warning("%s: %s under %d points: some are repeated", name, have, points)
     if skipped:
         for row in [row for row in rows if row.status != "ok"][:_SHOWN]:
-            log.warning("left out: %s", row.reason)
-        log.warning("%s: %s left out; manifest.csv says why", where, counted(skipped, "cloud"))
+            log.warning("left out: %s", printable(row.reason))
+        left = counted(skipped, "cloud")
+        log.warning("%s: %s left out; manifest.csv says why", printable(str(where)), left)

@@ -117,7 +117,7 @@ class CloudFolder(Importer):
                 several clouds, or a link that leads out of the folder.
         """
         layout = self._layout(classes)
-        log.info("%s is read in the layout %s", self.root, layout)
+        log.info("%s is read in the layout %s", printable(str(self.root)), layout)
         last = _LastFile()
         found: list[Item] = []
         for path in _files(self.root, self.root):
@@ -257,7 +257,7 @@ class _LastFile:
         cloud, dropped = measured(clouds[number], where)
         if dropped:
             points = counted(dropped, "point that is", "points that are")
-            log.info("%s: %s NaN or infinite left out", where, points)
+            log.info("%s: %s NaN or infinite left out", printable(where), points)
         return checked(cloud, where)
 
 
