@@ -24,6 +24,7 @@ OPENS = re.compile(
 )
 
 OWN = {
+    "config/compose.py": "the defaults of a preset that the user names, which Hydra reads as well",
     "config/hydra.py": "comments of our own configs",
     "data/download/catalogue.py": "a file of the package",
     "data/inspection/gravity.py": "a file of the package",
