@@ -11,7 +11,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
+import cv2
 import torch
 import torch.autograd.forward_ad as forward_ad
 import torch.nn.functional as F
@@ -100,13 +102,19 @@ def _tiled(brightness: torch.Tensor, frames: torch.Tensor) -> torch.Tensor:
     shape = inner(mean).shape
     rows, cols = (torch.arange(n) * _TILES // n for n in shape)
     tile = (rows[:, None] * _TILES + cols).flatten()
-    order = inner(brightness).flatten().argsort()
-    chosen = torch.empty_like(order)
-    for i, part in enumerate(torch.tensor_split(order, BRIGHTNESSES)):
-        chosen[part] = i
+    chosen = _equal_parts(inner(brightness).flatten(), BRIGHTNESSES)
     out = torch.zeros(len(values), _TILES**2 * BRIGHTNESSES, dtype=values.dtype)
     out.index_add_(1, tile * BRIGHTNESSES + chosen, values)
     return out.T.reshape(_TILES**2, BRIGHTNESSES, -1)
+
+
+def _equal_parts(values: torch.Tensor, count: int) -> torch.Tensor:
+    """[n] int64, 0 for the lowest n / count of the values and so on."""
+    order = values.argsort()
+    chosen = torch.empty_like(order)
+    for i, part in enumerate(torch.tensor_split(order, count)):
+        chosen[part] = i
+    return chosen
 
 
 class Speckled:
@@ -121,7 +129,7 @@ class Speckled:
     def __init__(self, projected: torch.Tensor, grain: torch.Tensor, everywhere: bool) -> None:
         self._projected, self._grain, self._everywhere = projected, grain, everywhere
         self._kept = lru_cache(maxsize=2)(lambda width: self._through(torch.tensor(width)))
-        self._orders: dict[tuple[float, ...], torch.Tensor] = {}
+        self._bins: dict[tuple[float, ...], torch.Tensor] = {}
         drawn = torch.randn(projected.shape, generator=torch.Generator().manual_seed(0))
         self._own = inner(drawn.double()).flatten()  # noise of each pixel's own
 
@@ -167,45 +175,71 @@ class Speckled:
     ) -> torch.Tensor:
         """[B, APART] covariances over time by speckle, in the bins that were found."""
         key = tuple(float(one) for one in (fields["width"], ambient, contrast))
-        if key not in self._orders:
-            self._orders = {key: self._order(fields, found, *key[1:])}
-        order = self._orders[key]
-        bright = inner(ambient + fields["dots"]).flatten()
-        covariances = []
+        if key not in self._bins:
+            self._bins = {key: self._binned(fields, found, *key[1:])}
+        chosen = self._bins[key]
+        columns = [inner(ambient + fields["dots"])]
         for lag in range(APART):
             squares = fields[f"2 {lag}"]
             if self._everywhere:
                 squares = squares + 2 * ambient * fields[f"1 {lag}"]
                 squares = squares + ambient**2 * fields[f"0 {lag}"]
-            covariances.append(inner(squares).flatten())
-        rows = []
-        for part, level in zip(
-            torch.tensor_split(order, len(found.level)), found.level, strict=True
-        ):
-            gain = level / bright[part].mean()
-            rows.append(torch.stack([c[part].mean() * gain**2 for c in covariances]))
-        return contrast**2 * torch.stack(rows)
+            columns.append(inner(squares))
+        values = torch.stack([one.flatten() for one in columns])  # [1 + APART, n]
+        sums = torch.zeros(len(values), len(found.level), dtype=values.dtype)
+        sums = sums.scatter_add(1, chosen.expand(len(values), -1), values)
+        mean = (sums / torch.bincount(chosen)).T
+        gain = found.level / mean[:, 0]
+        return contrast**2 * gain[:, None] ** 2 * mean[:, 1:]
 
-    def _order(
+    def _binned(
         self, fields: Fields, found: OverTime, ambient: float, contrast: float
     ) -> torch.Tensor:
-        """[n] pixels by brightness in the mean of a few frames, with what noise there is in it."""
+        """[n] each pixel's bin by brightness in the mean of a few frames, with its noise."""
         light = torch.tensor(ambient), torch.tensor(contrast / math.sqrt(found.sorters))
         seen = inner(self.picture(fields, *light)).detach().flatten()
         white = found.moments[:, 0] - found.moments[:, 1]  # at least; dark bins have little else
         spread = white.clamp_min(0).min().sqrt() * seen.mean() / found.level.mean()
-        return (seen + spread / math.sqrt(found.sorters) * self._own).argsort()
+        return _equal_parts(seen + spread / math.sqrt(found.sorters) * self._own, len(found.level))
 
 
 def through(image: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
-    """[h, w] convolved with an odd kernel down the rows and another along them."""
-    for axis, kernel in enumerate((rows, columns)):
-        reach, length = len(kernel) // 2, image.shape[axis]
-        edges = (0, 0, reach, reach) if axis == 0 else (reach, reach, 0, 0)
-        wide = F.pad(image, edges)
-        shifted = (wide.narrow(axis, i, length) * one for i, one in enumerate(kernel))
-        image = sum(shifted, torch.zeros_like(image))
-    return image
+    """[h, w] convolved with an odd kernel down the rows and another along them; 0 outside.
+
+    Kernels may have tangents (forward mode); the image may not.
+    """
+    assert forward_ad.unpack_dual(image).tangent is None
+    out: torch.Tensor = _Through.apply(image, rows, columns)
+    return out
+
+
+class _Through(torch.autograd.Function):
+    """By OpenCV: a sum of shifted images, torch's convolution of float64 still more, is slower."""
+
+    @staticmethod
+    def forward(image: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+        return _convolved(image, rows, columns)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[torch.Tensor, ...], output: torch.Tensor) -> None:
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: torch.Tensor | None) -> torch.Tensor:
+        image, rows, columns = ctx.saved_tensors
+        _, of_rows, of_columns = tangents
+        out = torch.zeros_like(image)
+        if of_rows is not None:
+            out = out + _convolved(image, of_rows, columns)
+        if of_columns is not None:
+            out = out + _convolved(image, rows, of_columns)
+        return out
+
+
+def _convolved(image: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
+    down, along = rows.detach().numpy(), columns.detach().numpy()
+    wide = cv2.sepFilter2D(image.numpy(), -1, along, down, borderType=cv2.BORDER_CONSTANT)
+    return torch.from_numpy(wide)
 
 
 def noise_residuals(

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
-import torch.nn.functional as F
 
 SMOOTH_PX = 12.0
 """Standard deviation of the Gaussian that is taken for shading."""
@@ -58,9 +59,7 @@ def inner(image: torch.Tensor) -> torch.Tensor:
 def smooth(grey: torch.Tensor) -> torch.Tensor:
     """[h, w] without its dots, mirrored at the edges."""
     reach = math.ceil(3 * SMOOTH_PX)
-    place = torch.arange(-reach, reach + 1, dtype=grey.dtype)
-    kernel = torch.exp(-(place**2) / (2 * SMOOTH_PX**2))
-    kernel = (kernel / kernel.sum()).to(grey.dtype)
-    padded = F.pad(grey[None, None], (reach,) * 4, mode="reflect")
-    rows = F.conv2d(padded, kernel[None, None, None])
-    return F.conv2d(rows, kernel[None, None, :, None])[0, 0]
+    kernel = np.exp(-(np.arange(-reach, reach + 1.0) ** 2) / (2 * SMOOTH_PX**2))
+    kernel /= kernel.sum()
+    found = cv2.sepFilter2D(grey.numpy(), -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
+    return torch.from_numpy(found)
