@@ -1,5 +1,6 @@
 """The distance of a wall with its standard error, and the bias that follows from some."""
 
+import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -42,9 +43,17 @@ def drawn(sensor, tilt, columns, size_px, draws=200):
     return np.array(off), np.array(said)
 
 
-@pytest.mark.parametrize("size_px", [0.0, 1.5, 3.0])
-@pytest.mark.parametrize("tilt", [5, 50])
-@pytest.mark.parametrize("columns", [slice(None), slice(0, 110), slice(200, None)])
+ALL, LEFT, RIGHT = slice(None), slice(0, 110), slice(200, None)
+QUICK = ((0.0, 5, LEFT), (1.5, 5, ALL), (3.0, 50, RIGHT), (3.0, 5, ALL))
+
+
+@pytest.mark.parametrize(
+    ("size_px", "tilt", "columns"),
+    [
+        pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow)
+        for case in itertools.product((0.0, 1.5, 3.0), (5, 50), (ALL, LEFT, RIGHT))
+    ],
+)
 def test_the_standard_error_of_a_distance_is_what_draws_of_the_noise_show(size_px, tilt, columns):
     """Of a wall in all of the view, and of one that the principal point is not on, too."""
     off, said = drawn(replace(WIDE, width_px=240, height_px=180), tilt, columns, size_px)
@@ -67,7 +76,13 @@ def test_a_bend_beyond_the_noise_moves_the_middle():
     assert found.centre_error_m < 0.0005
 
 
-@pytest.mark.parametrize("bias_m", [(0.0,), (0.0, 0.01), (0.02, 0.0, -0.02)])
+@pytest.mark.parametrize(
+    "bias_m",
+    [
+        (0.02, 0.0, -0.02),
+        *(pytest.param(bias_m, marks=pytest.mark.slow) for bias_m in ((0.0,), (0.0, 0.01))),
+    ],
+)
 def test_the_bias_of_a_noisy_camera_is_found_as_far_as_its_noise_allows(bias_m):
     sensor = replace(WIDE, correlation_px=3.0, bias_m=bias_m)
     distances, value = (0.8, 1.2, 1.7, 2.3, 3.0), np.polynomial.polynomial.polyval
