@@ -14,6 +14,8 @@ import pytest
 import torch
 import yaml
 
+from tests.commands import main
+
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("*.md")])
 LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -67,26 +69,35 @@ def test_pages_that_code_and_configs_name_are_there():
     assert not missing
 
 
-def test_commands_of_the_documents_exist():
+def help_of(words: list[str], capsys: pytest.CaptureFixture) -> str:
+    """What `--help` of a command says: `qs3 WORDS` in this process, the others in one of theirs."""
+    if words[0] == "qs3":
+        assert main([*words[1:], "--help"]) == 0, words
+        return capsys.readouterr().out
+    module = {"qs3-train": "qs3.training", "qs3-generate": "qs3.generation"}
+    start = [words[1]] if words[0] == "python" else ["-m", module[words[0]]]
+    done = subprocess.run(
+        [sys.executable, *start, "--help"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{words} --help: {done.stderr}"
+    return done.stdout
+
+
+def test_commands_of_the_documents_exist(capsys):
     """Their `--help` answers, and knows every key that a page gives to a command of `qs3`."""
     shown = commands()
     assert len(shown) > 10
     helps: dict[str, str] = {}
     for command, keys in sorted(shown.items()):
         words = command.split()
-        if words[0] == "python":
-            start, name = [sys.executable, words[1]], " ".join(words[:2])
-        else:
+        known = words[:2]
+        if words[0] == "qs3":
             known = words[: 3 if words[1:2] == ["report"] and len(words) > 2 else 2]
-            module = {"qs3": "qs3", "qs3-train": "qs3.training", "qs3-generate": "qs3.generation"}
-            start = [sys.executable, "-m", module[words[0]], *known[1:]]
-            name = " ".join(known if words[0] == "qs3" else words[:1])
+        elif words[0] != "python":
+            known = words[:1]
+        name = " ".join(known)
         if name not in helps:
-            done = subprocess.run(
-                [*start, "--help"], cwd=ROOT, capture_output=True, text=True, check=False
-            )
-            assert done.returncode == 0, f"{name} --help: {done.stderr}"
-            helps[name] = done.stdout
+            helps[name] = help_of(known, capsys)
         if words[0] == "qs3" and "qs3 report pipeline" not in name and "generate" not in name:
             for key in keys:
                 assert f"{key.split('.')[0]}" in helps[name], f"{name}: no help for {key}="
