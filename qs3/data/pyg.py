@@ -24,6 +24,7 @@ from torch import Tensor
 from torch_geometric.data import Data, Dataset, InMemoryDataset
 
 from qs3.classes import class_list
+from qs3.config.checks import check_int
 from qs3.data.domain import Domain, compose_domain
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
@@ -85,7 +86,7 @@ def from_pyg(
     datasets: Mapping[str, Dataset | Sequence[Data]],
     folder: str | Path,
     *,
-    classes: Sequence[str] | None = None,
+    classes: str | Sequence[str] | None = None,
     points: int | None = None,
     name: str | None = None,
 ) -> PointSet:
@@ -96,18 +97,22 @@ def from_pyg(
 
     Args:
         datasets: by split ("train", "validation", "test"). Each cloud has `pos` [n, 3], and all or
-            none of them a `y` of one whole number; `id` names it, if it has one.
+            none of them a `y` of one whole number. Its `id` names it, if it has one; a whole number
+            counts within class and split, like the position of a cloud without.
         folder: of the new dataset.
-        classes: names in the order of `y`; None: `classes` of the first dataset, if it has any;
-            without labels the benchmark's ten.
+        classes: names in the order of `y`, or "modelnet40"; None: `classes` of the first dataset,
+            if it has any; without labels the benchmark's ten.
         points: of a cloud; larger ones are thinned to their farthest points, from the first on.
             None: all clouds must have the same number.
         name: of the new dataset; None: that of the folder.
 
     Raises:
-        ConfigError: there is something in the folder, or the classes are not known.
+        ConfigError: there is something in the folder, the classes are not known or not told apart,
+            or `points` is no number of points.
         DataError: a cloud does not fit; names split and position.
     """
+    if points is not None:
+        points = check_int("points", points.item() if isinstance(points, np.integer) else points, 1)
     folder = Path(folder)
     if is_finished(folder) or is_begun(folder):
         raise ConfigError(f"{folder} holds something already; delete it or choose another folder")
@@ -125,7 +130,7 @@ def from_pyg(
             f"the clouds have {min(sizes)} to {max(sizes)} points: give points=, to which larger "
             "ones are thinned"
         )
-    points = points or sizes[0]
+    points = sizes[0] if points is None else points
     clouds, rows = [], []
     for (split, number), (pos, y, key) in taken.items():
         if len(pos) < points:
@@ -136,7 +141,8 @@ def from_pyg(
         thinned = farthest_point_sampling_np(pos, points) if len(pos) > points else slice(None)
         clouds.append(pos[thinned])
         cls = "" if y is None else names[y]
-        key = key or f"{cls or 'cloud'}/{split}/{number:06d}"
+        if not isinstance(key, str):
+            key = f"{cls or 'cloud'}/{split}/{number if key is None else key:06d}"
         rows.append(ManifestRow(id=key, cls=cls, split=split, valid_points=len(pos)))
     return write_pointset(
         folder,
@@ -148,7 +154,7 @@ def from_pyg(
     )
 
 
-def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str]:
+def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str | int | None]:
     """Points [n, 3] float32, label and id of one cloud, checked."""
     pos, y, key = (getattr(item, key, None) for key in ("pos", "y", "id"))
     if getattr(item, "face", None) is not None:
@@ -161,24 +167,41 @@ def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str]:
         if y.numel() != 1 or y.is_floating_point() or y.is_complex():
             raise DataError(f"{where}: y is {_shape(y)}, expected one whole number, the class")
         label = int(y)
-    points = pos.detach().cpu().numpy().astype(np.float32)
+    with np.errstate(over="ignore"):  # becomes infinite, and is reported as such
+        points = pos.detach().cpu().numpy().astype(np.float32)
     if not np.isfinite(points).all():
         raise DataError(f"{where} has points that are NaN or infinite")
-    return points, label, key if isinstance(key, str) else ""
+    return points, label, _id(key, where)
+
+
+def _id(key: Any, where: str) -> str | int | None:
+    """A name, or a number, which a collated dataset has as a tensor; None if there is neither."""
+    said = key.tolist() if isinstance(key, Tensor | np.ndarray | np.generic) else key
+    if isinstance(said, list) and len(said) == 1:
+        (said,) = said
+    if said is None or said == "":
+        return None
+    if isinstance(said, bool) or not isinstance(said, str | int):
+        raise DataError(f"{where}: id is {_shape(key)}, expected a name or a whole number")
+    return said
 
 
 def _shape(value: Any) -> str:
     return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else repr(value)[:40]
 
 
-def _classes(given: Sequence[str] | None, dataset: Any, labels: list[int | None]) -> list[str]:
+def _classes(
+    given: str | Sequence[str] | None, dataset: Any, labels: list[int | None]
+) -> list[str]:
     known = [label for label in labels if label is not None]
     if known and len(known) < len(labels):
         raise DataError(f"{len(labels) - len(known)} of {len(labels)} clouds have no label y")
     names = given if given is not None else getattr(dataset, "classes", None)
     if names is None and known:
         raise ConfigError(f"give classes=: {max(known) + 1} names or more, in the order of y")
-    names = [str(name) for name in (class_list(None) if names is None else names)]
+    names = list(class_list(names))
+    if not names or not all(names) or len(set(names)) < len(names):
+        raise ConfigError(f"classes are {names}: none, without a name, or twice")
     if known and not 0 <= min(known) <= max(known) < len(names):
         raise DataError(
             f"labels are {min(known)} to {max(known)}, but there "

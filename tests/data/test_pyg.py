@@ -9,6 +9,7 @@ from torch_geometric.data import Data, InMemoryDataset
 from torch_geometric.loader import DataLoader
 from torch_geometric.transforms import NormalizeScale, SamplePoints
 
+from qs3.classes import MODELNET40
 from qs3.data.domain import Domain
 from qs3.data.pyg import from_pyg, knn_graph, to_pyg
 from qs3.data.store import ManifestRow, write_pointset
@@ -148,6 +149,14 @@ def test_clouds_of_several_sizes_are_thinned_to_their_farthest_points(tmp_path):
         (clouds(4, y=torch.tensor([-1])), "labels are -1 to -1"),
         (clouds(4, y=torch.tensor([0])) + clouds(4), "1 of 2 clouds have no label"),
         (clouds(4, 4, y=torch.tensor([0]), id="a"), "the same id"),
+        (clouds(4, 4, y=torch.tensor([0]), id=7), "the same id"),
+        (
+            clouds(4, id=torch.zeros(4)),
+            r"cloud 0 of 'train': id is torch.float32 \[4\], expected a",
+        ),
+        (clouds(4, id=0.5), "id is 0.5, expected a name or a whole number"),
+        (clouds(4, id=True), "id is True"),
+        ([Data(pos=torch.full((4, 3), 1e300, dtype=torch.float64))], "NaN or infinite"),
     ],
 )
 def test_what_does_not_fit_is_refused_with_its_place(tmp_path, items, why):
@@ -159,6 +168,46 @@ def test_what_does_not_fit_is_refused_with_its_place(tmp_path, items, why):
 def test_names_of_classes_must_come_from_somewhere(tmp_path):
     with pytest.raises(ConfigError, match=r"give classes=: 3 names or more"):
         from_pyg({"train": clouds(4, y=torch.tensor([2]))}, tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"points": 0}, "points must be a whole number >= 1, got 0"),
+        ({"points": -3}, "points must be a whole number >= 1, got -3"),
+        ({"points": "4"}, "points must be a whole number"),
+        ({"classes": ["a", "a"]}, r"classes are \['a', 'a'\]: .* twice"),
+        ({"classes": ["a", ""]}, "without a name"),
+        ({"classes": []}, r"classes are \[\]"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(tmp_path, settings, why):
+    with pytest.raises(ConfigError, match=why):
+        from_pyg({"train": clouds(5, 7)}, tmp_path / "a", **{"points": 5, **settings})
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_list_of_classes_by_its_name(tmp_path):
+    items = clouds(5, y=torch.tensor([39]))
+    data = from_pyg({"train": items}, tmp_path / "a", classes="modelnet40")
+    assert (data.classes, data.ids) == (MODELNET40, ("xbox/train/000000",))
+    assert domain(tmp_path / "a", "modelnet40").open().sha256 == data.sha256
+
+
+class Numbered(InMemoryDataset):
+    """Clouds with numbers for ids, which collating makes tensors."""
+
+    def __init__(self, *numbers):
+        super().__init__(None)
+        items = [Data(pos=torch.randn(5, 3), id=number) for number in numbers]
+        self.data, self.slices = self.collate(items)
+
+
+def test_numbers_name_clouds_within_their_split(tmp_path):
+    lists = {"train": [*clouds(5, id=7), *clouds(5, id=np.int64(3))], "test": Numbered(7, 8)}
+    data = from_pyg(lists, tmp_path / "a", points=np.int64(5))
+    names = ("cloud/train/000007", "cloud/train/000003", "cloud/test/000007", "cloud/test/000008")
+    assert data.ids == names
 
 
 def slow_edges(x, batch, k, loop):
