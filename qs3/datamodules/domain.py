@@ -23,7 +23,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
-from qs3.config.checks import check_choice
+from qs3.config.checks import check_bool, check_choice, check_int
 from qs3.data.domain import Domain, compose_domain
 from qs3.data.store import PointSet
 from qs3.datamodules.augment import Augment
@@ -54,17 +54,20 @@ class DomainData(LightningDataModule):
         points: of a cloud as a net sees it.
         scale: "unit_ball", "metres" for clouds that keep their size, or "above_floor" for those
             that keep their height above the floor, too.
-        fps_starts: samples of each training cloud, from other first points; an epoch draws one.
+        fps_starts: samples of each training cloud, at least 1, from other first points; an epoch
+            draws one.
         batch_size: of training batches, at least 2 (batch norm).
-        eval_batch_size: of all others.
+        eval_batch_size: of all others, at least 1.
         augment: applied to training batches on their device; None leaves them as they are.
         val: rule that takes validation clouds from the training split (`validation_split.RULES`).
-        sampler: "shuffled" trains on each cloud once an epoch, "balanced" on as many of each class.
+        sampler: "shuffled" trains on each cloud once an epoch, "balanced", which takes labels, on
+            as many of each class.
         seed: of order, samples and augmentation, each a function of (seed, epoch).
         labels: False reads no label and keeps none; then there are no validation clouds.
         cache_dir: where farthest points are kept for the next time; None keeps none.
-        clouds_a_split: only so many clouds of each split, at even steps.
-        clouds_a_class: only the first so many training clouds of each class.
+        clouds_a_split: only so many clouds of each split, at even steps; at least 1.
+        clouds_a_class: only the first so many training clouds of each class, which takes labels; at
+            least 1.
         data_dir: where the dataset of a named domain lies.
         asks: who needs the labels, for the message where there are none; None: the domain.
         twin: one of `beside.SOURCE_TWINS`: load the twins of the training clouds, too.
@@ -80,9 +83,10 @@ class DomainData(LightningDataModule):
         beside_sha256: of what is loaded beside it, after `prepare_data`; "" if nothing is.
 
     Raises:
-        ConfigError: no such domain, rule, sampler or scale; labels are asked for and there are
-            none; metres are asked for and the clouds are not in metres, or heights above a floor of
-            which nobody knows where it is.
+        ConfigError: no such domain, rule, sampler or scale; a number is none or too small; labels
+            are asked for and there are none, or a setting takes them and `labels` is False; metres
+            are asked for and the clouds are not in metres, or heights above a floor of which nobody
+            knows where it is.
         DataError: from a loader, if its clouds have not been set up or there is no such split.
         MissingDataError: from `prepare_data`, if there are no files; says how to get them.
     """
@@ -113,12 +117,20 @@ class DomainData(LightningDataModule):
             domain = compose_domain(domain, {"paths.data_dir": str(data_dir)})
         domain.check_scale(scale)
         self.domain, self.scale = domain, scale
-        self.points, self.fps_starts = points, fps_starts
-        self.batch_size, self.eval_batch_size = batch_size, eval_batch_size
-        self.augment, self.seed, self.has_labels = augment, seed, labels
+        self.points = _whole("points", points, 1)
+        self.fps_starts = _whole("fps_starts", fps_starts, 1)
+        self.batch_size = _whole("batch_size", batch_size, 2)
+        self.eval_batch_size = _whole("eval_batch_size", eval_batch_size, 1)
+        self.seed = _whole("seed", seed, 0)
+        self.augment, self.has_labels = augment, check_bool("data.labels", labels)
         self.val = check_choice("data.val", val, sorted(RULES))
         self.sampler = check_choice("data.sampler", sampler, SAMPLERS)
-        self.clouds_a_split, self.clouds_a_class = clouds_a_split, clouds_a_class
+        few, each = clouds_a_split, clouds_a_class
+        self.clouds_a_split = few if few is None else _whole("clouds_a_split", few, 1)
+        self.clouds_a_class = each if each is None else _whole("clouds_a_class", each, 1)
+        if not labels and (sampler == "balanced" or each is not None):
+            key = "sampler=balanced" if sampler == "balanced" else f"clouds_a_class={each}"
+            raise ConfigError(f"data.{key} goes by classes, but data.labels=false reads no label")
         self.twin = twin if twin is None else check_choice("twin", twin, sorted(SOURCE_TWINS))
         self.asks = asks or f"domain {domain.name}"
         # Indices that are cached are those of whole splits.
@@ -283,6 +295,12 @@ class DomainData(LightningDataModule):
             return self.trainer.current_epoch
         self._epochs += 1
         return self._epochs - 1
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    """A setting's whole number, perhaps numpy's; ConfigError if it is another or below `least`."""
+    plain = value.item() if isinstance(value, np.integer) else value
+    return check_int(f"data.{name}", plain, least)
 
 
 class Loader:

@@ -362,11 +362,38 @@ def test_each_has_its_domain_and_says_what_is_missing(kind, name, tmp_path):
         ({"points": 65}, "points is 65"),
         ({"scale": "feet"}, "scale must be one of .*metres.*'feet'"),
         ({"scale": "metres"}, "domain specklenet10 are not in metres"),
+        ({"points": 0}, "data.points must be a whole number >= 1, got 0"),
+        ({"points": "32"}, "data.points must be .* got '32'"),
+        ({"fps_starts": 0}, "data.fps_starts must be a whole number >= 1, got 0"),
+        ({"fps_starts": -1}, "data.fps_starts"),
+        ({"batch_size": 0}, "data.batch_size must be a whole number >= 2, got 0"),
+        ({"batch_size": 1}, "data.batch_size must be a whole number >= 2, got 1"),
+        ({"batch_size": -4}, "data.batch_size"),
+        ({"batch_size": 2.5}, "data.batch_size"),
+        ({"eval_batch_size": 0}, "data.eval_batch_size must be a whole number >= 1, got 0"),
+        ({"clouds_a_split": 0}, "data.clouds_a_split must be a whole number >= 1, got 0"),
+        ({"clouds_a_class": 0}, "data.clouds_a_class must be a whole number >= 1, got 0"),
+        ({"clouds_a_class": -2}, "data.clouds_a_class"),
+        ({"seed": 0.5}, "data.seed must be a whole number >= 0, got 0.5"),
+        ({"labels": "false"}, "data.labels must be true or false, got 'false'"),
+        (
+            {"labels": False, "sampler": "balanced"},
+            "sampler=balanced goes by classes, but .*labels",
+        ),
+        ({"labels": False, "clouds_a_class": 5}, "clouds_a_class=5 goes by classes, but .*labels"),
     ],
 )
 def test_wrong_settings_are_errors_for_people(data_dir, settings, message):
     with pytest.raises(ConfigError, match=message):
         made(data_dir, **settings)
+
+
+def test_numbers_of_numpy_are_numbers(data_dir):
+    data = made(data_dir, points=np.int64(32), batch_size=np.int32(8), clouds_a_class=np.int8(9))
+    assert torch.equal(
+        clouds_of(data.train_dataloader()),
+        clouds_of(made(data_dir, clouds_a_class=9).train_dataloader()),
+    )
 
 
 # --- two of them -------------------------------------------------------------------------------
