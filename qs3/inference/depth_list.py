@@ -10,7 +10,8 @@
         box           left,top,right,bottom; a mask or a box
         intrinsics, up, depth_scale, label         those of the command line where empty
 
-A list may also be .json or .yaml: a list of such mappings.
+Columns are divided by commas, or by semicolons or tabs if the first row has no comma. A list may
+also be .json or .yaml: a list of such mappings.
 """
 
 from __future__ import annotations
@@ -175,7 +176,10 @@ def _of_list(path: Path, common: Shown) -> list[Shown]:
 
 
 def _table(text: str, path: Path) -> list[Mapping[str, Any]]:
-    reader = csv.DictReader(io.StringIO(text, newline=""), restkey="more", skipinitialspace=True)
+    first = next(iter(text.splitlines()), "")  # no column's name has any of these in it
+    mark = next((mark for mark in ";\t" if mark in first and "," not in first), ",")
+    lines = io.StringIO(text, newline="")
+    reader = csv.DictReader(lines, restkey="more", delimiter=mark, skipinitialspace=True)
     try:
         rows = list(reader)
     except csv.Error as error:

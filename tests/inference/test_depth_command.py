@@ -252,6 +252,25 @@ def test_rows_of_a_list_whose_values_cannot_be_are_told(tmp_path):
     assert "object=7 is the number of one of a mask; here is a box" in one.wrong
 
 
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_a_list_as_spreadsheets_write_it(tmp_path, mark):
+    rows = [
+        ["depth", "box", "mask", "object", "up", "depth_scale", "label"],
+        ["a.png", "60,20,100,100", "", "", "0,-1,0", "", "rod, long"],
+        ["b.png", "", "m.png", "7", "", "0.002", "slab"],
+    ]
+    lines = ["\ufeff" + mark.join(rows[0]), *(mark.join(row) for row in rows[1:])]
+    (tmp_path / "a.csv").write_text("\r\n".join(lines) + "\r\n", encoding="utf-8")
+    common = Shown("", intrinsics=CAMERA)
+    (first, second), _ = find_shown(str(tmp_path / "a.csv"), "", common)
+    assert (first.wrong, second.wrong) == ("", "")
+    assert (first.box, first.up, first.label) == ((60, 20, 100, 100), (0, -1, 0), "rod, long")
+    assert (second.mask, second.only, second.scale_m) == (tmp_path / "m.png", 7, 0.002)
+    with open(tmp_path / "b.csv", "w", newline="") as file:  # with commas it says the same
+        csv.writer(file).writerows(rows)
+    assert find_shown(str(tmp_path / "b.csv"), "", common)[0] == [first, second]
+
+
 @pytest.mark.parametrize("number", ["3.7", "true", "1.0000001"])
 def test_an_object_of_a_list_is_a_whole_number(tmp_path, number):
     (tmp_path / "a.yaml").write_text(f"- {{depth: a.png, mask: m.png, object: {number}}}\n")
