@@ -5,6 +5,7 @@ Light on purpose: `train.py` asks `Domain.check` before it imports anything heav
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 from collections.abc import Mapping, Sequence
@@ -323,7 +324,7 @@ class Domain:
         return problems
 
     def _refuse_stale(self, importer: Importer) -> None:
-        """Raise DataError if the store was imported with other settings than today's."""
+        """Raise DataError if the store was imported by other settings or rules than today's."""
         meta = read_meta(self.folder)
         imported = meta.get("imported")
         if imported is None:  # generated here
@@ -335,8 +336,12 @@ class Domain:
             now["on_error"] = "stop"
         changed = {key for key in {*now, *imported} if now.get(key) != imported.get(key)}
         if not changed:
-            return
-        if changed == {"files"}:
+            rows = functools.partial(read_manifest, self.folder, meta["classes"])
+            if not (outdated := importer.outdated(rows)):
+                return
+            problem = f"{self.folder} was imported by an earlier version of qs3, which took "
+            problem += f"{outdated}; delete it"
+        elif changed == {"files"}:
             origins = {row.origin for row in read_manifest(self.folder, meta["classes"])}
             problem = f"{self.folder} is not what its folder holds today: "
             problem += f"{importer.changes(origins)}; delete {self.folder}"

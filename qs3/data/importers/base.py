@@ -182,6 +182,13 @@ class Importer(abc.ABC):
         """How the files differ from an import of other "files"; `origins` of its manifest."""
         return f"the files in {self.root}"
 
+    def outdated(self, manifest: Callable[[], Iterable[ManifestRow]]) -> str:
+        """What an earlier version of qs3 read otherwise of the same files; "" if nothing.
+
+        `manifest` reads the rows of the store, which takes its time where there are many.
+        """
+        return ""
+
 
 def import_into(folder: Path, importer: Importer, *, name: str, classes: Sequence[str]) -> None:
     """Read the published files and put the finished store at `folder`, all or nothing.

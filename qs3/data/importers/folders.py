@@ -146,6 +146,22 @@ class CloudFolder(Importer):
         ]
         return f"the files in {self.root}: {', '.join(parts) or 'some have changed'}"
 
+    def outdated(self, manifest: Callable[[], Iterable[ManifestRow]]) -> str:
+        """See `Importer`: the split of `test/train_0.npy` was once taken from its name."""
+        if self.layout not in ("auto", "split/class"):
+            return ""
+        for row in manifest():
+            folder, *inner = row.origin.split("/")
+            if (
+                len(inner) == 1
+                and _NUMBER.search(row.origin)
+                and _is_split(folder)
+                and known_as(folder, [row.cls]) is None  # else it is the class: class/name.ext
+                and split_of(folder, row.origin) != row.split
+            ):
+                return f"{row.origin} as of the split {row.split!r}, by its name and not its folder"
+        return ""
+
     def thin(self, cloud: np.ndarray, where: str) -> np.ndarray:
         """See `Importer`: at most P points, the farthest."""
         if cloud.ndim != 2 or len(cloud) <= self.points:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import tracemalloc
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 
 from qs3.clouds.files import parse_clouds
 from qs3.data.importers import CloudFolder, Importer, XyzTree, import_into
-from qs3.data.store import open_pointset, read_manifest
+from qs3.data.store import open_pointset, read_manifest, write_pointset
 from qs3.errors import ConfigError, DataError
 from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write
 
@@ -225,6 +226,53 @@ def test_changed_files_are_noticed(tmp_path: Path) -> None:
         domain.open()
     (tmp_path / "in").rename(tmp_path / "away")  # put away after the import
     assert domain.open().sha256 == before
+
+
+def test_an_import_whose_split_came_from_a_name_is_noticed(tmp_path: Path) -> None:
+    """As versions before did, which trained on `test/train_station.npy`."""
+    several = np.stack([CLOUD, CLOUD + 1])
+    for place in ("test/train_station", "train/test_hall", "train/bed"):
+        (tmp_path / "in" / place).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / "in" / f"{place}.npy", several)
+    domain = own(tmp_path)
+    before = domain.open()
+    assert domain.open().sha256 == before.sha256
+
+    rows = read_manifest(tmp_path / "store", TWO)
+    once = [
+        dataclasses.replace(row, split="train", id=row.id.replace("test/", "train/", 1), index=None)
+        for row in rows
+    ]
+    write_pointset(
+        tmp_path / "store",
+        name="store",
+        classes=TWO,
+        arrays={"points": np.array(before.points)},
+        rows=once,
+        meta={key: before.meta[key] for key in ("imported", "made_of")},
+    )
+    with pytest.raises(
+        DataError,
+        match=r"store was imported by an earlier version of qs3, which took "
+        r"test/train_station\.npy\[0\] as of the split 'train', by its name .*; delete it to",
+    ):
+        domain.open()
+    (tmp_path / "in").rename(tmp_path / "away")
+    with pytest.raises(DataError, match="by an earlier version"):
+        domain.open()
+    assert own(tmp_path, layout="none").importer().outdated(lambda: once) == ""
+
+
+def test_a_class_that_is_called_as_a_split_is_not_taken_for_one(tmp_path: Path) -> None:
+    several = np.stack([CLOUD + i for i in range(5)])
+    for cls in ("test", "bed"):
+        (tmp_path / "in" / cls).mkdir(parents=True)
+        np.save(tmp_path / "in" / cls / "a.npy", several)
+    domain = dataclasses.replace(own(tmp_path), classes=("test", "bed"))
+    ids = domain.open().ids
+    assert "test/test/a_0004" in ids
+    assert "test/train/a_0000" in ids
+    assert domain.open().ids == ids
 
 
 def test_files_that_change_during_the_import(tmp_path: Path) -> None:
