@@ -107,7 +107,8 @@ def _other_units(good: Sequence[Mapping[str, Any]]) -> list[str]:
     they = "it was" if count == 1 else "they were"
     return [
         f"{count} of them as large as if {they} not in metres, so these answers mean nothing: "
-        "divide millimetres by 1000 and centimetres by 100, or leave out points far from the object"
+        "divide millimetres by 1000, centimetres by 100 and inches by 39.37, or leave out points "
+        "far from the object"
     ]
 
 

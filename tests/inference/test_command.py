@@ -107,6 +107,7 @@ def test_a_net_of_metres_says_how_it_took_the_files(metric_run, run, clouds, tmp
     said = capsys.readouterr().out
     n = len(clouds)
     assert f"{n} of them as large as if they were not in metres, so these answers mean noth" in said
+    assert "inches by 39.37" in said
     assert "organised" not in said
     assert all("size " in row["reason"] for row in table(out))
 
