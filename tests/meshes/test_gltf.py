@@ -50,6 +50,30 @@ def test_gltf_quantized_strided_and_without_scenes(tmp_path):
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 1]]
 
 
+def test_hidden_nodes_are_left_out_with_all_below(tmp_path, caplog):
+    for hidden, left in ((0, 1), (1, 1), (2, 0)):
+        tree, _ = gltf(extensionsRequired=["KHR_node_visibility"])
+        only, _ = gltf(scenes=[{"nodes": [[0], [2]][left]}])
+        tree["nodes"][hidden]["extensions"] = {"KHR_node_visibility": {"visible": False}}
+        mesh = load_mesh(save(tmp_path, "a.gltf", json.dumps(tree)))
+        expected = load_mesh(save(tmp_path, "b.gltf", json.dumps(only)))
+        np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+        np.testing.assert_array_equal(mesh.faces, expected.faces)
+        assert "1 node is hidden, and left out with all below" in caplog.text
+        caplog.clear()
+    for node in tree["nodes"]:
+        node["extensions"] = {"KHR_node_visibility": {"visible": True}}
+    assert len(load_mesh(save(tmp_path, "a.gltf", json.dumps(tree))).faces) == 12
+    assert not caplog.text
+
+
+def test_an_empty_list_of_scenes_is_none(tmp_path):
+    tree, _ = gltf(scenes=[])
+    whole = load_mesh(save(tmp_path, "a.gltf", json.dumps(gltf()[0])))
+    mesh = load_mesh(save(tmp_path, "b.gltf", json.dumps(tree)))
+    np.testing.assert_array_equal(mesh.vertices, whole.vertices)
+
+
 def test_buffers_beside_a_file_are_found_and_those_within_it_are_not_looked_for(tmp_path):
     tree, blob = gltf()
     inside = tree["buffers"][0]
@@ -123,7 +147,9 @@ def changed(path, value):
         (("meshes",), {}, "GLTF"),
         (("buffers", 0, "uri"), 5, "GLTF"),
         (("buffers",), [{}], "without data"),
-        (("scene",), 3, "GLTF"),
+        (("scene",), 3, "has no scene 3"),
+        (("scene",), -1, "has no scene -1"),
+        (("nodes", 2, "extensions"), {"EXT_mesh_gpu_instancing": {}}, "export each as a node"),
     ],
 )
 def test_broken_gltf_is_refused_with_the_reason(tmp_path, path, value, reason):

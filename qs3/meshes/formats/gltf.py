@@ -27,6 +27,7 @@ from qs3.meshes.formats.by_trimesh import MAX_PARTS, assembled, loaded
 from qs3.meshes.formats.colliders import Colliders
 from qs3.meshes.formats.gltf_materials import finish_of
 from qs3.utils.memory import check_memory
+from qs3.utils.plural import counted
 
 MAX_BUFFER_BYTES = 1 << 30
 
@@ -34,8 +35,9 @@ _HEADER = struct.Struct("<4xIII4s")  # of GLB: version, length, and of the JSON 
 _TRIANGLES, _STRIP = 4, 5  # below them: points and lines; above: fans
 _LARGEST = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}  # normalised, these mean 1
 _UNUSED = {"componentType": 5121, "type": "SCALAR", "count": 0}
+_VISIBILITY, _INSTANCES = "KHR_node_visibility", "EXT_mesh_gpu_instancing"
 _EXTENSIONS = (
-    "KHR_mesh_quantization",  # understood; the others do not touch the surface
+    *("KHR_mesh_quantization", _VISIBILITY),  # understood; the others do not touch the surface
     *("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_"),
 )
 
@@ -156,15 +158,17 @@ def _parsed(text: bytes) -> dict[str, Any]:
 
 
 def _roots(tree: dict[str, Any]) -> list[int]:
-    if "scenes" in tree:
-        return tree["scenes"][tree.get("scene", 0)].get("nodes", [])
+    if scenes := tree.get("scenes"):
+        if not 0 <= (scene := tree.get("scene", 0)) < len(scenes):
+            raise MeshError(f"has no scene {scene}, which it is said to show")
+        return scenes[scene].get("nodes", [])
     nodes = tree.get("nodes", [])
     children = {child for node in nodes for child in node.get("children", [])}
     return [index for index in range(len(nodes)) if index not in children]
 
 
 def _nodes(tree: dict[str, Any], colliders: Colliders) -> list[dict[str, Any]]:
-    """What trimesh shall see of each node; of those outside of the scene and colliders, nothing.
+    """What trimesh shall see of each node; of colliders and what is outside or hidden, nothing.
 
     Children stand in reverse, for trimesh visits the last one first. A node's matrix is made here:
     trimesh normalises its quaternion, which changes the last digits.
@@ -173,6 +177,7 @@ def _nodes(tree: dict[str, Any], colliders: Colliders) -> list[dict[str, Any]]:
     prepared: list[dict[str, Any]] = [{} for _ in nodes]
     waiting = list(_roots(tree))
     visited: set[int] = set()
+    hidden = 0
     while waiting:
         index = waiting.pop()
         if index in visited:
@@ -183,6 +188,10 @@ def _nodes(tree: dict[str, Any], colliders: Colliders) -> list[dict[str, Any]]:
             raise MeshError(f"has more than {MAX_PARTS} nodes")
         if colliders.left_out(node.get("name")):
             continue
+        extensions = node.get("extensions", {})
+        if extensions.get(_VISIBILITY, {}).get("visible", True) is False:  # nor what is below it
+            hidden += 1
+            continue
         children = node.get("children", [])
         waiting += children
         matrix = _transform(node).T.ravel().tolist()  # column-major
@@ -190,10 +199,18 @@ def _nodes(tree: dict[str, Any], colliders: Colliders) -> list[dict[str, Any]]:
         if "mesh" in node:
             if "skin" in node:
                 raise MeshError("has a skinned mesh, which is not read: export it unskinned")
+            if _INSTANCES in extensions:
+                raise MeshError(
+                    f"has instances of a mesh by {_INSTANCES}, which are not read: export each as "
+                    "a node"
+                )
             mesh = tree["meshes"][node["mesh"]]
             if not colliders.left_out(mesh.get("name")):
                 _check_targets(mesh, node)
                 prepared[index]["mesh"] = node["mesh"]
+    if hidden:
+        nodes_are = counted(hidden, "node is", "nodes are")
+        colliders.notes.append(f"{nodes_are} hidden, and left out with all below")
     return prepared
 
 
