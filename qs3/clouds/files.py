@@ -4,7 +4,8 @@
                 semicolons; # and // begin a comment
     .npy        [n, >= 3], or [m, n, >= 3]: m clouds, unless m and n are a depth camera's height
                 and width, as of one organised cloud: that is refused, as are depth images
-                (more than 32 columns) and [3, n], x y z as rows
+                (more than 32 columns) and [3, n], x y z as rows. Or [n] or [m, n] of records with
+                the fields x, y, z
     .npz        the array `points` (or the only one) as in .npy; perhaps `label` or `cls`
     .ply        the vertices, text or binary; faces are passed over
     .pcd        x y z
@@ -33,6 +34,7 @@ from qs3.clouds.text import read_text
 from qs3.errors import DataError, MeshError, Qs3Error
 from qs3.utils.memory import check_memory
 from qs3.utils.plural import counted
+from qs3.utils.text_table import printable
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +97,8 @@ def npy_clouds(path: Path) -> int | None:
         DataError: as `parse_clouds`.
     """
     shape, dtype = npy_header(path)
+    if fields := _fields(path, dtype):
+        shape, dtype = (*shape, len(fields)), np.result_type(*(dtype[name] for name in fields))
     _check_array(path, shape, dtype)
     if len(shape) == 3 and not shape[0]:
         raise DataError(f"{path}: there are no clouds")
@@ -141,7 +145,22 @@ def _hdf5(path: Path) -> CloudFile:
     return _of_array(path, *read_hdf5(path, functools.partial(_check_array, path)))
 
 
+def _fields(path: Path, dtype: np.dtype) -> list[str]:
+    """Of records, the fields x, y, z; of plain numbers none. Else DataError."""
+    if dtype.names is None:
+        return []
+    found = [name for axis in "xyz" for name in dtype.names if name.lower() == axis]
+    if [name.lower() for name in found] != list("xyz") or any(
+        dtype[name].kind not in "fiu" for name in found
+    ):
+        names = printable(", ".join(dtype.names[:8]))
+        raise DataError(f"{path}: records of {names}: which are numbers x, y and z?")
+    return found
+
+
 def _of_array(path: Path, array: np.ndarray, labels: np.ndarray | None = None) -> CloudFile:
+    if fields := _fields(path, array.dtype):
+        array = np.stack([array[name] for name in fields], axis=-1)
     _check_array(path, array.shape, array.dtype)
     many = array.ndim == 3
     clouds = array[..., :3] if many else array[None, :, :3]

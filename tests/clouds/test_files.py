@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from qs3.clouds.files import SUFFIXES, parse_cloud, parse_clouds
+from qs3.clouds.files import SUFFIXES, npy_clouds, parse_cloud, parse_clouds
 from qs3.errors import ConfigError, DataError
 from tests.limits import memory_of_at_most, time_of_at_most
 
@@ -320,3 +320,46 @@ def test_few_points_and_many_columns_are_clouds(shape, tmp_path):
     np.save(tmp_path / "a.npy", array)
     found = parse_clouds(tmp_path / "a.npy").clouds
     np.testing.assert_array_equal(np.stack(found), array.reshape(-1, *shape[-2:])[..., :3])
+
+
+def records(cloud: np.ndarray, names: str = "xyz", kind: str = "f4") -> np.ndarray:
+    """[..., 3] as records, a colour before the coordinates and after z."""
+    fields = [("rgb", "u4"), *((name, kind) for name in reversed(names)), ("ring", "u2")]
+    found = np.zeros(cloud.shape[:-1], dtype=fields)
+    for axis, name in enumerate(names):
+        found[name] = cloud[..., axis]
+    return found
+
+
+@pytest.mark.parametrize("names", ["xyz", "XYZ"])
+def test_records_go_by_the_names_of_their_fields(tmp_path: Path, names: str) -> None:
+    cloud = CLOUD.astype(np.float32)
+    np.save(tmp_path / "a.npy", records(cloud, names))
+    np.savez(tmp_path / "a.npz", points=records(cloud, names))
+    for name in ("a.npy", "a.npz"):
+        found = parse_cloud(tmp_path / name)
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, cloud)
+    assert npy_clouds(tmp_path / "a.npy") is None
+    many = np.stack([cloud, cloud + 1])
+    np.save(tmp_path / "many.npy", records(many, names))
+    assert npy_clouds(tmp_path / "many.npy") == 2
+    np.testing.assert_array_equal(parse_clouds(tmp_path / "many.npy").clouds, many)
+
+
+@pytest.mark.parametrize(
+    ("array", "why"),
+    [
+        (records(CLOUD, "xyw"), "records of rgb, w, y, x, ring: which are numbers x, y and z"),
+        (records(CLOUD, "xyz", "S4"), "which are numbers"),
+        (records(np.zeros((20, 4)), "xyzX"), "which are numbers"),
+        (records(np.zeros((480, 640, 3))), "organised cloud"),
+        (np.zeros(20, dtype=[("x", "f4", 3), ("y", "f4"), ("z", "f4")]), "which are numbers"),
+        (np.zeros((), dtype=[(axis, "f4") for axis in "xyz"]), r"shape \(3,\), expected"),
+    ],
+)
+def test_records_that_are_no_cloud(tmp_path: Path, array: np.ndarray, why: str) -> None:
+    np.save(tmp_path / "a.npy", array)
+    for read in (parse_clouds, npy_clouds):
+        with pytest.raises(DataError, match=why):
+            read(tmp_path / "a.npy")

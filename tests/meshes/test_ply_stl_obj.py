@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3.clouds.files import parse_cloud
 from qs3.meshes.io import load_mesh
 from tests.meshes.written import PYRAMID, corners, export, mixed_ply, refused, save
 
@@ -27,6 +28,20 @@ def test_text_ply_with_polygons_of_mixed_sizes(tmp_path):
     mesh = load_mesh(save(tmp_path, "a.ply", text))
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2]]
+
+
+def test_coordinates_of_ply_in_capitals(tmp_path):
+    text = mixed_ply("<")
+    capitals = text
+    for kind, axis in ((b"double", b"x"), (b"float", b"y"), (b"float", b"z")):
+        capitals = capitals.replace(
+            b"property " + kind + b" " + axis, b"property " + kind + b" " + axis.upper()
+        )
+    assert capitals != text
+    expected = load_mesh(save(tmp_path, "a.ply", text))
+    mesh = load_mesh(save(tmp_path, "b.ply", capitals))
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+    np.testing.assert_array_equal(parse_cloud(tmp_path / "b.ply"), parse_cloud(tmp_path / "a.ply"))
 
 
 @pytest.mark.parametrize(

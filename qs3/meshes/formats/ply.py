@@ -96,11 +96,12 @@ def _elements(data: bytes) -> Iterator[tuple[_Element, dict]]:
 
 
 def _vertices(columns: dict) -> np.ndarray:
-    if missing := [axis for axis in "xyz" if axis not in columns]:
+    names = [axis if axis in columns else axis.upper() for axis in "xyz"]
+    if missing := [name.lower() for name in names if name not in columns]:
         raise MeshError(f"has vertices without {', '.join(missing)}")
-    if lists := [axis for axis in "xyz" if isinstance(columns[axis], tuple)]:
+    if lists := [name for name in names if isinstance(columns[name], tuple)]:
         raise MeshError(f"has vertices with lists of {', '.join(lists)}")
-    return np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    return np.stack([columns[name] for name in names], axis=1).astype(np.float64)
 
 
 def _parse_header(data: bytes) -> tuple[list[_Element], bytes]:
