@@ -42,7 +42,7 @@ ADAPTERS: dict[str, Callable[..., None]] = {
     "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/twin.md
     "tent": minimise_entropy,
 }
-"""Values of `evaluation.norms` (`qs3.training.command.NORMS`), beside "trained"."""
+"""Values of `evaluation.norms` (`qs3.training.settings.NORMS`), beside "trained"."""
 
 
 @dataclass(frozen=True, eq=False)

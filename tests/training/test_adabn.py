@@ -13,8 +13,9 @@ from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.metrics import adapt_norms
 from qs3.methods.source_only import SourceOnly
 from qs3.runs.checkpoints import load
-from qs3.training.command import NORMS, train
+from qs3.training.command import train
 from qs3.training.evaluate import ADAPTERS
+from qs3.training.settings import NORMS
 from tests.methods import shapes
 from tests.methods.test_learning import POINTS, aside
 from tests.training.toy import TinyNet, write_domain

@@ -11,8 +11,8 @@ from hydra import compose, initialize_config_dir
 
 import qs3.config.hydra  # noqa: F401 (registers the resolvers)
 from qs3.config.hydra import build
-from qs3.training.command import KEYS
-from qs3.training.command import _check_keys as check_keys_of
+from qs3.training.settings import KEYS
+from qs3.training.settings import _check_keys as check_keys_of
 from qs3.utils.locks import owned
 from tests.commands import command
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)

@@ -16,7 +16,8 @@ from qs3.datamodules.splits import subsample_splits
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.runs.metrics import TrainingAccuracy
-from qs3.training.command import STILL, train
+from qs3.training.command import train
+from qs3.training.settings import STILL
 from qs3.utils.locks import owned
 from tests.composing import compose
 from tests.training.conftest import result_of

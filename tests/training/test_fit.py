@@ -21,7 +21,8 @@ from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error, Selec
 from qs3.inference.model_file import read_result
 from qs3.runs.metrics import Evaluated, Loading, read_metrics
 from qs3.training import build as built
-from qs3.training.command import CENTRED_ONLY, NOT_TAKEN, UNIT_BALL_ONLY, train
+from qs3.training.command import train
+from qs3.training.settings import CENTRED_ONLY, NOT_TAKEN, UNIT_BALL_ONLY
 from qs3.utils.locks import owned
 from qs3.utils.version import VERSION, commit
 from tests.training.conftest import result_of
