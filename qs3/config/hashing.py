@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,8 @@ def config_sha256(cfg: DictConfig) -> str:
 
     Interpolations are hashed as they are written: what they point to is hashed at its own place,
     or does not matter (`${paths.data_dir}/...`). But a method's or a model's file is hashed by its
-    content, and what comes from outside of the config (`${oc.env:NAME}`) by its value.
+    content, and by its value what comes from outside of the config (`${oc.env:NAME}`), or from a
+    `selftraining` without rounds, which is not hashed itself.
     """
     plain: Any = OmegaConf.to_container(cfg, resolve=False)
     for group in ("method", "model"):
@@ -62,7 +64,7 @@ def config_sha256(cfg: DictConfig) -> str:
             plain[group]["sha256"] = cfg[group].sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
-    plain = _with_values(plain, cfg, "")
+    plain = _with_values(plain, cfg, "", _FROM_OUTSIDE)
     for key in _NEW:
         if plain.get(key) is None:
             _leave_out(plain, key)
@@ -78,6 +80,7 @@ def config_sha256(cfg: DictConfig) -> str:
             _leave_out(plain, f"data.{domain}.views")
     if _without_rounds(plain.get("selftraining")):  # nobody reads its other settings
         plain["selftraining"] = None
+        plain = _with_values(plain, cfg, "", _from(["selftraining"]))
     trainer = plain.get("trainer")
     if isinstance(trainer, dict) and trainer.get("float32_matmul") == "highest":
         trainer.pop("float32_matmul")  # as it was before there was such a key
@@ -86,6 +89,14 @@ def config_sha256(cfg: DictConfig) -> str:
         trainer["devices"] = 1
     text = json.dumps(plain, sort_keys=True, ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def with_values(cfg: DictConfig, keys: Sequence[str]) -> Any:
+    """The config as nested dicts, with values in place of interpolations of these keys.
+
+    It can then be hashed without them: all else is as it is written.
+    """
+    return _with_values(OmegaConf.to_container(cfg, resolve=False), cfg, "", _from(keys))
 
 
 def file_sha256(file: str) -> str:
@@ -105,14 +116,20 @@ def _leave_out(plain: Any, key: str) -> None:
         plain.pop(leaf, None)
 
 
-def _with_values(node: Any, cfg: DictConfig, place: str) -> Any:
-    """The same, with values in place of what OmegaConf's own resolvers bring in."""
+def _from(keys: Sequence[str]) -> re.Pattern[str]:
+    """Finds interpolations of keys and what lies below: `${A}`, `${..A.b}`, `${oc.select:A.b}`."""
+    names = (re.escape(key).replace(r"\.", r"[.\[]") for key in keys)
+    return re.compile(rf"\$\{{[^}}]*(?<![\w\]]\.)(?<!\w)(?:{'|'.join(names)})\b")
+
+
+def _with_values(node: Any, cfg: DictConfig, place: str, which: re.Pattern[str]) -> Any:
+    """The same, with values in place of the interpolations that the pattern finds."""
     if isinstance(node, dict):
         begin = f"{place}." if place else ""
-        return {key: _with_values(value, cfg, f"{begin}{key}") for key, value in node.items()}
+        return {key: _with_values(v, cfg, f"{begin}{key}", which) for key, v in node.items()}
     if isinstance(node, list):
-        return [_with_values(value, cfg, f"{place}[{i}]") for i, value in enumerate(node)]
-    if isinstance(node, str) and _FROM_OUTSIDE.search(node):
+        return [_with_values(value, cfg, f"{place}[{i}]", which) for i, value in enumerate(node)]
+    if isinstance(node, str) and which.search(node):
         found = OmegaConf.select(cfg, place)
         return OmegaConf.to_container(found, resolve=True) if OmegaConf.is_config(found) else found
     return node

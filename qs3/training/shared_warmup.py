@@ -44,8 +44,7 @@ _AFTERWARDS = ("selftraining", "selection.student", "evaluation", "experiment_na
 
 def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
     """64 hex digits over what a warm-up depends on (also `started.json`), except its seed."""
-    before: Any = OmegaConf.to_container(cfg, resolve=False)
-    before = OmegaConf.create(before)
+    before = OmegaConf.create(hashing.with_values(cfg, _AFTERWARDS))
     for key in _AFTERWARDS:
         OmegaConf.update(before, key, None)
     parts = [hashing.config_sha256(before), started["data"], started["versions"]]

@@ -10,6 +10,7 @@ from qs3.config.compose import choices, composed
 from qs3.config.hashing import config_hash
 from qs3.config.hydra import build
 from qs3.errors import ConfigError
+from tests.composing import compose
 from tests.training.toy import toy_config
 
 
@@ -81,6 +82,40 @@ def test_a_value_from_outside_is_hashed_as_it_is(tmp_path, monkeypatch):
         hashes.append(config_hash(toy_config(tmp_path, "selection.teacher=${oc.env:RULE}")))
         assert hashes[-1] == config_hash(toy_config(tmp_path, f"selection.teacher={rule}"))
     assert hashes[0] != hashes[1]
+
+
+def hash_of(*words, **values):
+    cfg = compose("train", ["experiment=own_scans", *words])
+    for key, value in values.items():
+        OmegaConf.update(cfg, key, value, force_add=True)
+    return config_hash(cfg)
+
+
+@pytest.mark.parametrize("none", ["selftraining=none", "selftraining.rounds=0"])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"protocol.batch_size": "${selftraining.batch_size}"},
+        {"protocol.batch_size": "${..selftraining.batch_size}"},
+        {"data.points": "${oc.select:selftraining.batch_size}"},
+        {"short": "${selftraining[batch_size]}", "protocol.batch_size": "${short}"},
+        {"data.target.published.more": ["a", "x${selftraining.batch_size}"]},
+    ],
+)
+def test_what_comes_from_settings_of_no_rounds_is_hashed_by_its_value(none, values):
+    """They are not hashed themselves: nobody else reads them."""
+    small, large = ((none, f"selftraining.batch_size={size}") for size in (16, 64))
+    assert hash_of(*small) == hash_of(*large)
+    assert hash_of(*small, **values) != hash_of(*large, **values)
+
+
+def test_all_else_is_hashed_as_it_is_written():
+    """As runs were before: what comes from rounds that there are, or from a key of that name."""
+    written = {"protocol.batch_size": "${selftraining.batch_size}"}
+    assert hash_of(**written) != hash_of("protocol.batch_size=16", "selftraining.batch_size=16")
+    other = {"data.selftraining": 16, "protocol.batch_size": "${data.selftraining}"}
+    by_value = {**other, "protocol.batch_size": 16}
+    assert hash_of("selftraining=none", **other) != hash_of("selftraining=none", **by_value)
 
 
 def test_other_errors_keep_their_traceback():

@@ -262,6 +262,26 @@ def test_the_hash_covers_what_comes_before():
     assert len({of(), *others}) == 6
 
 
+@pytest.mark.parametrize(
+    "key", ["selftraining.rounds", "selection.student", "evaluation.turns", "experiment_name"]
+)
+@pytest.mark.parametrize("before", ["${", "${..", "a ${oc.select:"])
+def test_what_comes_from_later_settings_counts_by_its_value(key, before):
+    def of(interpolation, **values):
+        plain = {"protocol": {"a": interpolation, "b": "${data.evaluation}"}}
+        cfg = OmegaConf.create({**plain, "data": {"evaluation": 1}})
+        for place in (key, "selection.teacher"):
+            OmegaConf.update(cfg, place, values.get(place, 1))
+        return warmup_sha256(cfg, {"data": 1, "versions": 2})
+
+    assert of("x") == of("x", **{key: 2})
+    written = f"{before}{key}}}"
+    assert of(written) != of(written, **{key: 2})
+    if before == "${":
+        assert of(written) == of(1)
+    assert of("${selection.teacher}") != of(1)  # as it is written
+
+
 def shared_folders(folder: Path) -> list[Path]:
     return sorted((folder / "logs" / "warmups").glob("*"))
 
