@@ -24,16 +24,21 @@ def composing() -> Iterator[Callable[..., Any]]:
     """`hydra.compose` for the block; a running application's state is put back after it."""
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.utils import JobRuntime
+    from hydra.version import VersionBase
 
     import qs3.config.hydra  # noqa: F401  registers the resolvers that the configs use
 
-    running = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
+    outer, version, job = GlobalHydra.instance(), VersionBase.instance(), JobRuntime.instance()
+    running, base, name = outer.hydra, version.version_base, job.get("name")
+    outer.clear()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             yield compose
     finally:
-        GlobalHydra.instance().hydra = running
+        outer.hydra, version.version_base = running, base
+        GlobalHydra.set_instance(outer)
+        job.set("name", name)
 
 
 def composed(command: str | None, *overrides: str, place: str = "", **more: Any) -> DictConfig:
