@@ -41,11 +41,13 @@ def train(*overrides: str) -> Path:
     from qs3.errors import ConfigError
     from qs3.runs.unbegun import removed_if_unbegun
     from qs3.training.command import train as run_of
+    from qs3.training.settings import check_complete
     from qs3.utils.files import write_text
 
     if any(word.lstrip("+").startswith("hparams_search=") for word in overrides):
         raise ConfigError("hparams_search= is many runs: search with python train.py, or qs3-train")
     with _as_hydra("train", overrides) as cfg:
+        check_complete(cfg)  # of some the folder's name is made
         folder = run_folder(cfg)
         with removed_if_unbegun(folder):
             run_of(cfg)

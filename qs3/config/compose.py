@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +15,7 @@ from qs3.errors import ConfigError
 from qs3.utils.cli import hint_of
 
 _ONE_RUN = "one run at a time: call it once for each seed"
+_NO_NAME = re.compile(r"null|true|false|[-+]?[\d_.]+", re.IGNORECASE)  # to Hydra
 _FOLDER = re.compile(r"file://([^,\]'\"]+)")  # in hydra.searchpath=[file:///FOLDER]
 
 if TYPE_CHECKING:
@@ -55,6 +58,7 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
     """
     from hydra.errors import HydraException
 
+    check_choices(overrides)
     with composing() as compose:
         try:
             return compose(command, list(overrides), **more)
@@ -65,6 +69,33 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
 def choices(group: str) -> list[str]:
     """Names of the files of a config group, sorted: `choices("domain")`."""
     return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+
+
+def check_choices(words: Sequence[str]) -> None:
+    """Raise ConfigError for the first word whose value can name no file: logger=null, model=3."""
+    for word in words:
+        key, _, value = word.partition("=")
+        group = key.lstrip("+").partition("@")[0]
+        ours = (CONF / group).is_dir() and group and not group.startswith("hydra/")
+        if ours and _NO_NAME.fullmatch(value):
+            raise ConfigError(
+                f"{word}: {group} is chosen by the name of a file; there are "
+                f"{', '.join(choices(group))}; or leave {word} out"
+            )
+
+
+def choices_checked(main: Callable[[], Any]) -> Callable[[], None]:
+    """A Hydra command that ends with what `check_choices` says, where Hydra has a traceback."""
+
+    @functools.wraps(main)
+    def command() -> None:
+        try:
+            check_choices(sys.argv[1:])
+        except ConfigError as error:
+            sys.exit(f"{type(error).__name__}: {error}")
+        main()
+
+    return command
 
 
 def check_no_base(out: Path, group: str, base: str, words: Sequence[str] = ()) -> None:

@@ -64,6 +64,7 @@ def config_sha256(cfg: DictConfig) -> str:
             plain[group]["sha256"] = cfg[group].sha256
     for key in _UNHASHED:
         _leave_out(plain, key)
+    plain.setdefault("callbacks", {})  # ~callbacks is callbacks=none
     plain = _with_values(plain, cfg, "", _FROM_OUTSIDE)
     for key in _NEW:
         if plain.get(key) is None:

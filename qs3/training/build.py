@@ -70,8 +70,8 @@ def build_training(
     trainer = make_trainer(
         cfg,
         max_epochs=phases.total,
-        callbacks=[*build_each(cfg.callbacks), *callbacks],
-        logger=[CsvHistory(folder), *build_each(cfg.logger)],
+        callbacks=[*build_each(cfg.get("callbacks")), *callbacks],
+        logger=[CsvHistory(folder), *build_each(cfg.get("logger"))],
         plugins=[AtomicCheckpointIO()],
         default_root_dir=folder,
     )

@@ -7,7 +7,9 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
+from qs3.config.compose import choices
 from qs3.config.hydra import component_names, in_multirun
+from qs3.config.location import CONF
 from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.prior import check_told
@@ -86,18 +88,63 @@ _ONNX = "model=features needs an ONNX file"
 _FEATURES = "qs3.models.features.features"
 _PCFEA = "qs3.selftraining.pcfea.Pcfea"
 
-_SEVERAL = {
-    "selection": "selection.student=last",
-    "evaluation": "evaluation.rotations=0",
-    "report": "report.pictures=false",
+_NEEDED = {
+    **KEYS,
+    "data.": (
+        *("_target_", "points", "scale", "fps_starts", "val", "sampler", "eval_batch_size"),
+        *("cache_dir", "make_source", "clouds_a_split", "clouds_a_class"),
+    ),
+    "paths.": ("data_dir", "log_dir", "warmup_dir"),
+    "trainer.": ("accelerator", "threads"),
+    "report.": ("_target_", "pictures"),
+    **dict.fromkeys(
+        ("model.", "method.", "selftraining.", "protocol.optimizer.", "protocol.augment."),
+        ("_target_",),
+    ),
 }
+"""What has to be there; where keys are below one, it has to be several settings."""
+
+_MAY_LACK = ("callbacks", "logger")  # then there are none
+
+_INSTEAD = {
+    "selection": "give one, as selection.student=last",
+    "evaluation": "give one, as evaluation.rotations=0",
+    "report": "for no pictures set report.pictures=false",
+    "selftraining": "for no rounds set selftraining=none",
+    "protocol.optimizer": "give one, as protocol.optimizer.lr=0.001",
+    "protocol.augment": "for clouds as they are set protocol.augment.rotate_z=false, .scale=1, "
+    ".shift=0 and .jitter_sigma=0",
+}
+"""What to do in place of leaving something out, or of null."""
+
+
+def check_complete(cfg: DictConfig) -> None:
+    """Raise ConfigError for the first part or setting that a training reads and is not there."""
+    for prefix, keys in _NEEDED.items():
+        place = prefix.rstrip(".")
+        part: Any = OmegaConf.select(cfg, place) if place else cfg
+        if not isinstance(part, DictConfig):
+            value = "null" if part is None else part
+            raise ConfigError(f"{place}={value}: these are several settings; {_instead(place)}")
+        for key in keys:
+            if key not in part and key not in _MAY_LACK:
+                whole = f"{prefix}{key}"
+                raise ConfigError(f"{whole} is not there, and training reads it; {_instead(whole)}")
+
+
+def _instead(key: str) -> str:
+    """What to do about a key that is not there, or null."""
+    group = key.removesuffix("._target_")  # of what no file was chosen for
+    if group in _INSTEAD:
+        return _INSTEAD[group]
+    if (CONF / group).is_dir() and len(names := choices(group)) > 1:
+        return f"give {group}=NAME, one of {', '.join(names)}"
+    return "leave out the word with ~ that deletes it"
 
 
 def check_settings(cfg: DictConfig) -> None:
     """Raise ConfigError for settings that would otherwise fail late, and without their key."""
-    for key, one in _SEVERAL.items():
-        if cfg[key] is None:
-            raise ConfigError(f"{key}=null: these are several settings; give one, as {one}")
+    check_complete(cfg)
     for key in ("data.source", "data.target"):
         if not isinstance(domain := OmegaConf.select(cfg, key), DictConfig):
             raise ConfigError(

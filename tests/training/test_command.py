@@ -94,6 +94,8 @@ def test_help_imports_nothing_heavy(tmp_path):
             ("experiment=own_scans", "data.target.up=y"),
             ("did you mean data.target.published.up=?",),
         ),
+        (("logger=null",), ("ConfigError: logger=null: logger is chosen", "csv, wandb")),
+        (("~method",), ("ConfigError: method is not there", "give method=NAME, one of cpcm, ")),
         (("force=no",), ("ConfigError: force must be true or false, got 'no'",)),
         (("compile=off",), ("ConfigError: compile must be true or false, got 'off'",)),
         (("trainer.deterministic=no",), ("trainer.deterministic must be true or false",)),

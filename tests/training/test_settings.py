@@ -1,0 +1,84 @@
+"""What is left out, or null: an error that says what to do, or nothing of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from qs3.api import train as train_by_words
+from qs3.config import hashing
+from qs3.config.compose import composed
+from qs3.errors import ConfigError
+from qs3.runs.metrics import read_metrics
+from qs3.training.command import train
+from qs3.training.settings import check_settings
+from tests.composing import compose
+
+
+@pytest.mark.parametrize(
+    ("word", "advice"),
+    [
+        ("~method", "give method=NAME, one of cpcm, "),
+        ("~method._target_", "give method=NAME, one of cpcm, "),
+        ("~protocol", "leave out the word with ~"),
+        ("~selftraining", "for no rounds set selftraining=none"),
+        ("~report", "for no pictures set report.pictures=false"),
+        ("~report.pictures", "leave out the word with ~"),
+        ("~evaluation", "give one, as evaluation.rotations=0"),
+        ("~selection", "give one, as selection.student=last"),
+        ("~protocol.epochs", "leave out the word with ~"),
+        ("~protocol.augment", "for clouds as they are set protocol.augment.rotate_z=false"),
+        ("~protocol.optimizer", "give one, as protocol.optimizer.lr=0.001"),
+        ("~experiment_name", "leave out the word with ~"),
+        ("~paths", "leave out the word with ~"),
+        ("~data.scale", "leave out the word with ~"),
+        ("~trainer.accelerator", "leave out the word with ~"),
+    ],
+)
+def test_what_is_left_out_is_named(word, advice):
+    with pytest.raises(ConfigError, match=rf"^{word[1:].split('.')[0]}.* not there") as said:
+        check_settings(compose("train", ["experiment=quickstart", word]))
+    assert advice in str(said.value)
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize(
+    "key", ["evaluation", "selection", "report", "protocol.augment", "protocol.optimizer"]
+)
+def test_null_is_no_settings(key):
+    with pytest.raises(ConfigError, match=f"^{key}=null: these are several settings; "):
+        check_settings(compose("train", ["experiment=quickstart", f"{key}=null"]))
+
+
+@pytest.mark.parametrize(
+    ("word", "known"),
+    [
+        ("logger=null", "csv, wandb"),
+        ("+experiment=Null", "adabn_s2d, "),
+        ("domain@data.source=null", "blensor10, "),
+        ("model=3", "dgcnn, "),
+        ("callbacks=false", "default, none"),
+        ("trainer=-1.5", "cpu, "),
+    ],
+)
+def test_a_choice_of_a_file_is_its_name(word, known):
+    with pytest.raises(ConfigError) as said:
+        composed("train", "seed=3", word)
+    assert str(said.value).startswith(f"{word}: ")
+    assert f"there are {known}" in str(said.value)
+
+
+@pytest.mark.parametrize("word", ["~seed", "~experiment_name", "~paths.log_dir", "~method"])
+def test_a_function_says_so_too(word):
+    """Also where the run's folder cannot be named without it."""
+    with pytest.raises(ConfigError, match=f"^{word[1:]} is not there"):
+        train_by_words("experiment=quickstart", word)
+
+
+def test_without_callbacks_and_loggers_there_are_none(toy):
+    """The run is that of callbacks=none, and writes history.csv alone."""
+    cfg = toy("selftraining=none", "~callbacks", "~logger")
+    assert not {"callbacks", "logger"} & set(cfg)
+    folder = hashing.run_folder(cfg)
+    assert folder == hashing.run_folder(toy("selftraining=none"))
+    assert train(cfg) == read_metrics(folder)
+    assert (folder / "history.csv").is_file()
