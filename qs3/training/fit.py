@@ -90,8 +90,12 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     if not run.cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
         built.shared_warmup.take()
     last = run.folder / LAST
-    how = "fitting, continued" if last.is_file() else "fitting"
-    log.info("%s, %s", how, counted(run.phases.total, "epoch"))
+    epochs = counted(run.phases.total, "epoch")
+    if run.cfg.selection.teacher == "given" and not run.scheme.rounds:
+        what = "no rounds: the classifier of weights= is judged as it is, not after its"
+        log.info("%s %s of warm-up", what, epochs)
+    else:
+        log.info("%s, %s", "fitting, continued" if last.is_file() else "fitting", epochs)
     try:
         built.trainer.fit(
             built.classifier,

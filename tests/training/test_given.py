@@ -35,6 +35,17 @@ def test_the_teacher_is_what_was_given(toy, finished):
     assert len(metrics.rounds) == 2
 
 
+def test_without_rounds_nothing_is_said_to_be_fitted(toy, finished, caplog):
+    caplog.set_level("INFO")
+    words = ("selftraining=none", "protocol.epochs=1", f"weights={finished}")
+    given = train(toy(*words, "selection.teacher=given"))
+    assert given.final == read_metrics(finished).final
+    assert "is judged as it is, not after its 1 epoch of warm-up" in caplog.text
+    assert "fitting" not in caplog.text
+    train(toy(*words))
+    assert "fitting, 1 epoch" in caplog.text
+
+
 def test_weights_alone_are_trained_on(toy, finished):
     words = ("selftraining=none", "protocol.epochs=2", "experiment_name=two")
     given, fresh = toy(*words, f"weights={finished}"), toy(*words)
