@@ -107,7 +107,10 @@ def own_row(
 
 
 def beside(table: Table, name: str) -> Table:
-    """The row `name` first, and below it the rows with runs; of the columns those with some."""
+    """The row `name` first, and below it the rows with runs; of the columns those with some.
+
+    Averages that were published of all columns are left out where not all are shown.
+    """
     rows = {name: table.rows[name]}
     rows |= {row: cells for row, cells in table.rows.items() if table.groups(row)}
     kept = [
@@ -120,6 +123,7 @@ def beside(table: Table, name: str) -> Table:
         title=f"{table.title}: {name}",
         columns=tuple(table.columns[i] for i in kept),
         rows={row: tuple(cells[i] for i in kept) for row, cells in rows.items()},
+        averages=table.averages if len(kept) == len(table.columns) else {},
     )
 
 

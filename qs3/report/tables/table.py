@@ -316,33 +316,60 @@ def _without(word: str, words: Sequence[str]) -> tuple[str, ...]:
     return tuple(one for one in words if one != word)
 
 
+_Stamp = tuple[int, int] | None
+
+
 class _Composed(NamedTuple):
-    """What a table has to know of a cell's config."""
+    """What a table has to know of a cell's config.
+
+    `files`: those whose content is in the hash (`method.file`), each with its `_stamp`.
+    """
 
     experiment: str
     hash: str
     target: str
     simulated: bool
     supervised: bool
+    files: tuple[tuple[str, _Stamp], ...]
 
 
-@functools.lru_cache(maxsize=4096)
+def _stamp(file: str) -> _Stamp:
+    """When a file was written, in ns, and its bytes; None if it is not there."""
+    try:
+        found = Path(file).expanduser().stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
 def _composed(words: tuple[str, ...]) -> _Composed:
     """A command line of train.py, composed. Kept: `report train` and effects ask for it often.
 
     Raises:
         HydraException: as Hydra's `compose`.
     """
+    kept = _kept(words)
+    if any(_stamp(file) != was for file, was in kept.files):  # edited since, in a notebook
+        _kept.cache_clear()
+        kept = _kept(words)
+    return kept
+
+
+@functools.lru_cache(maxsize=4096)
+def _kept(words: tuple[str, ...]) -> _Composed:
     from qs3.config.hashing import config_hash
 
     with composing() as compose:
         cfg = compose("train", list(words))
         target = cfg.data.target
         supervised = cfg.method.get("_target_") == _SUPERVISED
+        files = [str(file) for part in (cfg.method, cfg.model) if (file := part.get("file"))]
+        stamps = tuple((file, _stamp(file)) for file in files)  # before they are read
         return _Composed(
             str(cfg.experiment_name),
             config_hash(cfg),
             str(target.name),
             bool(target.simulated),
             supervised,
+            stamps,
         )

@@ -15,7 +15,14 @@ from qs3.config.hashing import config_hash
 from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.errors import ConfigError
-from qs3.report.leaderboard.cli import ALONE, WITH_ROUNDS, _file_name, _intervals, own_row
+from qs3.report.leaderboard.cli import (
+    ALONE,
+    WITH_ROUNDS,
+    _file_name,
+    _intervals,
+    beside,
+    own_row,
+)
 from qs3.report.tables.formats import grid, markdown, to_run
 from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
@@ -308,6 +315,32 @@ def test_what_is_shown(tmp_path):
     assert [job.name for job in missing(table, [7], columns=["K"])] == [
         "source only, S → K, seed 7"
     ]
+
+
+AVERAGED = """
+title: Averaged
+layout: benchmark
+metrics: [accuracy]
+columns:
+  A: domain@data.source=roomscan10 domain@data.target=nyuv2
+  B: domain@data.source=specklenet10 domain@data.target=kinectsim10
+rows:
+  - {name: GAST, run: experiment=leaderboard method=gast, paper: [50.0, 60.0], average: 54.9}
+"""
+
+
+@pytest.mark.parametrize(("columns", "average"), [("A", "50.0"), ("AB", "54.9")])
+def test_a_published_average_stands_beside_all_of_its_columns(tmp_path, columns, average):
+    """Beside a part of them it would be of others: there it is their own mean."""
+    file = tmp_path / "averaged.yaml"
+    file.write_text(AVERAGED)
+    for cell in build_table(str(file), tmp_path).cells:
+        if cell.column in columns:
+            run_cell(tmp_path, cell)
+    head, published, _ = grid(beside(build_table(str(file), tmp_path), "GAST"))
+    shown = dict(zip(head, published, strict=True))
+    assert len(head) == 4 + len(columns)
+    assert shown["average accuracy %"] == average
 
 
 def test_without_two_seeds_in_common_there_is_a_reason_and_no_empty_table(tmp_path):

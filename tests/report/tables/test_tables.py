@@ -161,6 +161,28 @@ def test_composing_inside_an_application():
         assert GlobalHydra.instance().hydra is outer
 
 
+def test_an_edited_method_has_other_runs(tmp_path):
+    """Also in one process, as in a notebook: the file's content is in the hash."""
+    file, table = tmp_path / "mine.py", tmp_path / "mine.yaml"
+    run = f"experiment=leaderboard method=own method.file={file}"
+    table.write_text(
+        f"title: t\nmetrics: [accuracy]\ncolumns: [c]\nrows:\n  - {{name: mine, run: {run}}}\n"
+    )
+
+    def cell():
+        return build_table(str(table), tmp_path / "logs").rows["mine"][0]
+
+    file.write_text("# one\n")
+    run_cell(tmp_path / "logs", cell())
+    assert cell().group.seeds == [0, 1, 2]
+    file.write_text("# two\n")
+    assert cell().group is None
+    file.unlink()
+    assert cell().group is None
+    file.write_text("# one\n")
+    assert cell().group.seeds == [0, 1, 2]
+
+
 def test_extra_overrides_are_part_of_the_command(tmp_path):
     table = build_table("quickstart", tmp_path, extra=["data.points=64"])
     assert f"data.points=64 paths.log_dir={tmp_path} seed=0,1,2 -m" in table.cells[0].command
