@@ -83,7 +83,7 @@ class PointDan(Method):
         features, attended = {}, {}
         for domain in ("source", "target"):
             points = batch[domain]["points"]
-            check_points(points)
+            check_points(points, net.backbone)
             with use_domain(net, domain):
                 found, nodes = net.backbone.with_nodes(points)
             features[domain] = found.global_  # [B, 1024]

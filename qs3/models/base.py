@@ -96,7 +96,7 @@ class PointClassifier(nn.Module):
 
     def features(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Features of checked clouds: for heads besides the classifier's."""
-        check_points(points)
+        check_points(points, self.backbone)
         return self.backbone(points)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
@@ -108,15 +108,27 @@ class PointClassifier(nn.Module):
         self.backbone.compile(*args, **settings)
 
 
-def check_points(points: Tensor) -> None:
+def check_points(points: Tensor, net: nn.Module | None = None) -> None:
     """Raise `DataError`, naming the item, unless `points` is a finite, not empty [B, N, 3].
+
+    Clouds of one point are refused for a `net` with instance norms over points: one value has no
+    statistics, and torch says so for some of the nets only.
 
     A training step on a device would wait for the answer in each of its passes, so there values
     are looked at on the CPU and in evaluation alone: what is trained on was checked by the store.
     An exported net does not look at them.
     """
-    if points.ndim != 3 or points.shape[2] != 3 or points.shape[1] == 0:
-        raise DataError(f"expected points [B, N >= 1, 3], got {list(points.shape)}")
+    if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] == 0 or points.shape[1] == 0:
+        raise DataError(f"expected points [B >= 1, N >= 1, 3], got {list(points.shape)}")
+    if (
+        points.shape[1] == 1
+        and net is not None
+        and any(isinstance(module, nn.InstanceNorm1d) for module in net.modules())
+    ):
+        raise DataError(
+            "clouds of one point have no statistics for norm=instance: give clouds of more points "
+            "(data.points), or train with norm=batch"
+        )
     if exporting() or (points.device.type != "cpu" and torch.is_grad_enabled()):
         return
     if torch.isfinite(points).all():

@@ -81,7 +81,9 @@ class NodeModule(nn.Module):
             three = squares.topk(min(3, self.nodes), dim=1, largest=False)[1]  # [b, 3, n]
         nodes = gather(self.residual(f), nearest).amax(2)  # [b, m, c]
         three = three.transpose(1, 2)  # [b, n, 3]
-        weight = 1 / (x[:, :, None] - gather(place, three)).square().sum(3).clamp_min(1e-10)
+        apart = x[:, :, None] - gather(place, three)  # [b, n, 3, 3]
+        apart = apart.to(torch.promote_types(apart.dtype, torch.float32))  # 1e-10 is 0 in float16
+        weight = 1 / apart.square().sum(3).clamp_min(1e-10)
         weight = weight / weight.sum(2, keepdim=True)
         back = (weight[..., None] * gather(nodes, three)).sum(2)  # [b, n, c]
         return Nodes(torch.cat([f, back.to(f.dtype)], dim=2), nodes, place)

@@ -62,6 +62,7 @@ class SimpleView(Backbone):
         images = depth_images(
             points, self.image_size, views=self.views, up=self.up, pixel=self.pixel
         )
+        images = images.to(self.images.stem.conv.weight.dtype)  # of weights in half precision
         features = self.images(images.flatten(0, 1)[:, None])  # [b * v, 128] of [b * v, 1, h, w]
         return Features(features.view(points.shape[0], -1), None)
 

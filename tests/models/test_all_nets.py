@@ -122,6 +122,14 @@ def test_any_number_of_points(name: str, n: int) -> None:
     assert build(name)(clouds(1, n)).isfinite().all()
 
 
+@pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("name", NETS)
+def test_weights_in_half_precision(name: str, kind: torch.dtype) -> None:
+    logits = build(name).to(kind)(clouds(2, 40).to(kind))
+    assert logits.dtype == kind
+    assert logits.isfinite().all()
+
+
 @pytest.mark.parametrize("name", NETS)
 def test_one_point_many_times(name: str) -> None:
     net, points = build(name), torch.full((2, 60, 3), 0.3, dtype=torch.float64)

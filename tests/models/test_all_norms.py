@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
 from qs3.models import pointnet2, rscnn
 from qs3.models.base import PointClassifier
 from qs3.models.fast import plain
@@ -59,6 +59,19 @@ def test_instance_norm_is_of_each_cloud(name: str) -> None:
     assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
     alone = torch.cat([net.eval()(cloud[None]) for cloud in points])
     torch.testing.assert_close(net(points), alone, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", NETS)
+def test_instance_norm_of_one_point(name: str) -> None:
+    """It has no statistics; SimpleView's are of its images."""
+    net, points = _small(name, "instance"), clouds(2, 1)
+    for training in (True, False):
+        net.train(training)
+        if name == "simpleview":
+            assert net(points).isfinite().all()
+            continue
+        with pytest.raises(DataError, match="one point have no statistics for norm=instance"):
+            net(points)
 
 
 @pytest.mark.parametrize("name", NETS)

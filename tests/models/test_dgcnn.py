@@ -103,7 +103,7 @@ def test_autocast_keeps_neighbours_in_float32(monkeypatch: pytest.MonkeyPatch) -
     torch.testing.assert_close(half.float(), plain, rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize("shape", [(8, 3), (2, 8, 2), (2, 0, 3)])
+@pytest.mark.parametrize("shape", [(8, 3), (2, 8, 2), (2, 0, 3), (0, 8, 3)])
 def test_bad_shape(shape: tuple[int, ...]) -> None:
     with pytest.raises(DataError, match="expected points"):
         check_points(torch.zeros(shape))

@@ -144,6 +144,18 @@ def test_float32_error_is_that_of_the_straight_network(image_size: int) -> None:
     assert total[0] <= 2 * total[1]
 
 
+@pytest.mark.parametrize(("kind", "error"), [(torch.bfloat16, 0.03), (torch.float16, 0.004)])
+@pytest.mark.parametrize("training", [False, True])
+def test_half_precision_is_near(training: bool, kind: torch.dtype, error: float) -> None:
+    """Within some roundings (2^-8 and 2^-11) of the same weights and points in float64."""
+    half = _small().to(kind).train(training)
+    points = _points(8).to(kind)
+    logits = half(points)
+    exact = copy.deepcopy(half).double().train(training)(points.double())
+    assert logits.dtype == kind
+    assert (logits - exact).norm() <= error * exact.norm()
+
+
 def test_copies_of_one_point() -> None:
     model = _small().eval()
     once, twice = _points(2, 30)[:, :1], _points(2, 30)[:, :1].expand(-1, 9, -1)
