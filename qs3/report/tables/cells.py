@@ -119,8 +119,13 @@ class Cell:
             return "not available yet"
         if self.group and self.group.unlabelled:
             return "no target labels"
-        if self.group and self.group.results and value_of(self.group.results[0], metric) is None:
-            return "no such tier"
+        results = self.group.results if self.group else []
+        unknown = [value_of(result, metric, self.take) is None for result in results]
+        if results and all(unknown):
+            tiers = any(value_of(result, metric) is not None for result in results)
+            return "not of warm-ups" if tiers else "no such tier"
+        if any(unknown):
+            return "not of every seed" + mark
         if self.group and self.group.finished:
             return "not averaged" + mark
         return "not finished" + mark if mark else "not run"

@@ -13,7 +13,7 @@ from qs3.utils import text_table
 from qs3.utils.plural import counted
 from qs3.utils.text_table import latex_row, latex_text
 
-_ACCURACY: Metric = "accuracy"  # what papers give
+_ACCURACY: Metric = "accuracy"  # what papers give, and each run on labels has
 SIMULATED = "SIMULATED target"
 TO_RUN = "Not run yet, or with fewer seeds than are wanted"
 _RULES = {"source_val": "source validation", "last": "last epoch"}
@@ -250,13 +250,16 @@ def _majority(groups: Sequence[Group]) -> str:
 
 
 def to_run(table: Table) -> list[str]:
-    """Commands that fill the cells without a number or with few seeds, each once."""
+    """Commands that fill the cells without a number or with few seeds, each once.
+
+    By the accuracy, which every run on labels has: no command brings a tier that a target lacks.
+    """
     empty = [
         cell
         for cell in table.cells
         if cell.runnable
         and not cell.missing
-        and ((stat := cell.ours(table.metrics[0])) is None or stat.n < len(cell.seeds))
+        and ((stat := cell.ours(_ACCURACY)) is None or stat.n < len(cell.seeds))
         and not (cell.group and cell.group.unlabelled)
     ]
     return list(dict.fromkeys(cell.command for cell in empty))

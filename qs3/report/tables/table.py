@@ -46,7 +46,7 @@ class _Spec:
     """A table's file; a row's entries are `_cell`'s business."""
 
     title: str
-    metrics: list[Metric]
+    metrics: Annotated[list[Metric], Field(min_length=1)]
     columns: list[str] | dict[str, str | _Column | None]
     rows: list[dict[str, Any]]
     layout: Literal["", "benchmark"] = ""
@@ -243,6 +243,8 @@ def _cell(
         )
     overrides = () if line is None else (*shlex.split(line), *more)
     take = own.get("take", row.get("take", "final"))
+    if take not in ("final", "warmup"):
+        raise ConfigError(f"table row {row['name']!r}: take: must be final or warmup, got {take!r}")
     seeds = tuple(range(row["seeds"])) if "seeds" in row else SEEDS
     if isinstance(spec.columns, dict) and isinstance(of_all := spec.columns[column], _Column):
         seeds = seeds[: of_all.seeds]

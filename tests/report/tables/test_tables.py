@@ -119,6 +119,33 @@ def test_majority_rates_of_tiers_stand_below(tmp_path):
     )
 
 
+def test_tiers_that_a_number_lacks(tmp_path):
+    """A warm-up has no scores of tiers, a target without tiers never gets any by another run."""
+    path = tmp_path / "x.yaml"
+    run = "{run: experiment=quickstart"
+    path.write_text(
+        "title: x\nmetrics: [accuracy_clean, accuracy]\ncolumns: [target test]\nrows:\n"
+        f"- {{name: QS3, target test: {run}}}}}\n"
+        f"- {{name: PCM, target test: {run}, take: warmup}}}}\n"
+    )
+    known = Evaluated(
+        split="test", labels=True, rotations=0, norms="trained", tiers={"clean": scores(0.7)}
+    )
+    plain = replace(known, tiers=None)
+    for first, last, shown in (
+        (known, known, [["70.0 ± 0.0", "51.0 ± 0.6"], ["not of warm-ups", "50.0 ± 0.0"]]),
+        (known, plain, [["not of every seed", "51.0 ± 0.6"], ["not of warm-ups", "50.0 ± 0.0"]]),
+        (plain, plain, [["no such tier", "51.0 ± 0.6"], ["no such tier", "50.0 ± 0.0"]]),
+    ):
+        logs = tmp_path / shown[0][0]
+        cell = build_table(str(path), logs).cells[0]
+        run_cell(logs, cell, (0, 1), evaluation=first)
+        run_cell(logs, cell, (2,), evaluation=last)
+        table = build_table(str(path), logs)
+        assert [[cell.text(metric) for metric in table.metrics] for cell in table.cells] == shown
+        assert TO_RUN not in markdown(table)
+
+
 def test_factors_are_told_apart_by_their_names(empty):
     """`qs3 report judge` calls runs by their experiment's name; the source's path is not hashed."""
     cells = empty["real_factors"].cells
@@ -206,7 +233,9 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
         (f"HEAD\nrows:\n- {{name: r, a: {{paper: 1{'0' * 400}}}}}", "wrong entry int too large"),
         ("HEAD\nrows:\n- {a: {paper: 1}}", "x.yaml: missing or wrong entry 'name'"),
         ("HEAD\nrows: [{name: [a], a: {paper: 1}}]", "x.yaml: missing or wrong entry 'name'"),
-        ("title: x\nmetrics: []\ncolumns: []\nrows: [{}]", "x.yaml: missing or wrong entry 'name'"),
+        ("HEAD\nrows: [{}]", "x.yaml: missing or wrong entry 'name'"),
+        ("title: x\nmetrics: []\ncolumns: []\nrows: []", "x.yaml: metrics: List should have at"),
+        ("HEAD\nrows:\n- {name: r, a: {run: x, take: warmpu}}", "take: must be final or warmup"),
         ("HEAD\nrows:\n- {name: r, a: {run: nonsense}}", "table cell 'r', 'a': .*nonsense"),
         ("HEAD\nrows:\n- {name: r, run: x, columns: [a, c]}", "row 'r': columns: 'c' is none of"),
         ("HEAD\nrows:\n- {name: r, run: x, columns: a}", "row 'r': columns: 'a' is none of"),
