@@ -26,7 +26,7 @@ def _tune(more: Sequence[str], line: str, out: Path, rate: float, **given: Any) 
         raise ConfigError(f"rate must be > 0, got {rate}")
     if given["batch"] > given["objects"]:
         raise ConfigError("batch= is of the objects= that are searched with: it cannot be larger")
-    from qs3.config.compose import check_no_base
+    from qs3.config.preset_base import check_no_base
     from qs3.tuning.command import Wanted, tune
     from qs3.tuning.report import said, save
 

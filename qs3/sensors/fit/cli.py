@@ -179,8 +179,9 @@ def fit_images(
     Raises:
         ConfigError, DataError: say which argument or file is to blame.
     """
-    from qs3.config.compose import check_no_base, choices, composed
+    from qs3.config.compose import choices, composed
     from qs3.config.hydra import build
+    from qs3.config.preset_base import check_no_base
     from qs3.sensors.devices.speckle_stereo import SpeckleStereo
     from qs3.sensors.fit.infrared import fit_pictures
     from qs3.sensors.fit.pair_fill import pair_fills, words_of

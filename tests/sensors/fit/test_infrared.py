@@ -9,9 +9,8 @@ import pytest
 import torch
 import yaml
 
-from qs3.config.compose import check_no_base, composed
+from qs3.config.compose import composed
 from qs3.config.hydra import build
-from qs3.config.location import CONF
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
@@ -239,29 +238,6 @@ def test_folders_and_files_are_explained(tmp_path, capsys):
     assert "no active stereo camera" in capsys.readouterr().err
     assert main(["fit", "base=realsense_d415", "out=x.yaml", "focal=3", "a.npy"]) == 1
     assert "belong to images=" in capsys.readouterr().err
-
-
-def test_a_preset_is_not_written_over_what_it_is_made_of(tmp_path):
-    """A file whose defaults list names itself composes no more, and its values are lost."""
-    folder = tmp_path / "sensor"
-    folder.mkdir()
-    newer, older = folder / "newer.yaml", folder / "older.yaml"
-    older.write_text("defaults:\n  - realsense_d415\n  - matcher: sgbm\n  - _self_\n")
-    newer.write_text("defaults:\n  - older\n  - _self_\n")
-    (tmp_path / "linked.yaml").symlink_to(newer)
-    place = [f"hydra.searchpath=[file://{tmp_path}]"]
-    package = CONF / "sensor" / "realsense_d415.yaml"
-    for out, message in (
-        (newer, "is newer itself"),
-        (tmp_path / "linked.yaml", "is newer itself"),
-        (tmp_path / "newer.yaml", "is newer itself"),
-        (older, "is older, which newer is made of"),
-        (package, "is realsense_d415, which newer is made of"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            check_no_base(out, "sensor", "newer", place)
-    check_no_base(newer, "sensor", "older", place)
-    check_no_base(folder / "newest.yaml", "sensor", "newer", place)
 
 
 def test_the_command_does_not_write_over_its_base(tmp_path, capsys):
