@@ -44,6 +44,7 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     Raises:
         ConfigError, MissingDataError, DataError: nothing could be done at all.
     """
+    _check_out(settings, settings.input, settings.depth, settings.mask)
     source = _depth_images(settings) if settings.depth else _clouds(settings)
     ckpt = settings.ckpt or pretrained.usual(source.floor_known)
     predictor = _loaded(ckpt, settings)
@@ -172,6 +173,22 @@ def _camera_is_missing(predictor: Predictor, settings: Settings) -> bool:
     return predictor.needs_floor and not given and predictor.camera_height is None
 
 
+def _check_out(settings: Settings, *read: str | Path) -> None:
+    """Raise ConfigError if table or page would replace a file that is read, or a folder is there.
+
+    Asked first: what was predicted would be lost when it is saved.
+    """
+    table = Path(settings.out).expanduser()
+    for out in (table, table.with_suffix(".html")) if settings.page else (table,):
+        if os.path.isdir(out):
+            raise ConfigError(f"out={settings.out}: {out} is a folder; give the name of a file")
+        for file in (os.path.expanduser(place) for place in dict.fromkeys(read)):
+            if os.path.isfile(file) and os.path.exists(out) and os.path.samefile(file, out):
+                raise ConfigError(
+                    f"out={settings.out} would replace {file}, which is read; give another name"
+                )
+
+
 def _save(path: Path, text: str) -> str:
     replaces = path.exists()
     write_text(path, text)
@@ -225,6 +242,7 @@ def _depth_images(settings: Settings) -> Source:
     if settings.part:
         raise ConfigError(f"part={settings.part} is for an archive of objects, input=FILE.npz")
     shown, others = find_shown(settings.depth, settings.mask, common)
+    _check_out(settings, *(one.folder / Path(one.intrinsics).expanduser() for one in shown))
     if not any(one.intrinsics for one in shown):
         raise ConfigError(
             "intrinsics=fx,fy,cx,cy of the depth camera in pixels, or intrinsics=FILE, is missing"

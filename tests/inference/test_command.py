@@ -258,6 +258,10 @@ def test_a_net_that_diverged_says_so_of_each_cloud(run, clouds, tmp_path, suffix
     rows = table(out) if suffix == ".csv" else json.loads(out.read_text())["clouds"]
     assert [row["status"] for row in rows] == ["failed"] * 2
     assert all("its training has diverged" in row["reason"] for row in rows)
+    words[0] = f"ckpt={run}"
+    assert main(["predict", *words, f"second={tmp_path / 'nan.pt'}"]) == 0
+    rows = table(out) if suffix == ".csv" else json.loads(out.read_text())["clouds"]
+    assert all(row["class"] and not row["second"] for row in rows)
 
 
 def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):
@@ -311,6 +315,8 @@ def test_up_and_flags(run, clouds, tmp_path):
             "unknown key 'gravity'; keys are",
         ),
         (["predict", "ckpt={run}", "input={clouds}", "out=a.txt"], "must end in .csv or .json"),
+        (["predict", "ckpt={run}", "input={clouds}", "out=a.csv"], "a.csv is a folder; give the"),
+        (["predict", "ckpt={run}", "input={clouds}", "out=b.csv"], "b.html is a folder; give the"),
         (["predict", "ckpt={run}", "input={clouds}", "up=w"], "up must be one of"),
         (["predict", "ckpt={run}", "input={clouds}", "batch_size=0"], "batch_size must be"),
         (["predict", "ckpt={run}", "input={clouds}", "device=quantum"], "device=quantum"),
@@ -331,7 +337,8 @@ def test_up_and_flags(run, clouds, tmp_path):
 )
 def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty").mkdir()
+    for folder in ("empty", "a.csv", "b.html"):
+        (tmp_path / folder).mkdir()
     write(tmp_path / "a.xyz", clouds[0])
     for suffix in (".stl", ".png", ".csv"):
         (tmp_path / f"other{suffix}").touch()
@@ -343,6 +350,7 @@ def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, 
     assert message.format(**places) in capsys.readouterr().err
     assert not (tmp_path / "model.onnx").exists()
     assert not (tmp_path / "predictions.csv").exists()
+    assert not (tmp_path / "b.csv").exists()
 
 
 def test_names_that_are_no_utf8(run, clouds, tmp_path):

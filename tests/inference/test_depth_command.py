@@ -65,7 +65,7 @@ def frame(tmp_path) -> Path:
     return tmp_path
 
 
-def predict(run: Path, out: Path, *more: str) -> int:
+def predict(run: str | Path, out: Path, *more: str) -> int:
     return main(["predict", f"ckpt={run}", f"out={out}", "threads=1", *more])
 
 
@@ -240,6 +240,29 @@ def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys):
     page = (frame / "said.html").read_text()
     assert "Not predicted: 5" in page
     assert "broken off" in page
+
+
+@pytest.mark.parametrize(
+    ("words", "out"),
+    [
+        (["depth={at}/objects.csv", f"intrinsics={CAMERA}"], "objects.csv"),
+        (["depth={at}/objects.csv", f"intrinsics={CAMERA}"], "same.csv"),  # a link to it
+        (["depth={at}/depth.png", "mask={at}/mask.png", "intrinsics={at}/k.json"], "k.json"),
+        (["depth={at}/depth.png", "mask={at}/mask.png", "intrinsics={at}/k.html"], "k.csv"),
+        (["depth={at}/objects.csv"], "own.json"),  # of a row
+    ],
+)
+def test_what_is_read_is_not_replaced(frame, capsys, words, out):
+    lines = ("depth,mask,intrinsics", "depth.png,mask.png,own.json")
+    (frame / "objects.csv").write_text("\n".join(lines))
+    (frame / "same.csv").symlink_to(frame / "objects.csv")
+    for name in ("k.json", "k.html", "own.json"):
+        (frame / name).write_text(CAMERA)
+    before = {path: path.read_bytes() for path in frame.iterdir()}
+    given = [word.format(at=frame) for word in words]
+    assert predict("pointnet-speckle", frame / out, *given) == 1
+    assert "which is read; give another name" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in frame.iterdir()} == before
 
 
 def test_rows_of_a_list_whose_values_cannot_be_are_told(tmp_path):
