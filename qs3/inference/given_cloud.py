@@ -11,6 +11,7 @@ from torch import Tensor
 from qs3.clouds.finite import checked
 from qs3.clouds.shape import check_shape
 from qs3.errors import DataError
+from qs3.utils.plural import counted
 
 
 def given_cloud(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
@@ -21,12 +22,19 @@ def given_cloud(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
         name: of it, for messages.
 
     Raises:
-        DataError: something else, no points, or NaN or infinite coordinates; says which.
+        DataError: something else, no points, or NaN, infinite or masked coordinates; says which.
     """
     found = _array(cloud, name)
     if found.ndim != 2 or found.shape[1] < 3:
         raise DataError(f"{name}: the array has shape {found.shape}, expected [n, 3]")
     check_shape(name, found.shape)
+    if isinstance(cloud, np.ma.MaskedArray):  # numpy would hand on what it hides
+        masked = int(np.ma.getmaskarray(cloud)[:, :3].any(axis=1).sum())
+        if masked:
+            raise DataError(
+                f"{name}: {counted(masked, 'point is', 'points are')} masked; leave such points "
+                "out: numpy.ma.compress_rows(cloud)"
+            )
     return checked(found[:, :3], name)
 
 

@@ -27,9 +27,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.data.frames.given import Intrinsics, camera_of, check_intrinsics, check_metres, off_centre
+from qs3.config.checks import check_int
 from qs3.data.frames.images import Pinhole
-from qs3.data.frames.pointed import Pointed, point_out
+from qs3.data.frames.pointed import Pointed
 from qs3.data.importers.base import check_cloud
 from qs3.data.importers.folders import CloudFolder
 from qs3.datamodules.clouds import Clouds
@@ -39,6 +39,7 @@ from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
 from qs3.evaluation.prior import POWER, Prior, check_told, read_prior, shares_of
 from qs3.evaluation.trust import COMPARED, Known
+from qs3.inference.depth_image import DepthPrediction, objects_of
 from qs3.inference.floor import (
     camera_is_missing,
     check_camera_height,
@@ -52,6 +53,7 @@ from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.plural import counted
 
 BATCH = 32  # clouds: more are no faster on a CPU
+DIVERGED = "the classifier's answer is no number: its training has diverged"
 
 
 class Prepared(NamedTuple):
@@ -69,33 +71,6 @@ class Prepared(NamedTuple):
     given: int
     strange: tuple[str, ...]
     measures: tuple[float, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class DepthPrediction:
-    """A classifier's prediction for one object of a depth image.
-
-    Attributes:
-        name: "[3]", the number in the mask; "[210,95,480,430]", the box; "" of a mask of bool.
-        cls: the likeliest class; "" if nothing of the object was measured.
-        confidence: its probability, in [0, 1].
-        probabilities: [C] float64, in the order of the predictor's classes.
-        points_m: [n, 3] float32, z up, the camera at the origin.
-        tier: "clean", "hard", or "poor": datasets leave such objects out.
-        cautions: the reasons for `tier`, and what is not sure about the picture.
-        up: how the vertical is known: "given", "planes" of the picture, or "level" camera.
-        strange: how the cloud differs from all of training's; see `qs3.evaluation.ood`.
-    """
-
-    name: str
-    cls: str
-    confidence: float
-    probabilities: Float[np.ndarray, " c"]
-    points_m: Float[np.ndarray, "n 3"]
-    tier: str
-    cautions: tuple[str, ...]
-    up: str
-    strange: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +200,7 @@ class Predictor:
     def _said_by(
         self, net: nn.Module, points: Float[Tensor, "n m 3"], batch_size: int
     ) -> Float[np.ndarray, "n c"]:
-        found = predict(net, points, batch_size, self.device)
+        found = predict(net, points, check_int("batch_size", batch_size, 1), self.device)
         if found.shape[1] != len(self.classes):
             raise DataError(
                 f"the net tells {found.shape[1]} classes apart, the file names {len(self.classes)}"
@@ -241,7 +216,7 @@ class Predictor:
         floor: float | None = None,
         batch_size: int = BATCH,
     ) -> Float[np.ndarray, "n c"]:
-        """Class probabilities of clouds, float64, a row a cloud.
+        """Class probabilities of clouds, float64, a row a cloud; NaN if its training has diverged.
 
         Args:
             clouds: [N, P, 3], or a list of clouds with different numbers of points; their unit as
@@ -255,7 +230,7 @@ class Predictor:
         Raises:
             DataError: no list of clouds, or not as many names; or names the cloud that is empty or
                 not finite.
-            ConfigError: `floor` is needed, as `prepare` says.
+            ConfigError: `floor` is needed, as `prepare` says; `batch_size` is no number of clouds.
         """
         if clouds is None or isinstance(clouds, str | bytes) or not hasattr(clouds, "__iter__"):
             raise DataError(f"got {clouds!r:.60}; give a list of clouds, [n, 3] arrays")
@@ -289,7 +264,8 @@ class Predictor:
         """The classes of the objects of a mask, one a number, or of what lies in a box.
 
         Args:
-            depth_m: [h, w] floats, metres along the optical axis; 0 or not finite: not measured.
+            depth_m: [h, w] floats, metres along the optical axis; 0, not finite or masked: not
+                measured.
             camera: fx, fy, cx, cy in pixels, the centre of the top left one at (0, 0); or the
                 matrix [3, 3] of these.
             mask: [h, w] whole numbers or bool; 0 is background. Or:
@@ -303,24 +279,14 @@ class Predictor:
             In the order of the mask's numbers.
 
         Raises:
-            DataError: no depth image, a mask of another size, a box beside the picture, or
-                intrinsics that cannot be the picture's.
+            DataError: no depth image, a mask of another size, a box beside the picture,
+                intrinsics that cannot be the picture's, or no numbers where these are expected.
             ConfigError: `camera_height` is no height in metres, or nobody knows it.
         """
         if camera_height is None and self.needs_floor and self.camera_height is None:
             raise camera_is_missing()
         floor = None if camera_height is None else -check_camera_height(camera_height)
-        depth = np.asarray(depth_m)
-        if depth.ndim != 2 or depth.dtype.kind != "f":
-            raise DataError(
-                f"the depth image is {depth.dtype} {depth.shape}, expected floats [h, w] in metres"
-            )
-        check_metres(depth, "the depth image")
-        if not isinstance(camera, Pinhole):
-            camera = camera_of([float(value) for value in np.ravel(camera)], "camera")
-        check_intrinsics(given := Intrinsics(camera), depth, "the depth image")
-        unsure = [words] if (words := off_centre(given, depth)) else []
-        found = point_out(depth, camera, mask=mask, box=box, up=up)
+        found, unsure = objects_of(depth_m, camera, mask=mask, box=box, up=up)
         return [self._of_depth(one, unsure, floor) for one in found]
 
     def _of_depth(
@@ -328,14 +294,19 @@ class Predictor:
     ) -> DepthPrediction:
         points = one.piece.points_m
         cautions = (*(caution.words for caution in one.cautions), *unsure)
+        nothing = np.full(len(self.classes), np.nan)
         if one.why:
-            nothing = np.full(len(self.classes), np.nan)
             said = (*cautions, one.why)
             return DepthPrediction(
                 one.name, "", float("nan"), nothing, points, one.tier, said, one.up, ()
             )
         ready = self.prepare(one.cloud(self.result.gravity), one.name, floor=floor)
         (each,) = self.probabilities(ready.points[None])
+        if np.isnan(each).any():
+            said, strange = (*cautions, DIVERGED), ready.strange
+            return DepthPrediction(
+                one.name, "", float("nan"), nothing, points, one.tier, said, one.up, strange
+            )
         best = int(each.argmax())
         return DepthPrediction(
             one.name,

@@ -16,12 +16,10 @@ from qs3.inference.inputs import (
     Unit,
     reason_of,
 )
-from qs3.inference.predictor import Predictor, Prepared
+from qs3.inference.predictor import DIVERGED, Predictor, Prepared
 from qs3.inference.settings import Settings
 from qs3.inference.table import Row
 from qs3.models.norms import use_trained
-
-_DIVERGED = "the classifier's answer is no number: its training has diverged"
 
 
 def predict_units(
@@ -103,7 +101,7 @@ def _judged(
             prepared.items(), found, asked, others, strict=True
         ):
             if np.isnan(probabilities).any():
-                rows[i] = item.row(_DIVERGED, None), None
+                rows[i] = item.row(DIVERGED, None), None
                 continue
             row = item.row("; ".join(each.strange), probabilities)
             rows[i] = row._replace(second=other, measures=each.measures, asked=judged), item
@@ -111,9 +109,9 @@ def _judged(
 
 
 def _said(second: Predictor | None, items: Sequence[Sample], floor: float | None) -> list[str]:
-    """The classes that a second classifier names; "" if there is none."""
+    """The classes that a second classifier names; "" if there is none, or it has diverged."""
     if second is None:
         return [""] * len(items)
     clouds = [second.prepare(item.cloud, item.name, item.axis, floor).points for item in items]
     found = second.probabilities(torch.stack(clouds), len(clouds))
-    return [second.classes[best] for best in found.argmax(axis=1)]
+    return ["" if np.isnan(one).any() else second.classes[int(one.argmax())] for one in found]

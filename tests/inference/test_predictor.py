@@ -227,6 +227,15 @@ def test_what_is_no_list_of_clouds_is_told(predictor, test_clouds):
     with pytest.raises(DataError, match=r"point 3: .*leave such points out"):
         predictor([np.where(np.arange(64)[:, None] == 2, np.nan, cloud)])
     expected = predictor([cloud])
+    for size in (0, -1, 2.0, None):
+        with pytest.raises(ConfigError, match="batch_size must be a whole number >= 1"):
+            predictor([cloud], batch_size=size)
+    far = np.ma.masked_array(np.vstack([cloud, [[9, 9, 9]]]), mask=False)
+    far[-1, 2] = np.ma.masked  # numpy hands the 9 on where an array is asked for
+    with pytest.raises(DataError, match="cloud 0: 1 point is masked; leave such points out"):
+        predictor([far])
+    np.testing.assert_array_equal(predictor([np.ma.compress_rows(far)]), expected)
+    np.testing.assert_array_equal(predictor([far[:-1]]), expected)
     tensor = torch.from_numpy(cloud).requires_grad_()
     np.testing.assert_array_equal(predictor([tensor]), expected)
     np.testing.assert_array_equal(predictor([cloud.tolist()]), expected)
