@@ -10,13 +10,14 @@ import numpy as np
 
 from qs3.errors import DataError
 
+_MOST = 1e18  # of a coordinate: squares of distances overflow in float32 from about 1e19 on
 _FINE = 2.0**-13  # of the cloud, that a step of float32 may be: 0.1 mm of a chair
 
 
 def measured(cloud: np.ndarray, where: str) -> tuple[np.ndarray, int]:
     """[n, 3] without the points that are NaN or infinite, and how many these were.
 
-    Numbers too large for float32 stay: `checked` names them.
+    Numbers too large for float32, or for distances in it, stay: `checked` names them.
 
     Raises:
         DataError: no point is left.
@@ -37,8 +38,9 @@ def checked(cloud: np.ndarray, where: str) -> np.ndarray:
     where a cloud lies, but z is its height.
 
     Raises:
-        DataError: no points, a value that is not finite in float32 (above 3.4e38, or NaN), z too
-            far from 0, or numbers that have lost their digits already.
+        DataError: no points, a value that is not finite in float32 (above 3.4e38, or NaN), or
+            above 1e18, where distances are not; z too far from 0, or numbers that have lost their
+            digits already.
     """
     if len(cloud) == 0:
         raise DataError(f"{where}: there are no points")
@@ -49,6 +51,12 @@ def checked(cloud: np.ndarray, where: str) -> np.ndarray:
         raise DataError(
             f"{where}, point {row + 1}: {cloud[row].tolist()} is not finite in float32; "
             "leave such points out"
+        )
+    if (large := np.abs(small).max(axis=1) > _MOST).any():
+        row = int(np.flatnonzero(large)[0])
+        raise DataError(
+            f"{where}, point {row + 1}: {cloud[row].tolist()} is too far away for distances in "
+            "float32; if such numbers stand for no measurement, leave such points out"
         )
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     extent = float((high.astype(np.float64) - low.astype(np.float64)).max())

@@ -36,3 +36,14 @@ def test_what_float32_can_hold_is_only_cast():
 def test_lost_digits_and_lost_heights_are_named(cloud, message):
     with pytest.raises(DataError, match=message):
         checked(cloud, "a")
+
+
+@pytest.mark.parametrize("value", [3.4e38, -1e20])  # the largest float32 is some cameras' nothing
+def test_numbers_whose_squares_overflow_are_named(value):
+    cloud = CLOUD.copy()
+    cloud[7, 1] = value
+    with pytest.raises(DataError, match=r"a, point 8: .* too far away for distances in float32"):
+        checked(cloud, "a")
+    with np.errstate(over="raise"):
+        large = checked(1e18 * CLOUD.astype(np.float32), "a")
+        assert np.isfinite(np.square(large - large[0]).sum(axis=1)).all()
