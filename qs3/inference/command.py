@@ -7,6 +7,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from qs3.data.importers.object_archive import read_archive
 from qs3.data.place import is_archive
 from qs3.errors import ConfigError, DataError
@@ -32,6 +34,7 @@ from qs3.inference.trusted import trust_of, without_labels
 from qs3.inference.units import predict_units
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import make_folder, write_text
+from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar
 
 
@@ -66,11 +69,19 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
     began, gallery, rows = time.monotonic(), Gallery(classes), []
-    with progress_bar(f"{inputs.kind} read", total=len(inputs.units)) as advance:
-        for row, sample in predict_units(predictor, inputs.units, settings, advance, second):
-            rows.append(row)
-            if sample and settings.page:
-                gallery.add(row, sample)
+    try:
+        with progress_bar(f"{inputs.kind} read", total=len(inputs.units)) as advance:
+            for row, sample in predict_units(predictor, inputs.units, settings, advance, second):
+                rows.append(row)
+                if sample and settings.page:
+                    gallery.add(row, sample)
+    except torch.OutOfMemoryError as error:
+        batches = counted(settings.threads, "batch", "batches")
+        raise ConfigError(
+            f"device={settings.device} has no memory for {batches} of "
+            f"{counted(settings.batch_size, 'cloud')} at a time: give a smaller batch_size=, or "
+            f"threads=1 ({str(error).splitlines()[0]})"
+        ) from error
     seconds = time.monotonic() - began
     records = [record(row, classes) for row in rows]
     trained_on, worth = _trained_on(ckpt), predictor.result.worth

@@ -18,6 +18,7 @@ from qs3.config.location import typed
 from qs3.data.store import open_pointset
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.model_file import read_result, write_result
+from qs3.models.dgcnn import DGCNN
 from qs3.runs.predictions import read_predictions
 from tests.commands import main
 from tests.data.importers.own_clouds import write_odd
@@ -262,6 +263,20 @@ def test_a_net_that_diverged_says_so_of_each_cloud(run, clouds, tmp_path, suffix
     assert main(["predict", *words, f"second={tmp_path / 'nan.pt'}"]) == 0
     rows = table(out) if suffix == ".csv" else json.loads(out.read_text())["clouds"]
     assert all(row["class"] and not row["second"] for row in rows)
+
+
+def test_a_device_without_memory_is_told(run, clouds, tmp_path, capsys, monkeypatch):
+    """Only a GPU runs out of it; here the net says so."""
+
+    def full(self: DGCNN, points: torch.Tensor) -> None:
+        raise torch.OutOfMemoryError("Tried to allocate 20.00 MiB.\nand more")
+
+    monkeypatch.setattr(DGCNN, "forward", full)
+    np.save(tmp_path / "a.npy", clouds[:3])
+    assert predict(run, tmp_path / "a.npy", tmp_path / "said.csv", "batch_size=2") == 1
+    said = capsys.readouterr().err
+    assert "ConfigError: device=cpu has no memory for 2 batches of 2 clouds at a time" in said
+    assert "give a smaller batch_size=, or threads=1 (Tried to allocate 20.00 MiB.)" in said
 
 
 def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):
