@@ -24,8 +24,8 @@ OPENS = re.compile(
 )
 
 OWN = {
-    "config/compose.py": "the defaults of a preset that the user names, which Hydra reads as well",
     "config/hydra.py": "comments of our own configs",
+    "config/preset_base.py": "the defaults of a preset that the user names, which Hydra reads, too",
     "data/download/catalogue.py": "a file of the package",
     "data/inspection/gravity.py": "a file of the package",
     "data/place.py": "the names in a zip; what is damaged is called no archive",
