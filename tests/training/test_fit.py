@@ -241,7 +241,7 @@ def test_the_samples_do_not_lie_under_the_name_of_version_1(toy, tmp_path):
         ("objective=accuracy", "objective=accuracy is refused"),
         ("report.pictures=perhaps", r"report\.pictures"),
         ("evaluation=null", "evaluation=null: these are several .* as evaluation.rotations=0"),
-        ("report=null", "report=null: .* as report.pictures=false"),
+        ("report=null", "report=null: .* set report.pictures=false"),
         ("data.sampler=balanced method=supervised", r"=balanced draws source clouds only"),
         ("selection.student=snd", r"selection\.student=snd .*set selection\.student="),
     ],
