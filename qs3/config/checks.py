@@ -6,7 +6,7 @@ import difflib
 import math
 import operator
 from collections.abc import Iterable, Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 from qs3.errors import ConfigError
@@ -15,10 +15,10 @@ _COMPARE = {">": operator.gt, ">=": operator.ge}
 
 
 def check_int(key: str, value: Any, least: int) -> int:
-    """The value; ConfigError unless it is a whole number not below `least`."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+    """The value; ConfigError unless it is a whole number, numpy's too, not below `least`."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ConfigError(f"{key} must be a whole number >= {least}, got {value!r}")
-    return value
+    return int(value)
 
 
 def check_float(key: str, value: Any, allowed: str = "") -> float:

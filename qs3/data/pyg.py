@@ -112,7 +112,7 @@ def from_pyg(
         DataError: a cloud does not fit; names split and position.
     """
     if points is not None:
-        points = check_int("points", points.item() if isinstance(points, np.integer) else points, 1)
+        points = check_int("points", points, 1)
     folder = Path(folder)
     if is_finished(folder) or is_begun(folder):
         raise ConfigError(f"{folder} holds something already; delete it or choose another folder")

@@ -117,17 +117,17 @@ class DomainData(LightningDataModule):
             domain = compose_domain(domain, {"paths.data_dir": str(data_dir)})
         domain.check_scale(scale)
         self.domain, self.scale = domain, scale
-        self.points = _whole("points", points, 1)
-        self.fps_starts = _whole("fps_starts", fps_starts, 1)
-        self.batch_size = _whole("batch_size", batch_size, 2)
-        self.eval_batch_size = _whole("eval_batch_size", eval_batch_size, 1)
-        self.seed = _whole("seed", seed, 0)
+        self.points = check_int("data.points", points, 1)
+        self.fps_starts = check_int("data.fps_starts", fps_starts, 1)
+        self.batch_size = check_int("data.batch_size", batch_size, 2)
+        self.eval_batch_size = check_int("data.eval_batch_size", eval_batch_size, 1)
+        self.seed = check_int("data.seed", seed, 0)
         self.augment, self.has_labels = augment, check_bool("data.labels", labels)
         self.val = check_choice("data.val", val, sorted(RULES))
         self.sampler = check_choice("data.sampler", sampler, SAMPLERS)
         few, each = clouds_a_split, clouds_a_class
-        self.clouds_a_split = few if few is None else _whole("clouds_a_split", few, 1)
-        self.clouds_a_class = each if each is None else _whole("clouds_a_class", each, 1)
+        self.clouds_a_split = few if few is None else check_int("data.clouds_a_split", few, 1)
+        self.clouds_a_class = each if each is None else check_int("data.clouds_a_class", each, 1)
         if not labels and (sampler == "balanced" or each is not None):
             key = "sampler=balanced" if sampler == "balanced" else f"clouds_a_class={each}"
             raise ConfigError(f"data.{key} goes by classes, but data.labels=false reads no label")
@@ -295,12 +295,6 @@ class DomainData(LightningDataModule):
             return self.trainer.current_epoch
         self._epochs += 1
         return self._epochs - 1
-
-
-def _whole(name: str, value: Any, least: int) -> int:
-    """A setting's whole number, perhaps numpy's; ConfigError if it is another or below `least`."""
-    plain = value.item() if isinstance(value, np.integer) else value
-    return check_int(f"data.{name}", plain, least)
 
 
 class Loader:

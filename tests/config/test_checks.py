@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_ranges
@@ -11,6 +12,7 @@ from qs3.errors import ConfigError
 @pytest.mark.parametrize("value", [None, "1", 1.0, True, 0])
 def test_int(value):
     assert check_int("a.b", 1, 1) == 1
+    assert type(check_int("a.b", np.int16(3), 1)) is int
     with pytest.raises(ConfigError, match=r"a\.b must be a whole number >= 1, got"):
         check_int("a.b", value, 1)
 
