@@ -11,12 +11,10 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
-from qs3.data.domain import Domain, compose_domain
+from qs3.data.domain import compose_domain
 from qs3.data.store import PointSet, open_pointset
-from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
-from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled, Unlabelled, load_clouds
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import unit_ball
@@ -56,15 +54,6 @@ class Mine(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.Adam(self.parameters(), 0.02)
-
-
-@pytest.fixture(scope="module")
-def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """24 training and 8 test clouds of each of three classes, in two domains."""
-    folder = tmp_path_factory.mktemp("data")
-    write_domain(folder, "specklenet10", noise=0.05)
-    write_domain(folder, "kinectsim10", noise=0.15)
-    return folder
 
 
 @pytest.fixture
@@ -222,8 +211,6 @@ def test_batches_in_metres_keep_the_clouds_sizes(data_dir):
     stored = open_pointset(data_dir / "kinectsim10").split("test").points.astype(np.float64)
     centred = stored - stored.mean(axis=1, keepdims=True)
     np.testing.assert_allclose(batch["points"].numpy(), centred, atol=1e-5)
-    with pytest.raises(ConfigError, match="domain specklenet10 are not in metres"):
-        adaptation(data_dir, scale="metres")
 
 
 def test_heights_are_taken_from_the_domain_s_floor(data_dir):
@@ -394,69 +381,3 @@ def test_numbers_of_numpy_are_numbers(data_dir):
         clouds_of(data.train_dataloader()),
         clouds_of(made(data_dir, clouds_a_class=9).train_dataloader()),
     )
-
-
-# --- two of them -------------------------------------------------------------------------------
-
-
-def adaptation(data_dir: Path, **settings: Any) -> AdaptationData:
-    domains = (Domain(name, "X", name, data_dir / name) for name in ("specklenet10", "kinectsim10"))
-    data = AdaptationData(
-        *domains, phases=Phases(2), scheme=SelfTrainingConfig(), augment=Augment(), batch_size=8,
-        seed=0, points=32, **settings,
-    )  # fmt: skip
-    data.prepare_data()
-    data.setup("fit")
-    return data
-
-
-def test_the_targets_training_clouds_are_what_the_adaptation_predicts(data_dir):
-    data = adaptation(data_dir)
-    target = made(data_dir, domain="kinectsim10", labels=False)
-    assert data.target.ids == target.train.ids
-    batches = list(data.predict_dataloader())
-    assert {tuple(batch["target"]) for batch in batches} == {("points",)}
-    found = torch.cat([batch["target"]["points"] for batch in batches])
-    assert torch.equal(found, data.target.points)
-    assert torch.equal(found, target.train.points)
-
-
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # Lightning's on trainers without a loader
-@pytest.mark.parametrize("where", ["cpu", "cuda", "meta"])
-def test_batches_are_pinned_for_a_gpu_alone(data_dir, monkeypatch, where):
-    """Memory cannot be pinned where there is no GPU, so what asks for it is counted."""
-    asked = []
-    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda x: asked.append(len(x)) or x)
-    data = adaptation(data_dir)
-    data.trainer = Trainer(accelerator="cpu", devices=1, logger=False, barebones=True)
-    root = property(lambda _: torch.device(where))
-    monkeypatch.setattr(type(data.trainer.strategy), "root_device", root)
-    for loader, name in (
-        (data.train_dataloader(), "source"),
-        (data.predict_dataloader(), "target"),
-    ):
-        asked.clear()
-        points = next(iter(loader))[name]["points"]
-        assert (len(points) in asked) == (where == "cuda")
-        assert bool(asked) == (where == "cuda")
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs an NVIDIA GPU")
-def test_memory_of_batches_is_pinned(data_dir):
-    data = adaptation(data_dir)
-    data.trainer = Trainer(accelerator="gpu", devices=1, logger=False, barebones=True)
-    assert next(iter(data.train_dataloader()))["source"]["points"].is_pinned()
-
-
-def test_the_adaptation_has_the_source_s_labels_and_no_test_clouds(data_dir):
-    data = adaptation(data_dir)
-    source = made(data_dir)
-    for ours, theirs in ((data.labelled, source.train), (data.validation, source.validation)):
-        assert ours.ids == theirs.ids
-        assert torch.equal(ours.labels, theirs.labels)
-    assert torch.equal(data.all_labelled.all(), source.whole.points)
-    assert data.labelled_domain.test is data.target_domain.test is None
-    assert isinstance(data.target_domain.whole, Unlabelled)
-    bound = adaptation(data_dir, owner="target_train")
-    assert bound.labelled_domain.domain.name == "kinectsim10"
-    assert isinstance(bound.target_domain.train, Unlabelled)

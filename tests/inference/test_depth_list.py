@@ -1,0 +1,60 @@
+"""Lists of depth images: how they are written, and rows whose values cannot be."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+
+from qs3.errors import DataError
+from qs3.inference.depth_list import Shown, find_shown
+
+CAMERA = "525,525,319.5,239.5"
+
+
+def test_rows_of_a_list_whose_values_cannot_be_are_told(tmp_path):
+    for value in ("-0.001", "0", "nan", "1000"):
+        (tmp_path / "a.csv").write_text(f"depth,mask,depth_scale\na.png,m.png,{value}\n")
+        ((one,), _) = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+        assert "metres a unit, in (0, 1]" in one.wrong
+    (tmp_path / "a.csv").write_text('depth,box,object\na.png,"60,20,100,100",7\n')
+    ((one,), _) = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+    assert "object=7 is the number of one of a mask; here is a box" in one.wrong
+
+
+@pytest.mark.parametrize("mark", [";", "\t"])
+def test_a_list_as_spreadsheets_write_it(tmp_path, mark):
+    rows = [
+        ["depth", "box", "mask", "object", "up", "depth_scale", "label"],
+        ["a.png", "60,20,100,100", "", "", "0,-1,0", "", "rod, long"],
+        ["b.png", "", "m.png", "7", "", "0.002", "slab"],
+    ]
+    lines = ["\ufeff" + mark.join(rows[0]), *(mark.join(row) for row in rows[1:])]
+    (tmp_path / "a.csv").write_text("\r\n".join(lines) + "\r\n", encoding="utf-8")
+    common = Shown("", intrinsics=CAMERA)
+    (first, second), _ = find_shown(str(tmp_path / "a.csv"), "", common)
+    assert (first.wrong, second.wrong) == ("", "")
+    assert (first.box, first.up, first.label) == ((60, 20, 100, 100), (0, -1, 0), "rod, long")
+    assert (second.mask, second.only, second.scale_m) == (tmp_path / "m.png", 7, 0.002)
+    with open(tmp_path / "b.csv", "w", newline="") as file:  # with commas it says the same
+        csv.writer(file).writerows(rows)
+    assert find_shown(str(tmp_path / "b.csv"), "", common)[0] == [first, second]
+
+
+@pytest.mark.parametrize("number", ["3.7", "true", "1.0000001"])
+def test_an_object_of_a_list_is_a_whole_number(tmp_path, number):
+    (tmp_path / "a.yaml").write_text(f"- {{depth: a.png, mask: m.png, object: {number}}}\n")
+    found, _ = find_shown(str(tmp_path / "a.yaml"), "", Shown("", intrinsics=CAMERA))
+    assert "expected the whole number of an object" in found[0].wrong
+
+
+def test_rows_of_a_list_with_numbers_without_end_are_told(tmp_path):
+    rows = "- {depth: a.png, mask: m.png, object: .inf}\n"
+    rows += f"- {{depth: a.png, box: [1, 2, 3, 1{'0' * 400}]}}\n"
+    (tmp_path / "a.yaml").write_text(rows)
+    found, _ = find_shown(str(tmp_path / "a.yaml"), "", Shown("", intrinsics=CAMERA))
+    assert "object=inf: expected the whole number" in found[0].wrong
+    assert "box=" in found[1].wrong
+    (tmp_path / "a.yaml").write_text("- depth: 2020-99-99\n")
+    with pytest.raises(DataError, match=r"a\.yaml is not readable: month must be"):
+        find_shown(str(tmp_path / "a.yaml"), "", Shown(""))
