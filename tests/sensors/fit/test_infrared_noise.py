@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+import torch.autograd.forward_ad as forward_ad
 
 from qs3.sensors.fit.infrared_noise import Speckled, noise_residuals, over_time, through
 from qs3.sensors.gradients.twin import gaussian
@@ -131,6 +132,31 @@ def test_through_is_a_convolution_down_and_along():
                 slow[r, c] += down[i] * along[j] * image[y, x]
     found = through(*(torch.from_numpy(x) for x in (image, down, along)))
     np.testing.assert_allclose(found, slow, atol=1e-12)
+
+
+@pytest.mark.parametrize("which", [(0,), (1,), (0, 1)])
+def test_the_tangent_of_through_is_a_finite_difference(which):
+    generator = torch.Generator().manual_seed(0)
+    image, *kernels = (
+        torch.rand(shape, generator=generator, dtype=torch.float64) for shape in ((12, 15), 5, 3)
+    )
+    moved = [torch.rand_like(kernel) if i in which else None for i, kernel in enumerate(kernels)]
+    step = 1e-4
+
+    def at(scale):
+        return through(
+            image,
+            *(k if m is None else k + scale * m for k, m in zip(kernels, moved, strict=True)),
+        )
+
+    with forward_ad.dual_level():
+        dual = [
+            k if m is None else forward_ad.make_dual(k, m)
+            for k, m in zip(kernels, moved, strict=True)
+        ]
+        value, tangent = forward_ad.unpack_dual(through(image, *dual))
+    torch.testing.assert_close(value, at(0.0))
+    torch.testing.assert_close(tangent, (at(step) - at(-step)) / (2 * step))
 
 
 def test_the_lens_of_width_zero_is_none():
