@@ -111,7 +111,7 @@ The page shows the objects: with labels the errors first, the most confident bef
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.
 """,
     bare="input",
-    interrupted="nothing was saved",
+    interrupted="out= was not written",
 )
 
 EXPORT = Command(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -28,14 +31,16 @@ from qs3.inference.model_file import find_result
 from qs3.inference.page import Gallery, page
 from qs3.inference.predictor import Predictor, load
 from qs3.inference.settings import Inputs, Settings, Source
-from qs3.inference.table import as_csv, as_json, record
+from qs3.inference.table import Row, as_csv, as_json, record
 from qs3.inference.told import agreement, chosen, told
 from qs3.inference.trusted import trust_of, without_labels
 from qs3.inference.units import predict_units
-from qs3.runs.metrics import read_metrics
+from qs3.runs.metrics import Trust, read_metrics
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar
+
+log = logging.getLogger(__name__)
 
 
 def predict_command(settings: Settings) -> tuple[str, int]:
@@ -68,14 +73,18 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         raise camera_is_missing(key, why)
     out = Path(settings.out).expanduser()
     make_folder(out.parent)
-    began, gallery, rows = time.monotonic(), Gallery(classes), []
+    began, gallery = time.monotonic(), Gallery(classes)
+    rows: list[Row] = []
     try:
         with progress_bar(f"{inputs.kind} read", total=len(inputs.units)) as advance:
             for row, sample in predict_units(predictor, inputs.units, settings, advance, second):
                 rows.append(row)
                 if sample and settings.page:
                     gallery.add(row, sample)
-    except torch.OutOfMemoryError as error:
+    except BaseException as error:
+        _save_part(out, rows, predictor)
+        if not isinstance(error, torch.OutOfMemoryError):
+            raise
         batches = counted(settings.threads, "batch", "batches")
         raise ConfigError(
             f"device={settings.device} has no memory for {batches} of "
@@ -98,12 +107,7 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         lines += [agreement(rows, classes)] if second else []
         lines += [f"the classifier's data: {trained_on}"] * bool(trained_on)
         lines += [f"what it is worth: {worth}"] * bool(worth)
-    if out.suffix.lower() == ".json":
-        about = (trust, predictor.prior, trust is not None and predictor.before_target is not None)
-        text = as_json(records, classes, predictor.result.target, *about)
-    else:
-        text = as_csv(records, classes)
-    lines.append(_save(out, text))
+    lines.append(_save(out, _table(out, records, predictor, trust)))
     if settings.page:
         title = f"{_title(settings.input or settings.depth)}, as {printable_name(ckpt)} sees it"
         where = _floor_m(settings, predictor)
@@ -111,6 +115,26 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         html = page(title, rows, gallery, classes, trained_on, worth, taken, shown, where)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _table(
+    out: Path, records: Sequence[Mapping[str, Any]], predictor: Predictor, trust: Trust | None
+) -> str:
+    if out.suffix.lower() != ".json":
+        return as_csv(records, predictor.classes)
+    about = (trust, predictor.prior, trust is not None and predictor.before_target is not None)
+    return as_json(records, predictor.classes, predictor.result.target, *about)
+
+
+def _save_part(out: Path, rows: Sequence[Row], predictor: Predictor) -> None:
+    """Save what was said before something stopped it, beside `out`, where a whole table may lie."""
+    if rows:
+        part = out.with_name(f"{out.stem}.part{out.suffix}")
+        records = [record(row, predictor.classes) for row in rows]
+        words = _save(part, _table(part, records, predictor, None))
+        log.warning(
+            "stopped after %s: %s, which is no whole table", counted(len(rows), "cloud"), words
+        )
 
 
 def _title(place: str) -> str:

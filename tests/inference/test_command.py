@@ -14,6 +14,7 @@ import torch
 import trimesh
 
 import qs3
+import qs3.inference.inputs
 from qs3.config.location import typed
 from qs3.data.store import open_pointset
 from qs3.geometry.sampling import surface_sample
@@ -277,6 +278,39 @@ def test_a_device_without_memory_is_told(run, clouds, tmp_path, capsys, monkeypa
     said = capsys.readouterr().err
     assert "ConfigError: device=cpu has no memory for 2 batches of 2 clouds at a time" in said
     assert "give a smaller batch_size=, or threads=1 (Tried to allocate 20.00 MiB.)" in said
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".json"])
+def test_what_was_said_before_ctrl_c_is_kept_beside_the_table(
+    run, clouds, tmp_path, monkeypatch, caplog, capsys, suffix
+):
+    for i in range(30):
+        write(tmp_path / f"in/{i:02}.npy", clouds[i % len(clouds)])
+    real = qs3.inference.inputs.parse_clouds
+
+    def parse(path: Path):
+        if path.name == "29.npy":
+            raise KeyboardInterrupt
+        return real(path)
+
+    words = [f"ckpt={run}", f"input={tmp_path / 'in'}", f"out={tmp_path / ('a' + suffix)}"]
+    words += ["batch_size=4", "threads=1", "page=false"]
+    assert main(["predict", *words]) == 0
+    whole = (tmp_path / f"a{suffix}").read_text()
+    monkeypatch.setattr(qs3.inference.inputs, "parse_clouds", parse)
+    assert main(["predict", *words]) == 130
+    assert capsys.readouterr().err.endswith("interrupted; out= was not written\n")
+    part = tmp_path / f"a.part{suffix}"
+    assert (tmp_path / f"a{suffix}").read_text() == whole, "a whole table was replaced"
+    assert f"saved {part}, which is no whole table" in caplog.text
+    if suffix == ".csv":
+        lines = part.read_text().splitlines()
+        assert 1 < len(lines) < 30
+        assert whole.splitlines()[: len(lines)] == lines
+    else:
+        said = json.loads(part.read_text())
+        assert json.loads(whole)["clouds"][: len(said["clouds"])] == said["clouds"]
+        assert said["clouds"] and said["trust"] is None
 
 
 def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):
