@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from qs3.config.location import CONF
 from qs3.errors import ConfigError
-from qs3.utils.cli import hint_of
+from qs3.utils.hints import hint_of
 
 _ONE_RUN = "one run at a time: call it once for each seed"
 _NO_NAME = re.compile(r"null|true|false|[-+]?[\d_.]+", re.IGNORECASE)  # to Hydra

@@ -6,7 +6,6 @@ declaration. Declaring is light: a command imports what it works with when it ru
 
 from __future__ import annotations
 
-import difflib
 import functools
 import os
 import re
@@ -22,6 +21,7 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 from qs3.errors import ConfigError, Qs3Error
+from qs3.utils.hints import hint_of, missing_of, nearest
 from qs3.utils.threads import let_waiting_threads_sleep
 from qs3.utils.version import VERSION
 
@@ -30,7 +30,6 @@ INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help")
 _WIDTH = 100
-_BEGINS = 3  # letters that tell which word they begin
 # Flags of Hydra that show something and end.
 _SHOWS = (*_HELP, "--hydra-help", "--version", "--cfg", "-c", "--info", "-i", "-sc")
 
@@ -221,13 +220,13 @@ class Command:
     def _unknown(self, word: str, key: str) -> str:
         known = [*(option.key for option in self.options), *self.others]
         what = f"unknown key {key!r}" if key else f"{word!r} is not key=value"
-        near = _near(key, known)
+        near = nearest(key, known)
         hint = f"did you mean {near}=?" if near else f"keys are {', '.join(known)}"
         return f"{what}; {hint} (see {self.name} --help)"
 
     def _missing(self, options: Sequence[Option], given: Sequence[str]) -> str:
         keys = ", ".join(f"{option.key}={option.kind.word}" for option in options)
-        near = [f"; not {_near(o.key, given)}=" for o in options if _near(o.key, given)]
+        near = [f"; not {nearest(o.key, given)}=" for o in options if nearest(o.key, given)]
         choices = [f": one of {', '.join(o.choices())}" for o in options if o.choices is not tuple]
         first = "\n".join(self.examples).replace("\\\n", "").partition("\n")[0]
         hint = "".join(near or choices) or f"; for example: {' '.join(first.split())}"
@@ -278,7 +277,7 @@ class Group:
             return 0
         if self.default and "=" in first:
             return self.command(self.default)(argv)
-        near = _near(first, self.commands)
+        near = nearest(first, self.commands)
         raise ConfigError(
             f"unknown command {first!r}; "
             + (f"did you mean {near}?" if near else f"there are {', '.join(self.commands)}")
@@ -348,6 +347,11 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
                 raise
             print(f"\n{what}; run the same command again and it continues", file=sys.stderr)
             sys.exit(status)
+        except Exception as error:  # of Hydra's own keys, as the folder of a run; others it tells
+            if not (told := missing_of(error, sys.argv[1:])):
+                raise
+            print(told, file=sys.stderr)
+            sys.exit(1)
 
     return command
 
@@ -356,47 +360,6 @@ def _terminate(number: int, frame: FrameType | None) -> None:
     """End as after Ctrl-C, with all that is to be put away; a second SIGTERM ends at once."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     raise SystemExit(TERMINATED)
-
-
-def _near(word: str, known: Iterable[str]) -> str:
-    """The choice that is meant: the first that the word begins, else the one most like it."""
-    known = list(known)
-    if len(word) >= _BEGINS and (longer := [one for one in known if one.startswith(word)]):
-        return longer[0]
-    return next(iter(difflib.get_close_matches(word, known, n=1)), "")
-
-
-def hint_of(error: BaseException | None, words: Sequence[str]) -> str:
-    """What to type instead of one of `words`, of Hydra's error of a choice or key there is not.
-
-    It goes below Hydra's own message, or behind it; "" of other errors.
-    """
-    asked, there = getattr(error, "missing_cfg_file", None), getattr(error, "options", None)
-    if asked and there:  # MissingConfigException
-        group, _, name = asked.rpartition("/")
-        keys = [word.removesuffix(f"={name}") for word in words if word.endswith(f"={name}")]
-        key = keys[0] if keys else group  # as it was typed: domain@data.target
-        return f"did you mean {key}={near}?" if (near := _near(name, there)) else ""
-    cause = error and error.__cause__  # of ConfigCompositionException, by OmegaConf
-    key, node = getattr(cause, "key", None), getattr(cause, "parent_node", None)
-    if not isinstance(key, str) or not isinstance(node, Mapping):
-        return ""
-    place = str(getattr(cause, "full_key", key)).removesuffix(key)
-    if near := _near(key, keys := [str(known) for known in node]):
-        return f"did you mean {place}{near}=?"
-    if below := [known for known in keys if _has(node, known, key)]:
-        return f"did you mean {place}{below[0]}.{key}=?"
-    keys = [known for known in keys if not known.startswith("_")]
-    return f"keys of {place.rstrip('.') or 'the config'} are {', '.join(keys)}" if keys else ""
-
-
-def _has(node: Mapping[str, Any], name: str, key: str) -> bool:
-    """Whether a part of a config has a key; values that cannot be resolved yet have none."""
-    try:
-        part = node[name]
-    except Exception:  # of any resolver: a hint never takes the place of the error it belongs to
-        return False
-    return isinstance(part, Mapping) and key in part
 
 
 def _page(

@@ -310,7 +310,8 @@ def test_what_was_said_before_ctrl_c_is_kept_beside_the_table(
     else:
         said = json.loads(part.read_text())
         assert json.loads(whole)["clouds"][: len(said["clouds"])] == said["clouds"]
-        assert said["clouds"] and said["trust"] is None
+        assert said["clouds"]
+        assert said["trust"] is None
 
 
 def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):

@@ -12,8 +12,6 @@ import time
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
-from omegaconf.errors import ConfigKeyError
 
 from qs3.__main__ import QS3
 from qs3.data.scannet.settings import Extraction
@@ -24,7 +22,6 @@ from qs3.utils.cli import (
     Command,
     Group,
     Option,
-    hint_of,
     one_of,
     run,
     several,
@@ -136,16 +133,6 @@ def test_an_example_of_two_lines_is_shown_whole():
         QS3.command("fit").parse([])
     assert "\\" not in str(told.value)
     assert re.search(r"for example: qs3 fit \S.* out=\S+ .*\(see qs3 fit --help\)", str(told.value))
-
-
-def test_a_hint_survives_values_that_cannot_be_resolved():
-    """Beside the key that is meant, one level down, stands what needs more than there is."""
-    node = OmegaConf.create({"a": "${nowhere.b}", "c": "${oc.env:QS3_NOT_SET}", "d": {"up": "z"}})
-    cause = ConfigKeyError("Key 'up' is not in struct")
-    cause.key, cause.full_key, cause.parent_node = "up", "data.target.up", node
-    error = RuntimeError()
-    error.__cause__ = cause
-    assert hint_of(error, ["data.target.up=y"]) == "did you mean data.target.d.up=?"
 
 
 def test_a_key_that_any_domain_might_have_is_named_if_one_is_missing():
@@ -275,6 +262,19 @@ def test_sigterm_ends_a_hydra_command(tmp_path):
     process = start(["-c", code.format(more="os.kill(os.getpid(), signal.SIGTERM)")], **pipes)
     assert process.communicate() == ("put away\n", "")
     assert process.returncode == -signal.SIGTERM
+
+
+def test_a_command_without_its_seed_ends_in_words(tmp_path):
+    code = (
+        "from omegaconf import OmegaConf\nfrom qs3.utils.cli import hydra_command\n"
+        "@hydra_command\ndef main():\n OmegaConf.create({'a': '${b}'}).a\nmain()"
+    )
+    process = start(["-c", code, "~b"], stderr=subprocess.PIPE, cwd=tmp_path)
+    said = process.communicate()[1]
+    assert said.splitlines() == [
+        "ConfigError: a: Interpolation key 'b' not found", "leave out ~b, which deletes it",
+    ]  # fmt: skip
+    assert process.returncode == 1
 
 
 @pytest.mark.parametrize(
