@@ -42,6 +42,9 @@ from qs3.utils.progress import progress_bar
 
 log = logging.getLogger(__name__)
 
+FEW = 64
+"""Files of which the clouds are counted before they are read."""
+
 
 def predict_command(settings: Settings) -> tuple[str, int]:
     """Predict and save.
@@ -76,9 +79,13 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     began, gallery = time.monotonic(), Gallery(classes)
     rows: list[Row] = []
     try:
-        with progress_bar(f"{inputs.kind} read", total=len(inputs.units)) as advance:
-            for row, sample in predict_units(predictor, inputs.units, settings, advance, second):
+        label, total, each = _steps(inputs)
+        with progress_bar(label, total=total) as advance:
+            after = _nothing if each else advance
+            for row, sample in predict_units(predictor, inputs.units, settings, after, second):
                 rows.append(row)
+                if each:
+                    advance()
                 if sample and settings.page:
                     gallery.add(row, sample)
     except BaseException as error:
@@ -115,6 +122,21 @@ def predict_command(settings: Settings) -> tuple[str, int]:
         html = page(title, rows, gallery, classes, trained_on, worth, taken, shown, where)
         lines.append(_save(out.with_suffix(".html"), html))
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
+
+
+def _steps(inputs: Inputs) -> tuple[str, int, bool]:
+    """What the progress counts, how many, and whether these are the objects and not the files.
+
+    Objects where there are few files, one of which may hold thousands; to count those of many files
+    would take as long as to read them.
+    """
+    if inputs.sizes is None or len(inputs.units) > FEW:
+        return f"{inputs.kind} read", len(inputs.units), False
+    return "clouds", sum(inputs.sizes()), True
+
+
+def _nothing() -> None:
+    """Of a step that is not counted."""
 
 
 def _table(

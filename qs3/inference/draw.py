@@ -32,7 +32,7 @@ def draw(inputs: Inputs, count: int | None) -> Inputs:
     if count >= sum(sizes):
         return inputs
     chosen = np.sort(np.random.default_rng(0).choice(sum(sizes), count, replace=False))
-    units, first = [], 0
+    units, drawn, first = [], [], 0
     for unit, size in zip(inputs.units, sizes, strict=True):
         wanted = (chosen[(chosen >= first) & (chosen < first + size)] - first).tolist()
         first += size
@@ -40,7 +40,8 @@ def draw(inputs: Inputs, count: int | None) -> Inputs:
             units.append(unit)
         elif wanted:
             units.append(functools.partial(_some, unit, wanted, size))
-    return inputs._replace(units=units, sizes=None)
+        drawn += [len(wanted)] if wanted else []
+    return inputs._replace(units=units, sizes=lambda: drawn)
 
 
 def clouds_in(files: Sequence[Path]) -> list[int]:

@@ -14,6 +14,7 @@ import torch
 import trimesh
 
 import qs3
+import qs3.inference.command
 import qs3.inference.inputs
 from qs3.config.location import typed
 from qs3.data.store import open_pointset
@@ -76,7 +77,7 @@ def test_test_clouds_get_what_the_run_said(run, data_dir, clouds, tmp_path, caps
     out = tmp_path / "new" / "said.csv"
     with caplog.at_level("INFO"):
         assert predict(run, tmp_path / "test.npy", out, "batch_size=7") == 0
-    assert "files read: 1 of 1" in caplog.text
+    assert "clouds: 24 of 24, " in caplog.text
     expected = read_predictions(run / "predictions.csv")
     rows = table(out)
     assert [row["file"] for row in rows] == [f"test.npy[{i}]" for i in range(24)]
@@ -312,6 +313,18 @@ def test_what_was_said_before_ctrl_c_is_kept_beside_the_table(
         assert json.loads(whole)["clouds"][: len(said["clouds"])] == said["clouds"]
         assert said["clouds"]
         assert said["trust"] is None
+
+
+def test_progress_counts_clouds_where_files_are_few(run, clouds, tmp_path, caplog, monkeypatch):
+    caplog.set_level("INFO", logger="qs3")
+    np.save(tmp_path / "a.npy", clouds[:5])
+    assert predict(run, tmp_path / "a.npy", tmp_path / "a.csv") == 0
+    assert "clouds: 5 of 5, " in caplog.text
+    assert predict(run, tmp_path / "a.npy", tmp_path / "a.csv", "sample=3") == 0
+    assert "clouds: 3 of 3, " in caplog.text
+    monkeypatch.setattr(qs3.inference.command, "FEW", 0)
+    assert predict(run, tmp_path / "a.npy", tmp_path / "a.csv") == 0
+    assert "files read: 1 of 1, " in caplog.text
 
 
 def test_bytes_are_not_shown_as_they_are(run, tmp_path, capsys):
