@@ -203,7 +203,9 @@ class Classifier(LightningModule):
         if self._graphs is not None and self.trainer.accumulate_grad_batches == 1:
             self._graphs.begin_step()
             net = self._graphs.stand_in
-        terms = method.loss(net, {**batch, "progress": self._progress(batch_idx)}, generator)
+        begins = batch_idx % self.trainer.accumulate_grad_batches == 0
+        told = {"progress": self._progress(batch_idx), "step_begins": begins}
+        terms = method.loss(net, {**batch, **told}, generator)
         total = total_loss(method, terms)
         if self._regularisers:
             total = total + self.regulariser_weight * torch.stack(self._regularisers).sum()

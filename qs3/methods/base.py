@@ -1,9 +1,11 @@
 """What a method is: a loss on a batch, and perhaps heads of its own.
 
 A batch is `{"source": {"points": [B, N, 3], "y_source": [B]}, "target": {"points": ...},
-"progress": p}`, with only the domains that the method asks for. Labels carry their owner's name,
-so reading a label that one must not see is a KeyError. `p` in (0, 1] is the part of the warm-up
-that is done after this step: 1 in its last one.
+"progress": p, "step_begins": first}`, with only the domains that the method asks for. Labels
+carry their owner's name, so reading a label that one must not see is a KeyError. `p` in (0, 1] is
+the part of the warm-up that is done after this batch: 1 in its last one. `first`, True where it is
+not said, is whether it is the first of an optimiser's step, which may take several
+(`trainer.accumulate_grad_batches`).
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from qs3.config.checks import check_float
+from qs3.errors import ConfigError
 from qs3.methods.base import Method, feature_dims
 
 
@@ -52,8 +53,19 @@ class MeanTeacher(Method):
 
 @torch.no_grad()
 def move_towards(mean: nn.Module, net: nn.Module, part: Tensor) -> None:
-    """A running mean of weights and statistics takes `part` in [0, 1] of the net's."""
+    """A running mean of weights and statistics takes `part` in [0, 1] of the net's.
+
+    Raises:
+        ConfigError: weights are in half precision, in which a mean stands still: it rounds away
+            what a step adds, and a count beyond 256.
+    """
     theirs = net.state_dict()
+    if any(one.dtype in (torch.float16, torch.bfloat16) for one in theirs.values()):
+        raise ConfigError(
+            "trainer.precision: a running mean of a net's weights, as this method has, stands "
+            "still in half precision, which rounds its small steps away; set "
+            "trainer.precision=bf16-mixed, whose weights are float32, or 32-true"
+        )
     for name, value in mean.state_dict().items():
         if value.is_floating_point():
             value.lerp_(theirs[name], part.to(value))

@@ -74,7 +74,8 @@ class Sd(MeanTeacher):
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Terms "ce" and "consistency", each >= 0."""
-        self.follow(net)
+        if batch.get("step_begins", True):
+            self.follow(net)
         source = batch["source"]
         found = {}
         for domain in ("source", "target"):

@@ -137,7 +137,7 @@ class Twin(MeanTeacher):
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Terms "ce", "twin", "logits", "features", "again", "views" and "target", each >= 0."""
-        if self.teacher is not None:
+        if self.teacher is not None and batch.get("step_begins", True):
             self.follow(net)
         source = batch["source"]
         features = net.features(source["points"]).global_  # [B, D]

@@ -132,7 +132,7 @@ class Pcfea(Method):
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Terms "ce", and once there is a pool "align_source" and "align_target"; each >= 0."""
-        if self.teacher is not None:
+        if self.teacher is not None and batch.get("step_begins", True):
             move_towards(self.teacher, net, self.part)
         source = batch["source"]
         f, z = penultimate(net, source["points"])

@@ -1,0 +1,48 @@
+"""Steps of several batches (`trainer.accumulate_grad_batches`): a mean moves once in each."""
+
+from __future__ import annotations
+
+import pytest
+
+from qs3.config import hashing
+from qs3.errors import ConfigError
+from qs3.runs.checkpoints import load
+from qs3.training.command import train
+from tests.training.toy import TWIN
+
+FEATURED = "model._target_=tests.training.nets.featured"
+# Each epoch 15 batches of 4 clouds of 60: its last step is of one batch.
+SETTINGS = (
+    *(FEATURED, "protocol.epochs=2", "protocol.batch_size=4", "selftraining=none"),
+    *("+trainer.accumulate_grad_batches=2", "paths.warmup_dir=null"),
+)
+
+
+@pytest.mark.parametrize("method", [("method=sd",), TWIN], ids=["sd", "twin"])
+def test_means_count_the_steps_of_the_optimiser(toy, method):
+    cfg = toy(*method, *SETTINGS)
+    train(cfg)
+    saved = load(hashing.run_folder(cfg) / "last.ckpt")
+    batches = saved["loops"]["fit_loop"]["epoch_loop.batch_progress"]["total"]["completed"]
+    assert batches % 4 == 2, "an epoch ends within a step"
+    assert saved["global_step"] == 2 * -(-batches // 4)
+    assert saved["state_dict"]["method.steps"] == saved["global_step"]
+
+
+def test_the_mean_that_makes_pools_moves_as_often(toy, monkeypatch):
+    parts = []
+    monkeypatch.setattr(
+        "qs3.selftraining.pcfea.move_towards", lambda mean, net, part: parts.append(float(part))
+    )
+    cfg = toy("method=pcfea", "method.momentum=0.9", *SETTINGS)
+    train(cfg)
+    steps = load(hashing.run_folder(cfg) / "last.ckpt")["global_step"]
+    assert parts == pytest.approx([0.1] * steps)
+
+
+@pytest.mark.parametrize("precision", ["bf16-true", "16-true"])
+def test_a_mean_of_weights_in_half_precision_is_refused(toy, precision):
+    """Else it stands still: 1 - 0.999 of a weight's change is less than its last bit."""
+    cfg = toy("method=sd", *SETTINGS, f"trainer.precision={precision}")
+    with pytest.raises(ConfigError, match=r"set trainer\.precision=bf16-mixed"):
+        train(cfg)
