@@ -56,7 +56,8 @@ class DefRec(Method):
         check_float("method.defrec_weight", defrec_weight, "[0, 1]")
         self.defrec_weight, self.scale = defrec_weight, weight("scale", scale)
         self.min_points = check_int("method.min_points", min_points, 1)
-        self.pcm, self.on_source, self.dropout = pcm, on_source, dropout
+        self.pcm, self.on_source = pcm, on_source
+        self.dropout = check_float("method.dropout", dropout, "[0, 1]")
         self.head: ReconstructionHead | None = None
 
     def prepare(self, net: nn.Module) -> None:

@@ -68,7 +68,8 @@ class Mlsp(Method):
         self.normal_weight = weight("normal_weight", normal_weight)
         self.cardinality_weight = weight("cardinality_weight", cardinality_weight)
         self.min_points = check_int("method.min_points", min_points, 1)
-        self.pcm, self.dropout = pcm, dropout
+        self.pcm = pcm
+        self.dropout = check_float("method.dropout", dropout, "[0, 1]")
         self.head: ReconstructionHead | None = None
 
     def prepare(self, net: nn.Module) -> None:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from qs3.config.checks import check_int
 from qs3.errors import ConfigError
 from qs3.geometry.device import exact_products, takes_triton
 from qs3.geometry.matmul import linear
@@ -132,11 +133,8 @@ class DGCNN(Backbone):
         if variant not in VARIANTS:
             names = ", ".join(f"'{v}'" for v in VARIANTS)
             raise ConfigError(f"variant must be one of {names}, got {variant!r}")
-        if k < 1:
-            raise ConfigError(f"k must be at least 1, got {k}")
-        self.k = k
+        self.k = self.least_points = check_int("model.k", k, 1)
         self.variant = variant
-        self.least_points = k
         self.feature_dim = embedding if variant == "defrec" else 2 * embedding
         self.transform = EdgeTNet(norm) if variant == "defrec" else None
         self.edge_convs = nn.ModuleList(

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.config.checks import check_float, check_int
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import farthest_point_sampling, gather
@@ -59,7 +60,9 @@ class NodeModule(nn.Module):
         norm: str = "batch",
     ) -> None:
         super().__init__()
-        self.nodes, self.neighbours, self.radius = nodes, neighbours, radius
+        self.nodes = check_int("model.nodes", nodes, 1)
+        self.neighbours = check_int("model.neighbours", neighbours, 1)
+        self.radius = check_float("model.radius", radius, "> 0")
         self.offset = nn.Linear(channels, 3, bias=False)
         self.residual = PointMLP(channels, channels, norm=norm)
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.config.checks import check_int
 from qs3.errors import ConfigError
 from qs3.models.base import Backbone, Features, PointClassifier
 from qs3.models.norms import head_norm, make_norm
@@ -43,10 +44,8 @@ class SimpleView(Backbone):
         super().__init__()
         self.views = tuple(views)
         smallest = 9 if norm == "instance" else 8  # one pixel has no statistics
-        if image_size < smallest:
-            raise ConfigError(
-                f"image_size must be at least {smallest} with norm={norm}, got {image_size}"
-            )
+        check_int(f"model.image_size (with norm={norm})", image_size, smallest)
+        check_int("model.channels", channels, 1)
         if not self.views or not set(self.views) <= set(range(VIEWS)):
             raise ConfigError(f"views must be some of 0 to {VIEWS - 1}, got {list(views)}")
         if up not in ("y", "z"):

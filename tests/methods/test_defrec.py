@@ -90,6 +90,7 @@ def test_no_voxel_to_deform_is_no_loss_and_no_nan() -> None:
         ({"scale": -1.0}, "method.scale must be >= 0"),
         ({"scale": float("inf")}, "method.scale must be a finite number, got inf"),
         ({"min_points": 0}, "method.min_points"),
+        ({"dropout": -0.5}, r"method.dropout must be in \[0, 1\]"),
     ],
 )
 def test_wrong_settings_name_the_key(settings: dict, message: str) -> None:

@@ -154,6 +154,8 @@ def test_a_model_without_features_per_point_is_refused() -> None:
         Mlsp().prepare(net)
     with pytest.raises(ConfigError, match=r"method.position_weight must be in \[0, 1\]"):
         Mlsp(position_weight=2.0)
+    with pytest.raises(ConfigError, match=r"method\.dropout must be a number, got 'half'"):
+        Mlsp(dropout="half")
 
 
 def thin(points: Tensor) -> Tensor:
