@@ -7,12 +7,15 @@ interpolation, whoever named the folder.
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
+
+from qs3.errors import ConfigError
 
 
 def override(key: str, value: str | Path) -> str:
@@ -29,3 +32,18 @@ def quoted(text: str) -> str:
     except HydraException:
         read = None
     return text if read == text else QuotedString(text, Quote.single).with_quotes()
+
+
+def words_of(key: str, line: str) -> list[str]:
+    """The words of a line of overrides, as a shell takes it apart; `key`: whose value it is.
+
+    Raises:
+        ConfigError: a quotation mark or a backslash has no end.
+    """
+    try:
+        return shlex.split(line)
+    except ValueError as error:
+        raise ConfigError(
+            f"{key}={line}: {str(error).lower()}; a value with a quotation mark goes into others, "
+            "and so does one with spaces"
+        ) from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -31,10 +30,10 @@ def _built(
     columns: Sequence[str] = (),
 ) -> Table:
     """The table that the options ask for, with our runs; `runs`: there are some, one may think."""
-    from qs3.config.quoting import override
+    from qs3.config.quoting import override, words_of
     from qs3.report.tables.table import build_table
 
-    extra = shlex.split(overrides)
+    extra = words_of("overrides", overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
     if kept and not Path(kept).is_dir():
         raise ConfigError(f"kept={kept} is not there; `qs3 report keep` makes such a folder")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from qs3.config.compose import composed
-from qs3.config.quoting import override, quoted
+from qs3.config.quoting import override, quoted, words_of
 from qs3.errors import ConfigError
 from qs3.report.cli import _built
 from qs3.report.tables.running import Job, launch
@@ -71,6 +71,13 @@ def test_every_path_of_ours_reaches_the_config(tmp_path):
     (cell, *_) = [cell for cell in table.cells if cell.runnable]
     paths = composed("train", *cell.overrides).paths
     assert (paths.log_dir, paths.data_dir) == (str(folder), f"{folder}/data")
+
+
+def test_a_line_of_overrides_with_an_open_quote_is_an_error_for_people(tmp_path):
+    assert words_of("overrides", "a='1 2' b=3") == ["a=1 2", "b=3"]
+    for line in ("data.target.title=it's", 'a="b', "a=b\\"):
+        with pytest.raises(ConfigError, match=r"overrides=.*: no (closing|escaped)"):
+            _built("quickstart", str(tmp_path), None, None, line)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from qs3.classes import known_as
+from qs3.config.checks import check_float
 from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.prior import POWER, check_told
@@ -173,6 +174,9 @@ def judge(
             something else.
     """
     check_told(prior, prior_power)
+    check_float("prior_power", prior_power, ">= 0")
+    if floor is not None:
+        check_float("floor", floor)
     archive = read_archive(data)
     chosen, part = _chosen(archive, part)
     asks = [

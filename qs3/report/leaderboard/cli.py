@@ -43,14 +43,14 @@ def _leaderboard(
     more: Sequence[str],
 ) -> int:
     """Train what the row lacks, and print it beside the rows that are there."""
-    from qs3.config.quoting import override
+    from qs3.config.quoting import override, words_of
     from qs3.report.tables.formats import csv_text, latex, markdown
     from qs3.report.tables.running import launch, missing
     from qs3.report.tables.table import build_table
     from qs3.utils.files import write_text
 
     row = own_row(method, name, selftraining, more)
-    extra = shlex.split(overrides)
+    extra = words_of("overrides", overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
 
     def built() -> Table:

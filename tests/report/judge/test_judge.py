@@ -120,6 +120,19 @@ def test_runs_of_other_classes_are_judged_on_what_all_know(archive, logs, tmp_pa
         judge([str(camera)], archive)
 
 
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"floor": float("nan")}, "floor must be a finite number"),
+        ({"prior": "chair:4", "prior_power": float("inf")}, "prior_power must be"),
+        ({"prior": "chair:4", "prior_power": -1.0}, "prior_power must be"),
+    ],
+)
+def test_figures_that_are_none_are_refused(archive, logs, told, message):
+    with pytest.raises(ConfigError, match=message):
+        judge([str(logs / "other")], archive, **told)
+
+
 def test_runs_are_found(logs, tmp_path):
     assert len(find_runs([str(logs)])) == 3
     assert len(find_runs([f"{logs}/exp/seed*", str(logs / "exp")])) == 2
