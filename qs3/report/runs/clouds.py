@@ -13,7 +13,7 @@ from qs3.data.store import PointSet
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.figures.class_balance import class_picture
 from qs3.report.runs.data import RunFiles
-from qs3.report.runs.domains import domain_of, open_domain
+from qs3.report.runs.domains import domain_of, open_domain, positions_in
 from qs3.runs.predictions import Predictions
 from qs3.utils.plural import counted
 
@@ -116,14 +116,17 @@ class _Domains:
         rows: tuple[str, ...] = (),
     ) -> None:
         data = self.data("target")
-        place = {id_: i for i, id_ in enumerate(data.ids)}
+        there = [i for i in shown if i is not None]
+        place = dict(
+            zip(there, positions_in(data, self.run, [said.ids[i] for i in there]), strict=True)
+        )
 
         def title(i: int) -> str:
             named = f"{said.classes[said.predicted[i]]} {said.probabilities[i].max():.2f}"
             return named + (f", is {said.classes[said.labels[i]]}" if said.labels[i] >= 0 else "")
 
         contact_sheet(
-            [None if i is None else np.asarray(data.points[place[said.ids[i]]]) for i in shown],
+            [None if i is None else np.asarray(data.points[place[i]]) for i in shown],
             ["" if i is None else title(i) for i in shown],
             path,
             columns=_ROW,

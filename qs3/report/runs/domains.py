@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from qs3.data.domain import Domain
 from qs3.data.store import PointSet, is_finished
-from qs3.errors import Qs3Error
+from qs3.errors import DataError, Qs3Error
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs.data import RunFiles
+from qs3.runs.predictions import FILE
 
 _KEYS = tuple(field.name for field in dataclasses.fields(Domain))
 
@@ -63,3 +65,18 @@ def open_domain(run: RunFiles, role: str, data_dir: str | Path | None = None) ->
             "data_dir="
         )
     return data
+
+
+def positions_in(data: PointSet, run: RunFiles, ids: Sequence[str]) -> list[int]:
+    """Where the clouds of a run's predictions are in the dataset that `open_domain` gave.
+
+    Raises:
+        DataError: the dataset has no such cloud, although it is the one that the run used.
+    """
+    place = {id_: i for i, id_ in enumerate(data.ids)}
+    if odd := next((id_ for id_ in ids if id_ not in place), ""):
+        raise DataError(
+            f"{run.folder / FILE} is damaged (no cloud is called {odd!r}); repeat the run with "
+            "force=true"
+        )
+    return [place[id_] for id_ in ids]

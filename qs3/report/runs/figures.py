@@ -260,6 +260,8 @@ def calibration(run: RunFiles) -> Figure:
     """Reliability diagram of the result, and how many clouds each bin holds."""
     if run.predictions is None:
         raise NothingToDrawError("there is no predictions.csv")
+    if not np.isfinite(run.predictions.probabilities).all():
+        raise NothingToDrawError("the net has diverged: its probabilities are no numbers")
     found = reliability(run.predictions.probabilities, run.predictions.labels)
     if found is None:
         raise NothingToDrawError("the target has no labels")

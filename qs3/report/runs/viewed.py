@@ -14,7 +14,7 @@ from qs3.data.viewer.page import Part
 from qs3.errors import MissingDataError
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs.data import RunFiles
-from qs3.report.runs.domains import domain_of, open_domain
+from qs3.report.runs.domains import domain_of, open_domain, positions_in
 from qs3.runs.predictions import Predictions
 from qs3.utils.plural import counted
 
@@ -63,17 +63,15 @@ def part_of_run(
     except NothingToDrawError as error:
         raise MissingDataError(f"{run.folder}: {error}") from error
     opened = opened_domain(domain, data)
-    place = {id_: i for i, id_ in enumerate(data.ids)}
-    part = part_of(
-        opened, [place[said.ids[i]] for i in positions], residuals=residuals, advance=advance
-    )
+    rows = positions_in(data, run, [said.ids[i] for i in positions])
+    part = part_of(opened, rows, residuals=residuals, advance=advance)
     sure = said.probabilities.max(axis=1)
     shown = [
         dataclasses.replace(
             one,
             label="" if said.labels[i] < 0 else said.classes[said.labels[i]],
             called=said.classes[said.predicted[i]],
-            sure=float(sure[i]),
+            sure=float(sure[i]) if np.isfinite(sure[i]) else None,  # JSON knows no NaN
         )
         for one, i in zip(part.shown, positions, strict=True)
     ]

@@ -25,7 +25,7 @@ from qs3.report.runs.data import read_run
 from qs3.report.runs.pictures import AfterTraining, draw
 from qs3.runs.checkpoints import save
 from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
-from qs3.runs.predictions import read_predictions
+from qs3.runs.predictions import read_predictions, write_predictions
 from qs3.training.command import train
 from tests.commands import main
 from tests.report.made_runs import change, not_blank, table
@@ -170,6 +170,33 @@ def test_calibration_is_the_reported_error(run):
     axes = run_figures.calibration(read_run(run)).axes
     assert axes[1].containers[0].datavalues.sum() == 24
     assert heights(axes[0], "accuracy") == pytest.approx(found.accuracy[found.count > 0])
+
+
+def test_a_net_that_has_diverged_has_no_calibration_and_a_page_that_browsers_read(run):
+    """JSON.parse takes no NaN: the page of clouds would stay empty."""
+    p = read_predictions(run / "predictions.csv")
+    lost = replace(p, probabilities=np.full_like(p.probabilities, np.nan))
+    write_predictions(run / "predictions.csv", lost)
+    drawn = draw(run, embed=False)
+    assert "diverged" in drawn.skipped["calibration"]
+    assert "nan%" not in drawn.page.read_text()
+
+    def refused(constant):
+        raise AssertionError(constant)
+
+    (text,) = re.findall(r'id="clouds">(.*?)</script>', drawn.clouds.read_text())
+    data = json.loads(text, parse_constant=refused)
+    assert {one["sure"] for one in data["clouds"]} == {None}
+
+
+def test_predictions_of_a_cloud_that_the_data_lack_are_damaged(run):
+    path = run / "predictions.csv"
+    p = read_predictions(path)
+    write_predictions(path, replace(p, ids=tuple(f"{id_}?" for id_ in p.ids)))
+    drawn = draw(run, embed=False)
+    for name in ("mistakes", "clouds"):
+        assert f"{path} is damaged (no cloud is called" in drawn.skipped[name]
+    assert "confusion" in drawn.pictures
 
 
 def test_missing_round_folders(run):
