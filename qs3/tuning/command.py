@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
+from omegaconf import DictConfig
 from torch import Tensor
 
 from qs3.config.hydra import build
@@ -102,11 +103,42 @@ def tune(wanted: Wanted, overrides: Sequence[str]) -> Found:
     target, digest = target_clouds(wanted.target, wanted.sample, wanted.points, wanted.seed)
     describe = descriptor(wanted.features)
     distance = Distance(describe, target)
+    settings = _settings(wanted, cfg, trained, digest, keys, describe)
+    at = wanted.out.with_suffix(".search.json")
+    start = parameters.free(parameters.values_of(sensor, keys)).tolist()
+    zeros = [0.0] * len(keys)
+    state = read_state(at, settings) or State(settings, start, zeros, list(zeros))
+    renderer = Remembered(build(cfg.renderer))
+    if state.steps < wanted.steps:
+        _go_on(state, keys, wanted, recipe, trained, cfg.seed, renderer, distance, at)
+    found = parameters.as_floats(parameters.bounded(torch.tensor(settled(state)), keys))
+    judged = {}
+    for name, some in (("held_out", held), ("trained_on", trained)):
+        stills = [_unseen(recipe, item, cfg.seed, renderer) for item in some]
+        judged[name] = _judged(stills, found, distance, wanted)
+    return Found(
+        keys, parameters.values_of(sensor, keys), found, state.distances,
+        judged["held_out"], judged["trained_on"],
+        {"trained_on": len(trained), "held_out": len(held), "target": len(target)},
+        wanted.features,
+    )  # fmt: skip
+
+
+def _settings(
+    wanted: Wanted,
+    cfg: DictConfig,
+    trained: Sequence[MeshItem],
+    digest: str,
+    keys: Sequence[str],
+    describe: Descriptor,
+) -> str:
+    """Text of all that decides a search, see `State`; `digest`: of the target."""
     net = {"net": describe.sha256} if isinstance(describe, NetFeatures) else {}
-    settings = json.dumps(
+    return json.dumps(
         {
             "recipe": plan_settings(cfg),
-            "objects": [item.id for item in (*trained, *held)],
+            # Not the held-out ones, which only judge; and folders may have objects of one name.
+            "objects": [(item.id, item.load().sha256) for item in trained],
             "target": digest,
             "keys": keys,
             **net,
@@ -126,24 +158,6 @@ def tune(wanted: Wanted, overrides: Sequence[str]) -> Found:
         },
         sort_keys=True,
     )
-    at = wanted.out.with_suffix(".search.json")
-    start = parameters.free(parameters.values_of(sensor, keys)).tolist()
-    zeros = [0.0] * len(keys)
-    state = read_state(at, settings) or State(settings, start, zeros, list(zeros))
-    renderer = Remembered(build(cfg.renderer))
-    if state.steps < wanted.steps:
-        _go_on(state, keys, wanted, recipe, trained, cfg.seed, renderer, distance, at)
-    found = parameters.as_floats(parameters.bounded(torch.tensor(settled(state)), keys))
-    judged = {}
-    for name, some in (("held_out", held), ("trained_on", trained)):
-        stills = [_unseen(recipe, item, cfg.seed, renderer) for item in some]
-        judged[name] = _judged(stills, found, distance, wanted)
-    return Found(
-        keys, parameters.values_of(sensor, keys), found, state.distances,
-        judged["held_out"], judged["trained_on"],
-        {"trained_on": len(trained), "held_out": len(held), "target": len(target)},
-        wanted.features,
-    )  # fmt: skip
 
 
 def _go_on(

@@ -16,6 +16,7 @@ from qs3.generation.scan import composed_recipe
 from qs3.inference.model_file import read_result, write_result
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.tuning import parameters
+from qs3.tuning.command import Wanted, _drawn, _settings
 from qs3.tuning.features import Distance, roughness
 from qs3.tuning.scenes import _points, check_recipe, still_of
 from qs3.tuning.search import search, settled
@@ -142,6 +143,24 @@ def test_the_command_writes_a_preset_that_composes_and_goes_on(target, tmp_path,
     assert out.read_text() == before
     assert main(words(target, out, "steps=2", "rate=0.3")) == 1
     assert "other settings" in capsys.readouterr().err
+
+
+def test_a_search_is_known_by_the_objects_that_it_searches_with():
+    """Not by how many are drawn in all, nor by their names alone."""
+    cfg = composed_recipe([*TINY, "classes=[chair,sofa]", "limit=6"])
+    items = [item for item in mesh_items(cfg) if item.split == "train"][:9]
+    names = ("sample", "steps", "batch", "points", "features", "slopes", "rate", "seed")
+    given = {**dict.fromkeys(names, 1), "target": None, "out": None, "parameters": ()}
+
+    def known(objects, held_out, items=items):
+        wanted = Wanted(**given, objects=objects, held_out=held_out)
+        trained, _ = _drawn(items, wanted)
+        return _settings(wanted, cfg, trained, "d", ("ambient",), roughness)
+
+    assert len(items) == 9
+    assert known(4, 5) == known(4, 4) != known(5, 4)
+    others = [replace(a, load=b.load) for a, b in zip(items, items[::-1], strict=True)]
+    assert known(4, 5, others) != known(4, 5)
 
 
 def test_a_preset_is_not_written_over_the_one_that_it_begins_with(target, tmp_path, capsys):
