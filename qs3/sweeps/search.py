@@ -33,6 +33,7 @@ from qs3.sweeps.ray_launcher import RayLauncher
 from qs3.sweeps.search_report import FAILED, Tried, report
 from qs3.sweeps.search_space import distribution, overrides, split, words
 from qs3.training.reuse import check_finished
+from qs3.utils.locks import alone
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -86,8 +87,22 @@ class LabelFreeSearch(OverLauncher):
             )
         space = {key: distribution(one) for key, one in searched.items()}
         study = self._study(cfg, space)
-        self._refuse_changed(study, fixed)
-        _try_again(study)
+        lock = self.file.with_name(f".{self.file.stem}.lock")
+        with alone(lock, f"another process is searching in {self.file}; wait for it or stop it"):
+            # What has no end there was interrupted, then, and is nobody's any more.
+            self._refuse_changed(study, fixed)
+            _try_again(study)
+            done = self._until_enough(study, fixed, space)
+        headline = f"Search by {cfg.objective}, which needs no labels; the study is {self.file}"
+        sys.stdout.write(report(headline, cfg.objective, _tried(study), fixed) + "\n")
+        for result in done:
+            _ = result.return_value  # raises if the job failed
+        return done
+
+    def _until_enough(
+        self, study: Study, fixed: Sequence[str], space: Mapping[str, BaseDistribution]
+    ) -> list[JobReturn]:
+        """Ask for trials, launch them and tell the study, until it has as many as it should."""
         done: list[JobReturn] = []
         while (left := self.trials - _count(study)) > 0 or _any(study, "WAITING"):
             batch = [self._ask(study, space) for _ in range(min(self.at_once, max(left, 1)))]
@@ -99,10 +114,6 @@ class LabelFreeSearch(OverLauncher):
             failed = all(result.status != JobStatus.COMPLETED for result in results)
             if failed and not _any(study, "COMPLETE"):
                 break  # e.g. no data: the next would end like these
-        headline = f"Search by {cfg.objective}, which needs no labels; the study is {self.file}"
-        sys.stdout.write(report(headline, cfg.objective, _tried(study), fixed) + "\n")
-        for result in done:
-            _ = result.return_value  # raises if the job failed
         return done
 
     def _refuse_changed(self, study: Study, fixed: Sequence[str]) -> None:

@@ -36,11 +36,22 @@ def owned(
             be made or written to.
     """
     folder = make_folder(folder)
-    with _open_lock(folder / _NAME) as file:
+    with alone(folder / _NAME, f"another process is {doing} {folder}; {advice}"):
+        yield
+
+
+@contextlib.contextmanager
+def alone(path: str | os.PathLike[str], otherwise: str) -> Iterator[None]:
+    """Hold an exclusive lock on the file `path` (created, never deleted); never wait.
+
+    Raises:
+        Qs3Error: another process has it: what `otherwise` says; or it cannot be written.
+    """
+    with _open_lock(Path(path)) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise Qs3Error(f"another process is {doing} {folder}; {advice}") from error
+            raise Qs3Error(otherwise) from error
         yield
 
 

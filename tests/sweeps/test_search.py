@@ -24,6 +24,7 @@ from qs3.sweeps.search import LabelFreeSearch
 from qs3.sweeps.search_report import Tried, report
 from qs3.sweeps.search_space import check_varied, distribution, split, words
 from qs3.training.command import judged, objective_of, train
+from qs3.utils.locks import alone
 from tests.commands import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
@@ -65,6 +66,12 @@ def test_it_finds_goes_on_and_is_repeatable(tmp_path):
     assert f"selftraining.theta={rows[int(best)][2]}" in typed
 
     search(parts, 3)
+    (lock,) = (parts / "logs" / "searches").glob(".*.lock")
+    with alone(lock, "held twice"):  # by a search that is still running: its trials are its own
+        result = search(parts, 9)
+    assert result.returncode == 1
+    assert "another process is searching in" in result.stderr
+    assert "Traceback" not in result.stderr
     result = search(parts, 9)
     assert table(result.stdout) == rows  # as if it had never been interrupted
     assert all(run["times"] == 1 for run in light_runs(parts).values())
