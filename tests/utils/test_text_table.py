@@ -1,5 +1,11 @@
 """Tables as text: by hand."""
 
+import csv
+import io
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+
 from qs3.utils.text_table import aligned, csv_text, latex_row, markdown
 
 ROWS = [("class", "n"), ("a|b", "1000"), ("é", "5 %")]
@@ -25,3 +31,10 @@ def test_csv_and_latex():
         'a,,0.1\n"x""y","1,2","two\nlines"\n'
     )
     assert latex_row(ROWS[2]) == r"é & 5 \% \\"
+
+
+@given(st.lists(st.lists(st.text(max_size=5), min_size=2, max_size=3), min_size=1, max_size=4))
+@example([["a\rb", "\r"]])
+def test_any_text_comes_back_from_csv(rows):
+    """Also a carriage return, which ends a line for whoever reads it."""
+    assert list(csv.reader(io.StringIO(csv_text(rows), newline=""))) == rows
