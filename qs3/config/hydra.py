@@ -36,13 +36,15 @@ def _wandb_id(*, _root_: DictConfig) -> str:
     return hashing.run_name(_root_).replace("/", "-")
 
 
-def _tags(*, _root_: DictConfig) -> list[str]:
-    """For loggers: method, self-training, net and domains, and whether the target is simulated."""
+def _tags(*, _root_: DictConfig) -> ListConfig:
+    """For loggers: method, self-training, net and domains, and whether the target is simulated.
+
+    A node of the config: OmegaConf cannot put a plain list in its place (`--cfg job --resolve`).
+    """
     names, data = component_names(_root_), _root_.data
     tags = [f"{data.source.name} -> {data.target.name}", *dict.fromkeys(names.values())]
-    return [tag for tag in tags if tag != "none"] + ["simulated"] * bool(
-        data.target.get("simulated")
-    )
+    simulated = ["simulated"] if data.target.get("simulated") else []
+    return ListConfig([tag for tag in tags if tag != "none"] + simulated)
 
 
 def _gpu_in_turn(gpus: int | None = None) -> int:

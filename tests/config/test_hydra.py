@@ -132,6 +132,14 @@ def test_tags(tmp_path):
     assert cfg.logger.wandb.tags == ["specklenet10 -> scannet10", "pcm", "tinynet"]
 
 
+def test_a_config_with_tags_can_be_resolved(tmp_path):
+    """As `--cfg job --resolve` does: a plain list would be refused there."""
+    cfg = toy_config(tmp_path, "logger=wandb")
+    OmegaConf.resolve(cfg)
+    logger = OmegaConf.to_container(cfg.logger.wandb)
+    assert logger["tags"] == list(toy_config(tmp_path, "logger=wandb").logger.wandb.tags)
+
+
 def test_a_choice_that_is_none_is_told_those_that_are():
     with pytest.raises(ConfigError, match=r"^here: .*'light/nothing'; there are ") as caught:
         composed("generate", "light=nothing", place="here: ")
