@@ -192,7 +192,9 @@ def evaluate(run: Run, loaded: Loaded, built: Built) -> Outcome:
 
     @cache
     def prior_of(weights: Path) -> Prior | None:
-        met = loaded.learnt if weights in (files["selected"], files["last"]) else learnt
+        # A given teacher learnt elsewhere, but the warm-up's last net from the labelled clouds.
+        warmups = {files["selected"]: loaded.learnt, files["last"]: loaded.labelled}
+        met = warmups.get(weights, learnt)
         said = partial(nets.of_target, weights)
         return class_shares.prior_of(run.cfg.evaluation, evaluation.classes, met, said)
 

@@ -36,7 +36,7 @@ class Loaded:
         started: what `started.json` says: hashes of data and config, versions.
         made_of: what the labelled dataset and the target are made of.
         labelled: shares of the classes in the labelled clouds, as they are drawn.
-        learnt: the same in what the warm-up's net learnt from; another's, if it was given.
+        learnt: the same in what the first teacher learnt from; another's, if it was given.
     """
 
     data: AdaptationData

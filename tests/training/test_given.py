@@ -118,6 +118,19 @@ def test_a_students_shares_are_of_its_own_source(toy, finished, tmp_path):
     assert learnt == pytest.approx(both, abs=0.02)
 
 
+def test_a_prior_weighs_each_net_by_what_it_learnt_from(toy, finished, tmp_path):
+    """The teacher by the shares it came with, the warm-up's last net by the run's own source."""
+    result, warmups = read_result(finished), []
+    for name, learnt in (("even.pt", (1 / 3, 1 / 3, 1 / 3)), ("uneven.pt", (0.98, 0.01, 0.01))):
+        write_result(tmp_path / name, replace(result, learnt=learnt))
+        words = ("selftraining=none", "selection.teacher=given", f"weights={tmp_path / name}")
+        prior = ("evaluation.prior={ball: 1}", "evaluation.prior_power=1.0")
+        warmups.append(train(toy(*words, *prior, "protocol.epochs=1")).warmup)
+    even, uneven = warmups
+    assert even.selected.scores != uneven.selected.scores
+    assert even.last.scores == uneven.last.scores
+
+
 def test_it_goes_on_after_an_interruption(toy, finished, tmp_path):
     words = (*ONLY_ROUNDS, f"weights={finished}")
     whole = toy(*words)
