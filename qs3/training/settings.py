@@ -175,6 +175,7 @@ def check_settings(cfg: DictConfig) -> None:
         check_bool(key, OmegaConf.select(cfg, key))
     check_bool("trainer.cuda_graphs", cfg.trainer.get("cuda_graphs", True))
     _check_products(cfg.trainer)
+    _check_precision(cfg.trainer)
     if (exactly := cfg.trainer.get("deterministic")) not in (None, "warn"):
         check_bool("trainer.deterministic", exactly)
     _check_limits(cfg.trainer)
@@ -261,6 +262,16 @@ def _check_products(trainer: DictConfig) -> None:
         raise ConfigError(
             f"{key}=high rounds a GPU's products, and trainer.accelerator is cpu; set "
             "trainer=gpu, or leave it at highest"
+        )
+
+
+def _check_precision(trainer: DictConfig) -> None:
+    """Refuse weights of float16, with which the first steps make NaN of every net."""
+    if trainer.get("precision") in ("16-true", "transformer-engine-float16"):
+        raise ConfigError(
+            f"trainer.precision={trainer.precision}: float16 holds nothing below 6e-8, so that the "
+            "squares of gradients by which Adam divides round to 0, and weights become NaN; set "
+            "trainer.precision=bf16-mixed or 16-mixed, whose weights are float32, or bf16-true"
         )
 
 

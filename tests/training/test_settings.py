@@ -49,6 +49,14 @@ def test_null_is_no_settings(key):
         check_settings(compose("train", ["experiment=quickstart", f"{key}=null"]))
 
 
+def test_weights_of_float16_are_refused():
+    """Every net was NaN after a few steps of Adam, and the run ended as if nothing were wrong."""
+    with pytest.raises(
+        ConfigError, match=r"^trainer\.precision=16-true: .*set trainer\.precision=bf"
+    ):
+        check_settings(compose("train", ["experiment=quickstart", "trainer.precision=16-true"]))
+
+
 @pytest.mark.parametrize(
     ("word", "known"),
     [
