@@ -43,6 +43,7 @@ from qs3.selftraining.selectors import (
     TeacherPredictions,
     check_selection,
     check_teacher,
+    chosen_by,
     keep_all,
 )
 
@@ -163,7 +164,7 @@ class SelfTraining(Callback):
         said = self._predictions(trainer, pl_module, data, round_)
         check_teacher(said, round_, trainable=not self._given)
         theta = self.scheme.theta_of(round_, said.confidence)
-        selection = self.scheme.selector.select(said, theta, round_)
+        selection = chosen_by(self.scheme.selector, said, theta, round_)
         if selection.labels is not None:  # a selector may name another class than the most probable
             said = said.relabelled(selection.labels)
         if self.scheme.rehearsal:

@@ -24,7 +24,7 @@ from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, check_taught, class_loss, weight
 from qs3.methods.mean_teacher import move_towards
 from qs3.models.norms import begin_target_norms, use_domain
-from qs3.selftraining.selectors import Selector, TeacherPredictions, most_confident
+from qs3.selftraining.selectors import Selector, TeacherPredictions, chosen_by, most_confident
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
@@ -187,7 +187,7 @@ class Pcfea(Method):
             of_source = most_confident(own, labels, 1 - progress)
             of_target = most_confident(said.confidence, named, progress)
         if self.selector is not None:
-            chosen = self.selector.select(said, self.theta, (epoch - first) // between)
+            chosen = chosen_by(self.selector, said, self.theta, (epoch - first) // between)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels
         source_mean, _ = moments(f, torch.from_numpy(labels), classes)
         pool = torch.cat([f[torch.from_numpy(of_source)], g[torch.from_numpy(of_target)]])

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from qs3.config.checks import check_choice
 from qs3.datamodules.phases import LOWER_THETA
-from qs3.errors import SelectionError
+from qs3.errors import ConfigError, SelectionError
 from qs3.utils.plural import counted
 
 _KEEP_ALL = "set selftraining.selector.mu=one"
@@ -186,6 +186,30 @@ def most_confident(
         of_class = ranked[labels[ranked] == k]
         chosen[of_class[: max(least, round(share * len(of_class)))]] = True
     return chosen
+
+
+def chosen_by(
+    selector: Selector, teacher: TeacherPredictions, theta: float, round_: int
+) -> Selection:
+    """What a selector, perhaps a user's, chooses.
+
+    Raises:
+        ConfigError: it is no `Selection`, or does not say of each sample whether it is kept: places
+            in place of a mask would be taken for other samples.
+    """
+    found = selector.select(teacher, theta, round_)
+    mask, n = getattr(found, "selected", None), len(teacher.ids)
+    if isinstance(found, Selection) and isinstance(mask, np.ndarray):
+        if mask.dtype == np.bool_ and mask.shape == (n,):
+            return found
+        what = f"{mask.dtype} {list(mask.shape)}"
+    else:
+        what = f"of type {type(found if mask is None else mask).__name__}"
+    raise ConfigError(
+        f"{type(selector).__name__}.select must return a Selection (qs3.selftraining.selectors) "
+        f"whose `selected` is an array of True or False for each of {counted(n, 'sample')}; it is "
+        f"{what}"
+    )
 
 
 def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:

@@ -21,6 +21,7 @@ from qs3.selftraining.selectors import (
     TeacherPredictions,
     check_selection,
     check_teacher,
+    chosen_by,
     most_confident,
 )
 
@@ -227,3 +228,30 @@ def test_the_surest_worked_by_hand():
     assert [kept(0.3), kept(0.3, ids=list("abcdzfg"))] == ["ae", "af"]  # ties
     three = most_confident(confidence, np.array([0, 0, 1, 1, 2, 2, 2]), 0.2)  # and least is 0
     assert np.flatnonzero(three).tolist() == [4]  # 0.6 of three; 0.4 of two are none
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        (np.array([True, False]), "ndarray"),
+        (np.array([0]), "int64 [1]"),
+        (np.array([True]), "bool [1]"),
+        ([True, False], "list"),
+        (None, "NoneType"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_what_a_selector_of_one_s_own_returns_is_looked_at(returned, said):
+    """Places of samples were taken for a mask, and other samples than these trained on."""
+    teacher = TeacherPredictions.of(np.array([[0.9, 0.1], [0.4, 0.6]]), ["a", "b"])
+    good = Spst().select(teacher, 0.5)
+
+    class Own:
+        def select(self, teacher, theta, round_=0):
+            if said in ("ndarray", "NoneType"):
+                return returned
+            return replace(good, selected=returned)
+
+    with pytest.raises(ConfigError, match=r"^Own\.select must return a Selection") as told:
+        chosen_by(Own(), teacher, 0.5, 0)
+    assert f"each of 2 samples; it is {said}" in str(told.value).replace("of type ", "")
