@@ -183,9 +183,14 @@ def features(
         norm: of the head: "batch" or "domain".
 
     Raises:
-        ConfigError: the file is not there, or another one than that of this hash.
+        ConfigError: the file is not there, or another one than that of this hash; instance norm.
         DataError: it is damaged, or is not such a net.
     """
+    if norm == "instance":  # in heads it is batch norm, and a head is all that is trained here
+        raise ConfigError(
+            "model.norm=instance is of a cloud's points, and model=features trains a head on one "
+            "vector a cloud: the run would be that of batch; set model.norm=batch or domain"
+        )
     encoder = _encoder(str(file), str(sha256))
     head = ClassHead(encoder.dim, num_classes, hidden=tuple(hidden), dropout=dropout, norm=norm)
     return PointClassifier(Frozen(encoder), head)

@@ -52,6 +52,12 @@ def test_it_is_the_file_s_net_and_a_head(tmp_path):
     assert len(made(tmp_path / "a.onnx", hidden=(8, 5)).head) == 9
 
 
+def test_instance_norm_is_refused(tmp_path):
+    """It was batch norm under another name."""
+    with pytest.raises(ConfigError, match=r"^model\.norm=instance .* set model\.norm=batch or dom"):
+        made(write_encoder(tmp_path / "a.onnx"), norm="instance")
+
+
 def test_features_are_computed_once_and_kept(tmp_path, clouds, monkeypatch):
     asked = []
     real = Encoder.compute
