@@ -57,7 +57,8 @@ def read_given(cfg: DictConfig) -> Given | None:
     result = read_result(cfg.weights)
     name = Path(cfg.weights).name
     model: Any = OmegaConf.to_container(cfg.model, resolve=True)
-    keys = sorted({*model, *result.model})
+    moved = {"file"} if "sha256" in model else set()  # what is in it counts, not where it lies
+    keys = sorted({*model, *result.model} - moved)
     if odd := [key for key in keys if model.get(key) != result.model.get(key)]:
         was, wanted = result.model.get(odd[0]), model.get(odd[0])
         raise ConfigError(

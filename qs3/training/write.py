@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -140,6 +141,8 @@ def _student(run: Run, outcome: Outcome) -> StudentChoice | None:
 def _result(run: Run, loaded: Loaded, outcome: Outcome) -> Result:
     """What is reported, with all that using it elsewhere takes."""
     model: Any = OmegaConf.to_container(run.cfg.model, resolve=True)
+    if "sha256" in model:  # of a file, as of model=features: whoever loads it may stand elsewhere
+        model["file"] = str(Path(model["file"]).expanduser().absolute())
     return Result(
         model=model,
         classes=loaded.evaluation.classes,

@@ -8,10 +8,12 @@ import torch
 import qs3
 from qs3.config import hashing
 from qs3.errors import ConfigError
+from qs3.models import features
 from qs3.models.features import Encoder
 from qs3.runs.checkpoints import load
 from qs3.selftraining.pcfea import Pcfea
 from qs3.training.command import train
+from qs3.training.given import read_given
 from tests.models.onnx_files import write_encoder
 from tests.training.conftest import result_of
 from tests.training.toy import CONF, overrides
@@ -84,6 +86,22 @@ def test_a_run_is_computed_once_goes_on_and_is_loaded(frozen, tmp_path, monkeypa
     (tmp_path / "net.onnx").rename(tmp_path / "moved.onnx")
     again = frozen(*words, f"paths.log_dir={tmp_path / 'whole'}", file=tmp_path / "moved.onnx")
     assert hashing.run_folder(again) == folder
+
+
+def test_the_file_is_found_from_another_folder(frozen, tmp_path, monkeypatch):
+    """It was looked for below the folder that a reader stands in, and not where it was."""
+    words = ("method=source_only", "selftraining=none", "protocol.epochs=1")
+    monkeypatch.chdir(tmp_path)
+    cfg = frozen(*words, file="net.onnx")
+    train(cfg)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    folder = hashing.run_folder(cfg)
+    features._encoder.cache_clear()  # as in another process
+    assert qs3.load(folder).probabilities(torch.randn(3, 64, 3)).shape == (3, 3)
+    (tmp_path / "net.onnx").rename(tmp_path / "moved.onnx")  # another run begins with it
+    again = frozen(*words, f"weights={folder}", file=tmp_path / "moved.onnx")
+    assert read_given(again).name == folder.name
 
 
 def test_what_is_refused(frozen, tmp_path):
