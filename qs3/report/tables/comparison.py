@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -84,12 +84,17 @@ def minus_each(table: Table, row: str) -> list[Compared]:
     ]
 
 
+def check_row(table: Table, row: str) -> None:
+    """Raise ConfigError, with the rows there are, unless the table has this one."""
+    if row not in table.rows:
+        rows = ", ".join(map(repr, table.rows))
+        what = f"table {table.name} has no row {row!r}" if row else "against which row? give base="
+        raise ConfigError(f"{what}; rows are {rows}")
+
+
 def _beside(table: Table, base: str) -> list[tuple[str, Cell, Cell]]:
     """Name and cell of each other row and column, and the cell of the row `base` there."""
-    if base not in table.rows:
-        raise ConfigError(
-            f"table {table.name} has no row {base!r}; rows are {', '.join(map(repr, table.rows))}"
-        )
+    check_row(table, base)
     found = []
     for row, cells in table.rows.items():
         if row == base:
@@ -177,18 +182,22 @@ def _main_effects(
 class _Tiers:
     """Of which tier each cloud is, by the predictions that say it, whichever run of a table's.
 
-    Runs on one target saw the same clouds, and older ones did not save the tiers.
+    Runs on one target saw the same clouds, and older ones did not save the tiers. One recipe has
+    several content hashes where processors of several kinds have followed it.
     """
 
     def __init__(self, table: Table) -> None:
         self._runs = [run for c in table.cells if c.group for run in c.group.finished]
         self._known: dict[str, dict[str, str]] = {}
 
-    def __call__(self, target: str, ids: Sequence[str]) -> list[str]:
-        """Of each cloud of the target with this content hash; "" where nobody knows."""
-        if target not in self._known:
-            self._known[target] = self._of(target)
-        return [self._known[target].get(id_, "") for id_ in ids]
+    def __call__(self, targets: Iterable[str], ids: Sequence[str]) -> list[str]:
+        """Of each cloud of the target with one of these content hashes; "" where nobody knows."""
+        known: dict[str, str] = {}
+        for target in targets:
+            if target not in self._known:
+                self._known[target] = self._of(target)
+            known = self._known[target] | known
+        return [known.get(id_, "") for id_ in ids]
 
     def _of(self, target: str) -> dict[str, str]:
         for run in self._runs:
@@ -235,8 +244,8 @@ def _difference(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) ->
         found = _pair_of(both)
     except DataError as error:
         return Compared(name, None, str(error))
-    first, target = said[0][0], results[0].data.target
-    known = tiers(target, first.ids)
+    first, targets = said[0][0], dict.fromkeys(result.data.target for result in results)
+    known = tiers(targets, first.ids)
     has_tiers = any(result.evaluation.tiers for result in results)
     return Compared(
         name,

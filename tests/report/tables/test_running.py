@@ -273,6 +273,14 @@ def test_each_tier_is_compared_by_itself(tmp_path):
     assert hard["source_made_of"] == hard["other_source_made_of"] == "published files"
     assert hard["target_made_of"] == str(CATALOGUE)
 
+    # rendered from one recipe by two kinds of processors: the run that knows saw other bytes
+    made = DataMadeOf(source=CATALOGUE, target=replace(CATALOGUE, recipe="r" * 12))
+    for folder in folders:
+        seen = "c" if folder == folders[-1] else "b"
+        change(folder, data=DataHashes(source="a" * 64, target=seen * 64), made_of=made)
+    found = against(build_table("cad10", tmp_path), "source only")
+    assert [list(one.subsets) for one in found if one.differences] == [["all", "clean", "hard"]]
+
     plain = replace(read_predictions(folders[-1] / FILE), tiers=())
     write_predictions(folders[-1] / FILE, plain)
     found = against(build_table("cad10", tmp_path), "source only")
