@@ -61,7 +61,7 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
         try:
             return compose(command, list(overrides), **more)
         except HydraException as error:
-            raise ConfigError(f"{place}{_explained(error, command, overrides)}") from error
+            raise ConfigError(f"{place}{explained(error, command, overrides)}") from error
 
 
 def choices(group: str) -> list[str]:
@@ -96,7 +96,7 @@ def choices_checked(main: Callable[[], Any]) -> Callable[[], None]:
     return command
 
 
-def _explained(error: BaseException, command: str | None, words: Sequence[str]) -> str:
+def explained(error: BaseException, command: str | None, words: Sequence[str]) -> str:
     """Hydra's message in one line, and what to write instead where that is known."""
     line = first_line(error)
     word = getattr(error, "override", None)  # of Hydra's OverrideParseException

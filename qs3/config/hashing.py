@@ -92,6 +92,11 @@ def config_sha256(cfg: DictConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def is_hashed(key: str) -> bool:
+    """Whether a config key may change a result, so that a run's hash knows its value."""
+    return not any(key == one or key.startswith(f"{one}.") for one in _UNHASHED)
+
+
 def with_values(cfg: DictConfig, keys: Sequence[str]) -> Any:
     """The config as nested dicts, with values in place of interpolations of these keys.
 

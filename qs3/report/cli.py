@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import re
+import shlex
+import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,24 +30,35 @@ def _built(
     kept: str | None = None,
     runs: bool = True,
     columns: Sequence[str] = (),
+    row: str | None = None,
 ) -> Table:
-    """The table that the options ask for, with our runs; `runs`: there are some, one may think."""
+    """The table that the options ask for, with our runs.
+
+    `runs`: there are some, one may think; `row`: one that it has to have.
+    """
     from qs3.config.quoting import override, words_of
+    from qs3.report.tables.comparison import check_row
+    from qs3.report.tables.keeping import unused
     from qs3.report.tables.table import build_table
 
     extra = words_of("overrides", overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
-    if kept and not Path(kept).is_dir():
-        raise ConfigError(f"kept={kept} is not there; `qs3 report keep` makes such a folder")
     if runs and not kept and log_dir and not Path(log_dir).is_dir():
         raise ConfigError(f"log_dir={log_dir} is not there; it is the paths.log_dir of the runs")
-    return build_table(table, log_dir or "logs", extra, target, kept, columns=columns)
+    if row is not None:  # before cells are looked up, which takes a while
+        check_row(build_table(table, "logs", extra, target, columns=columns, runs=False), row)
+    built = build_table(table, log_dir or "logs", extra, target, kept, columns=columns)
+    if kept and (why := unused(built, kept)):
+        print(f"note: {why}", file=sys.stderr)
+    return built
 
 
 def _saved_at(table: Table, out: str | None, given: dict[str, Any]) -> Path:
-    """Where a table's files go, without suffix; a part of its columns has files of its own."""
-    part = (re.sub(r"\W+", "-", column).strip("-") for column in given["columns"])
-    name = "-".join(filter(None, (table.name, given["target"], *part)))
+    """Where a table's files go, without suffix."""
+    from qs3.report.tables.overrides import file_name
+
+    shown = {key: given[key] for key in ("columns", "overrides")}
+    name = file_name(table.name, given["target"], **shown)
     return Path(out or Path(given["log_dir"] or "logs") / "tables") / name
 
 
@@ -54,6 +67,8 @@ def _table(out: str | None, **given: Any) -> None:
     from qs3.utils.files import write_text
 
     table = _built(**given)
+    if settings := given["overrides"]:
+        table = replace(table, notes=(*table.notes, f"overrides of the runs: `{settings}`"))
     shown, at = markdown(table), _saved_at(table, out, given)
     write_text(f"{at}.md", shown)
     for suffix, write in ((".csv", csv_text), (".tex", latex)):
@@ -83,7 +98,8 @@ def _train(
     launcher = launcher or ("joblib" if (jobs or 1) > 1 else "basic")
     status = launch(todo, launcher, jobs, given["log_dir"] or "logs", more)
     if not status:
-        print(f"next: qs3 report table={table.name}")
+        shown = {**given, "columns": ",".join(only)}
+        print("next: qs3 report", shlex.join(f"{key}={one}" for key, one in shown.items() if one))
     return status
 
 
@@ -101,9 +117,8 @@ def _keep(into: str, **given: Any) -> None:
 def _compare(base: str | None, out: str | None, **given: Any) -> None:
     from qs3.report.tables import comparison
 
-    table = _built(**given)
-    if base is None:
-        raise ConfigError(f"against which row? base={'|'.join(table.rows)}")
+    base = base or ""
+    table = _built(**given, row=base)
     found, at = comparison.against(table, base), _saved_at(table, out, given)
     _save(f"{at}-compared", table, found, base)
 
@@ -188,8 +203,12 @@ def _pipeline(
     from qs3.report.figures.pipeline import kept_object, scan_object
     from qs3.report.figures.pipeline_figure import save_pipeline
 
-    if (domain is None) == (dataset is None):
+    if domain is None and dataset is None:
         raise ConfigError("missing argument: domain=NAME scans an object, dataset=FOLDER reads one")
+    if domain and dataset:
+        raise ConfigError(
+            "domain= scans an object now, dataset= reads one that was scanned: give one of them"
+        )
     if dataset is not None:
         if wrong := [*(["mesh="] if mesh else []), *more]:
             raise ConfigError(f"{wrong[0]} goes with domain=; with dataset= nothing is scanned")
@@ -244,7 +263,10 @@ TRAIN = Command(
         "qs3 report train table=uda launcher=joblib jobs=4",
         "qs3 report train table=uda launcher=slurm jobs=16 hydra.launcher.partition=gpu",
     ),
-    others={_LAUNCHER: "settings of the launcher"},
+    others={
+        _LAUNCHER: "settings of the launcher",
+        f"+{_LAUNCHER}": "such as +hydra.launcher.additional_parameters.mail-type=END",
+    },
 )
 
 KEEP = Command(

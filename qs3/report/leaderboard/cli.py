@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +46,8 @@ def _leaderboard(
     """Train what the row lacks, and print it beside the rows that are there."""
     from qs3.config.quoting import override, words_of
     from qs3.report.tables.formats import csv_text, latex, markdown
+    from qs3.report.tables.keeping import unused
+    from qs3.report.tables.overrides import file_name
     from qs3.report.tables.running import launch, missing
     from qs3.report.tables.table import build_table
     from qs3.utils.files import write_text
@@ -53,12 +56,15 @@ def _leaderboard(
     extra = words_of("overrides", overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
 
-    def built() -> Table:
-        return build_table(table, log_dir, extra, kept=kept, rows=[row], columns=columns)
+    def built(runs: bool = True) -> Table:
+        return build_table(table, log_dir, extra, None, kept, [row], columns, runs)
 
-    before, name = built(), row["name"]
-    _check_rules(before, name)
-    _check_class(before, name)
+    plain, name = built(runs=False), row["name"]
+    _check_rules(plain, name)
+    _check_class(plain, name)
+    before = built()  # looks every cell up, which takes a while
+    if kept and (why := unused(before, kept)):
+        print(f"note: {why}", file=sys.stderr)
     todo = missing(before, seeds, [name], columns)
     print(f"{name}: {counted(len(todo), 'run')} to do", flush=True)
     status = launch(todo, "joblib" if (jobs or 1) > 1 else "basic", jobs, log_dir)
@@ -66,7 +72,8 @@ def _leaderboard(
     if overrides:
         also = f"beside the rules all runs of this page have: {overrides}"
         shown = replace(shown, notes=(*shown.notes, also))
-    at = Path(out or Path(log_dir) / "tables") / f"{shown.name}-{_file_name(name)}"
+    place = file_name(shown.name, _file_name(name), columns=columns, overrides=overrides)
+    at = Path(out or Path(log_dir) / "tables") / place
     page = markdown(shown) + _intervals(shown, name)
     write_text(f"{at}.md", page)
     for suffix, write in ((".csv", csv_text), (".tex", latex)):
@@ -151,13 +158,18 @@ def _check_class(table: Table, name: str) -> None:
     """Build the method as each run will, and try its loss on random clouds, before any has begun.
 
     Raises:
-        ConfigError: the file is not a method (`qs3.methods.own`), or its loss fails.
+        ConfigError: the file is not a method (`qs3.methods.own`), its loss fails, or no column is
+            for runs.
     """
     from qs3.config.compose import composed
     from qs3.config.hydra import build
     from qs3.methods.trial import try_step
 
-    cell = next(cell for cell in table.rows[name] if cell and cell.runnable)
+    cells = [cell for cell in table.rows[name] if cell and cell.runnable]
+    if not cells:
+        shown = ", ".join(map(repr, table.columns))
+        raise ConfigError(f"{shown} of table {table.name} are published figures alone")
+    cell = cells[0]
     cfg = composed("train", *cell.overrides)
     method, net = build(cfg.method), build(cfg.model)
     try_step(method, net, cfg.method.file, cfg.num_classes, cfg.data.points)

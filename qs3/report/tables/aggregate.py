@@ -24,7 +24,7 @@ from qs3.utils.text_table import aligned
 FEW_SEEDS = 3
 """Below this number of seeds a mean is marked."""
 
-_FOLDER = re.compile(r"seed(\d+)-([0-9a-f]+)")
+FOLDER = re.compile(r"seed(\d+)-([0-9a-f]+)")
 _BEGUN = ("started.json", "last.ckpt", ".hydra")
 
 
@@ -155,7 +155,7 @@ def load_runs(log_dir: str | Path) -> list[Run]:
     root = Path(log_dir)
     folders = {path.parent for path in root.rglob(METRICS)}
     folders |= {
-        path for path in root.rglob("seed*-*") if path.is_dir() and _FOLDER.fullmatch(path.name)
+        path for path in root.rglob("seed*-*") if path.is_dir() and FOLDER.fullmatch(path.name)
     }
     return [load_run(folder) for folder in sorted(folders)]
 
@@ -163,7 +163,7 @@ def load_runs(log_dir: str | Path) -> list[Run]:
 def load_run(folder: str | Path) -> Run:
     """One run's result, or what is known of a run without one."""
     folder = Path(folder)
-    match = _FOLDER.fullmatch(folder.name)
+    match = FOLDER.fullmatch(folder.name)
     seed, config = (int(match[1]), match[2]) if match else (None, "")
     experiment = folder.parent.name
 

@@ -13,11 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
+from qs3.report.tables.aggregate import FOLDER as KEPT
 from qs3.report.tables.aggregate import Run, load_runs
 from qs3.report.tables.cells import Table
 from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
+from qs3.utils.plural import counted
 
 DIGITS = 4
 """Digits of the probabilities that are kept."""
@@ -57,14 +59,34 @@ def finished_runs(table: Table) -> list[Run]:
 
 
 def with_kept(runs: Iterable[Run], kept: str | Path | None) -> list[Run]:
-    """Runs, and of those that are kept the ones that are not finished among them."""
+    """Runs, and of those that are kept the ones that are not finished among them.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
     runs = list(runs)
     if kept is None:
         return runs
+    if not Path(kept).is_dir():
+        raise ConfigError(f"kept={kept} is not there; `qs3 report keep` makes such a folder")
     done = {_name(run) for run in runs if run.status == FINISHED}
     added = [run for run in load_runs(kept) if _name(run) not in done]
     known = {_name(run) for run in added}
     return [run for run in runs if _name(run) not in known] + added
+
+
+def unused(table: Table, kept: str | Path) -> str:
+    """Why none of the kept runs is in the table, which looks as if none were run; "" if one is."""
+    runs = [match for path in Path(kept).rglob("seed*") if (match := KEPT.fullmatch(path.name))]
+    found = {cell.group.hash for cell in table.cells if cell.group}
+    if any(match[2] in found for match in runs):
+        return ""
+    if not runs:
+        return f"kept={kept} holds no runs"
+    return (
+        f"kept={kept}: none of its {counted(len(runs), 'run')} is of a cell that is shown here; "
+        "they may have had other settings (overrides=, target=), or are of other columns or tables"
+    )
 
 
 def _says_already(folder: Path, metrics: RunMetrics) -> bool:

@@ -11,11 +11,16 @@ contain the word; spaces do not count.
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Iterable, Sequence
 
+from qs3.config.hashing import is_hashed
+from qs3.config.quoting import words_of
 from qs3.errors import ConfigError
 
 ALONE = 'for some columns alone: overrides="COLUMN:KEY=VALUE"'
+_LONGEST = 80
 
 
 def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -27,10 +32,10 @@ def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[s
     found: dict[str, list[str]] = {column: [] for column in columns}
     for word in words:
         named, override = _split(word)
-        meant = chosen(columns, named) if named else set(columns)
-        if not meant:
+        meant = chosen(columns, named)
+        if lost := unknown(columns, named):
             raise ConfigError(
-                f"overrides: {word}: no column has {' or '.join(map(repr, named))} in its name; "
+                f"overrides: {word}: no column has {' or '.join(map(repr, lost))} in its name; "
                 f"columns are {', '.join(columns)}"
             )
         for column in columns:
@@ -42,16 +47,52 @@ def chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
     """Names that are meant by the words: the one that is the word, else all that contain it.
 
     Case and spaces do not count, unless two names differ in nothing else, and an arrow may be typed
-    as "->"; no words mean all.
+    as "->"; words that commas have cut out of one name are that name again. No words mean all.
     """
+    names = list(names)
+    return set(names) if not words else set().union(*_meant(names, words).values())
+
+
+def unknown(names: Iterable[str], words: Sequence[str]) -> list[str]:
+    """The words that mean no name."""
+    return [word for word, meant in _meant(list(names), words).items() if not meant]
+
+
+def file_name(*parts: str | None, columns: Sequence[str], overrides: str) -> str:
+    """The name, without suffix, of the files of a table: of other runs it is another one.
+
+    Args:
+        parts: it begins with.
+        columns: that were asked for.
+        overrides: of its runs; of those that change no result the name says nothing.
+
+    Raises:
+        ConfigError: a quotation mark in `overrides` has no end.
+    """
+    matter = [w for w in words_of("overrides", overrides) if is_hashed(_key(_split(w)[1]))]
+    settings = "-".join(re.sub(r"[^\w.=]+", "-", word).strip("-") for word in matter)
+    if len(settings) > _LONGEST:
+        settings = hashlib.sha256(settings.encode()).hexdigest()[:8]
+    shown = (re.sub(r"\W+", "-", column).strip("-") for column in columns)
+    return "-".join(part for part in (*parts, *shown, settings) if part)
+
+
+def _meant(names: Sequence[str], words: Sequence[str]) -> dict[str, set[str]]:
     typed = {name: _typed(name) for name in names}
-    if not words:
-        return set(typed)
-    found: set[str] = set()
-    for word, own in zip(words, map(_typed, words), strict=True):
+    found: dict[str, set[str]] = {}
+    left = list(words)
+    while left:
+        many = range(len(left), 1, -1)
+        n = next((n for n in many if _typed(",".join(left[:n])) in typed.values()), 1)
+        word, left = ", ".join(left[:n]), left[n:]
+        own = _typed(word)
         exact = {word} & {*typed} or {name for name, text in typed.items() if text == own}
-        found |= exact or {name for name, text in typed.items() if own in text}
+        found[word] = exact or {name for name, text in typed.items() if own in text}
     return found
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0].partition("@")[0]
 
 
 def _typed(name: str) -> str:

@@ -18,7 +18,7 @@ from qs3.config.location import python_command, typed
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
 from qs3.report.tables.cells import Table
-from qs3.report.tables.overrides import chosen
+from qs3.report.tables.overrides import chosen, unknown
 
 LAUNCHERS: Mapping[str, str | None] = {
     "basic": None,
@@ -63,19 +63,22 @@ def missing(
             contains the word; all if empty.
 
     Raises:
-        ConfigError: `rows` fit no row, `columns` no column, or both together no cell.
+        ConfigError: one of `rows` fits no row, one of `columns` no column, or both together no
+            cell.
     """
     cells = [c for c in table.cells if c.runnable and not c.missing]
-    for kind, words, every in (("row", rows, table.rows), ("column", columns, table.columns)):
+    for kind, words, every in (("column", columns, table.columns), ("row", rows, table.rows)):
         names = dict.fromkeys(getattr(c, kind) for c in cells)
         meant = chosen(every, words)  # also one that cannot be run: no other is meant by its name
+        lost = unknown(every, words)
         cells = [c for c in cells if getattr(c, kind) in meant]
-        if words and not cells:
-            named = " or ".join(map(repr, words))
+        if words and (lost or not cells):
+            named = " or ".join(map(repr, lost or words))
             why = f"of table {table.name} has {named} in its name"
-            if meant:  # published figures alone, or what it needs is not there
+            if not lost:  # published figures alone, or what it needs is not there
                 why = f"{named} of table {table.name} can be run"
-            raise ConfigError(f"no {kind} {why}; {kind}s to run are {', '.join(map(repr, names))}")
+            left = f"; {kind}s to run are {', '.join(map(repr, names))}" if names else ""
+            raise ConfigError(f"no {kind} {why}{left}")
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in sorted(cells, key=lambda cell: not cell.first):
         done = set(cell.group.seeds) if cell.group else set()

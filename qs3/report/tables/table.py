@@ -18,14 +18,15 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from qs3.config.compose import composing, first_line
+from qs3.config.compose import composing, explained, first_line
 from qs3.config.location import CONF
 from qs3.config.quoting import override
 from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import Group, group, load_runs
 from qs3.report.tables.cells import SEEDS, Cell, Metric, Published, Table
 from qs3.report.tables.keeping import with_kept
-from qs3.report.tables.overrides import ALONE, by_column, chosen
+from qs3.report.tables.overrides import ALONE, by_column, chosen, unknown
+from qs3.report.tables.row_keys import check_keys
 from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.plural import counted
 from qs3.utils.yamls import load_yaml
@@ -68,6 +69,7 @@ def build_table(
     kept: str | Path | None = None,
     rows: Sequence[Mapping[str, Any]] = (),
     columns: Sequence[str] = (),
+    runs: bool = True,
 ) -> Table:
     """Read a table's file and find our runs of its cells.
 
@@ -82,10 +84,11 @@ def build_table(
         rows: further ones, as in the file.
         columns: only these, as `report train` takes them, and those that are published alone:
             each cell takes a fifth of a second.
+        runs: look for them; without, what the file says is there at once.
 
     Raises:
-        ConfigError: no such table, its file or an override is wrong, no column is meant, or
-            `target` is given for a table whose columns have targets of their own.
+        ConfigError: no such table, its file or an override is wrong, one of `columns` means none,
+            or `target` is given for a table whose columns have targets of their own.
     """
     path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
     if not path.is_file():
@@ -96,9 +99,9 @@ def build_table(
     name, spec = path.stem, _read(path)
     spec.rows.extend(map(dict, rows))
     wanted = chosen(spec.columns, columns)
-    if not wanted and columns:
+    if lost := unknown(spec.columns, columns):
         raise ConfigError(
-            f"no column of table {name} has {' or '.join(map(repr, columns))} in its name; "
+            f"no column of table {name} has {' or '.join(map(repr, lost))} in its name; "
             f"columns are {', '.join(map(repr, spec.columns))}"
         )
     shown = [column for column in spec.columns if column in wanted or _task(spec, column) is None]
@@ -113,6 +116,7 @@ def build_table(
     if str(log_dir) != "logs":
         more.append(place)
     own = by_column(more, tuple(spec.columns))
+    check_keys(spec.rows, tuple(spec.columns))
     try:
         cells = [
             replace(cell, column=_column(column, target))
@@ -130,9 +134,11 @@ def build_table(
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
     if twice := [one for one in names if names.count(one) > 1]:
         raise ConfigError(f"{path}: two rows are called {twice[0]!r}; give one another name")
-    groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
-    hint = f"; {ALONE}" if extra and len(shown) > 1 else ""
-    filled = {(c.row, c.column): c for c in _fill(cells, groups, target, hint, place)}
+    if runs:
+        groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
+        hint = f"; {ALONE}" if extra and len(shown) > 1 else ""
+        cells = _fill(cells, groups, target, hint, place, extra)
+    filled = {(cell.row, cell.column): cell for cell in cells}
     named = tuple(_column(column, target) for column in shown)
     filled_rows = {
         row["name"]: tuple(filled.get((row["name"], column)) for column in named)
@@ -279,11 +285,13 @@ def _fill(
     target: str | None,
     hint: str,
     place: str,
+    extra: Sequence[str],
 ) -> list[Cell]:
     """The cells with their runs, or with the reason why they cannot be run.
 
     `hint` ends the message about an override that a cell's config does not take; `place` is the
-    override that says where runs lie, which changes nothing of what is looked up.
+    override that says where runs lie, which changes nothing of what is looked up. What a table's
+    own words name and is not there may come later; what `extra` names is a mistake.
     """
     from hydra.errors import (
         ConfigCompositionException,
@@ -303,15 +311,20 @@ def _fill(
                 cell = replace(cell, overrides=(*cell.overrides, f"domain@data.source={target}"))
                 run = _composed(_without(place, cell.overrides))
         except MissingConfigException as error:
+            asked = (error.missing_cfg_file or "").rpartition("/")[2]
+            if any(word.endswith(f"={asked}") for word in extra):
+                raise ConfigError(_of_cell(cell, error) + hint) from error
             filled.append(replace(cell, missing=first_line(error)))
             continue
         except (ConfigCompositionException, OverrideParseException) as error:
-            raise ConfigError(
-                f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}{hint}"
-            ) from error
+            raise ConfigError(_of_cell(cell, error) + hint) from error
         found = groups.get((run.experiment, run.hash))
         filled.append(replace(cell, group=found, target=run.target, simulated=run.simulated))
     return filled
+
+
+def _of_cell(cell: Cell, error: Exception) -> str:
+    return f"table cell {cell.row!r}, {cell.column!r}: {explained(error, 'train', cell.overrides)}"
 
 
 def _without(word: str, words: Sequence[str]) -> tuple[str, ...]:

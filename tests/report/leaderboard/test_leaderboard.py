@@ -226,8 +226,9 @@ def test_one_s_own_method_beside_the_others(toy, capsys):
     assert re.fullmatch(r"\d+\.\d ± \d+\.\d \(n=2\)", ours[1])
     assert re.fullmatch(r"\d+\.\d( to \d+\.\d)? GB", ours[-1])
     saved = toy / "logs" / "tables"
-    assert (saved / "small-turned.md").read_text() in shown
-    assert {p.suffix for p in saved.glob("small-turned.*")} == {".md", ".csv", ".tex"}
+    (page,) = saved.glob("small-turned-*.md")  # behind the dash: which overrides
+    assert page.read_text() in shown
+    assert {p.suffix for p in saved.glob(f"{page.stem}.*")} == {".md", ".csv", ".tex"}
     assert f"- beside the rules all runs of this page have: {TOY}\n" in shown
 
     def runs(text, settings=("method.weight=0.5",)):
@@ -266,6 +267,10 @@ def test_what_is_refused(toy, tmp_path, capsys):
         return capsys.readouterr().err
 
     assert "two rows are called 'PCFEA'; give one another name" in said("name=PCFEA")
+    given = [word for word in words(toy) if not word.startswith("columns=")]
+    assert main([*given, "columns=PointDA"]) == 1
+    assert "'PointDA-10' of table small are published figures alone" in capsys.readouterr().err
+    assert "kept=nowhere is not there" in said("kept=nowhere")
     assert "selftraining=x is not there; there are cbst, " in said("selftraining=x")
     assert "Turned: " in said("method.wieght=1")
     other = [word for word in words(toy) if not word.startswith("table=")]

@@ -54,6 +54,14 @@ def test_kept_results_are_the_table_without_the_runs(file, tmp_path, capsys):
     assert "6 finished runs of table two, 6 new" in capsys.readouterr().out
     assert main(["report", "table", words[0], f"kept={tmp_path / 'nowhere'}"]) == 1
     assert "nowhere is not there; `qs3 report keep` makes" in capsys.readouterr().err
+    for more, note in (
+        ([], ""),
+        (["overrides=data.points=64"], f"note: kept={kept}: none of its 6 runs is of a cell that"),
+    ):
+        assert main(["report", "table", *words[:3], *more]) == 0
+        said = capsys.readouterr().err
+        assert said.startswith(note)
+        assert bool(said) == bool(note)
 
 
 def test_a_run_that_is_there_comes_before_a_kept_one(file, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.report.tables.overrides import by_column, chosen
+from qs3.report.tables.overrides import by_column, chosen, file_name, unknown
 from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
 from tests.commands import main
@@ -47,6 +47,30 @@ def test_whose_they_are(word, expected):
 def test_a_column_that_is_not_there_is_named():
     with pytest.raises(ConfigError, match=r"M->D:a=1: no column has 'M->D' in its name; columns"):
         by_column(["M->D:a=1"], COLUMNS)
+
+    with pytest.raises(ConfigError, match=r"S->K,M->D:a=1: no column has 'M->D' in its name"):
+        by_column(["S->K,M->D:a=1"], COLUMNS)
+
+
+def test_a_name_with_commas_is_one_name():
+    """`rows=` and `columns=` are lists between commas, and rows are called such things."""
+    names = ("source only", "source only, batches of 32", "AdaBN, batches of 32")
+    assert chosen(names, ["source only", "batches of 32"]) == {"source only, batches of 32"}
+    assert chosen(names, ["AdaBN", "source only"]) == {names[0], names[2]}
+    assert unknown(names, ["batches", "mars", "source only", "batches of 32"]) == ["mars"]
+
+
+def test_other_runs_have_other_files():
+    def name(overrides, columns=("S -> K",)):
+        return file_name("table", None, columns=columns, overrides=overrides)
+
+    quiet = "report.pictures=false S->K:data.target.published.file='/x y' paths.data_dir=/a"
+    assert name("") == name(quiet) == "table-S-K"
+    assert name("trainer=gpu") == "table-S-K-trainer=gpu"
+    assert name("DGCNN:trainer=gpu +a.b=[1,2]", ()) == "table-DGCNN-trainer=gpu-a.b=-1-2"
+    long = [f"data.points={i} model.dropout=0.12345 protocol.optimizer.lr=0.00{i}" for i in (1, 2)]
+    assert len({*map(name, long)}) == 2
+    assert all(len(name(f"{one} {one}")) < 30 for one in long)
 
 
 def test_spaces_and_arrows_do_not_count():

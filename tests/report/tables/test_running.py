@@ -78,6 +78,8 @@ def test_one_cell(tmp_path):
     assert chosen(names, []) == set(names)
     with pytest.raises(ConfigError, match=r"no column of table .* has 'x' in its name; columns to"):
         missing(table, [0], columns=["x"])
+    with pytest.raises(ConfigError, match=r"no row of table .* has 'mars' in its name; rows to"):
+        missing(table, [0], rows=[row, "mars"])  # not: the others, without a word
 
 
 def test_a_name_means_its_own_row_alone(tmp_path):
@@ -101,6 +103,7 @@ def test_a_name_means_its_own_row_alone(tmp_path):
     ("words", "message"),
     [
         (["launcher=dask"], "launcher=dask; set launcher=basic|joblib|"),
+        (["+hydra.launcher.a.b=1"], "+hydra.launcher.a.b=1 needs a launcher; set"),
         (["hydra.launcher.partition=gpu"], "partition=gpu needs a launcher; set"),
         (["jobs=0", "launcher=joblib"], "jobs must be a whole number of at least 1"),
     ],

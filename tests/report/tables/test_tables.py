@@ -215,6 +215,30 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
     assert f"data.points=64 paths.log_dir={tmp_path} seed=0,1,2 -m" in table.cells[0].command
     with pytest.raises(ConfigError, match=r"table cell 'source only, surface.*no_such_key"):
         build_table("quickstart", tmp_path, extra=["no_such_key=1"])
+    with pytest.raises(ConfigError, match=r"'data\.point'; did you mean data\.points=\?"):
+        build_table("quickstart", tmp_path, extra=["data.point=64"])
+    with pytest.raises(ConfigError, match=r"'model/dgcn'; did you mean model=dgcnn\?"):
+        build_table("quickstart", tmp_path, extra=["model=dgcn"])
+
+
+def test_other_settings_do_not_write_over_a_table(tmp_path, capsys):
+    words = ["report", "table=quickstart", f"log_dir={tmp_path}"]
+    assert main(words) == 0
+    plain = (tmp_path / "tables" / "quickstart.csv").read_bytes()
+    assert main([*words, "overrides=data.points=64"]) == 0
+    assert (tmp_path / "tables" / "quickstart.csv").read_bytes() == plain
+    page = (tmp_path / "tables" / "quickstart-data.points=64.md").read_text()
+    assert "- overrides of the runs: `data.points=64`\n" in page
+    assert "saved" in capsys.readouterr().out
+
+
+def test_a_row_to_compare_with_is_looked_for_before_any_run(tmp_path, capsys):
+    """Each cell takes a while to look up, a table with many minutes."""
+    words = ["report", "compare", "table=leaderboard", f"log_dir={tmp_path}"]
+    assert main(words) == 1
+    assert "against which row? give base=; rows are '" in capsys.readouterr().err
+    assert main([*words, "base=x"]) == 1
+    assert "table leaderboard has no row 'x'; rows are '" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -239,6 +263,9 @@ def test_extra_overrides_are_part_of_the_command(tmp_path):
         ("HEAD\nrows:\n- {name: r, a: {run: nonsense}}", "table cell 'r', 'a': .*nonsense"),
         ("HEAD\nrows:\n- {name: r, run: x, columns: [a, c]}", "row 'r': columns: 'c' is none of"),
         ("HEAD\nrows:\n- {name: r, run: x, columns: a}", "row 'r': columns: 'a' is none of"),
+        ("HEAD\nrows:\n- {name: r, run: x, sed: 5}", "row 'r': sed is not a column or .* seeds"),
+        ("HEAD\nrows:\n- {name: r, A: {run: x}}", "row 'r': A is not a column .* there are a, b"),
+        ("HEAD\nrows:\n- {name: r, a: {runs: x}}", "row 'r', 'a': runs is not a key .* run?"),
     ],
 )
 def test_wrong_tables(tmp_path, text, message):
