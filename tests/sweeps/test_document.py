@@ -13,6 +13,7 @@ from qs3.config.hydra import build
 from tests.commands import ROOT
 from tests.training.toy import CONF
 
+ANY = "+hydra.launcher.additional_parameters.mail-type=END"
 PAGE = (ROOT / "docs" / "how-to" / "sweep.md").read_text("utf-8")
 COMMANDS = [
     re.split(r"   +|; ", line.strip())[0]
@@ -43,6 +44,7 @@ def test_command_composes(command):
 
 def test_slurm_takes_every_setting(tmp_path):
     """From conf/hydra/launcher/slurm.yaml to the script that sbatch would get."""
+    assert f"`{ANY}`" in PAGE
     from submitit.slurm.slurm import SlurmExecutor, _make_sbatch_string
 
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -50,6 +52,7 @@ def test_slurm_takes_every_setting(tmp_path):
             "hydra/launcher=slurm",
             "hydra.launcher.partition=gpu",
             "hydra.launcher.account=us",
+            ANY,
         ]
         launcher = compose("train", words, return_hydra_config=True).hydra.launcher
     given = {k: v for k, v in launcher.items() if v is not None and not k.startswith("_")}
@@ -64,6 +67,6 @@ def test_slurm_takes_every_setting(tmp_path):
     script = _make_sbatch_string("python x", str(tmp_path), map_count=40, **ours)
     for line in (
         "--account=us", "--partition=gpu", "--gpus-per-node=1", "--cpus-per-task=4", "--mem=16GB",
-        "--time=720", "--array=0-39%16", "--job-name=qs3",
+        "--time=720", "--array=0-39%16", "--job-name=qs3", "--mail-type=END",
     ):  # fmt: skip
         assert f"#SBATCH {line}\n" in script, script

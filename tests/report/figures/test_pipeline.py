@@ -141,6 +141,7 @@ def test_own_mesh(tmp_path):
     ("arguments", "message"),
     [
         ([], "missing argument"),
+        (["domain=modelnet10", "dataset=DATA"], "give one of them"),
         (["domain=nothing10"], "nothing10"),
         (["domain=depthscannet10"], "published, not generated"),
         (["domain=modelnet10", "object=chair/train/chair_9999"], "such as chair/"),
