@@ -162,9 +162,11 @@ def _head(
     """What is said before everything else."""
     said, often = len(rows) - len(failed), _commonest(rows, classes)
     if found is None:
+        given = any(row.label and row.probabilities is not None for row in rows)
+        labels = "No label given is a class of the net" if given else "No labels were given"
         return [
             f'<p class="big">{said} predicted</p>',
-            "<p>No labels were given, so nobody knows which are right.</p>",
+            f"<p>{labels}, so nobody knows which are right.</p>",
             *often,
         ]
     label, times = found.majority

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from qs3.inference.inputs import Sample
-from qs3.inference.page import Gallery
+from qs3.inference.page import Gallery, page
 from qs3.inference.thumbnails import around, depth_png
 
 HIGH, WIDE = 240, 320
@@ -55,3 +55,17 @@ def test_no_object_keeps_its_frame() -> None:
         assert depth.base is None
         assert depth.nbytes < 100 * 100 * 8
         assert depth_png(depth, own) == depth_png(frame(int(row.file)), mask)
+
+
+@pytest.mark.parametrize(
+    ("label", "said"),
+    [("", "No labels were given, so"), ("mug", "No label given is a class of the net, so")],
+)
+def test_the_page_says_why_nothing_was_judged(label: str, said: str) -> None:
+    gallery = Gallery(("a", "b"))
+    sample = Sample("x.npy", np.eye(3), 0, label=label)
+    row = sample.row("", np.array([0.75, 0.25]))
+    gallery.add(row, sample)
+    text = page("x", [row], gallery, ("a", "b"))
+    assert said in text
+    assert text.count("so nobody knows which are right") == 1
