@@ -100,7 +100,7 @@ in your place: others count as 1, 0 is never. More answers are right then, fewer
 
 A row for each object: file (name[3] is cloud 3 of a file, or object 3 of a mask), status, class,
 confidence, second (the class that another net names, pointnet-speckle without ckpt=: where the two
-differ, look yourself), label, points, dropped (NaN or infinite, or pixels without depth), tier
+differ, look yourself), label, points, dropped (NaN, infinite or 0 0 0: without depth), tier
 (clean, hard, or poor, what datasets leave out), caution, up, out_of_range, reason, p_<class> each.
 
 out_of_range=yes: a cloud unlike all those of training (fewer points than the net samples and than

@@ -23,6 +23,7 @@ def given_cloud(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
 
     Raises:
         DataError: something else, no points, or NaN, infinite or masked coordinates; says which.
+            Or several points that are (0, 0, 0), which stand for no measurement.
     """
     found = _array(cloud, name)
     if found.ndim != 2 or found.shape[1] < 3:
@@ -35,6 +36,12 @@ def given_cloud(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
                 f"{name}: {counted(masked, 'point is', 'points are')} masked; leave such points "
                 "out: numpy.ma.compress_rows(cloud)"
             )
+    zeros = int((found[:, :3] == 0).all(axis=1).sum())
+    if zeros > 1:  # one may be a shape's own
+        raise DataError(
+            f"{name}: {zeros} points are (0, 0, 0), as depth cameras write pixels without depth; "
+            "leave such points out: cloud[cloud.any(axis=1)]"
+        )
     return checked(found[:, :3], name)
 
 

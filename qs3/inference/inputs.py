@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float
 
 from qs3.classes import known_as
 from qs3.clouds.files import SUFFIXES, CloudFile, parse_clouds
-from qs3.clouds.finite import measured
 from qs3.data.frames.cutting import Piece, faults
 from qs3.data.frames.given import (
     check_intrinsics,
@@ -29,6 +28,7 @@ from qs3.data.frames.given import (
 )
 from qs3.data.frames.pointed import RULES, Caution, Pointed, point_out
 from qs3.data.importers.object_archive import ADAPT, JUDGE, Archive
+from qs3.data.with_depth import with_depth
 from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.depth_list import IMAGES, Shown
@@ -195,7 +195,7 @@ def _clouds(path: Path, root: Path, axis: str, classes: Sequence[str]) -> Iterat
         own = f"{name}[{i}]" if found.many else name
         label = _label(found.labels[i], classes) if found.labels is not None else folder
         try:
-            cloud, dropped = measured(given, own)
+            cloud, dropped = with_depth(given, own)
         except DataError as error:
             yield Row(own, 0, len(given), reason_of(error, own), None, label)
             continue

@@ -29,7 +29,7 @@ class Row(NamedTuple):
         file: relative to the input; name[3] is cloud 3 of a file that holds several, or object 3
             of a depth image's mask.
         points: that were used; None if it could not be read.
-        dropped: points that were left out: NaN, infinite or marked as stray; of a depth image the
+        dropped: points that were left out: without depth or marked as stray; of a depth image the
             object's pixels without depth. None if it could not be read.
         reason: in what it is out of range, or why it failed; "" otherwise.
         probabilities: [C] float64; None if it failed.

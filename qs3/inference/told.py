@@ -8,6 +8,7 @@ from typing import Any
 
 from qs3.config.location import typed
 from qs3.data.frames.pointed import LEVEL, PLANES
+from qs3.data.with_depth import NOTHING
 from qs3.evaluation.ood import OTHER_UNITS
 from qs3.inference.inputs import printable_name
 from qs3.inference.predictor import Predictor
@@ -55,7 +56,7 @@ def told(
     if holed := [one["dropped"] for one in good if one["dropped"]]:
         files = inputs.kind == "files"
         of = counted(len(holed), "cloud" if files else "object")
-        why = "NaN or infinite" if files else "without depth or stray"
+        why = NOTHING if files else "without depth or stray"
         lines.append(f"left out of {of}: {counted(sum(holed), 'point')}, {why} (column dropped)")
     if drawn := sum(row.drawn for row in rows):
         lines.append(

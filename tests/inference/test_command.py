@@ -18,6 +18,7 @@ import qs3.inference.command
 import qs3.inference.inputs
 from qs3.config.location import typed
 from qs3.data.store import open_pointset
+from qs3.errors import DataError
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.model_file import read_result, write_result
 from qs3.models.dgcnn import DGCNN
@@ -246,7 +247,17 @@ def test_points_that_are_not_finite_are_left_out_and_counted(run, clouds, tmp_pa
     assert [row["dropped"] for row in others] == ["0"] * ("many" in suffix)
     assert json.loads((tmp_path / "said.json").read_text())["clouds"][0]["dropped"] == 3
     told = capsys.readouterr().out
-    assert "left out of 1 cloud: 3 points, NaN or infinite (column dropped)" in told
+    assert "left out of 1 cloud: 3 points, NaN, infinite or (0, 0, 0) (column dropped)" in told
+
+
+def test_pixels_that_saw_nothing_are_no_points(run, clouds, tmp_path):
+    np.save(tmp_path / "a.npy", np.vstack([clouds[0], np.zeros((20, 3))]))
+    assert predict(run, tmp_path / "a.npy", tmp_path / "said.csv") == 0
+    (row,) = table(tmp_path / "said.csv")
+    assert (row["points"], row["dropped"]) == (str(len(clouds[0])), "20")
+    np.testing.assert_allclose(probabilities(row), qs3.load(run)(clouds[:1])[0], atol=1e-6)
+    with pytest.raises(DataError, match=r"cloud 0: 20 points are \(0, 0, 0\)"):
+        qs3.load(run)([np.load(tmp_path / "a.npy")])
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])

@@ -30,7 +30,7 @@ import numpy as np
 
 from qs3.classes import known_as
 from qs3.clouds.files import SUFFIXES, CloudFile, npy_clouds, parse_clouds
-from qs3.clouds.finite import checked, measured
+from qs3.clouds.finite import checked
 from qs3.config.checks import check_choice, check_int
 from qs3.data.importers.base import (
     UP_AXES,
@@ -46,6 +46,7 @@ from qs3.data.importers.base import (
 )
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import ManifestRow
+from qs3.data.with_depth import NOTHING, with_depth
 from qs3.errors import ConfigError, DataError
 from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
@@ -65,8 +66,8 @@ class CloudFolder(Importer):
     """See the module. Clouds may have any number of points.
 
     A cloud with more than P points is thinned to its P farthest (farthest point sampling from the
-    first on); one with fewer repeats its points. Points that are NaN or infinite are left out
-    before. The manifest's `valid_points` says how many there were of the others.
+    first on); one with fewer repeats its points. Points without depth are left out before
+    (`with_depth`). The manifest's `valid_points` says how many there were of the others.
 
     Attributes:
         layout: one of those above; "auto" looks at the names of the folders.
@@ -266,14 +267,14 @@ class _LastFile:
         return self._file
 
     def cloud(self, path: Path, number: int, of: int, where: str) -> np.ndarray:
-        """[n, 3] float32, without points that are not finite, and checked."""
+        """[n, 3] float32, without points that have no depth, and checked."""
         clouds = self.read(path).clouds
         if len(clouds) != of:
             raise DataError(f"{path} has {counted(len(clouds), 'cloud')}, a moment ago it had {of}")
-        cloud, dropped = measured(clouds[number], where)
+        cloud, dropped = with_depth(clouds[number], where)
         if dropped:
             points = counted(dropped, "point that is", "points that are")
-            log.info("%s: %s NaN or infinite left out", printable(where), points)
+            log.info("%s: %s %s left out", printable(where), points, NOTHING)
         return checked(cloud, where)
 
 

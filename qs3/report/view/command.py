@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from qs3.clouds.files import SUFFIXES, parse_clouds
-from qs3.clouds.finite import checked, measured
+from qs3.clouds.finite import checked
 from qs3.config.checks import check_choice
 from qs3.config.compose import choices
 from qs3.data.contact_sheets import drawn
@@ -22,6 +22,7 @@ from qs3.data.place import is_archive
 from qs3.data.store import is_finished
 from qs3.data.viewer import MOST_POINTS
 from qs3.data.viewer.page import Part, Shown, captions, page, points_each, thinned
+from qs3.data.with_depth import with_depth
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.inputs import find_files, reason_of
@@ -211,12 +212,12 @@ def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]
         own = f"{name}[{i}]" if found.many else name
         label = _folder(name) if found.labels is None else _words(found.labels[i])
         try:
-            finite, dropped = measured(found.clouds[i], own)
-            cloud = turned(checked(finite, own), up)
+            seen, dropped = with_depth(found.clouds[i], own)
+            cloud = turned(checked(seen, own), up)
         except DataError as error:
             yield f"{own}: {reason_of(error, own)}"
             continue
-        note = f"{counted(dropped, 'point is', 'points are')} not finite" if dropped else ""
+        note = f"{counted(dropped, 'point')} without depth left out" if dropped else ""
         one = Shown(own, cloud, label=label, note=note)
         yield thinned(one, MOST_POINTS)  # of a large file nothing else stays in memory
 

@@ -124,7 +124,7 @@ def test_points_that_are_not_finite_are_left_out(
         (read,), (row,) = CloudFolder(tmp_path, points=10, test_every=0).read(("bed",))
     np.testing.assert_array_equal(read, left)
     assert row.valid_points == 10
-    lost = r"(1 point that is|\d points that are) NaN or infinite left out"
+    lost = r"(1 point that is|\d points that are) NaN, infinite or \(0, 0, 0\) left out"
     assert re.search(rf"a{suffix}\S*: {lost}", caplog.text)
 
 

@@ -58,7 +58,7 @@ def test_files_of_all_kinds_with_their_labels(view, tmp_path):
     assert "saved view.html" in said
     assert [(c["name"], c["label"], c["note"]) for c in data["clouds"]] == [
         ("c.npz[0]", "sofa", ""), ("chair/a.xyz", "chair", ""),
-        ("holes.npy", "", "1 point is not finite"),
+        ("holes.npy", "", "1 point without depth left out"),
         ("lamp/old/b.npy[0]", "old", ""), ("lamp/old/b.npy[1]", "old", ""),
     ]  # fmt: skip
     for found in data["clouds"]:
