@@ -114,8 +114,9 @@ class CloudFolder(Importer):
         """See `Importer`. Sorted by split, class and name.
 
         Raises:
-            DataError: an unknown class, two files of one name, mixed layouts, a damaged file of
-                several clouds, or a link that leads out of the folder.
+            DataError: an unknown class, two files of one name, mixed layouts, clouds with and
+                without labels, a damaged file of several clouds, or a link that leads out of the
+                folder.
         """
         layout = self._layout(classes)
         log.info("%s is read in the layout %s", printable(str(self.root)), layout)
@@ -128,6 +129,7 @@ class CloudFolder(Importer):
                 stem = path.relative_to(self.root).with_suffix("").as_posix()
             found += self._of_file(path, cls, split, stem, classes, last)
         found = unique(found)
+        _check_labels(found)
         if self.test_every and layout == "class":
             found = _with_tests(found, self.test_every)
         return by_class(found, classes)
@@ -304,6 +306,22 @@ def _label(labels: tuple[Any, ...] | None, number: int, classes: Sequence[str], 
     if not isinstance(label, int) or not 0 <= label < len(classes):
         raise DataError(f"{where}: label {label!r} is not 0..{len(classes) - 1}")
     return classes[label]
+
+
+def _check_labels(items: Sequence[Item]) -> None:
+    """Raise DataError if some clouds have labels and others none; not of what cannot be read."""
+    known = next((item for item in items if item.row.cls), None)
+    unknown = next((item for item in items if not item.row.cls and not _fails(item)), None)
+    if known and unknown:
+        raise DataError(
+            f"{known.where} has a label ({known.row.cls}) and {unknown.where} has none: give all "
+            "clouds of a folder labels, or none; what has labels can be a folder and a dataset of "
+            "its own"
+        )
+
+
+def _fails(item: Item) -> bool:
+    return getattr(item.load, "func", None) is _raise
 
 
 def _is_split(name: str) -> bool:

@@ -121,7 +121,7 @@ def test_a_folder_whose_name_is_no_utf8(tmp_path: Path) -> None:
 def test_a_store_is_labelled_or_not(tmp_path: Path) -> None:
     write(tmp_path / "train" / "bed" / "a.xyz")
     write(tmp_path / "train" / "b.xyz")
-    with pytest.raises(DataError, match=r"line 2|the same id|unknown class ''"):
+    with pytest.raises(DataError, match=r"bed/a.xyz has a label \(bed\) and \S*/b.xyz has none"):
         import_into(
             tmp_path / "store",
             CloudFolder(tmp_path, points=4, layout="split/class"),
@@ -129,6 +129,17 @@ def test_a_store_is_labelled_or_not(tmp_path: Path) -> None:
             classes=TWO,
         )
     assert not (tmp_path / "store").exists()
+
+
+def test_labels_of_files_beside_scans_without(tmp_path: Path) -> None:
+    """A damaged file has none either, and is told as damaged."""
+    np.savez(tmp_path / "known.npz", points=CLOUD[None], label=np.array(["chair"]))
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    importer = CloudFolder(tmp_path, points=4, layout="none", on_error="skip")
+    assert [row.cls for row in importer.read(TWO)[1]] == ["", "chair"]
+    write(tmp_path / "scan.ply")
+    with pytest.raises(DataError, match=r"known.npz, cloud 0 has a label .*scan.ply has none"):
+        importer.items(TWO)
 
 
 def test_any_number_of_points(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
