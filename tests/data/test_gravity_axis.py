@@ -236,6 +236,24 @@ def test_a_warning_says_where_nobody_knows_how_many_views_there_are(tmp_path):
         assert ("can be a false alarm" in of_domain(facts)) is unknown
 
 
+@pytest.mark.parametrize(("stands", "evidence"), [(True, "clear"), (False, "weak")])
+def test_the_table_says_no_more_than_the_verdict(tmp_path, stands, evidence):
+    """Two clouds can be sure of z and its sign, and no better on it than on their sides."""
+    rows = [ManifestRow(f"chair/{i}", "chair", "train") for i in range(2)]
+    clouds = upright_examples("chair", 2)[:2]
+    made = {"name": "s", "classes": CLASSES, "arrays": {"points": clouds}}
+    write_pointset(tmp_path / "s", rows=rows, meta={}, **made)
+    facts = inspect(open_named(str(tmp_path / "s"), {}), Bounds(sample=1))
+    sure = {"up": "+z", "axis_sure": True, "sign_sure": True, "stands": stands, "lies": False}
+    facts["gravity"]["by_class"]["chair"] |= sure
+    facts["gravity"] |= {"contradicting": [], "confirming": ["chair"] * stands}
+    text = of_domain(facts)
+    ends = [line.split()[-1] for line in text.splitlines() if line.startswith("chair ")]
+    assert evidence in ends
+    assert {"clear", "weak"} & {*ends} == {evidence}
+    assert ("z is up, by the shapes of chair" in text) is stands
+
+
 @pytest.mark.parametrize("views", [False, True])
 def test_the_model_on_disk_is_what_is_learnt(views):
     shipped, again = catalogue_model(views), learnt("bathtub", views)

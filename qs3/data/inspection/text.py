@@ -154,7 +154,8 @@ def _ups(up: Numbers) -> list[str]:
     rows = [["class", "up", "clouds", *shares, "evidence"]]
     for cls, of in up["by_class"].items():
         shown, evidence = "?", "weak"
-        if of["axis_sure"]:
+        # On z and not better than on their sides: too few for `_up_verdict`, too.
+        if of["axis_sure"] and (of["stands"] or of["up"][1] != "z"):
             shown, evidence = f"{of['up'][1]}?", "of the axis only"
             if of["sign_sure"]:
                 shown, evidence = of["up"], "clear"
