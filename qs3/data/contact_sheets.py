@@ -16,7 +16,7 @@ from qs3.data.store import PointSet
 from qs3.errors import DataError
 from qs3.geometry.orthographic import project
 from qs3.utils.files import atomic_path
-from qs3.utils.plotting import GRID, INK, PANEL, SOFT, blank, cloud_colours
+from qs3.utils.plotting import GRID, INK, PANEL, SOFT, blank, boxes_for_letters, cloud_colours
 
 _PANEL, _TITLE = 1.45, 0.22  # inches
 _DPI = 130
@@ -199,7 +199,8 @@ class _Figure:
         """Write the PNG, atomically and without a date, in 256 colours: a third of the bytes."""
         from PIL import Image
 
-        self._figure.canvas.draw()
+        with boxes_for_letters():
+            self._figure.canvas.draw()
         seen = np.asarray(self._figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
         with atomic_path(path) as temporary:
             Image.fromarray(seen).quantize(256).save(temporary, format="png", optimize=True)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,9 +37,17 @@ def blank(width: float, height: float, dpi: float, *, constrained: bool = False)
     return figure
 
 
+@contextlib.contextmanager
+def boxes_for_letters() -> Iterator[None]:
+    """Draw names with letters that no font here has; matplotlib warns of each of them."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        yield
+
+
 def save_png(figure: Figure, path: Path) -> None:
     """Save, atomically; the file names no program, so that it is the same with any version."""
-    with atomic_path(path) as temporary:
+    with boxes_for_letters(), atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", metadata={"Software": None})
 
 

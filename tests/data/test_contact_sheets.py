@@ -35,6 +35,11 @@ def test_projection_of_a_single_point():
     assert np.isfinite([*seen.ravel(), *depth, *height]).all()
 
 
+def test_contact_sheet_of_names_in_any_script(tmp_path):
+    path = contact_sheet([cloud("chair", "x", 300)], ["椅子"], tmp_path / "a.png", heading="十")
+    assert matplotlib.image.imread(path).ndim == 3
+
+
 def test_contact_sheet(tmp_path):
     clouds = [cloud(cls, "x", 300) for cls in CLASSES]
     path = contact_sheet(clouds, CLASSES, tmp_path / "a.png", columns=5, heading="ten")
