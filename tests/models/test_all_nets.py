@@ -81,7 +81,7 @@ def test_parameter_count(name: str, settings: dict[str, Any], expected: int) -> 
         ("dgcnn", {"variant": "x"}, "'uda', 'simpleview', 'defrec'"),
         ("dgcnn", {"k": 0}, "model.k must be a whole number >= 1, got 0"),
         ("pointdan", {"nodes": 0}, "model.nodes must be a whole number >= 1"),
-        ("pointdan", {"radius": 0}, "model.radius must be > 0, got 0"),
+        ("pointdan", {"radius": 0.0}, "model.radius must be > 0, got 0"),
         ("pointnet", {"variant": "big"}, "'simpleview', 'uda', 'basic'"),
         ("pointnet2", {"variant": "msgg"}, "'ssg' or 'msg'"),
         ("rscnn", {"relation": "x"}, "relation must be 'released'"),
