@@ -16,6 +16,7 @@ from qs3.methods.deform import deform
 from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of, thinnest
 from qs3.models.base import Features
 from tests.methods.shapes import CLASSES, boxes, tiny_net, train, unit_ball
+from tests.unchecked import unchecked
 
 
 @settings(max_examples=30, deadline=None)
@@ -154,6 +155,10 @@ def test_a_model_without_features_per_point_is_refused() -> None:
         Mlsp().prepare(net)
     with pytest.raises(ConfigError, match=r"method.position_weight must be in \[0, 1\]"):
         Mlsp(position_weight=2.0)
+
+
+@unchecked
+def test_a_setting_that_is_no_number_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"method\.dropout must be a number, got 'half'"):
         Mlsp(dropout="half")
 
