@@ -40,7 +40,7 @@ def given_cloud(cloud: Any, name: str) -> Float[np.ndarray, "n 3"]:
     if zeros > 1:  # one may be a shape's own
         raise DataError(
             f"{name}: {zeros} points are (0, 0, 0), as depth cameras write pixels without depth; "
-            "leave such points out: cloud[cloud.any(axis=1)]"
+            "leave such points out: cloud[cloud[:, :3].any(axis=1)]"
         )
     return checked(found[:, :3], name)
 
