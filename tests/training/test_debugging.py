@@ -60,7 +60,8 @@ def test_profiler_writes_into_the_run(profiler, toy):
     )  # fmt: skip
     train(cfg)
     text = (hashing.run_folder(cfg) / "fit-profile.txt").read_text()
-    assert {"SimpleProfiler": "run_training_epoch", "PyTorchProfiler": "aten::"}[profiler] in text
+    own = {"SimpleProfiler": "run_training_epoch", "PyTorchProfiler": "Self CPU time total"}
+    assert own[profiler] in text  # not a kernel's name: the twenty dearest rows may have none
 
 
 def test_few_of_each_split(tmp_path):

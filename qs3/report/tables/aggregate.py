@@ -279,9 +279,10 @@ def data_lines(results: Iterable[RunMetrics]) -> list[str]:
     """
     found: dict[tuple[str, str, str], MadeOf] = {}
     for r in results:
-        hashes = {r.source: r.data.source, r.target: r.data.target}
-        for name, made in r.domains.items():
-            key = (name, hashes[name], str(replace(made, benchmark="")))
+        domains = r.domains
+        hashes = (r.data.source, r.data.target)[-len(domains) :]  # two of one name may be one
+        for (name, made), sha in zip(domains.items(), hashes, strict=True):
+            key = (name, sha, str(replace(made, benchmark="")))
             if key not in found or found[key].benchmark.startswith("like "):
                 found[key] = made
     return list(dict.fromkeys(f"data: {key[0]}: {made}" for key, made in found.items()))

@@ -234,3 +234,13 @@ def test_an_older_word_for_the_same_data_is_not_a_second_line():
     other = replace(runs[0], data=DataHashes(source="e" * 64, target="b" * 64))
     assert data_lines([*runs, other])[-1] == f"data: specklenet10: {old}"  # other bytes
     assert same_data(runs, "source")
+
+
+def test_data_of_one_name_have_a_line_each():
+    """As two folders of own clouds, which are both called so."""
+    made = DataMadeOf(source=replace(CATALOGUE, objects="others"), target=CATALOGUE)
+    run = replace(metrics(made_of=made), source="own", target="own")
+    lines = [f"data: own (source): {made.source}", f"data: own (target): {made.target}"]
+    assert data_lines([run, run]) == lines
+    same = replace(run, made_of=DataMadeOf(source=CATALOGUE, target=CATALOGUE))
+    assert data_lines([same]) == [f"data: own: {CATALOGUE}"]
