@@ -24,7 +24,13 @@ from qs3.evaluation.metrics import said_of
 from qs3.methods.base import Method, check_taught, class_loss, weight
 from qs3.methods.mean_teacher import move_towards
 from qs3.models.norms import begin_target_norms, use_domain
-from qs3.selftraining.selectors import Selector, TeacherPredictions, chosen_by, most_confident
+from qs3.selftraining.selectors import (
+    Selector,
+    TeacherPredictions,
+    chosen_by,
+    doubts,
+    most_confident,
+)
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
@@ -183,9 +189,12 @@ class Pcfea(Method):
             of_target = said.confidence > 1 - t
         else:
             progress = (epoch - first) / (epochs - first)
-            own = p[np.arange(len(p)), labels] if self.rank == "label" else p.max(axis=1)
-            of_source = most_confident(own, labels, 1 - progress)
-            of_target = most_confident(said.confidence, named, progress)
+            by = labels if self.rank == "label" else p.argmax(axis=1)
+            own, ids = p[np.arange(len(p)), by], data.labelled.ids
+            of_source = most_confident(own, labels, 1 - progress, ids, doubts(p, by))
+            of_target = most_confident(
+                said.confidence, named, progress, data.target.ids, said.doubt
+            )
         if self.selector is not None:
             chosen = chosen_by(self.selector, said, self.theta, (epoch - first) // between)
             of_target, named = chosen.selected, named if chosen.labels is None else chosen.labels

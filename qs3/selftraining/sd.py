@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_bool, check_int, check_ranges
 from qs3.errors import ConfigError
-from qs3.selftraining.selectors import Selection, TeacherPredictions, most_confident
+from qs3.selftraining.selectors import Selection, TeacherPredictions, doubts, most_confident
 from qs3.utils.seeding import derive
 
 _KEY = "selftraining.selector"
@@ -84,10 +84,11 @@ class GraphRefined:
         if round_:
             scores = self._scores(teacher, round_) if self.graph else teacher.probabilities
             share = min(self.growth * round_, 1.0)
+            named = scores.argmax(axis=1)
             sure = most_confident(
-                scores.max(axis=1), scores.argmax(axis=1), share, teacher.ids, least=1
+                scores.max(axis=1), named, share, teacher.ids, doubts(scores, named), least=1
             )
-            labels = np.where(sure, scores.argmax(axis=1), labels)
+            labels = np.where(sure, named, labels)
         soft = np.eye(classes)[labels] * np.where(sure, 1.0, self.unsure)[:, None]
         selected = teacher.relabelled(labels).confidence > theta
         return Selection(

@@ -1,8 +1,8 @@
 """Which pseudo-labels to trust: pure functions on a table of predictions (numpy only).
 
 A selector sees one row a target sample: its id and the probabilities that the teacher gives it. It
-never sees a label. The result does not depend on the order of the rows: ties are broken by id.
-Here: QBST and SPST; CBST and CRST in `cbst`, baselines in `baselines`.
+never sees a label. The result does not depend on the order of the rows, nor on what names say
+(`ranked`). Here: QBST and SPST; CBST and CRST in `cbst`, baselines in `baselines`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from qs3.config.checks import check_choice
 from qs3.datamodules.phases import LOWER_THETA
 from qs3.errors import ConfigError, SelectionError
 from qs3.utils.plural import counted
+from qs3.utils.seeding import derive
 
 _KEEP_ALL = "set selftraining.selector.mu=one"
 
@@ -59,6 +60,12 @@ class TeacherPredictions:
         assert self.probabilities is not None
         chosen = np.take_along_axis(self.probabilities, labels[:, None], axis=1)[:, 0]
         return replace(self, predicted=labels, confidence=chosen.astype(np.float64))
+
+    @property
+    def doubt(self) -> Float[np.ndarray, " n"] | None:
+        """See `doubts`; None where only confidences are known."""
+        known = self.probabilities
+        return None if known is None else doubts(known, self.predicted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +135,7 @@ class Qbst:
         check_choice("selftraining.selector.counts", self.counts, ("confident", "all"))
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
-        """As `Selector.select`; looks at the predicted classes alone."""
+        """As `Selector.select`; looks at the predicted classes and how sure of them it is."""
         confidence, predicted = teacher.confidence, teacher.predicted
         classes = teacher.classes
         above = confidence > theta
@@ -138,12 +145,10 @@ class Qbst:
         rest = np.full(classes, n) if self.mu == "one" else np.maximum(n - counted, 0)  # mu_k n
         quota = -(-(rest * n_k) // max(n, 1))  # ceil(mu_k n_k), in whole numbers: no rounding error
 
-        ranked = np.lexsort(
-            (np.asarray(teacher.ids), confidence if self.order == "ascending" else -confidence)
-        )
+        order = ranked(confidence, teacher.ids, teacher.doubt, ascending=self.order == "ascending")
         selected = np.zeros(len(confidence), dtype=bool)
         for k in range(classes):
-            of_class = ranked[above[ranked] & (predicted[ranked] == k)]
+            of_class = order[above[order] & (predicted[order] == k)]
             selected[of_class[: quota[k]]] = True
         return Selection(
             selected=selected,
@@ -169,21 +174,47 @@ class Spst:
         return Selection(selected, theta, mu=np.ones(len(kept)), confident=kept, kept=kept)
 
 
+def doubts(
+    probabilities: Float[np.ndarray, "n k"], labels: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """1 - p of each row's label, as the sum of the others: with digits where p is rounded to 1."""
+    others = probabilities.copy()
+    np.put_along_axis(others, labels[:, None], 0.0, axis=1)
+    return others.sum(axis=1)
+
+
+def ranked(
+    confidence: Float[np.ndarray, " n"],
+    ids: Sequence[str],
+    doubt: Float[np.ndarray, " n"] | None = None,
+    *,
+    ascending: bool = False,
+) -> Int[np.ndarray, " n"]:
+    """Positions of the most confident samples first; of the least confident if `ascending`.
+
+    A net that has trained for long says exactly 1 of many: among equal ones the less doubtful are
+    the more confident. What ties still goes by a number made from the id, neither by the id nor by
+    place: names begin with classes ("chair/train/0001") and datasets are sorted by them, so these
+    would be labels.
+    """
+    lot = np.array([derive(0, "tie", id_) for id_ in ids])
+    keys = (np.zeros(len(lot)) if doubt is None else doubt, -confidence)
+    return np.lexsort((lot, *(-key if ascending else key for key in keys)))
+
+
 def most_confident(
     confidence: Float[np.ndarray, " n"],
     labels: Int[np.ndarray, " n"],
     share: float,
-    ids: Sequence[str] | None = None,
+    ids: Sequence[str],
+    doubt: Float[np.ndarray, " n"] | None = None,
     least: int = 0,
 ) -> Bool[np.ndarray, " n"]:
-    """The max(least, round(share n_k)) most confident of the n_k samples of each label k.
-
-    Ties go by id, or by position where there are none.
-    """
-    ranked = np.lexsort((np.arange(len(labels)) if ids is None else np.asarray(ids), -confidence))
+    """The max(least, round(share n_k)) first of the n_k samples of each label k, by `ranked`."""
+    order = ranked(confidence, ids, doubt)
     chosen = np.zeros(len(labels), dtype=bool)
     for k in np.unique(labels):
-        of_class = ranked[labels[ranked] == k]
+        of_class = order[labels[order] == k]
         chosen[of_class[: max(least, round(share * len(of_class)))]] = True
     return chosen
 

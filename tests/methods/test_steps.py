@@ -153,12 +153,14 @@ def _passes(net: nn.Module) -> list[int]:
 
 def test_a_pool_takes_one_pass_of_each_cloud() -> None:
     """In batches for evaluation, and of no more clouds than there are."""
-    clouds = torch.rand(2, 50, 16, 3)
+    clouds, ids = torch.rand(2, 50, 16, 3), [f"{i:02d}" for i in range(50)]
     data = SimpleNamespace(
         labelled=SimpleNamespace(
-            clouds=SimpleNamespace(all=lambda: clouds[0]), labels=torch.arange(50) % CLASSES
+            clouds=SimpleNamespace(all=lambda: clouds[0]),
+            labels=torch.arange(50) % CLASSES,
+            ids=ids,
         ),
-        target=SimpleNamespace(points=clouds[1], ids=[f"{i:02d}" for i in range(50)]),
+        target=SimpleNamespace(points=clouds[1], ids=ids),
         eval_batch_size=20,
     )
     for settings in ({}, {"pool": "threshold"}, {"selector": Qbst()}):

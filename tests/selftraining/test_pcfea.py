@@ -84,11 +84,16 @@ def test_moments_are_numpy_s_and_empty_classes_zero() -> None:
 def _data(b: int = 40) -> Any:
     generator = torch.Generator().manual_seed(0)
     source, target = (torch.rand(b, 16, 3, generator=generator) * 2 - 1 for _ in range(2))
-    labels = torch.arange(b) % CLASSES
+    return _both(source, torch.arange(b) % CLASSES, target, 16)
+
+
+def _both(source: torch.Tensor, labels: torch.Tensor, target: torch.Tensor, size: int) -> Any:
+    ids = [f"{i:03d}" for i in range(len(labels))]
+    clouds = SimpleNamespace(all=lambda: source)
     return SimpleNamespace(
-        labelled=SimpleNamespace(clouds=SimpleNamespace(all=lambda: source), labels=labels),
-        target=SimpleNamespace(points=target, ids=[f"{i:03d}" for i in range(b)]),
-        eval_batch_size=16,
+        labelled=SimpleNamespace(clouds=clouds, labels=labels, ids=ids),
+        target=SimpleNamespace(points=target, ids=list(ids)),
+        eval_batch_size=size,
     )
 
 
@@ -150,6 +155,19 @@ def test_a_pool_by_hand() -> None:
             )
         of_class = sides[0][0][labels[0] == k]
         torch.testing.assert_close(method.source_mean[k], of_class.mean(0), rtol=1e-4, atol=1e-5)
+
+
+def test_of_clouds_that_tie_the_place_says_nothing() -> None:
+    """A dataset is sorted by class: in another order the same clouds are chosen."""
+    net, data = tiny_net(), _data()
+    net.head[-1].weight.data *= 1e6  # each probability is 0 or 1
+    method = Pcfea()
+    method.prepare(net)
+    method.start_epoch(net, data, 55, 100)
+    found, order = method.mean.clone(), torch.arange(39, -1, -1)
+    data.target.points, data.target.ids = data.target.points[order], data.target.ids[::-1]
+    method.start_epoch(net, data, 55, 100)
+    torch.testing.assert_close(method.mean, found)
 
 
 def test_a_class_without_a_cloud_in_the_pool_keeps_the_source_s_mean() -> None:
@@ -389,11 +407,7 @@ def _accuracy_of(
     labels, held_out = torch.arange(300) % 2, torch.randint(2, (600,), generator=generator)
     source, target = (clouds(labels, generator, t) for t in (False, True))
     test = clouds(held_out, generator, True)
-    data = SimpleNamespace(
-        labelled=SimpleNamespace(clouds=SimpleNamespace(all=lambda: source), labels=labels),
-        target=SimpleNamespace(points=target, ids=[f"{i:03d}" for i in range(300)]),
-        eval_batch_size=300,
-    )
+    data = _both(source, labels, target, 300)
     torch.manual_seed(seed)
     net = PointClassifier(OneLayer(), nn.Sequential(nn.Linear(OneLayer.feature_dim, 2)))
     method.prepare(net)

@@ -22,7 +22,9 @@ from qs3.selftraining.selectors import (
     check_selection,
     check_teacher,
     chosen_by,
+    doubts,
     most_confident,
+    ranked,
 )
 
 # Worked by hand for theta = 0.8. Confident: class 0: a b c d e (5), class 1: g h (2),
@@ -30,7 +32,7 @@ from qs3.selftraining.selectors import (
 TABLE = [
     ("a", 0, 0.95),
     ("b", 0, 0.99),
-    ("c", 0, 0.95),  # ties with a: the smaller id goes first
+    ("c", 0, 0.95),  # ties with a, which a lot puts first
     ("d", 0, 0.85),
     ("e", 0, 0.81),
     ("f", 0, 0.80),  # not above the threshold
@@ -217,17 +219,29 @@ def test_the_surest_worked_by_hand():
     confidence = np.array([0.9, 0.8, 0.7, 0.6, 0.9, 0.9, 0.6])  # a b c d are 0, e f g are 1
     labels = np.array([0, 0, 0, 0, 1, 1, 1])
 
-    def kept(share, ids=None, least=0):
-        return "".join(
-            np.array(list("abcdefg"))[most_confident(confidence, labels, share, ids, least)]
-        )
+    def kept(share, ids="abcdefg", **more):
+        chosen = most_confident(confidence, labels, share, list(ids), **more)
+        return "".join(np.array(list("abcdefg"))[chosen])
 
     for share, expected in ((0.0, ""), (0.5, "abef"), (0.74, "abcef"), (1.0, "abcdefg")):
         assert kept(share) == expected
     assert [kept(0.01), kept(0.01, least=1), kept(0.5, least=3)] == ["", "ae", "abcefg"]
-    assert [kept(0.3), kept(0.3, ids=list("abcdzfg"))] == ["ae", "af"]  # ties
-    three = most_confident(confidence, np.array([0, 0, 1, 1, 2, 2, 2]), 0.2)  # and least is 0
+    assert [kept(0.3), kept(0.3, ids="abcdfeg")] == ["ae", "af"]  # ties
+    assert kept(0.3, doubt=np.array([0, 0, 0, 0, 2e-20, 1e-20, 0])) == "af"
+    three = most_confident(confidence, np.array([0, 0, 1, 1, 2, 2, 2]), 0.2, list("abcdefg"))
     assert np.flatnonzero(three).tolist() == [4]  # 0.6 of three; 0.4 of two are none
+
+
+def test_ties_go_by_doubt_then_by_lot():
+    confidence, doubt = np.array([1.0, 1.0, 0.9, 1.0]), np.array([2e-20, 1e-30, 0.1, 2e-20])
+    ids = ["a", "b", "c", "z"]
+    assert ranked(confidence, ids, doubt).tolist() == [1, 0, 3, 2]
+    assert ranked(confidence, ids, doubt, ascending=True).tolist() == [2, 0, 3, 1]
+    many = [f"{name}/train/{i}" for name in ("bed", "sofa") for i in range(100)]
+    first = ranked(np.ones(200), many)[:100]
+    assert 35 <= (first < 100).sum() <= 65
+    half = doubts(np.array([[1.0, 3e-20, 1e-20], [0.25, 0.25, 0.5]]), np.array([0, 1]))
+    assert half == pytest.approx([4e-20, 0.75], rel=1e-12, abs=0)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from qs3.datamodules.phases import SelfTrainingConfig
 from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst
 from qs3.selftraining.selectors import Qbst, Spst
+from qs3.utils.seeding import derive
 from tests.composing import compose
 from tests.selftraining.test_selectors_balanced import select
 from tests.training.toy import CONF
@@ -84,18 +85,59 @@ def test_no_pseudo_label_at_or_below_theta_and_figures_agree(name, p, theta) -> 
     assert confident.tolist() == selection.confident.tolist()
 
 
+SURE = {"qbst", "qbst ascending", "qbst of all", "random", "sd"}
+
+
+@pytest.mark.parametrize("name", sorted(SURE))
+def test_a_net_that_says_1_of_many_is_taken_by_what_it_doubts(name) -> None:
+    """Logits 40 to 80 apart: each confidence is exactly 1, and each doubt another number."""
+    rng = np.random.default_rng(0)
+    gaps, k = rng.uniform(40, 80, size=120), np.repeat([0, 1, 1], 40)
+    p = np.exp(-gaps)[:, None] * np.array([[0.5, 0.5, 0.5]])
+    p[np.arange(120), k] = 1.0
+    selection, _ = select(SELECTORS[name], p, 0.8, ids_of(p), 5)
+    kept = selection.selected if name != "sd" else selection.soft.max(axis=1) == 1
+    for label in (0, 1):
+        of, here = gaps[k == label], kept[k == label]
+        assert 0 < here.sum() < len(of)
+        order = here[np.argsort(of)]  # least sure first
+        if name == "random":
+            assert order.tolist() not in (sorted(order), sorted(order, reverse=True))
+        else:
+            assert order.tolist() == sorted(order, reverse=name.endswith("ascending") or (
+                SELECTORS[name] == SELECTORS["qbst of all"]))  # fmt: skip
+
+
+@every_selector
+def test_a_name_is_no_label(name) -> None:
+    """Of clouds that tie, as many are kept of each folder of a dataset sorted by class."""
+    classes = np.arange(300) % 3
+    p = np.full((300, 3), 1e-30)
+    p[:, 0] = 1.0
+    p[:60] = [0.1, 0.85, 0.05]  # so that no mu is 0
+    ids = [f"{'abc'[k]}/train/{i:03d}" for i, k in enumerate(classes)]
+    selection, _ = select(SELECTORS[name], p, 0.8, ids, 5)
+    kept = selection.selected if selection.soft is None else selection.soft.max(axis=1) == 1
+    counts = np.bincount(classes[60:][kept[60:]], minlength=3)
+    assert counts.max() <= 1.7 * counts.min() + 10
+
+
 # --- QBST ------------------------------------------------------------------------------------
 
 
 def qbst_by_hand(p: np.ndarray, theta: float, ids: list[str], sign: int) -> list[str]:
     """One sample after the other, in fractions; the least confident first with sign = 1."""
-    above = [(i, int(row.argmax()), row.max()) for i, row in zip(ids, p, strict=True)]
-    above = [row for row in above if row[2] > theta]
+    above = [(i, int(row.argmax()), row) for i, row in zip(ids, p, strict=True)]
+    above = [row for row in above if row[2].max() > theta]
     kept = []
     for k in range(p.shape[1]):
-        of_class = sorted((sign * c, i) for i, label, c in above if label == k)
+        of_class = sorted(
+            (sign * row[k], -sign * sum(np.delete(row, k)), derive(0, "tie", i), i)
+            for i, label, row in above
+            if label == k
+        )
         mu = 1 - Fraction(len(of_class), len(above)) if above else Fraction(0)
-        kept += [f"{i}{k}" for _, i in of_class[: math.ceil(mu * len(of_class))]]
+        kept += [f"{i}{k}" for *_, i in of_class[: math.ceil(mu * len(of_class))]]
     return sorted(kept)
 
 
