@@ -48,6 +48,8 @@ class Figures:
         counts: objects of each class that is there.
         recall: of each of them, the mean over seeds.
         predicted: objects called each class, the mean over seeds.
+        alone: classes whose objects are all of one block: with them the interval of `balanced` is
+            too narrow, see `qs3.report.judge.intervals`.
     """
 
     tier: str
@@ -59,6 +61,7 @@ class Figures:
     counts: dict[str, int]
     recall: dict[str, float]
     predicted: dict[str, float]
+    alone: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -367,4 +370,5 @@ def _figures(
         {names[k]: int(counts[k]) for k in there},
         {names[k]: float(right[:, truth == k].mean()) for k in there},
         {names[k]: float((guesses == k).sum(axis=1).mean()) for k in range(len(names))},
+        tuple(names[k] for k in there if len(np.unique(blocks[truth == k])) == 1),
     )

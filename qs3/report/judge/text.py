@@ -36,6 +36,12 @@ def text(verdict: Verdict) -> str:
         "Mean ± SEM over seeds; in brackets the interval at 95 %, with blocks of frames as clusters"
         " and, of several runs, seeds.",
     ]
+    alone = [f for f in v.families[0].figures if f.alone and f.blocks > 1]
+    if said := "; ".join(f"{', '.join(f.alone)} ({f.tier})" for f in alone):
+        lines.append(
+            f"(!) seen in one block alone: {said}. How they vary from block to block is not known: "
+            "these balanced intervals are too narrow"
+        )
     lines += [f"data of {family.name}: {family.data}" for family in v.families if family.data]
     lines += [f"trained by, {f.name}: {f.trained_by}" for f in v.families if f.trained_by]
     lines.append(f"judged by {v.judged_by}")

@@ -87,6 +87,21 @@ def test_by_hand(archive, logs):
     assert sum(everything.predicted.values()) == pytest.approx(everything.n)
 
 
+def test_classes_of_one_block_are_named(archive, logs, tmp_path):
+    """Their recalls add nothing to the interval, which is too narrow then: it is said."""
+    plain = text(judge([str(logs / "other")], archive))
+    assert "one block alone" not in plain
+    arrays = dict(np.load(archive))
+    beds = np.flatnonzero((arrays["cls"] == "bed") & (arrays["dev"] == "judge"))
+    arrays["cls"][beds[1:]] = "sofa"
+    np.savez(tmp_path / "held_back.npz", **arrays)
+    verdict = judge([str(logs / "other")], tmp_path / "held_back.npz")
+    assert {f.tier: f.alone for f in verdict.families[0].figures} == {
+        "all": ("bed",), "clean": ("bed",), "hard": ()
+    }  # fmt: skip
+    assert "(!) seen in one block alone: bed (all); bed (clean). How they vary" in text(verdict)
+
+
 def test_families_parts_and_classes(archive, logs):
     verdict = judge([str(logs)], archive, part="adapt", classes=["chair", "sofa"])
     assert [family.name for family in verdict.families] == ["exp 0123abcd", "other ffff0000"]
