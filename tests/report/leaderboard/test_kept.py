@@ -11,8 +11,10 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from qs3.runs.metrics import METRICS, read_metrics
 from tests.commands import ROOT, main
 
 KEPT = ROOT / "docs" / "results" / "leaderboard"
@@ -123,3 +125,31 @@ def _figures(path: Path) -> list[list[str]]:
     """Without what a run cost, and its command."""
     keys = ("row", "column", "metric", "mean", "sem", "n", "seeds", "hash")
     return [[row[key] for key in keys] for row in _rows(path)]
+
+
+def test_the_page_of_expected_accuracies_has_the_verdicts_of_the_kept_runs() -> None:
+    """R -> A, nets with the statistics that were trained, without rounds and with them."""
+    found: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
+    for file in KEPT.rglob(METRICS):
+        run = read_metrics(file.parent)
+        assert run is not None
+        on_real = run.final.n == 334 and run.source != run.target
+        if not on_real or run.quality is None or run.quality.trust is None:
+            continue
+        if run.evaluation.norms == "trained" and run.final.accuracy is not None:
+            found[bool(run.rounds)].append((run.final.accuracy, run.quality.trust.expected))
+    (true, expected), (students, of_them) = (np.array(found[some]).T for some in (False, True))
+    refused = expected < 0.5
+    known = true[refused]
+    (odd,), (thought,) = true[~refused], expected[~refused]
+    assert (of_them < 0.5).all()
+    said = (
+        f"Of the {len(true)} without rounds and with the statistics that were trained "
+        f"{len(known)} were refused, {(known < 0.5).sum()} of which are right about fewer than "
+        f"half and {(known >= 0.5).sum()} about 50 to {100 * known.max():.0f} %; one was not "
+        f"({100 * thought:.0f} % expected, {100 * odd:.0f} % true). The estimate is "
+        f"{100 * np.abs(expected - true).mean():.1f} points off on average, at most "
+        f"{100 * (expected - true).max():.1f} too high. Of {len(students)} students of rounds, all "
+        f"refused, it is {100 * np.abs(of_them - students).mean():.1f} off"
+    )
+    assert said in " ".join((ROOT / "docs" / "results" / "trust.md").read_text("utf-8").split())
