@@ -19,6 +19,7 @@ from qs3.runs.metrics import DataMadeOf
 from qs3.training import class_shares
 from qs3.training.given import Given
 from qs3.training.provenance import note_start
+from qs3.training.real_sizes import check_real_sizes
 from qs3.training.run import Run
 
 log = logging.getLogger(__name__)
@@ -103,6 +104,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         _objects_by_id(target, run.target),
         _tiers_by_id(target, run.target),
     )
+    check_real_sizes(run.target.name, data.all_labelled, data.target, evaluation.test)
     made_of = DataMadeOf(source=labelled, target=of_target)
     return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt)
 

@@ -357,7 +357,8 @@ def _check_complete(
     """Raise DataError (or warn) if a class has no cloud in a split that other classes have."""
     have = {(row.split, row.cls) for row in rows if row.status == "ok"}
     if not have:
-        raise DataError(f"{where} holds no clouds")
+        reasons = [row.reason for row in rows if row.status != "ok"]
+        raise DataError(f"{where} holds no clouds" + _why(reasons))
     if not any(cls for _, cls in have):
         return  # no labels at all
     for split in sorted({split for split, _ in have}):
@@ -366,6 +367,15 @@ def _check_complete(
             if strict:
                 raise DataError(problem)
             log.warning("%s", printable(problem))
+
+
+def _why(reasons: Sequence[str]) -> str:
+    """What was wrong with the clouds that were left out, of a dataset where all were."""
+    if not reasons:
+        return ""
+    lines = [f"  {reason}" for reason in reasons[:_SHOWN]]
+    lines += [f"  and {len(reasons) - _SHOWN} more"] * (len(reasons) > _SHOWN)
+    return "\n".join([f" that can be read; {counted(len(reasons), 'is', 'are')} damaged:", *lines])
 
 
 def _report(rows: Sequence[ManifestRow], points: int, where: Path) -> None:

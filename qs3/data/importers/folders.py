@@ -247,7 +247,7 @@ class CloudFolder(Importer):
             except DataError as error:
                 load = functools.partial(_raise, error)
             name = (path.stem if own else stem) + (f"_{i:04d}" if many else "")
-            place = f"{origin}[{i}]" if numbered else origin
+            place = f"{origin}[{i}]" if many else origin
             row = ManifestRow(cloud_id(own, split, name), own, split, origin=place)
             found.append(Item(row, where, load))
         return found

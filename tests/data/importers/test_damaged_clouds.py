@@ -167,6 +167,23 @@ def test_damaged_files_are_named_and_the_others_go_on(
     assert config_hash(cfg) == config_hash(stops)  # data have hashes of their own
 
 
+def test_where_all_files_are_damaged_the_reasons_are_said(tmp_path: Path) -> None:
+    files = [write(tmp_path / f"{i}.npy", np.full((4, 3), np.nan)) for i in range(7)]
+    with pytest.raises(DataError) as found:
+        CloudFolder(tmp_path, points=4, on_error="skip").read(TWO)
+    first, *reasons = str(found.value).splitlines()
+    assert first == f"{tmp_path} holds no clouds that can be read; 7 are damaged:"
+    assert reasons[0] == f"  {files[0]}: all 4 points are not finite (NaN or infinite)"
+    assert reasons[5:] == ["  and 2 more"]
+
+
+def test_a_file_of_one_cloud_is_called_as_it_is(tmp_path: Path) -> None:
+    write(tmp_path / "one.npy")
+    np.save(tmp_path / "several.npy", np.stack([CLOUD, 2 * CLOUD]))
+    _, rows = CloudFolder(tmp_path, points=len(CLOUD)).read(TWO)
+    assert [row.origin for row in rows] == ["one.npy", "several.npy[0]", "several.npy[1]"]
+
+
 def test_a_store_without_damage_may_be_used_where_damage_is_left_out(tmp_path: Path) -> None:
     write(tmp_path / "in" / "bed" / "a.xyz")
     own(tmp_path, test_every=0).open()

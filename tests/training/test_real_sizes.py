@@ -1,0 +1,86 @@
+"""Own clouds that are not in metres, or not above the floor, though their config says so."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from qs3.data.store import ManifestRow, open_pointset, write_pointset
+from qs3.datamodules.clouds import Clouds
+from qs3.datamodules.splits import Unlabelled
+from qs3.errors import DataError
+from qs3.training.command import train
+from qs3.training.real_sizes import check_real_sizes
+
+
+def boxes(*sizes: float, scale: str = "metres", lowest: float = 0.0) -> Clouds:
+    """A cube of each edge length, in metres, that stands at `lowest` above the floor."""
+    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3), -1).reshape(-1, 3)
+    stored = np.array([corners * size + (0, 0, lowest) for size in sizes], dtype=np.float32)
+    return Clouds.of(stored, scale=scale)
+
+
+def named(clouds: Clouds) -> Unlabelled:
+    return Unlabelled(clouds, tuple(f"scan{i}" for i in range(len(clouds))))
+
+
+FURNITURE = (0.3, 0.5, 0.5, 2.0)
+
+
+def test_a_target_in_millimetres_is_refused():
+    scans = named(boxes(300, 500, 0.5))
+    with pytest.raises(DataError, match=r"^own: 2 clouds of 3 .*up to 433, there 1.73.* by 1000"):
+        check_real_sizes("own", boxes(*FURNITURE), scans)
+    check_real_sizes("own", boxes(*FURNITURE, scale="unit_ball"), scans)  # sizes do not matter
+    with pytest.raises(DataError, match=r"^own: 2 clouds of 3"):  # in any of its parts
+        check_real_sizes("own", boxes(*FURNITURE), named(boxes(0.5)), scans)
+
+
+def test_a_source_in_millimetres_is_refused():
+    with pytest.raises(DataError, match=r"any of own \(4 of 4; .* is 433, there 0.433\)"):
+        check_real_sizes("own", boxes(300, 500, 500, 2000), named(boxes(0.4, 0.6)))
+
+
+def test_some_clouds_in_other_units_are_named(caplog: pytest.LogCaptureFixture):
+    check_real_sizes("own", boxes(*FURNITURE), named(boxes(0.5, 500, 0.5, 0.4, 1.9, 18)))
+    (said,) = caplog.messages
+    assert said.startswith("own: 1 cloud of 6 more than ten times as large")
+    assert ": scan1; not in metres" in said
+
+
+def test_small_things_beside_large_ones_are_no_other_unit(caplog: pytest.LogCaptureFixture):
+    check_real_sizes("own", boxes(*FURNITURE), named(boxes(0.15, 0.1)))
+    assert not caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("lowest", "said"), [(-1.2, ["own: half of the clouds end 1.2 m or more below"]), (-0.2, [])]
+)
+def test_a_floor_that_clouds_reach_through(lowest, said, caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.WARNING)
+    source = boxes(*FURNITURE, scale="above_floor")
+    scans = boxes(0.4, 0.6, scale="above_floor", lowest=lowest)
+    check_real_sizes("own", source, named(scans))
+    assert [message[: len(said[0])] for message in caplog.messages] == said
+
+
+def test_a_training_finds_it_before_it_trains(toy, toy_data: Path, tmp_path: Path):
+    old = open_pointset(toy_data / "kinectsim10")
+    write_pointset(
+        tmp_path / "millimetres",
+        name="kinectsim10",
+        classes=old.classes,
+        arrays={"points": 1000 * np.asarray(old.points)},
+        rows=[
+            ManifestRow(id=id_, cls=old.classes[label], split=split)
+            for id_, label, split in zip(old.ids, old.labels, old.splits, strict=True)
+        ],
+        meta={},
+    )
+    metres = [f"data.{domain}.unit=metres" for domain in ("source", "target")]
+    cfg = toy(*metres, "data.scale=metres", f"data.target.path={tmp_path / 'millimetres'}")
+    with pytest.raises(DataError, match=r"kinectsim10: 72 clouds of 72 .* not in metres"):
+        train(cfg)
