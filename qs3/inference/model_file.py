@@ -259,15 +259,23 @@ def _filled(make: Any, settings: dict[str, Any], result: Result, target: str) ->
 
 def _maker(target: str, packages: Sequence[str]) -> Any:
     """The class or function, if it is defined in one of the packages (or modules) itself."""
+    packages = (packages,) if isinstance(packages, str) else packages
     module_name, _, name = target.rpartition(".")
     if not any(f"{module_name}.".startswith(f"{package}.") for package in packages):
         raise DataError(
-            f"the file's model is {target}, which is not in {' or '.join(packages)}; refused"
+            f"the file's model is {target}, which is not in {' or '.join(packages)}; refused. "
+            "If it is a net of your own, name its package: "
+            "qs3.load(run, packages=['qs3.models', 'my_package'])"
         )
     try:
         make = getattr(importlib.import_module(module_name), name)
     except (ImportError, AttributeError) as error:
-        raise DataError(f"the file's model {target} is not in this version of qs3") from error
+        if target.startswith(f"{PACKAGES[0]}."):
+            raise DataError(f"the file's model {target} is not in this version of qs3") from error
+        raise DataError(
+            f"the file's model {target} cannot be imported here ({error}); its module must be on "
+            "the Python path"
+        ) from error
     if getattr(make, "__module__", None) != module_name or not callable(make):
         raise DataError(f"the file's model {target} is not defined there; refused")
     return make

@@ -315,6 +315,22 @@ def test_only_our_nets_are_built(run, tmp_path, model):
     assert not mark.exists()
 
 
+def test_what_is_wrong_with_a_net_of_ones_own_is_said(run, tmp_path):
+    for target, packages, words in (
+        (
+            "my_nets.MeanNet",
+            ("qs3.models",),
+            r"refused\. If it is a net of your own, name its pack",
+        ),
+        ("my_nets.MeanNet", ("qs3.models", "my_nets"), r"No module named 'my_nets'.*Python path"),
+        ("tests.training.toy.MeanNet", ("tests",), r"cannot be imported here .*MeanNet"),
+        ("qs3.models.dgcnn.MeanNet", ("qs3.models",), "not in this version of qs3"),
+    ):
+        file = changed(run, tmp_path, model={"_target_": target, "num_classes": 3})
+        with pytest.raises(DataError, match=words):
+            load(file, packages=packages)
+
+
 @pytest.mark.parametrize("package", ["tests.training", "tests.training.toy"])
 def test_a_net_of_ones_own_is_asked_for_by_package_or_module(run, tmp_path, package):
     from tests.training.toy import TinyNet
@@ -323,6 +339,7 @@ def test_a_net_of_ones_own_is_asked_for_by_package_or_module(run, tmp_path, pack
     net = TinyNet(3).eval()
     model = {"_target_": "tests.training.toy.TinyNet", "num_classes": 3}
     file = changed(run, tmp_path, model=model, weights=net.state_dict())
+    assert isinstance(load(file, packages=package).net, TinyNet)  # a word is one package
     found = load(file, packages=("qs3.models", package))
     assert isinstance(found.net, TinyNet)
     assert not found.net.training
