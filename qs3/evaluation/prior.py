@@ -87,8 +87,8 @@ def read_prior(
 
     Args:
         given: "rooms", as in `ROOMS`; or classes and how common they are, in any unit, as
-            "chair:4,table:2,bathtub:0" or as a mapping: those that are not named count as 1, and
-            0 is never.
+            "chair:4,table:2,bathtub:0" or as a mapping, or as a mapping's words, such as the
+            `prior_shares` of a metrics.json: those that are not named count as 1, and 0 is never.
         classes: that the net knows.
         learnt: u, shares of the classes in its training, each above 0; None: all alike.
         power: t >= 0.
@@ -170,8 +170,11 @@ def _of_rooms(classes: Sequence[str], key: str) -> dict[str, float]:
 
 def _pairs(words: str, key: str) -> list[tuple[str, float]]:
     pairs: list[tuple[str, float]] = []
-    for part in words.split(","):
+    inner = words.strip()
+    inner = inner[1:-1] if inner[:1] == "{" and inner[-1:] == "}" else inner
+    for part in inner.split(","):
         name, colon, value = part.rpartition(":")
+        name = name.strip().strip("\"'")
         if not colon or not name.strip():
             raise ConfigError(
                 f"{key}={words}: {part.strip()!r} should be CLASS:NUMBER, as in "

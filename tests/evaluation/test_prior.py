@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
@@ -102,11 +103,19 @@ def test_shares_whatever_the_unit_and_no_more(
     np.testing.assert_allclose(alike(p), p)
 
 
+def test_shares_may_be_given_as_a_metrics_file_has_them():
+    known = {"chair": 0.5, "table": 0.3, "lamp": 0.2}
+    wanted = read_prior(known, THREE).shares
+    for words in (json.dumps(known, indent=6), str(known), "{chair: .5, table: .3, lamp: .2}"):
+        np.testing.assert_allclose(read_prior(words, THREE).shares, wanted)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ("chairs:4", "prior=chairs: the classifier's classes are chair, table, lamp"),
         ("chair", "'chair' should be CLASS:NUMBER"),
+        ("{chair:4", "prior={chair: the classifier's classes are chair"),
         ("", "'' should be CLASS:NUMBER"),
         ("chair:4;table:2", "'4;table' after chair|CLASS:NUMBER|classes are"),
         ("chair:many", "'many' after chair should be a number"),
