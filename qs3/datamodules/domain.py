@@ -232,6 +232,14 @@ class DomainData(LightningDataModule):
             self.random_views = RandomViews(measured, exact, self.points, rows, self.scale, floor)
 
     def _setup_training(self, dataset: PointSet) -> None:
+        if len(dataset.indices("train")) == 0:
+            raise DataError(
+                f"domain {self.domain.name}: {dataset.name} has no clouds for training, only for "
+                f"{' and '.join(sorted(dataset.counts()))}, and a training takes some of its "
+                "source and of its target: put them into a folder train/, or an archive of "
+                "objects needs parts (`dev`), some of them in published.train_parts; then delete "
+                f"{self.domain.folder} to import it again"
+            )
         self._setup_beside()
         train = self._load(dataset, "train", starts=self.fps_starts)
         if isinstance(train, Unlabelled):

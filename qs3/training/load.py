@@ -104,7 +104,8 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
         _objects_by_id(target, run.target),
         _tiers_by_id(target, run.target),
     )
-    check_real_sizes(run.target.name, data.all_labelled, data.target, evaluation.test)
+    tested = [evaluation.test] if split == "test" else []  # else they are those for training
+    check_real_sizes(run.target.name, data.all_labelled, data.target, *tested)
     made_of = DataMadeOf(source=labelled, target=of_target)
     return Loaded(data, evaluation, split, target.points.shape[1], started, made_of, drawn, learnt)
 

@@ -67,20 +67,40 @@ def test_a_floor_that_clouds_reach_through(lowest, said, caplog: pytest.LogCaptu
     assert [message[: len(said[0])] for message in caplog.messages] == said
 
 
-def test_a_training_finds_it_before_it_trains(toy, toy_data: Path, tmp_path: Path):
+def rescaled(toy_data: Path, folder: Path, splits: tuple[str, ...], large: int) -> Path:
+    """The toy target's clouds of these splits, the first `large` in millimetres."""
     old = open_pointset(toy_data / "kinectsim10")
+    kept = [i for i, split in enumerate(old.splits) if split in splits]
+    points = np.array(old.points[kept])
+    points[:large] *= 1000
+    rows = [
+        ManifestRow(id=old.ids[i], cls=old.classes[old.labels[i]], split=old.splits[i])
+        for i in kept
+    ]
+    folder.mkdir()
     write_pointset(
-        tmp_path / "millimetres",
+        folder / "kinectsim10",
         name="kinectsim10",
         classes=old.classes,
-        arrays={"points": 1000 * np.asarray(old.points)},
-        rows=[
-            ManifestRow(id=id_, cls=old.classes[label], split=split)
-            for id_, label, split in zip(old.ids, old.labels, old.splits, strict=True)
-        ],
+        arrays={"points": points},
+        rows=rows,
         meta={},
     )
-    metres = [f"data.{domain}.unit=metres" for domain in ("source", "target")]
-    cfg = toy(*metres, "data.scale=metres", f"data.target.path={tmp_path / 'millimetres'}")
-    with pytest.raises(DataError, match=r"kinectsim10: 72 clouds of 72 .* not in metres"):
-        train(cfg)
+    return folder / "kinectsim10"
+
+
+METRES = ("data.source.unit=metres", "data.target.unit=metres", "data.scale=metres")
+
+
+def test_a_training_finds_it_before_it_trains(toy, toy_data: Path, tmp_path: Path):
+    path = rescaled(toy_data, tmp_path / "mm", ("train", "test"), large=60)
+    with pytest.raises(DataError, match=r"kinectsim10: 60 clouds of 72 .* not in metres"):
+        train(toy(*METRES, f"data.target.path={path}"))
+
+
+def test_clouds_for_training_that_are_predicted_too_are_named_once(
+    toy, toy_data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    path = rescaled(toy_data, tmp_path / "mm", ("train",), large=2)
+    train(toy(*METRES, "selftraining=none", f"data.target.path={path}"))
+    assert sum("not in metres" in message for message in caplog.messages) == 1

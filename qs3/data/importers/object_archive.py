@@ -273,6 +273,12 @@ class ObjectArchive(Importer):
             )
             return [split.get(str(part), "") for part in archive.dev]
         ours = np.isin(archive.dev, self.train_parts)
+        if not ours.any():
+            has = f"its parts are {', '.join(archive.parts)}" if archive.parts else "no parts"
+            raise DataError(
+                f"{self.path} has no objects of {' or '.join(self.train_parts) or 'no part'} "
+                f"(published.train_parts) to make folds of: {has} (array `dev`)"
+            )
         frames = archive.frame
         blocks = np.unique(frames[ours] // self.block)
         if len(blocks) < self.folds:

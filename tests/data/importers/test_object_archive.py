@@ -10,6 +10,7 @@ from qs3.data.domain import compose_domain
 from qs3.data.importers.object_archive import read_archive
 from qs3.data.inspection.open_dataset import open_named
 from qs3.data.store import is_finished, read_manifest
+from qs3.datamodules.domain import DomainData
 from qs3.errors import ConfigError, DataError, Qs3Error
 from tests.fixtures.frame_files import write_archive
 
@@ -120,8 +121,13 @@ def test_what_looks_at_the_part_that_judges_says_so(file, tmp_path, caplog):
 
 def test_without_parts_all_of_it_judges(tmp_path):
     write_archive(tmp_path / "held_back.npz", {"test": 2}, dev=False)
-    data = domain(tmp_path / "held_back.npz", tmp_path).open()
-    assert set(data.splits) == {"test"}
+    data = domain(tmp_path / "held_back.npz", tmp_path)
+    assert set(data.open().splits) == {"test"}
+    target = DomainData(data, labels=False, points=4)
+    with pytest.raises(DataError, match=r"no clouds for training, only for test.* parts .`dev`"):
+        target.setup("fit")
+    with pytest.raises(DataError, match=r"no objects of adapt .* to make folds of: no parts"):
+        domain(tmp_path / "held_back.npz", tmp_path / "0", fold="0").open()
 
 
 @pytest.mark.parametrize(
