@@ -23,7 +23,7 @@ from qs3.config.checks import check_choice, check_float
 from qs3.datamodules.beside import SOURCE_TWINS
 from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
-from qs3.methods.base import check_taught, class_loss, weight
+from qs3.methods.base import check_of_use, check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher
 from qs3.models.norms import use_domain
 
@@ -73,8 +73,9 @@ class Twin(MeanTeacher):
         target_temperature: T_t > 0.
 
     Raises:
-        ConfigError: a value is out of its range, or a teacher of its own learns nothing
-            (twin_weight=0) or teaches nothing (logit_weight=0 and feature_weight=0).
+        ConfigError: a value is out of its range, a temperature is of a term that is left out, or a
+            teacher of its own learns nothing (twin_weight=0) or teaches nothing (logit_weight=0
+            and feature_weight=0).
     """
 
     def __init__(
@@ -112,6 +113,9 @@ class Twin(MeanTeacher):
             "method.target_temperature", target_temperature, "> 0"
         )
         self.uses_target = self.target_weight > 0  # type: ignore[misc]
+        logits, target = "set method.logit_weight above 0", "set method.target_weight above 0"
+        check_of_use("temperature", temperature, 2.0, self.logit_weight, logits)
+        check_of_use("target_temperature", target_temperature, 0.5, self.target_weight, target)
         self.wants = Wants(
             twin=self.sees if self.twin_weight or self._distils else None,
             again=self.again_weight > 0 or self.view_weight > 0,

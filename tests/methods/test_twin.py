@@ -220,6 +220,17 @@ def test_wrong_settings_name_the_key(settings: dict[str, Any], message: str) -> 
         Twin(**settings)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "weight"),
+    [("temperature", 4.0, "logit_weight"), ("target_temperature", 1.0, "target_weight")],
+)
+def test_a_temperature_that_nothing_reads_is_refused(key: str, value: float, weight: str) -> None:
+    """It would be a run of its own, equal to the bit to the one without it."""
+    with pytest.raises(ConfigError, match=rf"method.{key}={value} would .* method.{weight} above"):
+        Twin(**{key: value})
+    assert getattr(Twin(**{key: value, weight: 1.0}), key) == value
+
+
 @pytest.mark.slow
 def test_a_cut_target_cloud_is_taken_for_what_it_was_before_the_cut() -> None:
     """The source's left side says nothing of the class, the target's another corner than the right.

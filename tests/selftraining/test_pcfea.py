@@ -361,6 +361,8 @@ def test_terms_before_and_with_a_pool() -> None:
         ({"momentum": 1.0}, r"method.momentum must be in \[0, 1\)"),
         ({"plain": 1.0}, r"method.plain must be in \[0, 1\)"),
         ({"every": 0.0}, r"method.every must be in \(0, 1\]"),
+        ({"theta": 0.3}, "theta=0.3 would have no effect; set method.selector, as .* at 0.8"),
+        ({"pool": "threshold", "rank": "most"}, "rank=most would have no effect; set method.pool="),
         ({"selector": "qbst"}, "method.selector must be null or a selector"),
         ({"selector": GraphRefined()}, "method.selector chooses by features"),
         ({"selector": Random(of=GraphRefined())}, "method.selector chooses by features"),
