@@ -34,11 +34,11 @@ def _built(
 ) -> Table:
     """The table that the options ask for, with our runs.
 
-    `runs`: there are some, one may think; `row`: one that it has to have.
+    `runs`: there are some, one may think; `row`: a word for one that it has to have.
     """
     from qs3.config.quoting import override, words_of
-    from qs3.report.tables.comparison import check_row
     from qs3.report.tables.keeping import unused
+    from qs3.report.tables.overrides import row_of
     from qs3.report.tables.table import build_table
 
     extra = words_of("overrides", overrides)
@@ -46,7 +46,8 @@ def _built(
     if runs and not kept and log_dir and not Path(log_dir).is_dir():
         raise ConfigError(f"log_dir={log_dir} is not there; it is the paths.log_dir of the runs")
     if row is not None:  # before cells are looked up, which takes a while
-        check_row(build_table(table, "logs", extra, target, columns=columns, runs=False), row)
+        plain = build_table(table, "logs", extra, target, columns=columns, runs=False)
+        row_of(plain.rows, row, plain.name)
     built = build_table(table, log_dir or "logs", extra, target, kept, columns=columns)
     if kept and (why := unused(built, kept)):
         print(f"note: {why}", file=sys.stderr)
@@ -64,17 +65,15 @@ def _saved_at(table: Table, out: str | None, given: dict[str, Any]) -> Path:
 
 def _table(out: str | None, **given: Any) -> None:
     from qs3.report.tables.formats import csv_text, latex, markdown
-    from qs3.utils.files import write_text
+    from qs3.report.tables.saving import save
 
     table = _built(**given)
     if settings := given["overrides"]:
         table = replace(table, notes=(*table.notes, f"overrides of the runs: `{settings}`"))
-    shown, at = markdown(table), _saved_at(table, out, given)
-    write_text(f"{at}.md", shown)
-    for suffix, write in ((".csv", csv_text), (".tex", latex)):
-        write_text(f"{at}{suffix}", write(table))
-    print(shown)
-    print(f"saved {at}.md, .csv, .tex")
+    texts = {".md": markdown(table), ".csv": csv_text(table), ".tex": latex(table)}
+    said = save(_saved_at(table, out, given), texts)
+    print(texts[".md"])
+    print(said)
 
 
 def _train(
@@ -116,9 +115,10 @@ def _keep(into: str, **given: Any) -> None:
 
 def _compare(base: str | None, out: str | None, **given: Any) -> None:
     from qs3.report.tables import comparison
+    from qs3.report.tables.overrides import row_of
 
-    base = base or ""
-    table = _built(**given, row=base)
+    table = _built(**given, row=base or "")
+    base = row_of(table.rows, base or "", table.name)
     found, at = comparison.against(table, base), _saved_at(table, out, given)
     _save(f"{at}-compared", table, found, base)
 
@@ -135,12 +135,12 @@ def _effects(out: str | None, **given: Any) -> None:
 
 def _save(at: str, table: Table, found: Sequence[Any], base: str = "") -> None:
     from qs3.report.tables.comparison import csv_text, text
-    from qs3.utils.files import write_text
+    from qs3.report.tables.saving import save
 
-    write_text(f"{at}.md", text(found, base, markdown=True, table=table))
-    write_text(f"{at}.csv", csv_text(found))
+    page = text(found, base, markdown=True, table=table)
+    said = save(at, {".md": page, ".csv": csv_text(found)})
     print(text(found, base, table=table))
-    print(f"saved {at}.md, .csv")
+    print(said)
 
 
 def _page(run: str, data_dir: str | None, out: str | None) -> None:
@@ -292,7 +292,7 @@ COMPARE = Command(
     _compare,
     (
         *_TABLE,
-        Option("base", text("ROW"), "the row to compare with (default: an error that names them)"),
+        Option("base", text("ROW"), "the row to compare with: its name, or a word of it alone"),
         _OUT,
     ),
     ('qs3 report compare table=cad10 base="source only"',),

@@ -34,6 +34,7 @@ OWN = {
     "models/features.py": "a net that the user names, parsed and run by onnxruntime",
     "report/runs/page.py": "pictures that were drawn before, taken over as bytes",
     "report/tables/keeping.py": "bytes that are compared",
+    "report/tables/saving.py": "bytes that are compared",
     "sensors/bench/comparison.py": "the bench's own cache",
     "sensors/renderers/blender.py": "what this process has just said",
     "sensors/renderers/exr.py": "what Blender has just written",

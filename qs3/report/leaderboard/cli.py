@@ -49,8 +49,8 @@ def _leaderboard(
     from qs3.report.tables.keeping import unused
     from qs3.report.tables.overrides import file_name
     from qs3.report.tables.running import launch, missing
+    from qs3.report.tables.saving import save
     from qs3.report.tables.table import build_table
-    from qs3.utils.files import write_text
 
     row = own_row(method, name, selftraining, more)
     extra = words_of("overrides", overrides)
@@ -75,10 +75,8 @@ def _leaderboard(
     place = file_name(shown.name, _file_name(name), columns=columns, overrides=overrides)
     at = Path(out or Path(log_dir) / "tables") / place
     page = markdown(shown) + _intervals(shown, name)
-    write_text(f"{at}.md", page)
-    for suffix, write in ((".csv", csv_text), (".tex", latex)):
-        write_text(f"{at}{suffix}", write(shown))
-    print(f"{page}\nsaved {at}.md, .csv, .tex")
+    said = save(at, {".md": page, ".csv": csv_text(shown), ".tex": latex(shown)})
+    print(f"{page}\n{said}")
     return status
 
 

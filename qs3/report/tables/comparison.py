@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from qs3.data.importers.object_archive import TIERS
-from qs3.errors import ConfigError, DataError
+from qs3.errors import DataError
 from qs3.report.clustered import LEVEL
 from qs3.report.tables.aggregate import data_differences, data_lines, same_data
 from qs3.report.tables.cells import Cell, Table
 from qs3.report.tables.formats import SIMULATED, marks, problems_of
 from qs3.report.tables.made_of import data_marks, results_of
+from qs3.report.tables.overrides import row_of
 from qs3.report.tables.paired import Difference, compare_on_average
 from qs3.runs.predictions import FILE, Predictions, read_predictions
 from qs3.utils import text_table
@@ -84,17 +85,9 @@ def minus_each(table: Table, row: str) -> list[Compared]:
     ]
 
 
-def check_row(table: Table, row: str) -> None:
-    """Raise ConfigError, with the rows there are, unless the table has this one."""
-    if row not in table.rows:
-        rows = ", ".join(map(repr, table.rows))
-        what = f"table {table.name} has no row {row!r}" if row else "against which row? give base="
-        raise ConfigError(f"{what}; rows are {rows}")
-
-
 def _beside(table: Table, base: str) -> list[tuple[str, Cell, Cell]]:
     """Name and cell of each other row and column, and the cell of the row `base` there."""
-    check_row(table, base)
+    base = row_of(table.rows, base, table.name)
     found = []
     for row, cells in table.rows.items():
         if row == base:

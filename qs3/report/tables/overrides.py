@@ -18,8 +18,14 @@ from collections.abc import Iterable, Sequence
 from qs3.config.hashing import is_hashed
 from qs3.config.quoting import words_of
 from qs3.errors import ConfigError
+from qs3.utils.hints import nearest
 
 ALONE = 'for some columns alone: overrides="COLUMN:KEY=VALUE"'
+_ELSEWHERE = {
+    "seed": "each cell has several; which of them `qs3 report train` trains, seeds=0,1 says",
+    "paths.log_dir": "the table would not look there; log_dir=FOLDER says where runs are",
+}
+"""What a table says itself of its runs, and how to say it."""
 _LONGEST = 80
 
 
@@ -43,6 +49,17 @@ def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[s
     return {column: tuple(own) for column, own in found.items()}
 
 
+def check_words(words: Iterable[str]) -> None:
+    """Raise ConfigError for what a table says itself of its runs: it would be passed over.
+
+    Args:
+        words: as a user gave them.
+    """
+    for word in words:
+        if instead := _ELSEWHERE.get(_key(_split(word)[1])):
+            raise ConfigError(f"overrides: {word}: {instead}")
+
+
 def chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
     """Names that are meant by the words: the one that is the word, else all that contain it.
 
@@ -56,6 +73,26 @@ def chosen(names: Iterable[str], words: Sequence[str]) -> set[str]:
 def unknown(names: Iterable[str], words: Sequence[str]) -> list[str]:
     """The words that mean no name."""
     return [word for word, meant in _meant(list(names), words).items() if not meant]
+
+
+def row_of(rows: Iterable[str], word: str, table: str) -> str:
+    """The one row that `base=` means, by its words as `chosen` takes them.
+
+    Raises:
+        ConfigError: there is none, or there are several; says which.
+    """
+    rows = list(rows)
+    if not word:
+        raise ConfigError(f"against which row? give base=; rows are {', '.join(map(repr, rows))}")
+    meant = [row for row in rows if row in chosen(rows, [word])]
+    if len(meant) > 1:
+        several = ", ".join(map(repr, meant))
+        raise ConfigError(f"base={word} may be several rows of table {table}: {several}")
+    if not meant:
+        hint = f" (did you mean {near!r}?)" if (near := nearest(word, rows)) else ""
+        named = ", ".join(map(repr, rows))
+        raise ConfigError(f"table {table} has no row {word!r}{hint}; rows are {named}")
+    return meant[0]
 
 
 def file_name(*parts: str | None, columns: Sequence[str], overrides: str) -> str:

@@ -25,7 +25,7 @@ from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import Group, group, load_runs
 from qs3.report.tables.cells import SEEDS, Cell, Metric, Published, Table
 from qs3.report.tables.keeping import with_kept
-from qs3.report.tables.overrides import ALONE, by_column, chosen, unknown
+from qs3.report.tables.overrides import ALONE, by_column, check_words, chosen, unknown
 from qs3.report.tables.row_keys import check_keys
 from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.plural import counted
@@ -111,6 +111,7 @@ def build_table(
             raise ConfigError(
                 f"target={target}: the columns of table {name} have several targets; leave it out"
             )
+    check_words(extra)
     more = [*extra, *([f"domain@data.target={target}"] if target else [])]
     place = override("paths.log_dir", log_dir)
     if str(log_dir) != "logs":

@@ -64,6 +64,28 @@ def test_kept_results_are_the_table_without_the_runs(file, tmp_path, capsys):
         assert bool(said) == bool(note)
 
 
+def test_a_table_that_takes_another_s_place_is_said(file, tmp_path, capsys):
+    """Of two folders of kept runs; their tables have one name."""
+    for name, row in (("a", "source only"), ("b", "DANN")):
+        keep(fill(tmp_path / name, file, {(row, PLACE): 10}), tmp_path / f"kept_{name}")
+    words = [f"table={file}", "log_dir=nowhere", f"out={tmp_path}"]
+
+    def said(*more):
+        assert main(["report", *more, *words]) == 0
+        return capsys.readouterr().out.splitlines()[-1]
+
+    replaced = " (replaced what was there; out=FOLDER would keep both)"
+    saved = f"saved {tmp_path}/two.md, .csv, .tex"
+    assert said("table", f"kept={tmp_path / 'kept_a'}") == saved
+    assert said("table", f"kept={tmp_path / 'kept_a'}") == saved  # the same
+    (tmp_path / "two.md").unlink()
+    kept = f"kept={tmp_path / 'kept_b'}"
+    assert said("table", kept) == saved + replaced
+    saved = f"saved {tmp_path}/two-compared.md, .csv"
+    assert said("compare", kept, "base=dann") == saved
+    assert said("compare", kept, "base=source") == saved + replaced
+
+
 def test_a_run_that_is_there_comes_before_a_kept_one(file, tmp_path):
     logs, kept = tmp_path / "logs", tmp_path / "kept"
     before = fill(tmp_path / "before", file, {("source only", PLACE): 10, ("DANN", PLACE): 14})

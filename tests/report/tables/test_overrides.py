@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from qs3.errors import ConfigError
-from qs3.report.tables.overrides import by_column, chosen, file_name, unknown
+from qs3.report.tables.overrides import by_column, chosen, file_name, row_of, unknown
 from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
 from tests.commands import main
@@ -58,6 +58,35 @@ def test_a_name_with_commas_is_one_name():
     assert chosen(names, ["source only", "batches of 32"]) == {"source only, batches of 32"}
     assert chosen(names, ["AdaBN", "source only"]) == {names[0], names[2]}
     assert unknown(names, ["batches", "mars", "source only", "batches of 32"]) == ["mars"]
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("seed=0,1", r"overrides: seed=0,1: each cell has several; .*, seeds=0,1 says"),
+        ("S->K:+seed=3", r"overrides: S->K:\+seed=3: each cell has several"),
+        ("paths.log_dir=/x", r"overrides: paths.log_dir=/x: the table .*; log_dir=FOLDER says"),
+    ],
+)
+def test_what_a_table_says_itself_is_no_override(word, message, tmp_path):
+    """Commands of the page ended in `seed=3 seed=0,1,2`; runs went where no table looked."""
+    path = tmp_path / "several.yaml"
+    path.write_text(TABLE)
+    with pytest.raises(ConfigError, match=message):
+        build_table(str(path), tmp_path, ["data.points=64", word], runs=False)
+
+
+def test_the_row_that_a_word_means():
+    rows = ("source only", "source only, batches of 32", "AdaBN, batches of 32", "PCM")
+    assert row_of(rows, "source only", "t") == "source only"
+    assert row_of(rows, "pcm", "t") == "PCM"
+    assert row_of(rows, "ada", "t") == "AdaBN, batches of 32"
+    with pytest.raises(ConfigError, match=r"against which row.*; rows are 'source only', 'so"):
+        row_of(rows, "", "t")
+    with pytest.raises(ConfigError, match=r"several rows of table t: 'source only, .*'AdaBN"):
+        row_of(rows, "of 32", "t")
+    with pytest.raises(ConfigError, match=r"t has no row 'PMC' \(did you mean 'PCM'\?\); rows are"):
+        row_of(rows, "PMC", "t")
 
 
 def test_other_runs_have_other_files():
