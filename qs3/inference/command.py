@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from qs3.inference.depth_list import Shown, direction, find_shown, numbers
 from qs3.inference.draw import clouds_in, draw, objects_in
 from qs3.inference.floor import Floor, camera_is_missing, floor_is_missing, floor_under
 from qs3.inference.inputs import (
+    Sample,
+    Unit,
     archive_part,
     archive_units,
     cloud_units,
@@ -79,12 +82,14 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     began, gallery = time.monotonic(), Gallery(classes)
     rows: list[Row] = []
     try:
-        label, total, each = _steps(inputs)
-        with progress_bar(label, total=total) as advance:
-            after = _nothing if each else advance
-            for row, sample in predict_units(predictor, inputs.units, settings, after, second):
+        label, sizes = _steps(inputs)
+        with progress_bar(label, total=sum(sizes or [1] * len(inputs.units))) as advance:
+            after, units = (_nothing if sizes else advance), inputs.units
+            if sizes:
+                units = [partial(_all_of, *one, advance) for one in zip(units, sizes, strict=True)]
+            for row, sample in predict_units(predictor, units, settings, after, second):
                 rows.append(row)
-                if each:
+                if sizes:
                     advance()
                 if sample and settings.page:
                     gallery.add(row, sample)
@@ -124,15 +129,25 @@ def predict_command(settings: Settings) -> tuple[str, int]:
     return "\n".join(lines), sum(row.probabilities is None for row in rows)
 
 
-def _steps(inputs: Inputs) -> tuple[str, int, bool]:
-    """What the progress counts, how many, and whether these are the objects and not the files.
+def _steps(inputs: Inputs) -> tuple[str, Sequence[int] | None]:
+    """What the progress counts: the objects, so many of each file, or (None) the files.
 
     Objects where there are few files, one of which may hold thousands; to count those of many files
     would take as long as to read them.
     """
     if inputs.sizes is None or len(inputs.units) > FEW:
-        return f"{inputs.kind} read", len(inputs.units), False
-    return "clouds", sum(inputs.sizes()), True
+        return f"{inputs.kind} read", None
+    return "clouds", inputs.sizes()
+
+
+def _all_of(unit: Unit, size: int, advance: Callable[[], None]) -> Iterator[Sample | Row]:
+    """A unit; `advance` is called for those of its objects that it does not give: it is damaged."""
+    given = 0
+    for item in unit():
+        given += 1
+        yield item
+    for _ in range(size - given):
+        advance()
 
 
 def _nothing() -> None:

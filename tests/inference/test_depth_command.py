@@ -202,7 +202,8 @@ def test_a_box_without_gravity_and_metres_in_npy(run, frame):
     assert 0.9 * true < one["points"] <= true
 
 
-def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys):
+def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys, caplog):
+    caplog.set_level("INFO", logger="qs3")
     whole = (frame / "depth.png").read_bytes()
     (frame / "broken.png").write_bytes(whole[: len(whole) // 2])
     (frame / "objects.csv").write_text(
@@ -235,6 +236,7 @@ def test_a_list_with_a_damaged_picture_goes_on(run, frame, capsys):
         assert words in reason
     said = capsys.readouterr().out
     assert "5 failed:" in said
+    assert "clouds: 9 of 9, " in caplog.text  # two masks of two, whose pictures are not read
     assert re.search(r"right [012] of 2 \(", said)
     page = (frame / "said.html").read_text()
     assert "Not predicted: 5" in page
