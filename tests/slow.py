@@ -208,6 +208,20 @@ PATTERNS = (
     r"generation/test_generate_configs\.py::test_every_key.*\[(?!specklenet10\]|kinectsim10\]|roomscan10)",
     r"generation/test_depth_errors\.py::test_every_row",
     r"test_docs\.py::test_the_example_of_gradients",
+    # What had grown since, or takes longer than the parts that stay.
+    r"report/leaderboard/test_kept\.py::test_a_table_s_figures.*(A0|S -> [KC])",
+    r"report/tables/test_running\.py::test_each_tier",
+    r"report/runs/test_pictures\.py::test_(predictions_of_a_cloud|damaged_data_cost)",
+    r"training/test_cuda_graphs\.py::test_a_run_is_the_same_with_graphs\[method1",
+    r"training/test_command\.py::test_a_start_that_fails",
+    r"geometry/test_exact_products\.py::test_nets_round.*\[(pointnet2|simpleview)",
+    r"methods/test_steps\.py::test_a_graph_s_step_does_not_grow",
+    r"inference/test_trusted\.py::test_norms_of_each_domain_are_the_target_s",
+    r"generation/test_twins\.py::test_asking_for_twins",
+    r"tuning/test_tune\.py::test_another_net",
+    r"sensors/fit/test_fill\.py::test_holes_of_one_rate.*\[(0\.8-1|0\.97)",
+    r"sensors/fit/test_infrared\.py::test_an_amplifier",
+    r"sensors/bench/test_presets\.py::test_a_d400_loses.*d415",
 )
 
 _SLOW = re.compile("|".join(PATTERNS))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.plugins.environments import LightningEnvironment
 from omegaconf import OmegaConf
 
 from qs3.config.hydra import build
@@ -72,7 +73,8 @@ def build_training(
         max_epochs=phases.total,
         callbacks=[*build_each(cfg.get("callbacks")), *callbacks],
         logger=[CsvHistory(folder), *build_each(cfg.get("logger"))],
-        plugins=[AtomicCheckpointIO()],
+        # In a job of SLURM Lightning would take its tasks for the processes: one, of trainer.devices=2.
+        plugins=[AtomicCheckpointIO(), LightningEnvironment()],
         default_root_dir=folder,
     )
     if any(isinstance(module, DomainNorm) for module in classifier.net.modules()):

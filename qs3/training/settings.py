@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -213,7 +214,7 @@ def check_run(run: Run) -> None:
     _check_scale(run)
     _check_frozen(run)
     check_objective(run.cfg.objective)
-    _refuse_ddp_in_multirun(run.cfg)
+    _check_processes(run.cfg)
 
 
 def _check_keys(cfg: DictConfig) -> None:
@@ -328,12 +329,22 @@ def _check_frozen(run: Run) -> None:
         )
 
 
-def _refuse_ddp_in_multirun(cfg: DictConfig) -> None:
-    """Lightning would start each further process with the whole sweep's command line."""
+def _check_processes(cfg: DictConfig) -> None:
+    """Refuse copies of a run that are no processes of it: `train.py` starts those itself."""
+    if "TORCHELASTIC_RUN_ID" in os.environ:
+        raise ConfigError(
+            "torchrun starts several copies of this command, which starts its processes itself: "
+            "python train.py ... trainer=ddp trainer.devices=N"
+        )
+    if (nodes := check_int("trainer.num_nodes", cfg.trainer.get("num_nodes", 1), 1)) > 1:
+        raise ConfigError(
+            f"trainer.num_nodes={nodes} cannot be had: a run is on one machine; runs of a sweep can "
+            "be on several, with hydra/launcher=slurm or ray"
+        )
+    # Lightning would start each further process with the whole sweep's command line.
     devices = cfg.trainer.get("devices", 1)
     one = len(devices) == 1 if isinstance(devices, ListConfig) else str(devices) == "1"
-    several = not one or cfg.trainer.get("num_nodes", 1) > 1
-    if several and in_multirun():
+    if not one and in_multirun():
         raise ConfigError(
             "trainer uses several processes (DDP), which cannot be swept with -m; run each seed by "
             "itself, or sweep one-process runs with hydra/launcher=joblib"

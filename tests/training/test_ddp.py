@@ -149,8 +149,15 @@ def test_weights_are_the_same_in_both(both: Both) -> None:
 
 
 @pytest.mark.slow
-def test_too_few_pseudo_labels_for_two_processes(toy_data: Path, tmp_path: Path) -> None:
-    """Two are enough for one process; of two each would have a batch of one."""
+def test_too_few_pseudo_labels_for_two_processes(
+    toy_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two are enough for one process; of two each would have a batch of one.
+
+    In a job of SLURM with one task (`sbatch`): Lightning by itself would train in one process there.
+    """
+    for key, value in {"JOB_ID": 7, "NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0}.items():
+        monkeypatch.setenv(f"SLURM_{key}", str(value))
     few = ("method=source_only", "selftraining=confident", "selftraining.share=0.02")
     short = ("protocol.epochs=1", "selftraining.rounds=1", "selftraining.epochs=1")
     done = command(tmp_path, *overrides(tmp_path, f"paths.data_dir={toy_data}", *few, *short, *TWO))

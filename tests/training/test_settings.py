@@ -90,3 +90,13 @@ def test_without_callbacks_and_loggers_there_are_none(toy):
     assert folder == hashing.run_folder(toy("selftraining=none"))
     assert train(cfg) == read_metrics(folder)
     assert (folder / "history.csv").is_file()
+
+
+def test_copies_of_a_run_are_refused(toy, monkeypatch):
+    """Each would take itself for one of several processes, and nobody would lead them."""
+    with pytest.raises(ConfigError, match=r"^trainer\.num_nodes=2 cannot be had: a run is on one"):
+        train(toy("trainer.num_nodes=2"))
+    for key, value in {"TORCHELASTIC_RUN_ID": "none", "LOCAL_RANK": "1"}.items():
+        monkeypatch.setenv(key, value)
+    with pytest.raises(ConfigError, match=r"^torchrun starts several .* trainer\.devices=N$"):
+        train(toy())
