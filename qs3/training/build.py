@@ -73,7 +73,7 @@ def build_training(
         max_epochs=phases.total,
         callbacks=[*build_each(cfg.get("callbacks")), *callbacks],
         logger=[CsvHistory(folder), *build_each(cfg.get("logger"))],
-        # In a job of SLURM Lightning would take its tasks for the processes: one, of trainer.devices=2.
+        # In a job of SLURM Lightning would take its tasks, mostly one, for the processes.
         plugins=[AtomicCheckpointIO(), LightningEnvironment()],
         default_root_dir=folder,
     )

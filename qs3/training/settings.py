@@ -338,8 +338,8 @@ def _check_processes(cfg: DictConfig) -> None:
         )
     if (nodes := check_int("trainer.num_nodes", cfg.trainer.get("num_nodes", 1), 1)) > 1:
         raise ConfigError(
-            f"trainer.num_nodes={nodes} cannot be had: a run is on one machine; runs of a sweep can "
-            "be on several, with hydra/launcher=slurm or ray"
+            f"trainer.num_nodes={nodes} cannot be had: a run is on one machine; those of a sweep "
+            "can be on several, with hydra/launcher=slurm or ray"
         )
     # Lightning would start each further process with the whole sweep's command line.
     devices = cfg.trainer.get("devices", 1)

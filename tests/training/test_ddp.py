@@ -154,7 +154,7 @@ def test_too_few_pseudo_labels_for_two_processes(
 ) -> None:
     """Two are enough for one process; of two each would have a batch of one.
 
-    In a job of SLURM with one task (`sbatch`): Lightning by itself would train in one process there.
+    In a job of SLURM with one task (`sbatch`): Lightning by itself would train in one process.
     """
     for key, value in {"JOB_ID": 7, "NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0}.items():
         monkeypatch.setenv(f"SLURM_{key}", str(value))
