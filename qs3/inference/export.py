@@ -360,8 +360,8 @@ def _cannot(predictor: Predictor, error: Exception) -> Qs3Error:
     first = next((line for line in f"{cause}\n{error}".splitlines() if line.strip()), "")
     return Qs3Error(
         f"torch {torch.__version__} cannot export {predictor.result.model['_target_']}: its layers "
-        "do what depends on values or on the number of clouds, which a graph cannot hold; use it "
-        f"by qs3.load ({type(cause).__name__}: {first[:200]})"
+        "do what a graph cannot hold, mostly work that depends on values or on the number of "
+        f"clouds ({type(cause).__name__}: {first[:200]}); use it by qs3.load"
     )
 
 
