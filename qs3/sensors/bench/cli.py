@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,9 +40,9 @@ def _bench(
         if real is not None and subject.name == "kinect_v1":
             figure = folder / comparison.FIGURE
             compared = comparison.compare(subject, config, renderer, cache, figure, Path(real))
-    shown = [word for word in line.split() if not word.startswith(("out=", "real="))]
+    typed = [word for word in shlex.split(line) if not word.startswith(("out=", "real="))]
     detail = ", ".join(f"{k} {v}" for k, v in renderer.provenance().items())
-    said = page.page(results, captions, compared, plan, " ".join(shown), detail)
+    said = page.page(results, captions, compared, plan, shlex.join(typed), detail)
     write_text(folder / "index.md", said)
     write_text(folder / "planes.csv", page.csv_text(results))
     write_json(folder / "settings.json", {subject.name: config for subject, config in subjects})
@@ -73,6 +74,9 @@ Measures planes, an edge and whole frames of rooms, and writes a page (index.md)
 all numbers of the planes (planes.csv). The exit status is 1 if a band does not hold. Every finished
 condition is kept in OUT/cache.
 """,
-    others={"sensor.": "settings of all of them"},
+    others={
+        "sensor.": "settings of all of them",
+        "hydra.": "as 'hydra.searchpath=[file:///FOLDER]': presets of yours in FOLDER/sensor, too",
+    },
     line=True,
 )

@@ -124,11 +124,16 @@ class SensorResult:
 def load(name: str, overrides: Sequence[str] = ()) -> tuple[Subject, dict[str, Any]]:
     """A sensor by the name of its file in conf/sensor ("kinect_v1"), and its resolved settings.
 
+    Args:
+        overrides: "sensor.key=value", or "hydra.searchpath=[file:///FOLDER]", whose FOLDER/sensor
+            has files, too.
+
     Raises:
-        ConfigError: there is no such sensor, or `overrides` ("sensor.key=value") do not fit.
+        ConfigError: there is no such sensor, or `overrides` do not fit.
     """
     known = [choice for choice in choices("sensor") if choice != "none"]
-    if name not in known:
+    elsewhere = any(word.startswith("hydra.searchpath=") for word in overrides)
+    if name not in known and not elsewhere:  # of other folders Hydra says what they have
         raise ConfigError(f"sensor={name} is unknown; there are {', '.join(known)}")
     cfg = composed(None, f"+sensor={name}", *overrides, place=f"sensor={name}: ")
     settings = OmegaConf.to_container(cfg.sensor, resolve=True)

@@ -63,6 +63,22 @@ def test_more_read_noise_is_more_noise_over_time(renderer):
     assert over_time[1] > 3 * over_time[0]
 
 
+def test_a_preset_of_one_s_own_folder(tmp_path):
+    """As generation takes it: the file may begin with one of ours."""
+    (tmp_path / "conf" / "sensor").mkdir(parents=True)
+    own = "defaults: [kinect_v1, _self_]\nbaseline_m: 0.06\n"
+    (tmp_path / "conf" / "sensor" / "my_camera.yaml").write_text(own)
+    words = [f"hydra.searchpath=[file://{tmp_path / 'conf'}]"]
+    subject, settings = runner.load("my_camera", words)
+    _, ours = runner.load("kinect_v1")
+    assert settings == {**ours, "baseline_m": 0.06}
+    assert subject.sensor.baseline_m == 0.06
+    with pytest.raises(ConfigError, match=r"sensor=my_camer: .*did you mean \+sensor=my_camera"):
+        runner.load("my_camer", words)
+    with pytest.raises(ConfigError, match="sensor=my_camera is unknown; there are"):
+        runner.load("my_camera")
+
+
 def test_a_still_scene_is_rendered_once_and_its_noise_is_new(renderer):
     plane = TiltedPlane(2.0)
     k = KINECT.intrinsics
