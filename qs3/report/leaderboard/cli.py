@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ALONE = "experiment=leaderboard"
 WITH_ROUNDS = "protocol.epochs=10 protocol.steps=180"
 """What rows with rounds have beside `ALONE`: as many steps in all as the others."""
+SURE = {"sd": "selftraining.selector.growth=0.5"}
+"""What a scheme has in the table's rows, because there are two rounds, not as many as its own."""
 
 
 def _leaderboard(
@@ -95,6 +97,7 @@ def own_row(
         MissingDataError: there is no such file.
         ConfigError: there is no such selftraining.
     """
+    from qs3.config.compose import composed
     from qs3.config.hashing import file_sha256
     from qs3.config.quoting import override
 
@@ -107,7 +110,11 @@ def own_row(
         *(f"+{word}" for word in settings),
     ]
     if selftraining != "none":
-        words += [f"selftraining={selftraining}", *WITH_ROUNDS.split()]
+        scheme = f"selftraining={selftraining}"
+        words += [scheme, *SURE.get(selftraining, "").split()]
+        if composed("train", ALONE, scheme).selftraining.get("theta") == 0:
+            words.append("selftraining.share=null")  # it has thresholds of its own
+        words += WITH_ROUNDS.split()
     return {"name": name or file.stem, "run": shlex.join(words)}
 
 

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
+from qs3.config.compose import choices
 from qs3.config.hashing import config_hash
 from qs3.config.hydra import build
 from qs3.config.location import CONF
@@ -179,6 +180,20 @@ def test_rows_differ_in_nothing_but_what_they_name(column):
         assert (cfg.data.points, cfg.protocol.batch_size) == (512, clouds), row
         assert scheme.rounds == 0 or scheme.batch_size == 16
         assert (cfg.selection.teacher, cfg.selection.student) == ("last", "last")
+
+
+@pytest.mark.parametrize("scheme", sorted({*choices("selftraining")} - {"none"}))
+def test_rounds_of_a_row_of_ones_own_are_those_of_the_tables_rows(tmp_path, scheme):
+    """Schemes with thresholds of their own have no other, and no row but SD's a setting more."""
+    (tmp_path / "mine.py").write_text(METHOD.format(name="Mine"))
+    row = own_row(tmp_path / "mine.py", None, scheme)
+    own = compose("train", shlex.split(row["run"])).selftraining
+    assert build(own).rounds == 2
+    graph = "selftraining.selector.graph=false"  # another row, a control
+    alike = [w for w in LINES.values() if f"selftraining={scheme}" in w and graph not in w]
+    assert alike or scheme in ("confident", "random")
+    for words in alike[:1]:
+        assert own == compose("train", words).selftraining
 
 
 @pytest.fixture(scope="module")
