@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import functools
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
@@ -135,12 +136,17 @@ def build_table(
         raise ConfigError(f"{path}: missing or wrong entry {error}") from error
     if twice := [one for one in names if names.count(one) > 1]:
         raise ConfigError(f"{path}: two rows are called {twice[0]!r}; give one another name")
+    named = tuple(_column(column, target) for column in shown)
+    if twice := [one for one in named if named.count(one) > 1]:
+        raise ConfigError(
+            f"{path}: two columns are called {twice[0]!r}; give one another name, or "
+            "choose one of them, columns=WORD"
+        )
     if runs:
         groups = {(g.experiment, g.hash): g for g in group(with_kept(load_runs(log_dir), kept))}
         hint = f"; {ALONE}" if extra and len(shown) > 1 else ""
         cells = _fill(cells, groups, target, hint, place, extra)
     filled = {(cell.row, cell.column): cell for cell in cells}
-    named = tuple(_column(column, target) for column in shown)
     filled_rows = {
         row["name"]: tuple(filled.get((row["name"], column)) for column in named)
         for row in spec.rows
@@ -193,9 +199,10 @@ def _factors(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, str]]:
 
 
 def _column(name: str, target: str | None) -> str:
-    """A column's name with another target: "S → D" becomes "S → kinectsim10"."""
-    source, arrow, _ = name.partition(" → ")
-    return f"{source}{arrow}{target}" if target and arrow else name
+    """A column's name with another target: "S → D, DGCNN" becomes "S → kinectsim10, DGCNN"."""
+    if not target:
+        return name
+    return re.sub(r"(?<= → )[^\s,;:(]+", lambda _: target, name, count=1)
 
 
 def _task(spec: _Spec, column: str) -> str | None:

@@ -142,3 +142,44 @@ def test_a_column_s_seeds_are_a_number(tmp_path, seeds):
     path.write_text(TABLE.replace("seeds: 1", f"seeds: {seeds}"))
     with pytest.raises(ConfigError, match=r"x\.yaml: columns.*seeds"):
         build_table(str(path))
+
+
+@pytest.mark.parametrize("seeds", ["0", "-1", "1.5", "true", "[0, 1]"])
+def test_a_row_wants_a_seed_at_least(tmp_path, seeds):
+    """Of none nothing would be trained, and the command would end in `seed= -m`."""
+    path = tmp_path / "x.yaml"
+    path.write_text(TABLE + f"  - {{name: none, run: experiment=leaderboard, seeds: {seeds}}}\n")
+    with pytest.raises(ConfigError, match="row 'none': seeds: is how many"):
+        build_table(str(path), runs=False)
+
+
+NETS = """
+title: Nets
+metrics: [accuracy]
+columns: ["S → D, DGCNN", "S → D (PointNet)", "M → D*"]
+rows:
+  - name: source only
+    "S → D, DGCNN": {run: experiment=source_only_s2d}
+    "S → D (PointNet)": {run: experiment=source_only_s2d model=pointnet}
+    "M → D*": {run: experiment=source_only_m2d}
+"""
+
+
+def test_columns_of_another_target_are_still_told_apart(tmp_path):
+    """Of two that were called alike the second's numbers stood in both."""
+    path = tmp_path / "nets.yaml"
+    path.write_text(NETS)
+    table = build_table(str(path), target="kinectsim10", runs=False)
+    assert table.columns == (
+        "S → kinectsim10, DGCNN",
+        "S → kinectsim10 (PointNet)",
+        "M → kinectsim10",
+    )
+    runs = ["source_only_s2d", "source_only_s2d model=pointnet", "source_only_m2d"]
+    more = "domain@data.target=kinectsim10"
+    cells = table.rows["source only"]
+    assert [" ".join(cell.overrides) for cell in cells] == [f"experiment={x} {more}" for x in runs]
+    path.write_text(NETS.replace("M → D*", "S → B, DGCNN"))
+    assert build_table(str(path), runs=False).columns[2] == "S → B, DGCNN"
+    with pytest.raises(ConfigError, match="two columns are called 'S → kinectsim10, DGCNN'"):
+        build_table(str(path), target="kinectsim10", runs=False)
