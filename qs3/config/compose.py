@@ -56,10 +56,12 @@ def composed(command: str | None, *overrides: str, place: str = "", **more: Any)
     """
     from hydra.errors import HydraException
 
+    from qs3.config.quoting import as_text
+
     check_choices(overrides)
     with composing() as compose:
         try:
-            return compose(command, list(overrides), **more)
+            return compose(command, [as_text(word) for word in overrides], **more)
         except HydraException as error:
             raise ConfigError(f"{place}{explained(error, command, overrides)}") from error
 
@@ -83,14 +85,20 @@ def check_choices(words: Sequence[str]) -> None:
 
 
 def choices_checked(main: Callable[[], Any]) -> Callable[[], None]:
-    """A Hydra command that ends with what `check_choices` says, where Hydra has a traceback."""
+    """A Hydra command that ends with what `check_choices` says, where Hydra has a traceback.
+
+    Words that are plain text to people reach Hydra as text, see `as_text`.
+    """
 
     @functools.wraps(main)
     def command() -> None:
+        from qs3.config.quoting import as_text
+
         try:
             check_choices(sys.argv[1:])
         except ConfigError as error:
             sys.exit(f"{type(error).__name__}: {error}")
+        sys.argv[1:] = [as_text(word) for word in sys.argv[1:]]
         main()
 
     return command

@@ -101,7 +101,7 @@ def find_files(
 
     Raises:
         MissingDataError: nothing there.
-        DataError: one file, of an unknown format.
+        DataError: one file, of an unknown format; a folder that cannot be looked into.
     """
     place = Path(place).expanduser()
     if place.is_file():
@@ -113,7 +113,7 @@ def find_files(
         raise MissingDataError(f"{key}{place} is not there")
     found: list[Path] = []
     others: Counter[str] = Counter()
-    for folder, folders, names in os.walk(place):
+    for folder, folders, names in os.walk(place, onerror=_unreadable):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__MACOSX")
         for name in sorted(names):
             if name.startswith("."):
@@ -125,6 +125,11 @@ def find_files(
     if not found:
         raise MissingDataError(f"{key}{place} holds no file of {' '.join(suffixes)}")
     return sorted(found), place, others
+
+
+def _unreadable(error: OSError) -> None:
+    """Stops `os.walk`, which would leave the folder out without a word."""
+    raise DataError(f"{error.filename} cannot be read ({error.strerror})") from error
 
 
 def _instead(suffix: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -40,6 +41,12 @@ def hint_of(error: BaseException | None, words: Sequence[str]) -> str:
 
     It goes below Hydra's own message, or behind it; "" of other errors.
     """
+    word = getattr(error, "override", None)  # of OverrideParseException
+    if isinstance(word, str) and "=" in word:
+        key, _, value = word.partition("=")
+        inner = value.replace('"', '\\"')
+        typed = shlex.quote(f'{key}="{inner}"')
+        return f"if that is text, such as a path, quote it twice: {typed}"
     asked, there = getattr(error, "missing_cfg_file", None), getattr(error, "options", None)
     if asked and there:  # MissingConfigException
         group, _, name = asked.rpartition("/")

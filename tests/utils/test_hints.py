@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
+
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import ConfigKeyError, OmegaConfBaseException
 
@@ -17,6 +21,15 @@ def test_a_hint_survives_values_that_cannot_be_resolved():
     error = RuntimeError()
     error.__cause__ = cause
     assert hint_of(error, ["data.target.up=y"]) == "did you mean data.target.d.up=?"
+
+
+@pytest.mark.parametrize("value", ["scans (1)", "it's", "a=b", 'a"b', "[a", "C:\\x (1)"])
+def test_a_value_that_hydra_cannot_read_is_quoted_for_shell_and_hydra(value):
+    with pytest.raises(OverrideParseException) as found:
+        OverridesParser.create().parse_overrides([f"folder={value}"])
+    typed = hint_of(found.value, []).partition("twice: ")[2]
+    (word,) = shlex.split(typed)
+    assert OverridesParser.create().parse_override(word).value() == value
 
 
 @pytest.mark.parametrize("value", ["${seed}", "${paths.log_dir}/${seed}"])

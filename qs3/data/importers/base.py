@@ -20,7 +20,7 @@ from qs3.config.checks import check_choice, check_int
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import SPLITS, ManifestRow
 from qs3.data.store import is_begun, is_finished, write_pointset
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.utils.locks import locked
 from qs3.utils.plural import counted
 from qs3.utils.progress import shown
@@ -77,7 +77,12 @@ class Importer(abc.ABC):
     """Whether a class without clouds in a split means that something is wrong."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "folder", Path(self.folder))
+        if not isinstance(self.folder, str | Path):  # folder: 2024 in a file of settings
+            raise ConfigError(
+                f"published.folder must be the path of a folder, got {self.folder!r}; a number "
+                "goes into quotes"
+            )
+        object.__setattr__(self, "folder", Path(os.path.expanduser(self.folder)))
         check_int("published.points", self.points, 1)
         check_choice("published.on_error", self.on_error, ("stop", "skip"))
 

@@ -356,3 +356,10 @@ def test_other_settings_are_told_without_digests(tmp_path: Path) -> None:
     write(tmp_path / "in" / "bed" / "b.xyz")
     with pytest.raises(DataError, match=r"imported with \{'up': 'z'\}, the config says"):
         own(tmp_path, test_every=0, up="y").open()
+
+
+def test_the_home_folder_and_numbers_as_folders(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert CloudFolder("~/scans").root == tmp_path / "scans"
+    with pytest.raises(ConfigError, match=r"published\.folder must be the path .* got 2024; a num"):
+        CloudFolder(2024)  # type: ignore[arg-type]  # folder: 2024 in a file of settings
