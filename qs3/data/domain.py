@@ -331,6 +331,7 @@ class Domain:
             return
         now = importer.settings()
         if not importer.is_there():  # the published files were put away after the import
+            self._refuse_another(importer, Path(str(imported.get("folder", ""))))
             now.update({key: imported.get(key) for key in ("folder", "files") if key in now})
         if imported.get("on_error") == "stop":  # nothing was wrong, so nothing was left out
             now["on_error"] = "stop"
@@ -350,6 +351,13 @@ class Domain:
             was, wanted = ({key: of.get(key) for key in keys} for of in (imported, now))
             problem = f"{self.folder} was imported with {was}, the config says {wanted}; delete it"
         raise DataError(f"{problem} to import it again, or give another `path`")
+
+    def _refuse_another(self, importer: Importer, was: Path) -> None:
+        """Raise DataError for a mistyped name; by the name alone, because all may have moved."""
+        why = self._absent(importer)
+        if why and was.name and importer.root.name != was.name:
+            told = f"{self.folder} holds what was in {was}: give that, or a folder that is there"
+            raise DataError(f"domain {self.name}: {why}{told} (and another `path`)")
 
 
 def check_all(*domains: Domain) -> None:

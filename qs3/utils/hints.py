@@ -41,11 +41,11 @@ def hint_of(error: BaseException | None, words: Sequence[str]) -> str:
 
     It goes below Hydra's own message, or behind it; "" of other errors.
     """
-    word = getattr(error, "override", None)  # of OverrideParseException
-    if isinstance(word, str) and "=" in word:
-        key, _, value = word.partition("=")
+    unread = getattr(error, "override", None)  # of OverrideParseException
+    if isinstance(unread, str) and "=" in unread:
+        asks, _, value = unread.partition("=")
         inner = value.replace('"', '\\"')
-        typed = shlex.quote(f'{key}="{inner}"')
+        typed = shlex.quote(f'{asks}="{inner}"')
         return f"if that is text, such as a path, quote it twice: {typed}"
     asked, there = getattr(error, "missing_cfg_file", None), getattr(error, "options", None)
     if asked and there:  # MissingConfigException

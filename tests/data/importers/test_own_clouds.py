@@ -237,6 +237,11 @@ def test_changed_files_are_noticed(tmp_path: Path) -> None:
         domain.open()
     (tmp_path / "in").rename(tmp_path / "away")  # put away after the import
     assert domain.open().sha256 == before
+    moved = CloudFolder(tmp_path / "elsewhere" / "in", points=4, test_every=0)
+    assert dataclasses.replace(domain, published=moved).open().sha256 == before
+    mistyped = CloudFolder(tmp_path / "inn", points=4, test_every=0)
+    with pytest.raises(DataError, match=r"there is no folder .*inn; .* holds what was in .*in:"):
+        dataclasses.replace(domain, published=mistyped).open()
 
 
 def test_an_import_whose_split_came_from_a_name_is_noticed(tmp_path: Path) -> None:
