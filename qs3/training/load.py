@@ -81,6 +81,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
     _check_norms(run, len(data.target.ids))
+    _check_rounds(run, len(data.target.ids))
     learnt = drawn = class_shares.of_labelled(data, len(target.classes))
     if given and run.cfg.selection.teacher == "given" and given.learnt is not None:
         learnt = given.learnt
@@ -131,6 +132,15 @@ def _check_norms(run: Run, clouds: int) -> None:
             f"evaluation.norms={norms} takes the statistics of batch norms from the target's "
             f"training clouds, of which {run.target.name} has {clouds}, and two are needed; set "
             "evaluation.norms=trained, or give it more clouds"
+        )
+
+
+def _check_rounds(run: Run, clouds: int) -> None:
+    """Refuse rounds on one target cloud before the warm-up: a student's batch needs two."""
+    if run.scheme.rounds and clouds < 2:
+        raise DataError(
+            f"self-training learns from the target's training clouds, of which {run.target.name} "
+            f"has {clouds}, and two are needed; set selftraining=none, or give it more clouds"
         )
 
 

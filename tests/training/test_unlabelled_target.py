@@ -10,7 +10,7 @@ import pytest
 
 from qs3.config import hashing
 from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import summarise
 from qs3.report.tables.formats import markdown
 from qs3.report.tables.table import build_table
@@ -126,6 +126,16 @@ def test_without_a_test_split_predictions_of_the_training_clouds_are_counted(
     assert "no test split" in caplog.text
     known = metrics.rounds[0].with_target_labels  # they judge pseudo-labels only
     assert (known is not None) == labelled
+
+
+def test_rounds_on_one_target_cloud_are_refused_before_the_warm_up(toy, toy_data, tmp_path):
+    one = only(
+        toy_data, tmp_path / "cut", lambda row: row.split == "test" or "ball/train/000" in row.id
+    )
+    cfg = toy(f"paths.data_dir={one}")
+    with pytest.raises(DataError, match=r"self-training .* kinectsim10 has 1, and two are needed"):
+        train(cfg)
+    assert not (hashing.run_folder(cfg) / "last.ckpt").exists()
 
 
 def test_labels_of_some_classes_only(toy, toy_data, tmp_path):
