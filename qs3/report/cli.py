@@ -138,7 +138,7 @@ def _save(at: str, table: Table, found: Sequence[Any], base: str = "") -> None:
     from qs3.report.tables.saving import save
 
     page = text(found, base, markdown=True, table=table)
-    said = save(at, {".md": page, ".csv": csv_text(found)})
+    said = save(at, {".md": page, ".csv": csv_text(found, base)})
     print(text(found, base, table=table))
     print(said)
 

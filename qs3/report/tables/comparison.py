@@ -354,10 +354,10 @@ def text(
     return "\n".join([*head, *body, "", *(f"- {note}" for note in notes)]) + "\n"
 
 
-def csv_text(found: Sequence[Compared]) -> str:
-    """A line a difference, metric and tier, in percentage points."""
+def csv_text(found: Sequence[Compared], base: str = "") -> str:
+    """A line a difference, metric and tier, in percentage points; `base` as of `text`."""
     rows: list[list[Any]] = [
-        ["name", "clouds", "metric", "difference", "low", "high", "seeds", "clusters",
+        ["name", "minus", "clouds", "metric", "difference", "low", "high", "seeds", "clusters",
          "clusters_are", "seeds_needed", "simulated", "source_made_of", "other_source_made_of",
          "target_made_of", "why"]
     ]  # fmt: skip
@@ -366,7 +366,7 @@ def csv_text(found: Sequence[Compared]) -> str:
         simulated = str(one.simulated).lower()
         if one.differences is None:
             rows += [
-                [one.name, ALL, name, *[""] * 7, simulated, *one.made_of, one.why]
+                [one.name, base, ALL, name, *[""] * 7, simulated, *one.made_of, one.why]
                 for name in metrics
             ]
         for subset, pair in one.subsets.items():
@@ -374,7 +374,7 @@ def csv_text(found: Sequence[Compared]) -> str:
                 points = [f"{value:.4f}" for value in _points(d)]
                 needed = "" if d.seeds_needed is None else d.seeds_needed
                 known = [d.seeds, d.meshes, one.clusters, needed, simulated, *one.made_of, ""]
-                rows.append([one.name, subset, metric, *points, *known])
+                rows.append([one.name, base, subset, metric, *points, *known])
     return text_table.csv_text(rows)
 
 

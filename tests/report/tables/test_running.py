@@ -160,8 +160,9 @@ def test_compare_by_hand(tmp_path):
         shown = text(list(found.values()), "source only", markdown, table)
         assert shown.splitlines()[0].removeprefix("## ") == table.title
         assert "SIMULATED target: kinectsim10" in shown.splitlines()
-    rows = list(csv.DictReader(io.StringIO(csv_text(list(found.values())))))
+    rows = list(csv.DictReader(io.StringIO(csv_text([*found.values()], "source only"))))
     assert len(rows) == 2 * len(found)
+    assert {row["minus"] for row in rows} == {"source only"}
     (row,) = (r for r in rows if (r["name"], r["metric"]) == ("DANN", "accuracy"))
     assert float(row["difference"]) == pytest.approx(20)
     assert (row["seeds"], row["clusters"], row["simulated"]) == ("3", "20", "true")
