@@ -16,7 +16,6 @@ from qs3.data.ensure_source import check_or_make
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import chosen_in_words
-from qs3.runs import folder as runs
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
 from qs3.training.reuse import refuse_changed
@@ -41,9 +40,8 @@ def train(cfg: DictConfig) -> RunMetrics:
 
     _warn_of_one_domain(run)
     with owned(run.folder):
-        if cfg.force:
-            runs.clear(run.folder)
-        metrics = read_metrics(run.folder)
+        # What `force` begins anew stays until its data are open (`note_start`).
+        metrics = None if cfg.force else read_metrics(run.folder)
         if metrics is None:
             run.target.tell_of_judging("data.target.")
             with _wandb_forgotten():

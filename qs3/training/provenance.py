@@ -34,7 +34,7 @@ def note_start(
     given: Given | None = None,
     beside_sha256: str = "",
 ) -> dict[str, Any]:
-    """Read `started.json` and compare it with today's data, or write it.
+    """Read `started.json` and compare it with today's data, or write it; `force` begins anew.
 
     `beside_sha256`: of twins and views that are trained on; "" where there are none.
     """
@@ -55,6 +55,8 @@ def note_start(
                 "while they started?); start it again"
             )
         return {**now, "threads": first.get("threads")}
+    if run.cfg.force:  # not before: without its data an old result would be lost for nothing
+        runs.clear(run.folder)
     for folder in (run.folder, *run.folder.glob("round_*")):
         remove_leftovers(folder)
     if run.cfg.data.cache_dir:
