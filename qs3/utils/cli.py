@@ -30,6 +30,7 @@ INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help")
 _WIDTH = 100
+_PLACES = ("FILE", "FOLDER", "PATH")
 # Flags of Hydra that show something and end.
 _SHOWS = (*_HELP, "--hydra-help", "--version", "--cfg", "-c", "--info", "-i", "-sc")
 
@@ -49,8 +50,15 @@ class Kind(NamedTuple):
 
 
 def text(word: str = "TEXT") -> Kind:
-    """Anything; `word` stands for it in the help."""
-    return Kind(word, str)
+    """Anything; `word` stands for it in the help: in a FILE, FOLDER or PATH ~/ is the home folder.
+
+    Bash writes it out behind `=`, and other shells leave it.
+    """
+    return Kind(word, _from_home if word in _PLACES else str)
+
+
+def _from_home(words: str) -> str:
+    return os.path.expanduser(words) if words == "~" or words.startswith("~/") else words
 
 
 def path(word: str = "PATH") -> Kind:

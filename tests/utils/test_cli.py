@@ -128,6 +128,19 @@ def test_one_bare_word_may_stand_for_a_key():
         inspect.parse(["variant=x"])
 
 
+def test_places_may_begin_with_the_home_folder(monkeypatch):
+    """Shells but bash leave ~ behind =; of what is no file or folder it is a letter."""
+    monkeypatch.setenv("HOME", "/home/me")
+    keys = {"into": text("FOLDER"), "runs": several(text("PATH")), "row": text("NAME")}
+    options = tuple(Option(key, kind, "what") for key, kind in keys.items())
+    command = Command("qs3 x", "x", lambda **_: 0, options, ("qs3 x",))
+    assert command.parse(["into=~/data", "runs=~/a,b/~,~me/c", "row=~/x"]) == {
+        "into": "/home/me/data",
+        "runs": ("/home/me/a", "b/~", "~me/c"),
+        "row": "~/x",
+    }
+
+
 def test_an_example_of_two_lines_is_shown_whole():
     with pytest.raises(ConfigError) as told:
         QS3.command("fit").parse([])
