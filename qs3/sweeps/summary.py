@@ -20,12 +20,14 @@ from typing import Any
 from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, Qs3Error
 from qs3.evaluation.selection_rules import check_objective
 from qs3.runs.metrics import METRICS
 from qs3.sweeps.search import register
 from qs3.sweeps.search_space import check_varied, split
+from qs3.utils.files import make_folder
 from qs3.utils.memory import JSON_PEAK, read_whole
 
 log = logging.getLogger(__name__)
@@ -51,9 +53,15 @@ class SummaryOfSeeds(Callback):
         self._main = 0
         self.objective: str | None = None
 
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Leave if the folder of a single run cannot be written."""
+        with contextlib.suppress(OmegaConfBaseException):  # a key that it is made of: Hydra says so
+            _check_folder(config.hydra.run.dir)
+
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Begin a new list; leave if an objective could not compare the runs."""
+        """Begin a new list; leave if nothing can be written, or an objective could not compare."""
         register()
+        _check_folder(config.hydra.sweep.dir)
         self.objective = config.get("objective")
         if self.objective is not None:
             _check_fair(config)
@@ -223,12 +231,16 @@ def _check_fair(config: DictConfig) -> None:
         raise SystemExit(f"{type(error).__name__}: {error}") from error
 
 
-def _new_file(folder: Path) -> Path:
-    """An empty file in `folder`, which machines of a cluster share, or in the temporary one."""
+def _check_folder(folder: str) -> None:
+    """Leave, with a message, unless Hydra can write there: it would end in a traceback."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=".multirun-", suffix=".txt", dir=folder)
-    except OSError:  # whether runs can be written there is for each of them to say
-        handle, name = tempfile.mkstemp(prefix="qs3-multirun-", suffix=".txt")
+        make_folder(folder)
+    except Qs3Error as error:
+        raise SystemExit(f"{type(error).__name__}: {error} (paths.log_dir)") from error
+
+
+def _new_file(folder: Path) -> Path:
+    """An empty file in `folder`, which machines of a cluster share."""
+    handle, name = tempfile.mkstemp(prefix=".multirun-", suffix=".txt", dir=folder)
     os.close(handle)
     return Path(name)

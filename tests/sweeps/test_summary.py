@@ -20,6 +20,7 @@ def config(folder: Path, *overrides: str, pictures: object = False, num: int = 0
     hydra = {
         "runtime": {"output_dir": str(folder)},
         "overrides": {"task": list(overrides)},
+        "run": {"dir": str(folder)},
         "sweep": {"dir": str(folder)},
         "job": {"num": num},
     }
@@ -39,6 +40,14 @@ def summary(tmp_path):
     yield summary
     summary.on_multirun_end(config(tmp_path))
     assert not list(tmp_path.glob(".multirun*"))
+
+
+@pytest.mark.parametrize("start", ["on_run_start", "on_multirun_start"])
+def test_a_folder_that_cannot_be_made_is_told(start, tmp_path):
+    """Hydra makes it before train.py looks at anything, and would show its traceback."""
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit, match=r"^Qs3Error: cannot make the folder .*file/logs"):
+        getattr(SummaryOfSeeds(), start)(config(tmp_path / "file" / "logs"))
 
 
 def test_an_error_of_all_jobs_is_said_once(summary, tmp_path, caplog):
@@ -200,12 +209,3 @@ def test_errors_in_words():
     assert in_words(CompactHydraException("DataError: no\nmore")) == "DataError: no"
     assert in_words(KeyError("k")) == "KeyError: 'k'"
     assert in_words(CompactHydraException()) == "CompactHydraException"
-
-
-def test_a_folder_that_cannot_be_written_to_keeps_no_sweep_from_its_errors(tmp_path):
-    (tmp_path / "file").touch()
-    summary = SummaryOfSeeds()
-    summary.on_multirun_start(config(tmp_path / "file" / "logs"))
-    assert summary.journal is not None
-    assert summary.journal.is_file()
-    summary.on_multirun_end(config(tmp_path))
