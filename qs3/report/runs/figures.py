@@ -125,7 +125,8 @@ def pseudo_labels(run: RunFiles) -> Figure:
     Precision and recall know the target's labels: they judge, and nothing is chosen by them.
     """
     if not run.rounds:
-        raise NothingToDrawError("the run has no rounds of self-training")
+        yet = "" if run.metrics else " yet"
+        raise NothingToDrawError(f"the run has no rounds of self-training{yet}")
     names, rounds = run.classes, run.rounds
     numbers = [str(r.number) for r in rounds]
     nothing = np.full(len(names), -1)

@@ -255,6 +255,10 @@ def test_unfinished_run(run):
     assert "not finished" in drawn.page.read_text()
     (run / "history.csv").write_text("epoch,phase,lr\n")
     assert "no epoch" in draw(run).skipped["curves"]
+    for folder in run.glob("round_*"):
+        shutil.rmtree(folder)
+    skipped = draw(run, embed=False).skipped
+    assert skipped["pseudo_labels"] == "the run has no rounds of self-training yet"
 
 
 @pytest.mark.parametrize(
