@@ -15,7 +15,7 @@ import sys
 import time
 
 from qs3.config.location import python_command, typed
-from qs3.errors import ConfigError
+from qs3.config.quoting import override
 from qs3.utils.cli import Command, Option, text
 
 MESHES = "limit=40 splits=[train]"
@@ -29,28 +29,32 @@ DATASETS = (
 )
 
 
+def steps(out: str) -> list[str]:
+    """All commands, as they are typed; `out` may hold any letters."""
+    data, logs = f"{out}/data", f"{out}/logs"
+    paths = shlex.join([override("paths.data_dir", data), override("paths.log_dir", logs)])
+    # Nets this small gain little from a second thread, and nothing beside another busy process.
+    at_once = min(len(os.sched_getaffinity(0)), 4)
+    runs = "trainer.threads=1 logger=csv report.pictures=false"  # they take as long as a training
+    shown = shlex.join([f"data_dir={data}", f"log_dir={logs}"])
+    table = f"table=quickstart {shown} overrides={runs!r}"
+    domains = "domains=modelnet10,specklenet10,kinectsim10"
+    return [
+        *(f"python {command} {paths}" for command in DATASETS),
+        f"qs3 report train {table} seeds=0,1,2 jobs={at_once}",
+        f"qs3 report {table} {shlex.quote(f'out={out}')}",
+        f"qs3 report pictures {domains} {shlex.join([f'data_dir={data}', f'out={out}/scans.png'])}",
+    ]
+
+
 def _quickstart(out: str) -> int:
     """Run all steps; a step that was finished by an earlier call is skipped by the step itself."""
-    if " " in out:
-        raise ConfigError(f"out={out!r}: a path without spaces, please")
-    paths = f"paths.data_dir={out}/data paths.log_dir={out}/logs"
     start = time.monotonic()
     print(
         "The main job in small: few meshes, views, points and epochs, and a SIMULATED target.\n"
         "It shows that everything works; its figures are not the paper's.\n"
     )
-    # Nets this small gain little from a second thread, and nothing beside another busy process.
-    at_once = min(len(os.sched_getaffinity(0)), 4)
-    runs = "trainer.threads=1 logger=csv report.pictures=false"  # they take as long as a training
-    table = f"table=quickstart data_dir={out}/data log_dir={out}/logs overrides={runs!r}"
-    commands = (
-        *(f"python {command} {paths}" for command in DATASETS),
-        f"qs3 report train {table} seeds=0,1,2 jobs={at_once}",
-        f"qs3 report {table} out={out}",
-        "qs3 report pictures domains=modelnet10,specklenet10,kinectsim10"
-        f" data_dir={out}/data out={out}/scans.png",
-    )
-    for command in commands:
+    for command in steps(out):
         if _run(command):
             return 1
     memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
