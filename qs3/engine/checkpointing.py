@@ -11,10 +11,13 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import CheckpointIO
 
+from qs3.errors import DataError
 from qs3.runs.checkpoints import LAST, load, save
 from qs3.runs.metrics import Times
 from qs3.utils.memory import forget_peak, peak_bytes
 from qs3.utils.processor_time import Moment, processor_seconds
+
+_LIGHTNINGS = "pytorch-lightning_version"  # what every checkpoint of its trainer has
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -30,7 +33,10 @@ class AtomicCheckpointIO(CheckpointIO):
         self, path: Any, map_location: Any | None = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
         """Read `path`, never a pickle of arbitrary objects."""
-        return load(path, "cpu" if map_location is None else map_location)
+        found = load(path, "cpu" if map_location is None else map_location)
+        if not isinstance(found, dict) or _LIGHTNINGS not in found:
+            raise DataError(f"{path} holds something else than a run; start again with force=true")
+        return found
 
     def remove_checkpoint(self, path: Any) -> None:
         """Delete `path`."""

@@ -53,6 +53,24 @@ def read_started(folder: str | Path) -> dict[str, Any] | None:
         )
 
 
+def read_begun(folder: str | Path) -> dict[str, Any] | None:
+    """As `read_started`, of a run, which has to say what it was trained on.
+
+    Raises:
+        DataError: it does not.
+    """
+    started = read_started(folder)
+    if started is not None:
+        data, versions = started.get("data"), started.get("versions")
+        said = isinstance(data, dict) and {*data} >= {"source", "target"}
+        if not said or not isinstance(versions, dict):
+            raise DataError(
+                f"{Path(folder) / STARTED} cannot be read (nothing of data and versions); delete "
+                "it or run with force=true"
+            )
+    return started
+
+
 def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:
     """Note what a run was started with, so that it is never continued with something else."""
     write_json(Path(folder) / STARTED, started)

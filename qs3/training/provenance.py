@@ -61,7 +61,7 @@ def note_start(
         remove_leftovers(folder)
     if run.cfg.data.cache_dir:
         remove_old_leftovers(Path(run.cfg.data.cache_dir))
-    started = runs.read_started(run.folder)
+    started = runs.read_begun(run.folder)
     if started is None:
         runs.write_started(run.folder, now)
         return now

@@ -65,8 +65,13 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
             "it (qs3 predict uses finished runs)"
         )
     other = path.resolve().parent
-    begun = runs.read_started(other)
-    if begun is None or other.name != run.folder.name:
+    begun = runs.read_begun(other)
+    if begun is None:
+        raise MissingDataError(
+            f"ckpt_path={where}: there is no {runs.STARTED} beside {LAST}, which says what the run "
+            "was begun with; bring its whole folder, or leave ckpt_path out to begin anew"
+        )
+    if other.name != run.folder.name:
         raise ConfigError(
             f"ckpt_path={where} belongs to another run: its folder is {other.name}, this one's "
             f"{run.folder.name} (seed and hash of the settings). Give the command that began it, "

@@ -10,7 +10,8 @@ import torch
 from qs3.config import hashing
 from qs3.engine import checkpointing
 from qs3.engine.checkpointing import AtomicCheckpointIO, Clock
-from qs3.runs.checkpoints import load
+from qs3.errors import DataError
+from qs3.runs.checkpoints import load, save
 from qs3.training.command import train
 from qs3.utils.files import sha256_file
 from qs3.utils.processor_time import Moment
@@ -27,6 +28,14 @@ def wind_forward(checkpoint):
     content["callbacks"]["Clock"]["seconds"] += LONG
     content["callbacks"]["Clock"]["core_seconds"] += LONG
     torch.save(content, checkpoint)
+
+
+@pytest.mark.parametrize("odd", [{"weight": torch.zeros(2)}, [1]])
+def test_a_file_that_is_no_checkpoint_is_refused(tmp_path, odd):
+    """Such as weights that were copied over it: Lightning would miss a key of its own."""
+    save(odd, tmp_path / "last.ckpt")
+    with pytest.raises(DataError, match=r"last\.ckpt holds something else.*force=true"):
+        AtomicCheckpointIO().load_checkpoint(tmp_path / "last.ckpt")
 
 
 def test_earlier_starts_count(toy):  # noqa: F811
@@ -113,7 +122,7 @@ def test_what_an_older_start_did_not_count_is_not_known(meters):
 
 def test_a_checkpoint_goes_where_it_is_asked_for(tmp_path):
     files, path = AtomicCheckpointIO(), tmp_path / "a.ckpt"
-    files.save_checkpoint({"x": torch.ones(2)}, path)
+    files.save_checkpoint({"pytorch-lightning_version": "2", "x": torch.ones(2)}, path)
     assert files.load_checkpoint(path)["x"].device.type == "cpu"
     assert files.load_checkpoint(path, map_location="meta")["x"].device.type == "meta"
     files.remove_checkpoint(path)

@@ -116,6 +116,17 @@ def test_what_a_run_was_started_with(tmp_path):
             runs.read_started(tmp_path)
 
 
+@pytest.mark.parametrize("odd", [{"data": []}, {"versions": "1"}, {"data": {"source": "a"}}])
+def test_what_a_run_was_started_with_names_its_data(tmp_path, odd):
+    known = {"data": {"source": "a", "target": "b"}, "versions": {"qs3": "1"}}
+    assert runs.read_begun(tmp_path) is None
+    runs.write_started(tmp_path, known)
+    assert runs.read_begun(tmp_path) == known
+    runs.write_started(tmp_path, known | odd)
+    with pytest.raises(DataError, match=r"started\.json cannot be read.*force=true"):
+        runs.read_begun(tmp_path)
+
+
 def test_lock_says_what_the_other_process_does(tmp_path):
     run = tmp_path / "run"
     with (

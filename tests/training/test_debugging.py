@@ -144,7 +144,7 @@ def test_ckpt_path_of_another_run(toy, toy_data, begun, tmp_path):
     with pytest.raises(DataError, match=r"another version of data\.target"):
         train(toy(f"ckpt_path={begun}", f"paths.data_dir={data}", f"paths.log_dir={tmp_path}/new"))
     (begun / "started.json").unlink()
-    with pytest.raises(ConfigError, match="belongs to another run"):
+    with pytest.raises(MissingDataError, match=r"no started\.json beside last\.ckpt"):
         train(toy(f"ckpt_path={begun}"))
 
 
