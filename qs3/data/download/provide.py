@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shlex
 import shutil
 from pathlib import Path
 
@@ -60,7 +61,8 @@ def provide(
     """
     if source.agreement and accept_terms != source.agreement:
         text = AGREEMENTS[source.agreement]
-        raise AgreementError(text.format(name=source.name, title=source.title))
+        where = "" if into == Path("data") else f" {shlex.quote(f'into={into}')}"
+        raise AgreementError(text.format(name=source.name, where=where, title=source.title))
     if root and len(source.parts) > 1:
         raise ConfigError(f"{source.name} has several parts, so root= cannot be given")
     if archive is not None and mirror:

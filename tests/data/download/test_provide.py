@@ -96,7 +96,8 @@ def test_what_somebody_put_there_is_left_alone(site, tmp_path, caplog):
 def test_scannet_needs_an_agreement(site, tmp_path, speckle):
     site.files["/depthscannet10.zip"] = File(speckle)
     for word in ("", "yes"):
-        with pytest.raises(AgreementError, match=r"(?s)ScanNet_TOS\.pdf.*accept_terms=scannet"):
+        again = re.escape(f"accept_terms=scannet into={tmp_path}\n")
+        with pytest.raises(AgreementError, match=rf"(?s)ScanNet_TOS\.pdf.*{again}"):
             get(site, "depthscannet10", tmp_path, accept_terms=word)
     assert site.requests == []
     assert list(tmp_path.iterdir()) == []
