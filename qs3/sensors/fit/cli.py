@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,10 +50,11 @@ def _fit(
         return
     if (base, distance, gain) != (None, None, None):
         raise ConfigError("base=, distance= and gain= belong to images=FOLDER")
-    preset = fit(words, **given)
     file = Path(out).expanduser()
+    picture = Path(plot).expanduser() if plot else file.with_suffix(".png")
+    _check_picture(picture, words)
+    preset = fit(words, **given)
     preset.save(file, line)
-    picture = Path(plot or file.with_suffix(".png"))
     preset.plot(picture)
     for said in preset.summary():
         print(said)
@@ -65,6 +67,17 @@ def _fit(
             "to use it, put it into conf/sensor, or name the folder that holds sensor/"
             f"{file.name}: {generate} 'hydra.searchpath=[file:///FOLDER]' sensor={file.stem}"
         )
+
+
+def _check_picture(picture: Path, frames: Sequence[str]) -> None:
+    """Raise ConfigError if the plot is no .png, or would replace a frame that it is fitted to."""
+    if picture.suffix.lower() != ".png":
+        raise ConfigError(f"plot={picture} must end in .png")
+    for frame in frames:
+        if os.path.exists(picture) and os.path.exists(frame) and os.path.samefile(picture, frame):
+            raise ConfigError(
+                f"the plot would replace {frame}, which is a frame: give plot=FILE another name"
+            )
 
 
 def fit(

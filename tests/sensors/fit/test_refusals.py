@@ -96,3 +96,20 @@ def test_a_file_that_is_missing_and_frames_of_two_sizes(tmp_path, capsys):
     files = [str(tmp_path / name) for name in ("a.npy", "b.npy")]
     assert main(["fit", *files, "focal=300", f"out={tmp_path / 'x.yaml'}"]) == 1
     assert "one size" in capsys.readouterr().err
+
+
+def test_the_plot_replaces_no_frame_and_is_a_png(tmp_path, capsys):
+    """Without plot= it has the preset's name, which may be a frame's."""
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.png").write_bytes(name.encode())
+    frames = [str(tmp_path / "a.png"), str(tmp_path / "b.png")]
+    for more in ([], [f"plot={tmp_path}/../{tmp_path.name}/b.png"]):
+        out = f"out={tmp_path / 'a.yaml'}"
+        assert main(["fit", *frames, "focal=300", out, *more]) == 1
+        assert "png, which is a frame: give plot=FILE another name" in capsys.readouterr().err
+    assert main(["fit", *frames, "focal=300", f"out={tmp_path / 'c.yaml'}", "plot=c.yaml"]) == 1
+    assert "plot=c.yaml must end in .png" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
+        "a.png": b"a",
+        "b.png": b"b",
+    }
