@@ -212,21 +212,17 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
             raise ConfigError("no depth image")
         box = numbers(given["box"], 4, "box") if "box" in given else None
         _one_of(str(given.get("mask", "")), box)
-        only = given.get("object")
+        only = _object(given["object"]) if "object" in given else None
         if only is not None and box is not None:
             raise ConfigError(f"object={only} is the number of one of a mask; here is a box")
-        if isinstance(only, bool) or (isinstance(only, float) and not only.is_integer()):
-            raise ConfigError(f"object={only}: expected the whole number of an object of the mask")
-        scale = float(given["depth_scale"]) if "depth_scale" in given else None
-        if scale is not None:
-            check_scale(scale)
+        scale = _scale(given["depth_scale"]) if "depth_scale" in given else None
         shown = replace(
             common,
             name=name,
-            depth=folder / name,
-            mask=folder / str(given["mask"]) if "mask" in given else None,
+            depth=folder / Path(name).expanduser(),
+            mask=folder / Path(str(given["mask"])).expanduser() if "mask" in given else None,
             box=box,
-            only=None if only is None else int(only),
+            only=only,
             up=direction(given["up"]) if "up" in given else common.up,
             scale_m=common.scale_m if scale is None else scale,
             label=str(given.get("label", "")),
@@ -240,6 +236,28 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
     if not shown.intrinsics:
         return replace(shown, wrong=f"{path.name}, row {number}: no intrinsics")
     return shown
+
+
+def _object(words: Any) -> int:
+    """A whole number, also as 3.0: so spreadsheets and pandas write columns with empty cells."""
+    try:
+        found = float("nan") if isinstance(words, bool) else float(words)
+    except (TypeError, ValueError, OverflowError):
+        found = float("nan")
+    if not found.is_integer():
+        raise ConfigError(f"object={words}: expected the whole number of an object of the mask")
+    return int(words) if isinstance(words, int) else int(found)
+
+
+def _scale(words: Any) -> float:
+    try:
+        found = float(words)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(
+            f"depth_scale={words}: expected a number, the metres of a unit, such as 0.001"
+        ) from error
+    check_scale(found)
+    return found
 
 
 def _plain(value: Any) -> bool:

@@ -41,6 +41,26 @@ def test_a_list_as_spreadsheets_write_it(tmp_path, mark):
     assert find_shown(str(tmp_path / "b.csv"), "", common)[0] == [first, second]
 
 
+def test_numbers_as_pandas_writes_them_and_homes_are_taken(tmp_path, monkeypatch):
+    """A column of whole numbers with an empty cell is one of floats there: 3.0."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    text = "depth,mask,object\n~/a.png,~/m.png,3.0\nb.png,m.png,\n"
+    (tmp_path / "a.csv").write_text(text)
+    (first, second), _ = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+    assert (first.wrong, second.wrong, first.only, second.only) == ("", "", 3, None)
+    home = tmp_path / "home"
+    assert (first.depth, first.mask) == (home / "a.png", home / "m.png")
+    assert (second.depth, second.mask) == (tmp_path / "b.png", tmp_path / "m.png")
+
+
+def test_words_in_place_of_numbers_are_told_in_words(tmp_path):
+    rows = "a.png,m.png,chair,\na.png,m.png,3,1mm\n"
+    (tmp_path / "a.csv").write_text("depth,mask,object,depth_scale\n" + rows)
+    (first, second), _ = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+    assert first.wrong.startswith("a.csv, row 1: object=chair: expected the whole number of an")
+    assert second.wrong.startswith("a.csv, row 2: depth_scale=1mm: expected a number, the metres")
+
+
 @pytest.mark.parametrize("number", ["3.7", "true", "1.0000001"])
 def test_an_object_of_a_list_is_a_whole_number(tmp_path, number):
     (tmp_path / "a.yaml").write_text(f"- {{depth: a.png, mask: m.png, object: {number}}}\n")
