@@ -13,6 +13,7 @@ from qs3.sensors.bench import metrics
 from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.targets import ALBEDO, POSE, TiltedPlane
+from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.renderers.base import Renderer
 
 _GOLDEN = (5**0.5 - 1) / 2
@@ -172,8 +173,10 @@ def stated_sigma_m(sensor: Any, depth_m: float, frame: DepthFrame) -> float | No
         depth_m: of the plane, whose albedo is ALBEDO.
         frame: of that plane, for exposures that no one knows beforehand.
     """
-    if hasattr(sensor, "noise_law_m"):
-        return float(np.asarray(sensor.noise_law_m(depth_m)))
+    if isinstance(sensor, FittedDepth):  # its law is that before the quantiser
+        steps = (sensor.inverse_step_per_m * depth_m**2, sensor.depth_step_m)
+        rounding = np.hypot(*steps) / np.sqrt(12)
+        return float(np.hypot(sensor.noise_law_m(depth_m), rounding))
     if hasattr(sensor, "distance_sigma_m"):  # time of flight: light falls with the square
         lamp = sensor.electrons_at_1m * ALBEDO / depth_m**2
         mean = lamp + sensor.electrons_at_1m * ALBEDO * sensor.ambient
