@@ -66,7 +66,7 @@ def measure(
     k = subject.intrinsics
     depth_ratio = 1 / condition.near_m - 1 / condition.far_m
     shadow = 0.0 if fb is None else fb * depth_ratio
-    around = int(np.ceil(shadow)) + subject.margin_px + 20
+    around = int(np.ceil(abs(shadow))) + subject.margin_px + 20  # a projector may be to the left
     widths, sides, wall = (defaultdict(list) for _ in range(3))
     for i in range(condition.frames):
         place = ((i + 0.5) / condition.frames + 0.13, (0.37 * i) % 1)

@@ -102,7 +102,7 @@ class Subject:
         """Depths within its range, with room for the spread of a condition."""
         low = self._get("min_depth_m", 0.2)
         high = self._get("max_depth_m", self._get("max_distance_m", 6.0))
-        fb = self.focal_baseline
+        fb = None if self.focal_baseline is None else abs(self.focal_baseline)  # to either side
         out = []
         for depth in DEPTHS_M:
             spread = 0.02 * depth if fb is None else depth - fb / (fb / depth + 0.55)

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from qs3.errors import ConfigError, MissingDataError
-from qs3.sensors.bench import comparison, edges, metrics, planar, runner
+from qs3.sensors.bench import comparison, edges, planar, runner
 from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.bench.subject import Subject
 from qs3.sensors.bench.targets import POSE, TiltedPlane
-from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from tests.commands import main
@@ -52,22 +51,6 @@ def test_phases_are_spread_evenly_over_a_pixel_and_over_the_steps():
     for period in (1.0, 1 / 8):
         counts, _ = np.histogram(disparity % period / period, bins=4, range=(0, 1))
         assert counts.min() >= 2
-
-
-@pytest.mark.parametrize("steps", [(0.0, 0.0), (0.00575, 0.001), (0.0, 0.01)])
-def test_the_law_of_a_fitted_preset_holds_its_steps(renderer, steps):
-    """`qs3 bench` holds what is measured, quantiser included, against it."""
-    step, depth_step = steps
-    sensor = FittedDepth(
-        width_px=320, height_px=240, focal_px=290, baseline_m=0.075, noise_factor=0.0027,
-        inverse_step_per_m=step, depth_step_m=depth_step,
-    )  # fmt: skip
-    subject = Subject("mine", sensor)
-    for depth in (0.5, 2.0):
-        condition = planar.PlanarCondition(depth, phases=8, half_px=20)
-        found = planar.measure(subject, condition, renderer)
-        stated = found["law_m"] * metrics.TRIMMED_NORMAL
-        assert found["sigma_m"] == pytest.approx(stated, rel=0.08), (depth, stated)
 
 
 def test_more_read_noise_is_more_noise_over_time(renderer):
