@@ -116,37 +116,37 @@ def _bias(result: SensorResult) -> list[_Band]:
     facing = [m for m in result.facing() if m["bias_px"] is not None]
     if _is_misaligned(result.subject.sensor):
         return _accuracy(facing)
-    off = [(m["bias_px"] - _stated_bias_px(result, m), m["condition"]["depth_m"]) for m in facing]
-    if not off:
+    worst = max(facing, key=lambda m: abs(m["bias_px"]), default=None)
+    if worst is None:
         return [("median bias", "nothing measured", 0, 0, None)]
-    value, depth = max(off, key=lambda one: abs(one[0]))
-    if _has_bias(result.subject.sensor):
-        limit = 0.25 / 16
-        band = f"median bias within {limit:.4f} px of the preset's own at every distance"
-    elif "d4" in result.subject.name:
+    if isinstance(result.subject.sensor, FittedDepth):
+        return _fitted_bias(result.subject.sensor, result.subject.focal_baseline or 0.0, facing)
+    if "d4" in result.subject.name:
         limit = 0.02
         band = "median bias under 0.02 px at every distance"
     else:
         limit = 0.25 / (result.subject.steps_per_px or 16)
         band = f"median bias under a quarter of a step ({limit:.4f} px) at every distance"
-    return [(band, f"{value:+.4f} px at {depth:g} m", -limit, limit, value)]
+    text = f"{worst['bias_px']:+.4f} px at {worst['condition']['depth_m']:g} m"
+    return [(band, text, -limit, limit, worst["bias_px"])]
 
 
-def _has_bias(sensor: Any) -> bool:
-    return isinstance(sensor, FittedDepth) and any(sensor.bias_m)
+def _fitted_bias(sensor: FittedDepth, fb: float, facing: list[dict[str, Any]]) -> list[_Band]:
+    """The bias beyond the one that a preset by `qs3 fit` states, because its camera has it.
 
-
-def _stated_bias_px(result: SensorResult, m: dict[str, Any]) -> float:
-    """Bias of the disparity that a preset by `qs3 fit` has because its camera has it."""
-    sensor, fb, depth = (
-        result.subject.sensor,
-        result.subject.focal_baseline,
-        m["condition"]["depth_m"],
-    )
-    if not isinstance(sensor, FittedDepth) or fb is None:
-        return 0.0
-    bias_m = float(np.polynomial.polynomial.polyval(depth, sensor.bias_m))
-    return fb / (depth + bias_m) - fb / depth
+    A quarter of the largest step there: its own of 1 / Z or of Z, or 1/16 px.
+    """
+    found = []
+    for m in facing:
+        depth = m["condition"]["depth_m"]
+        stated = depth + float(np.polynomial.polynomial.polyval(depth, sensor.bias_m))
+        off = m["bias_px"] - (fb / stated - fb / depth)
+        own = max(sensor.inverse_step_per_m, sensor.depth_step_m / depth**2)
+        found.append((off, 0.25 * max(abs(fb) * own, 1 / 16), depth))
+    off, limit, depth = max(found, key=lambda one: abs(one[0]) / one[1])
+    band = "median bias within a quarter of a step of the preset's own at every distance"
+    text = f"{off:+.4f} px at {depth:g} m, where that is {limit:.4f} px"
+    return [(band, text, -limit, limit, off)]
 
 
 def _accuracy(facing: list[dict[str, Any]]) -> list[_Band]:

@@ -35,6 +35,18 @@ def test_the_law_holds_the_steps(renderer, steps):
         assert found["sigma_m"] == pytest.approx(stated, rel=0.08), (depth, stated)
 
 
+def test_a_bias_is_held_against_the_steps_at_its_distance():
+    """Millimetres are a fifth of a pixel at 0.3 m, and next to nothing at 3 m."""
+    subject = Subject("mine", replace(FITTED, depth_step_m=0.001))
+    for depth, passed in ((0.3, True), (3.0, False)):
+        result = runner.SensorResult(subject, {})
+        plane = {"tilt_deg": 0.0, "depth_m": depth}
+        result.planes.append({"condition": plane, "bias_px": 0.03, "sigma_m": None, "fill": 1.0})
+        result.edge = {}
+        (found,) = (v for v in bands.judge(result) if "bias" in v.band)
+        assert found.passed is passed, found.measured
+
+
 @pytest.mark.parametrize("bias_m", [(0.0,), (0.002, 0.003, 0.001)])
 @pytest.mark.parametrize("baseline_m", [0.075, -0.075])
 def test_a_fitted_preset_holds_its_bands(renderer, baseline_m, bias_m):
