@@ -53,20 +53,23 @@ def judge(result: SensorResult) -> list[Verdict]:
     """All bands that apply to a sensor."""
     name = result.subject.name
     out: list[_Band] = []
+    # A preset by `qs3 fit` is held against what its camera's frames say, however it is called.
+    device = "" if isinstance(result.subject.sensor, FittedDepth) else name
     if result.subject.focal_baseline is not None:
-        p, _ = exponent(result, _reach_m(name))
-        band = "sigma_Z grows as Z^p, p in 1.8 to 2.2" + _up_to(name)
-        out.append((band, f"p = {p:.2f}", 1.8, 2.2, p))
+        if device:
+            p, _ = exponent(result, _reach_m(name))
+            band = "sigma_Z grows as Z^p, p in 1.8 to 2.2" + _up_to(name)
+            out.append((band, f"p = {p:.2f}", 1.8, 2.2, p))
         out += _bias(result) + _levels(result)
-    if name.startswith("kinect_v1"):
+    if device.startswith("kinect_v1"):
         out += _nguyen(result)
-    if "d415" in name:
+    if "d415" in device:
         out += _real_d415(result)
-    elif "d4" in name:
+    elif "d4" in device:
         out += _d400(result)
-    if "d435" in name:
+    if "d435" in device:
         out += _kotsonis(result)
-    if "d4" in name:
+    if "d4" in device:
         out += _grazing(result)
     out += _own_law(result) + _fill(result) + _edge(result)
     out += _rooms(result)
@@ -272,10 +275,25 @@ def _real_d415(result: SensorResult) -> list[_Band]:
 def _fill(result: SensorResult) -> list[_Band]:
     both = result.tilted(True) + result.tilted(False)
     gentle = result.facing() + [m for m in both if m["condition"]["tilt_deg"] <= 45]
+    sensor = result.subject.sensor
+    if isinstance(sensor, FittedDepth):
+        return _fitted_fill(sensor, gentle)
     worst = min(gentle, key=lambda m: m["fill"])
     where = f"{worst['condition']['depth_m']:g} m, {worst['condition']['tilt_deg']:g} deg"
     text = f"at least {worst['fill']:.1%} ({where})"
     return [("fill above 95 % up to 45 degrees", text, 0.95, 1.0, worst["fill"])]
+
+
+def _fitted_fill(sensor: FittedDepth, gentle: list[dict[str, Any]]) -> list[_Band]:
+    """Of a preset by `qs3 fit` what its camera filled is asked for, which may be less than 95 %."""
+    found = []
+    for m in gentle:
+        depth, tilt = m["condition"]["depth_m"], m["condition"]["tilt_deg"]
+        stated = float(np.interp(tilt, sensor.tilts_deg, sensor.fill_rates))
+        found.append((m["fill"] - stated, m["fill"], stated, f"{depth:g} m, {tilt:g} deg"))
+    off, fill, stated, where = max(found, key=lambda one: abs(one[0]))
+    band = "fill within 5 points of the preset's own up to 45 degrees"
+    return [(band, f"{fill:.1%} against {stated:.1%} ({where}), the worst", -0.05, 0.05, off)]
 
 
 def _edge(result: SensorResult) -> list[_Band]:
