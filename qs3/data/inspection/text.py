@@ -115,9 +115,10 @@ def _counts(counts: Numbers) -> str:
 def _valid(valid: Numbers) -> list[str]:
     found = []
     if valid["known"]:
+        clouds = counted(valid["repeating"], "cloud has", "clouds have")
         found.append(
-            f"points before sampling: {valid['median']:.0f} (median), at least {valid['min']}; "
-            f"{counted(valid['repeating'], 'cloud has', 'clouds have')} too few: some are repeated"
+            f"points before sampling: {valid['median']:.0f} (median), at least {valid['min']}"
+            + f"; {clouds} too few: some are repeated" * bool(valid["repeating"])
         )
     return found + [f"left out: {n} {status}" for status, n in valid["left_out"].items()]
 

@@ -227,6 +227,19 @@ def test_both_say_what_datasets_are_made_of(tmp_path, capsys):
     assert (facts["made_of_a"], facts["made_of_b"]) == (told, str(samples))
 
 
+@pytest.mark.parametrize("measured", [64, 50])
+def test_repeated_points_are_told_where_there_are_any(measured, tmp_path, capsys):
+    clouds = np.random.default_rng(0).normal(size=(2, 64, 3)).astype(np.float32)
+    rows = [
+        ManifestRow(f"a/{i}", "a", "train", valid_points=n) for i, n in enumerate((80, measured))
+    ]
+    folder = tmp_path / "s"
+    write_pointset(folder, name="s", classes=("a",), arrays={"points": clouds}, rows=rows, meta={})
+    assert main(["inspect", str(folder), f"out={tmp_path / 'i'}", "sheets=0"]) == 0
+    told = "; 1 cloud has too few: some are repeated" * (measured < 64)
+    assert f"(median), at least {measured}{told}\n" in capsys.readouterr().out
+
+
 def test_over_the_floor():
     """A board of 60 x 40 x 4 cm, leaning by 30 degrees, and a box 50 cm high on the floor."""
     rng = np.random.default_rng(0)
