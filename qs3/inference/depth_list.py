@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -219,8 +220,8 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
         shown = replace(
             common,
             name=name,
-            depth=folder / Path(name).expanduser(),
-            mask=folder / Path(str(given["mask"])).expanduser() if "mask" in given else None,
+            depth=folder / os.path.expanduser(name),
+            mask=folder / os.path.expanduser(str(given["mask"])) if "mask" in given else None,
             box=box,
             only=only,
             up=direction(given["up"]) if "up" in given else common.up,

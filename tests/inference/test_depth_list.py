@@ -44,13 +44,16 @@ def test_a_list_as_spreadsheets_write_it(tmp_path, mark):
 def test_numbers_as_pandas_writes_them_and_homes_are_taken(tmp_path, monkeypatch):
     """A column of whole numbers with an empty cell is one of floats there: 3.0."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    text = "depth,mask,object\n~/a.png,~/m.png,3.0\nb.png,m.png,\n"
+    text = "depth,mask,object\n~/a.png,~/m.png,3.0\nb.png,m.png,\n~$c.png,~m.png,\n"
     (tmp_path / "a.csv").write_text(text)
-    (first, second), _ = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+    (first, second, third), _ = find_shown(
+        str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA)
+    )
     assert (first.wrong, second.wrong, first.only, second.only) == ("", "", 3, None)
     home = tmp_path / "home"
     assert (first.depth, first.mask) == (home / "a.png", home / "m.png")
     assert (second.depth, second.mask) == (tmp_path / "b.png", tmp_path / "m.png")
+    assert (third.depth, third.mask) == (tmp_path / "~$c.png", tmp_path / "~m.png")  # nobody's
 
 
 def test_words_in_place_of_numbers_are_told_in_words(tmp_path):
