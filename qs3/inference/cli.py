@@ -88,12 +88,12 @@ any unit, any place. A net that knows sizes takes them as metres; one that knows
 floor=, which is 0 if objects stand on z = 0. Which way is up is not guessed (default z), and the
 wrong axis costs most of the accuracy. Labels: the file's own, or a folder called as a class.
 
-DEPTH IMAGES are .png of 16 bits, in millimetres, or .npy; 0 is not measured. A mask has 0 where no
-object is and a number for each object. A list is .csv, .json or .yaml with a row an object or a
-picture: depth, mask, object (number in the mask), box, intrinsics, up, depth_scale, label; files
-are relative to it, and what is empty holds as given here. up=x,y,z is up in the camera's frame (x
-right, y down, z forward), at any length: what an accelerometer at rest reads, in these axes. -y is
-a level camera. Without it planes of the picture tell, else the camera counts as level (column up).
+DEPTH IMAGES are .png of 16 bits, in millimetres, or .npy; 0 and 65535 are not measured. A mask has
+0 where no object is and a number for each object. A list is .csv, .json or .yaml with a row an
+object or a picture: depth, mask, object (number in the mask), box, intrinsics, up, depth_scale,
+label; files are relative to it, and what is empty holds as given here. up=x,y,z is up in the
+camera's frame (x right, y down, z forward), at any length: what an accelerometer at rest reads, in
+these axes. -y is a level camera. Without it planes of the picture tell, else it counts as level.
 
 prior=rooms takes classes as common as in ScanNet's rooms (42 % chairs), prior=chair:4,bathtub:0 as
 in your place: others count as 1, 0 is never. More answers are right then, fewer of rare classes.

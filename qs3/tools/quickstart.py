@@ -15,7 +15,6 @@ import sys
 import time
 
 from qs3.config.location import python_command, typed
-from qs3.config.quoting import override
 from qs3.utils.cli import Command, Option, text
 
 MESHES = "limit=40 splits=[train]"
@@ -31,6 +30,8 @@ DATASETS = (
 
 def steps(out: str) -> list[str]:
     """All commands, as they are typed; `out` may hold any letters."""
+    from qs3.config.quoting import override  # imports Hydra, which no help page waits for
+
     data, logs = f"{out}/data", f"{out}/logs"
     paths = shlex.join([override("paths.data_dir", data), override("paths.log_dir", logs)])
     # Nets this small gain little from a second thread, and nothing beside another busy process.

@@ -47,6 +47,10 @@ _DOCUMENT = re.compile(r"^---\s*$", re.MULTILINE)  # begins one, or ends the one
 _SIZES = (("width", "height"), ("image_width", "image_height"))
 _CENTRES = (("cx", "cy"), ("ppx", "ppy"))
 _BENT = ("D", "d", "coeffs", "distortion_coefficients")
+_BENT_BY_ONE = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_UNMEASURED = 65535
+"""What cameras that have no 0 write into 16 bits where nothing was measured."""
+
 _SCALE = "depth_scale"
 _OFF = 0.2  # of a side, from the picture's middle
 _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the unit is wrong
@@ -71,7 +75,7 @@ class Intrinsics(NamedTuple):
 def read_depth(
     path: str | Path, scale_m: float | None = None, of_camera: float | None = None
 ) -> Float[np.ndarray, "h w"]:
-    """Depth in metres, float64; 0 where nothing was measured.
+    """Depth in metres, float64; 0 where nothing was measured, which 16 bits say by 65535, too.
 
     Args:
         path: of a .png or .npy.
@@ -103,6 +107,8 @@ def read_depth(
     scale = scale_m if scale_m is not None else MILLIMETRE if whole else 1.0
     depth = found.astype(np.float64) * scale
     depth[~np.isfinite(depth) | (depth < 0)] = 0
+    if found.dtype.kind == "u" and found.dtype.itemsize == 2:
+        depth[found == _UNMEASURED] = 0
     if not (depth > 0).any():
         raise DataError(f"{path}: no pixel has depth")
     middle = float(np.median(depth[depth > 0]))
@@ -345,7 +351,12 @@ def _of_mapping(given: Any, where: str) -> Intrinsics:
         raise DataError(f"{where}: no fx, fy, cx, cy and no matrix K")
     matrix = next((given[key] for key in _MATRICES if key in given), None)
     if isinstance(matrix, Mapping) and "data" not in matrix:
-        beside = {*itertools.chain(*_SIZES), *_BENT, _SCALE}  # may stand within, or about it
+        beside = {
+            *itertools.chain(*_SIZES),
+            *_BENT,
+            *_BENT_BY_ONE,
+            _SCALE,
+        }  # may stand within, or about it
         return _of_mapping({key: given[key] for key in beside & {*given}} | {**matrix}, where)
     if isinstance(matrix, Mapping):
         matrix = matrix["data"]
@@ -360,9 +371,11 @@ def _of_mapping(given: Any, where: str) -> Intrinsics:
     size = (int(given[sides[0]]), int(given[sides[1]])) if sides else None
     bent = next((given[key] for key in _BENT if key in given), None)
     bent = bent.get("data") if isinstance(bent, Mapping) else bent
+    if bent is None:
+        bent = [given[key] for key in _BENT_BY_ONE if key in given]
     scale = given.get(_SCALE)
     scale = float(scale) if isinstance(scale, int | float) else None
-    return Intrinsics(camera_of(values, where), size, bent is not None and any(_flat(bent)), scale)
+    return Intrinsics(camera_of(values, where), size, any(_flat(bent)), scale)
 
 
 def _flat(values: Any) -> list[float]:

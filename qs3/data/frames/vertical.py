@@ -29,6 +29,7 @@ _ROUNDS = 6  # of fit and trimming
 _TRIM = 3.0  # median absolute deviations
 _LEAST_SHARE = 0.5  # of the floor's pixels that must lie in the plane
 _LEAST_FRAMES = 10  # with readings and a floor, for the mounting
+_MOST_OF_EIGHT = 5
 _STEP_PX, _REACH_PX = 4, 8  # every how many pixels a normal, and from how far
 _FOCAL_PX = 525.0  # of the cameras for which that is so; smaller pictures have smaller windows
 _SPAN_SHARE = 0.15  # of the depth, that a window's depths may span
@@ -118,7 +119,7 @@ def planes_up_steep(
     seen, and were found from up in the picture. A table seen from straight above looks like a wall
     from the front: nobody can be sure of that.
     """
-    normals = _normals(depth_m, camera)
+    normals = _normals(_without_lone_holes(depth_m), camera)
     level = _fitted(normals, CAMERA_UP)
     floors, ceilings = _level_shares(normals, level)
     if level is not None and ceilings <= max(floors, _LEAST_LEVEL):
@@ -155,6 +156,21 @@ def _fitted(
 def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:
     """Between two unit vectors."""
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+def _without_lone_holes(depth_m: np.ndarray) -> np.ndarray:
+    """Pixels without depth as the mean of those around them, where most of the eight have one.
+
+    Depth cameras leave such holes all over a picture, and one in a window would take its normal.
+    """
+    measured = (depth_m > 0).astype(np.float64)
+    nine = np.ones(3)
+    count = cv2.sepFilter2D(measured, cv2.CV_64F, nine, nine, borderType=cv2.BORDER_CONSTANT)
+    known = np.where(measured > 0, depth_m, 0.0)
+    total = cv2.sepFilter2D(known, cv2.CV_64F, nine, nine, borderType=cv2.BORDER_CONSTANT)
+    lone = (measured == 0) & (count >= _MOST_OF_EIGHT)
+    filled: np.ndarray = np.where(lone, total / np.maximum(count, 1), depth_m)
+    return filled
 
 
 def _normals(depth_m: np.ndarray, camera: Pinhole) -> np.ndarray:

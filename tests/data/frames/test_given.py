@@ -50,6 +50,17 @@ def test_the_unit_of_depth_is_that_of_its_numbers(tmp_path):
     np.testing.assert_allclose(read_depth(tum, 1 / 5000), DEPTH, atol=1e-4)
 
 
+def test_the_highest_number_of_16_bits_is_no_depth(tmp_path):
+    """65.5 m far: cameras that have no 0 write it where nothing was measured."""
+    full = np.array([[900, 65535], [65534, 0]])
+    for kind in ("<u2", ">u2"):
+        found = read_depth(npy(tmp_path / "u.npy", full.astype(kind)), 1e-4)
+        assert found.tolist() == [[pytest.approx(0.09), 0.0], [pytest.approx(6.5534), 0.0]]
+    found = read_depth(png(tmp_path / "u.png", full.astype(np.uint16)), 1e-4)
+    assert found[0, 1] == 0
+    assert read_depth(npy(tmp_path / "i.npy", full.astype(np.int32)), 1e-4)[0, 1] > 6
+
+
 def test_a_camera_s_scale_of_depth_is_not_passed_over(tmp_path):
     """BOP's YCB-V: a tenth of a millimetre a unit; 0.8 m were read as 8 m."""
     tenths = png(tmp_path / "a.png", np.full((480, 640), 8000, np.uint16))
@@ -183,6 +194,13 @@ MATRIX = [[525.0, 0, 319.5], [0, 526.0, 239.5], [0, 0, 1]]
             True,
         ),
         ("e.json", {"K": MATRIX}, None, False),
+        (
+            "k.json",  # one by one
+            {"fx": 525, "fy": 526, "cx": 319.5, "cy": 239.5, "k1": 0.0, "k2": 0, "p1": 0.001},
+            None,
+            True,
+        ),
+        ("l.json", {"K": MATRIX, "k1": 0, "p2": 0.0}, None, False),
         (
             "h.json",  # size and lens about the numbers
             {

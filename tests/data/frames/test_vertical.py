@@ -57,8 +57,9 @@ def test_accelerometer_of_any_mounting():
 
 @pytest.mark.parametrize("pitch", [10, 20, 30])
 @pytest.mark.parametrize("noise_m", [0.0, 0.005])
+@pytest.mark.parametrize("holes", [0.0, 0.05])
 @pytest.mark.parametrize("width", [640, 320, 224, 160])
-def test_planes_of_small_pictures(width, noise_m, pitch):
+def test_planes_of_small_pictures(width, holes, noise_m, pitch):
     """A floor 1.2 m below the camera and a wall 4.5 m before it, by a camera of 63 degrees."""
     height, focal = width * 3 // 4, 525 * width / 640
     camera = Pinhole(focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -67,7 +68,9 @@ def test_planes_of_small_pictures(width, noise_m, pitch):
     rays = camera.rays(height, width)
     floor, wall = 1.2 / np.maximum(-(rays @ up), 1e-9), 4.5 / np.maximum(rays @ ahead, 1e-9)
     depth = np.minimum(floor, wall)
-    depth += noise_m * np.random.default_rng(0).normal(size=depth.shape)
+    rng = np.random.default_rng(0)
+    depth += noise_m * rng.normal(size=depth.shape)
+    depth[rng.random(depth.shape) < holes] = 0  # all over the picture, mostly single pixels
     found, sure = planes_up_steep(depth, camera)
     assert sure
     assert angle_deg(found, up) < 1
