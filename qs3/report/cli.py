@@ -221,7 +221,12 @@ def _pipeline(
 
 _TABLE = (
     Option(
-        "table", text("NAME"), "of conf/table, or a file", None, True, partial(choices, "table")
+        "table",
+        text("NAME|FILE"),
+        "of conf/table, or a file",
+        None,
+        True,
+        partial(choices, "table"),
     ),
     Option("log_dir", text("FOLDER"), "paths.log_dir of the runs (default logs)"),
     Option("data_dir", text("FOLDER"), "paths.data_dir of the runs (default: data)"),

@@ -80,7 +80,10 @@ TUNE = Command(
         Option("batch", whole(2), "objects a step", 8),
         Option("points", whole(64), "of a cloud", 1024),
         Option(
-            "features", text("NAME"), "roughness, or a net: a run, or dgcnn-speckle", "roughness"
+            "features",
+            text("NAME|RUN"),
+            "roughness, or a net: a run, or dgcnn-speckle",
+            "roughness",
         ),
         Option(
             "slopes",

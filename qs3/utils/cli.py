@@ -30,7 +30,7 @@ INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
 TERMINATED = 128 + signal.SIGTERM
 _HELP = ("-h", "--help")
 _WIDTH = 100
-_PLACES = ("FILE", "FOLDER", "PATH")
+_PLACES = {"FILE", "FOLDER", "PATH", "RUN"}
 # Flags of Hydra that show something and end.
 _SHOWS = (*_HELP, "--hydra-help", "--version", "--cfg", "-c", "--info", "-i", "-sc")
 
@@ -50,20 +50,23 @@ class Kind(NamedTuple):
 
 
 def text(word: str = "TEXT") -> Kind:
-    """Anything; `word` stands for it in the help: in a FILE, FOLDER or PATH ~/ is the home folder.
+    """Anything; `word` stands for it in the help.
 
-    Bash writes it out behind `=`, and other shells leave it.
+    Of a FILE, FOLDER, PATH or RUN ~/ is the home folder. Bash writes it out behind `=`, and other
+    shells leave it.
     """
-    return Kind(word, _from_home if word in _PLACES else str)
+    return Kind(word, _from_home if _PLACES.intersection(word.split("|")) else str)
 
 
 def _from_home(words: str) -> str:
-    return os.path.expanduser(words) if words == "~" or words.startswith("~/") else words
+    found = os.path.expanduser(words)
+    # A file called ~scan.xyz is nobody's home, and `Path.expanduser` would stop at it.
+    return os.path.abspath(words) if found == words and words.startswith("~") else found
 
 
 def path(word: str = "PATH") -> Kind:
     """A file or folder; ~ is the home folder."""
-    return Kind(word, lambda words: Path(words).expanduser(), "a path")
+    return Kind(word, lambda words: Path(_from_home(words)), "a path")
 
 
 def whole(least: int = 1) -> Kind:
@@ -202,7 +205,7 @@ class Command:
                     raise ConfigError(self._one(known[key], word))
             option = known.get(key) or known.get(key.removeprefix("paths."))
             if not equals and self.words:
-                words.append(word)
+                words.append(_from_home(word))
             elif equals and option:
                 if option.key in given:
                     raise ConfigError(f"{option.key}= is given twice")
@@ -222,7 +225,7 @@ class Command:
 
     def _one(self, option: Option, word: str) -> str:
         folder = "; of several files give the folder" if option.kind.word == "PATH" else ""
-        what = f"one {option.kind.word} is enough, and {word} is another"
+        what = f"one {option.kind.word.replace('|', ' or ')} is enough, and {word} is another"
         return f"{what}{folder} (see {self.name} --help)"
 
     def _unknown(self, word: str, key: str) -> str:

@@ -116,27 +116,31 @@ def test_one_bare_word_may_stand_for_a_key():
     assert inspect.parse(["modelnet10", "sample=9"]) == inspect.parse(
         ["domain=modelnet10", "sample=9"]
     )
-    assert inspect.help().startswith("qs3 inspect NAME: ")
+    assert inspect.help().startswith("qs3 inspect NAME|FOLDER: ")
     for first in ("modelnet10", "domain=modelnet10"):
-        with pytest.raises(ConfigError, match=r"one NAME is enough, and shapenet10 is another \(s"):
+        with pytest.raises(ConfigError, match="one NAME or FOLDER is enough, and shapenet10 is"):
             inspect.parse([first, "shapenet10"])
     with pytest.raises(ConfigError, match="domain= is given twice"):
         inspect.parse(["modelnet10", "domain=shapenet10"])
     with pytest.raises(ConfigError, match="'--sample' is not key=value"):
         inspect.parse(["modelnet10", "--sample"])
-    with pytest.raises(ConfigError, match="domain=NAME is missing"):
+    with pytest.raises(ConfigError, match=r"domain=NAME\|FOLDER is missing"):
         inspect.parse(["variant=x"])
 
 
-def test_places_may_begin_with_the_home_folder(monkeypatch):
-    """Shells but bash leave ~ behind =; of what is no file or folder it is a letter."""
+def test_places_may_begin_with_the_home_folder(tmp_path, monkeypatch):
+    """Shells but bash leave ~ behind =; of what is no file or folder it is a letter.
+
+    A file may be called ~me, too, if nobody is: it keeps its name whoever looks for homes later.
+    """
     monkeypatch.setenv("HOME", "/home/me")
+    monkeypatch.chdir(tmp_path)
     keys = {"into": text("FOLDER"), "runs": several(text("PATH")), "row": text("NAME")}
     options = tuple(Option(key, kind, "what") for key, kind in keys.items())
     command = Command("qs3 x", "x", lambda **_: 0, options, ("qs3 x",))
     assert command.parse(["into=~/data", "runs=~/a,b/~,~me/c", "row=~/x"]) == {
         "into": "/home/me/data",
-        "runs": ("/home/me/a", "b/~", "~me/c"),
+        "runs": ("/home/me/a", "b/~", f"{tmp_path}/~me/c"),
         "row": "~/x",
     }
 
@@ -149,7 +153,7 @@ def test_an_example_of_two_lines_is_shown_whole():
 
 
 def test_a_key_that_any_domain_might_have_is_named_if_one_is_missing():
-    with pytest.raises(ConfigError, match="domain=NAME is missing; not domian="):
+    with pytest.raises(ConfigError, match=r"domain=NAME\|FOLDER is missing; not domian="):
         QS3.command("inspect").parse(["domian=modelnet10", "variant=x"])
 
 

@@ -67,7 +67,7 @@ INSPECT = Command(
     (
         Option(
             "domain",
-            text("NAME"),
+            text("NAME|FOLDER"),
             "of conf/domain, or a dataset's folder; domain= may be left out",
             required=True,
         ),
