@@ -14,7 +14,6 @@ from qs3.methods.cpcm import Cpcm
 from qs3.methods.dann import Dann
 from qs3.methods.defrec import DefRec
 from qs3.methods.gast import Gast
-from qs3.methods.joint_norm import JointNorm
 from qs3.methods.mlsp import Mlsp
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
@@ -70,7 +69,6 @@ CASES = {
     "gast_no_rotation": Case(lambda: Gast(min_points=2, rot_weight=0.0), 3),
     "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),
     "cpcm": Case(Cpcm, 3),
-    "joint_norm": Case(JointNorm, 1),  # of both domains
     "mlsp": Case(lambda: Mlsp(min_points=2), 2),
     "sd": Case(Sd, 2),
     "sd_cut_both": Case(lambda: Sd(cut="both"), 2),

@@ -26,7 +26,7 @@ from tests.methods.cases import Case, batch_of, total
 NAMES = [
     *("source_only", "pcm", "dann", "defrec_on_source", "defrec_pcm", "gast", "gast_pcm"),
     *("pointdan", "cpcm", "mlsp", "sd", "twin_everything", "twin_shared", "twin_own"),
-    *("pcfea_styled", "student_all", "joint_norm"),
+    *("pcfea_styled", "student_all"),
 ]
 CASES = {
     **cases.CASES,
@@ -80,7 +80,6 @@ def test_a_step_is_a_function_of_the_generator(name: str) -> None:
         "source_only",
         "dann",
         "pointdan",
-        "joint_norm",
         "pcfea_styled",
         "twin_everything",
         "twin_shared",

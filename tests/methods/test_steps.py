@@ -98,7 +98,6 @@ ABOVE = {
     **{"source_only": 0, "supervised": 0, "pcm": 60, "dann": 60, "dann_apart": 60},
     **{"pointdan": 200, "defrec": 130, "defrec_on_source": 260, "defrec_pcm": 200},
     **{"gast": 250, "gast_no_rotation": 70, "gast_pcm": 250, "cpcm": 200, "mlsp": 400},
-    "joint_norm": 10,
     **{"sd": 400, "sd_cut_both": 400},
     **{"twin": 30, "twin_everything": 506, "twin_shared": 90, "twin_of_the_source": 280},
     "twin_own": 250,

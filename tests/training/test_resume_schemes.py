@@ -45,7 +45,6 @@ METHODS = {
     "pointdan": ("method=pointdan", NODES),
     "sd": ("method=sd", FEATURED),
     "cpcm": ("method=cpcm",),
-    "joint_norm": ("method=joint_norm",),
     "twin": (*TWIN, "method.teacher=own", "data.source.views=random", FEATURED),
     "mlsp": ("method=mlsp", FEATURED),
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1

@@ -2,8 +2,8 @@
 
 Where runs were kept since: `qs3 report table` of each column and `compare` of R -> A, as asked
 below, with `out=` a folder, whose CSV files go to docs/results/leaderboard; then `page_lines()` and
-`development_lines()` are the page's. Likewise of docs/results/leaderboard_second, whose runs learnt
-from another copy of R.
+`development_lines()` are the page's. Likewise of docs/results/leaderboard_second and
+leaderboard_third, whose runs learnt from other copies of R.
 """
 
 from __future__ import annotations
@@ -19,13 +19,19 @@ from tests.commands import ROOT, main
 
 KEPT = ROOT / "docs" / "results" / "leaderboard"
 SECOND = ROOT / "docs" / "results" / "leaderboard_second"
+THIRD = ROOT / "docs" / "results" / "leaderboard_third"
 PAGE = ROOT / "docs" / "results" / "leaderboard.md"
 DEVELOPMENT = ("R -> A0", "S -> C", "S -> K")
 COLUMNS = (
     *((KEPT, "R -> A"), (KEPT, "R -> A0"), (KEPT, "S -> K"), (KEPT, "S -> C")),
     (SECOND, "R -> A"),
+    (THIRD, "R -> A"),
 )
-OURS = {KEPT: "Twins (ours)", SECOND: "alpha-BN and estimated shares, batches of 32 (ours)"}
+OURS = {
+    KEPT: "Twins (ours)",
+    SECOND: "alpha-BN and estimated shares, batches of 32 (ours)",
+    THIRD: "alpha-BN and estimated shares, batches of 32 (ours)",
+}
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
@@ -95,7 +101,9 @@ def _shown(mark: str) -> list[str]:
     return shown.splitlines()[2:]
 
 
-@pytest.mark.parametrize(("kept", "mark"), [(KEPT, "R-A"), (SECOND, "R-A-second")])
+@pytest.mark.parametrize(
+    ("kept", "mark"), [(KEPT, "R-A"), (SECOND, "R-A-second"), (THIRD, "R-A-third")]
+)
 def test_the_page_has_the_table_s_figures(kept: Path, mark: str) -> None:
     assert _shown(mark) == page_lines(kept)
 
@@ -113,7 +121,7 @@ def test_a_table_s_figures_are_those_of_the_kept_runs(
     assert _figures(tmp_path / _file(column)) == _figures(kept / _file(column))
 
 
-@pytest.mark.parametrize("kept", [KEPT, SECOND])
+@pytest.mark.parametrize("kept", OURS)
 def test_the_differences_are_those_of_the_kept_runs(kept: Path, tmp_path: Path) -> None:
     asked = ["compare", *_settings(kept), "columns=R -> A", f"base={OURS[kept]}", f"out={tmp_path}"]
     assert main(["report", *asked]) == 0

@@ -76,17 +76,13 @@ def test_every_method_is_there():
 
 HALF = {"evaluation.norms=alpha_bn"}
 SHARES = {"evaluation.prior=estimated", "evaluation.prior_power=0.2"}
-JOINT = {"method=joint_norm"}
-QUARTER = HALF | {"evaluation.prior=estimated", "evaluation.prior_power=0.25"}
 AT_32 = {"protocol.batch_size=32"}  # as many labelled clouds a step as Twins
-ADDED = {  # when R -> A had been looked at: a control, and two rules fixed without it
+ADDED = {  # when R -> A had been looked at: a control, and a rule fixed without it
     "source only, batches of 32": AT_32,
     "alpha-BN, batches of 32": AT_32 | HALF,
     "alpha-BN and estimated shares, batches of 32 (ours)": AT_32 | HALF | SHARES,
     "alpha-BN": HALF,
     "alpha-BN and estimated shares (ours)": HALF | SHARES,
-    "joint norms, batches of 32": AT_32 | JOINT,
-    "joint norms, alpha-BN and estimated shares, batches of 32 (ours)": AT_32 | JOINT | QUARTER,
 }
 
 
