@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from qs3.utils.cli import FLAG, NUMBER, Command, Option, text, whole
+from qs3.utils.cli import FLAG, NUMBER, Command, Option, several, text, whole
 
 _CKPT = Option(
     "ckpt", text("RUN"), "a finished run's or an exported folder, or result.pt", required=True
 )
 _CKPT_OR_OWN = Option(
     "ckpt", text("RUN"), "a run's or exported folder, result.pt, or a name (default: see below)", ""
+)
+_PACKAGES = Option(
+    "packages", several(text("NAME")), "packages or modules that define a net of your own", ()
 )
 _THREADS = Option("threads", whole(), "batches at the same time (default: one a processor)")
 
@@ -70,6 +73,7 @@ PREDICT = Command(
         Option("batch_size", whole(), "clouds that the net sees at a time", 16),
         _THREADS,
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
+        _PACKAGES,
     ),
     (
         "qs3 predict scans",
@@ -106,7 +110,6 @@ differ, look yourself), label, points, dropped (NaN, infinite or 0 0 0: without 
 out_of_range=yes: a cloud unlike all those of training (fewer points than the net samples and than
 training had; spacing, flatness, height or stray points outside what 99.8 % of them had). It
 guarantees nothing: an object of no known class also gets a class, often with high confidence.
-
 The page shows the objects: with labels the errors first, the most confident before the others.
 A damaged file gets status=failed and its reason, and the others go on. The exit status is then 1.
 """,
@@ -124,6 +127,7 @@ EXPORT = Command(
         Option("judged", text("FILE"), "folder: .json of qs3 report judge, for the card", ""),
         Option("half", FLAG, "folder: matrices in 16 bits, half the size", False),
         _THREADS,
+        _PACKAGES,
     ),
     (
         "qs3 export ckpt=logs/own_scans/seed0-5f0c2a71 out=model.onnx",

@@ -30,7 +30,7 @@ from qs3.inference.inputs import (
     find_files,
     printable_name,
 )
-from qs3.inference.model_file import find_result
+from qs3.inference.model_file import PACKAGES, find_result
 from qs3.inference.page import Gallery, page
 from qs3.inference.predictor import Predictor, load
 from qs3.inference.settings import Inputs, Settings, Source
@@ -182,7 +182,13 @@ def _title(place: str) -> str:
 
 def _loaded(name: str, settings: Settings) -> Predictor:
     prior = settings.prior or None
-    return load(name, device=settings.device, prior=prior, prior_power=settings.prior_power)
+    return load(
+        name,
+        device=settings.device,
+        packages=(*PACKAGES, *settings.packages),
+        prior=prior,
+        prior_power=settings.prior_power,
+    )
 
 
 def _floor(source: Source, settings: Settings, predictor: Predictor) -> Floor | None:

@@ -9,7 +9,7 @@ import logging
 import re
 import shlex
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +24,14 @@ from qs3.config.checks import check_int
 from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.inference.judgement import read_judgement
 from qs3.inference.model_card import card, carried
-from qs3.inference.model_file import build_net, find_result, read_result, values_of
+from qs3.inference.model_file import (
+    PACKAGES,
+    build_net,
+    find_result,
+    own_module,
+    read_result,
+    values_of,
+)
 from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
 from qs3.inference.predictor import Predictor, load
 from qs3.models.base import PointClassifier
@@ -96,21 +103,22 @@ def export_command(
     threads: int = 1,
     judged: str | Path = "",
     half: bool = False,
+    packages: Sequence[str] = (),
 ) -> str:
     """Export the classifier of a run (or its result.pt) and compare; text for the terminal.
 
-    `judged` and `half` as of `export_folder`.
+    `judged`, `half` and `packages` as of `export_folder`.
     """
     from qs3.inference.command import saved
 
     if not Path(out).suffix:
-        return export_folder(ckpt, Path(out).expanduser(), judged, half)
+        return export_folder(ckpt, Path(out).expanduser(), judged, half, packages)
     if judged or half:
         raise ConfigError(f"judged= and half= are for a folder; out={out} is a file")
     before = torch.get_num_threads()
     torch.set_num_threads(check_int("threads", threads, 1))
     try:
-        predictor = load(ckpt)
+        predictor = load(ckpt, packages=(*PACKAGES, *packages))
         replaces = Path(out).expanduser().exists()
         compared = export(predictor, out)
     finally:
@@ -130,7 +138,11 @@ def export_command(
 
 
 def export_folder(
-    ckpt: str | Path, folder: Path, judged: str | Path = "", half: bool = False
+    ckpt: str | Path,
+    folder: Path,
+    judged: str | Path = "",
+    half: bool = False,
+    packages: Sequence[str] = (),
 ) -> str:
     """Write a model's folder (see `qs3.inference.model_folder`); text for the terminal.
 
@@ -140,6 +152,7 @@ def export_folder(
         judged: what `qs3 report judge runs=CKPT out=FILE.json` wrote, for the card; "" for none.
         half: matrices as numbers of 16 bits: half the size, and other probabilities in the fourth
             digit. They count as 32 bits again when the net is built.
+        packages: where a net of one's own is defined, beside those of qs3; the code there is run.
 
     Raises:
         ConfigError: the folder holds a README.md or config.json of something else, or the result.
@@ -162,6 +175,7 @@ def export_folder(
         text = carried(beside, judgement)
     else:
         text = card(result, metrics, _command(file.parent), judgement)
+    build_net(result, (*PACKAGES, *packages))  # before anything is written
     write_folder(folder, values_of(result), text)
     again = read_result(folder)
     for name in ("weights", "held_out", "trained_norms"):
@@ -170,10 +184,12 @@ def export_folder(
             torch.equal(one, theirs[key]) for key, one in ours.items()
         ):
             raise Qs3Error(f"{folder} does not hold the {name} as written; is the disk sound?")
-    build_net(again)
+    build_net(again, (*PACKAGES, *packages))
+    module = own_module(again)
+    named = f"; both need packages= and {module}" if module else ""
     return (
         f"saved {folder}: {WEIGHTS} ({(folder / WEIGHTS).stat().st_size / 1e6:.1f} MB), {CONFIG} "
-        f"and {CARD}\nqs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it; read "
+        f"and {CARD}\nqs3.load({str(folder)!r}) and qs3 predict ckpt={folder} read it{named}; read "
         f"{CARD}, which is the model's card, before you publish it"
     )
 

@@ -7,7 +7,7 @@ import re
 
 from qs3.evaluation.selection_rules import chosen_in_words
 from qs3.inference.judgement import Judgement, percent
-from qs3.inference.model_file import Result
+from qs3.inference.model_file import PACKAGES, Result, own_module
 from qs3.runs.metrics import RunMetrics
 from qs3.utils.plural import counted
 from qs3.utils.version import VERSION
@@ -32,6 +32,9 @@ def card(
     net = result.model["_target_"].rpartition(".")[2]
     title = f"{net}, {metrics.source} to {metrics.target}" if metrics else f"{net}"
     floor = ", floor=0.0" if result.scale == "above_floor" else ""
+    own = own_module(result)
+    packages = f', packages=["{PACKAGES[0]}", "{own}"]' if own else ""
+    told = f" packages={own}" if own else ""
     lines = [
         "---",
         "library_name: qs3",
@@ -47,11 +50,12 @@ def card(
         "```python",
         "import qs3",
         "",
-        'predictor = qs3.load("this folder")',
+        f'predictor = qs3.load("this folder"{packages})',
         f"probabilities = predictor([cloud]{floor})  # [n, 3], any n, {_frame(result)}",
         "```",
         "",
-        f"Or: `qs3 predict ckpt=FOLDER input=SCANS{floor.replace(',', '')}`.",
+        f"Or: `qs3 predict ckpt=FOLDER input=SCANS{floor.replace(',', '')}{told}`.",
+        *([f"The net is defined in {own}, which is not part of qs3."] if own else []),
         "",
         "## Input",
         "",

@@ -211,6 +211,12 @@ def read_result(path: str | Path) -> Result:
     return _checked(file, load(file, advice=_ADVICE))
 
 
+def own_module(result: Result) -> str:
+    """Where the net is defined, of a net that is not one of qs3; else ""."""
+    module = str(result.model["_target_"]).rpartition(".")[0]
+    return "" if f"{module}.".startswith(f"{PACKAGES[0]}.") else module
+
+
 def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
     """The net in eval mode, with its weights, on the CPU; the file need not be trusted.
 
@@ -222,7 +228,7 @@ def build_net(result: Result, packages: Sequence[str] = PACKAGES) -> nn.Module:
     settings = dict(result.model)
     target = settings.pop("_target_")
     make = _maker(target, packages)
-    if target.startswith(f"{PACKAGES[0]}."):  # one's own is trusted with any arguments
+    if not own_module(result):  # one's own is trusted with any arguments
         with torch.device("meta"), warnings.catch_warnings():  # takes no memory
             warnings.simplefilter("ignore", UserWarning)  # nothing is copied there: as is meant
             net = _filled(make, settings, result, target)
@@ -265,7 +271,8 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
         raise DataError(
             f"the file's model is {target}, which is not in {' or '.join(packages)}; refused. "
             "If it is a net of your own, name its package: "
-            "qs3.load(run, packages=['qs3.models', 'my_package'])"
+            "qs3.load(run, packages=['qs3.models', 'my_package']), or packages=my_package in a "
+            "command"
         )
     try:
         make = getattr(importlib.import_module(module_name), name)
@@ -274,7 +281,7 @@ def _maker(target: str, packages: Sequence[str]) -> Any:
             raise DataError(f"the file's model {target} is not in this version of qs3") from error
         raise DataError(
             f"the file's model {target} cannot be imported here ({error}); its module must be on "
-            "the Python path"
+            "the Python path: PYTHONPATH=FOLDER before the command"
         ) from error
     if getattr(make, "__module__", None) != module_name or not callable(make):
         raise DataError(f"the file's model {target} is not defined there; refused")

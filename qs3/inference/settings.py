@@ -42,6 +42,8 @@ class Settings:
         batch_size: clouds that the net sees at a time.
         threads: batches that are worked on at the same time.
         device: of the net.
+        packages: where nets of one's own may be defined, beside those of qs3; the code there is
+            run.
     """
 
     ckpt: str = ""
@@ -64,6 +66,7 @@ class Settings:
     batch_size: int = 16
     threads: int = 1
     device: str = "cpu"
+    packages: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         if bool(self.input) == bool(self.depth):

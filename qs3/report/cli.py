@@ -143,10 +143,10 @@ def _save(at: str, table: Table, found: Sequence[Any], base: str = "") -> None:
     print(said)
 
 
-def _page(run: str, data_dir: str | None, out: str | None) -> None:
+def _page(run: str, data_dir: str | None, out: str | None, packages: Sequence[str]) -> None:
     from qs3.report.runs.pictures import draw
 
-    drawn = draw(run, out, data_dir=data_dir)
+    drawn = draw(run, out, data_dir=data_dir, packages=packages)
     for note in drawn.notes:
         print(f"note: {note}")
     for name, reason in drawn.skipped.items():
@@ -321,6 +321,7 @@ PAGE = Command(
         Option("run", text("PATH"), "the folder that training names", required=True),
         Option("data_dir", text("FOLDER"), "where its data are now, if they have moved"),
         Option("out", text("FOLDER"), "default RUN/pictures"),
+        Option("packages", several(text("NAME")), "where a net of your own is defined", ()),
     ),
     ("qs3 report page run=logs/qs3_s2d/seed0-5f0c2a71 data_dir=data",),
     about="""

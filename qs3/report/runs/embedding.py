@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from qs3.data.store import PointSet
 from qs3.datamodules.splits import load_clouds
 from qs3.errors import Qs3Error
 from qs3.evaluation.metrics import global_features
-from qs3.inference.model_file import build_net, read_result
+from qs3.inference.model_file import PACKAGES, build_net, read_result
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
 from qs3.report.runs.data import RunFiles
@@ -32,12 +33,16 @@ _BATCH = 32
 
 
 def draw_embedding(
-    run: RunFiles, data_dir: str | Path | None = None, clouds: int = CLOUDS
+    run: RunFiles,
+    data_dir: str | Path | None = None,
+    clouds: int = CLOUDS,
+    packages: Sequence[str] = PACKAGES,
 ) -> Figure:
     """t-SNE of the global features of test clouds of source and target, before and after.
 
     "Before" are the weights that the warm-up selected, "after" those of the result: without rounds
     they are the same, and there is one panel. Which `clouds` follows from the run's seed.
+    `packages` as of `qs3.load`.
 
     Raises:
         NothingToDrawError: data or weights are not there; says which.
@@ -47,12 +52,11 @@ def draw_embedding(
     assert run.metrics is not None
     try:
         result = read_result(run.folder)
-        nets = {"result": build_net(result)}
+        nets = {"result": build_net(result, packages)}
         if run.rounds and (run.folder / _WARMUP).is_file():
             before = load(run.folder / _WARMUP)
-            nets = {"after the warm-up": build_net(dataclasses.replace(result, weights=before))} | {
-                "after self-training": nets["result"]
-            }
+            first = build_net(dataclasses.replace(result, weights=before), packages)
+            nets = {"after the warm-up": first, "after self-training": nets["result"]}
     except Qs3Error as error:
         raise NothingToDrawError(str(error)) from error
     if not all(callable(getattr(net, "features", None)) for net in nets.values()):

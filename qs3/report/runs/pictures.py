@@ -66,6 +66,7 @@ def draw(
     data_dir: str | Path | None = None,
     embed: bool = True,
     config: Mapping[str, Any] | None = None,
+    packages: Sequence[str] = (),
 ) -> Drawn:
     """Draw a run's pictures; those of an earlier call are replaced.
 
@@ -74,6 +75,7 @@ def draw(
         data_dir: where the datasets lie; None: where the run's config says.
         embed: also lay out the features of both domains; takes a minute.
         config: of the run; None: what Hydra wrote into its folder.
+        packages: where a net of one's own is defined, beside those of qs3; the code there is run.
 
     Raises:
         MissingDataError, DataError: see `qs3.report.runs.data.read_run`.
@@ -83,7 +85,7 @@ def draw(
         run = dataclasses.replace(run, config=config)
     out = run.folder / FOLDER if out is None else Path(out)
     pictures, skipped = {}, {}
-    for name, make in _makers(run, data_dir, embed).items():
+    for name, make in _makers(run, data_dir, embed, packages).items():
         path = out / f"{name}.png"
         try:
             make(path)
@@ -107,7 +109,7 @@ def _write_clouds(run: RunFiles, path: Path, data_dir: str | Path | None) -> Pat
 
 
 def _makers(
-    run: RunFiles, data_dir: str | Path | None, embed: bool
+    run: RunFiles, data_dir: str | Path | None, embed: bool, packages: Sequence[str]
 ) -> dict[str, Callable[[Path], object]]:
     """What writes each picture, in the order of the page."""
 
@@ -115,9 +117,10 @@ def _makers(
         return run_figures.classes(run, _train_labels(run, data_dir))
 
     def embedding() -> Figure:
-        from qs3.report.runs.embedding import draw_embedding  # torch
+        from qs3.inference.model_file import PACKAGES  # torch
+        from qs3.report.runs.embedding import draw_embedding
 
-        return draw_embedding(run, data_dir)
+        return draw_embedding(run, data_dir, packages=(*PACKAGES, *packages))
 
     figures: dict[str, Callable[[], Figure]] = {
         "curves": lambda: run_figures.curves(run),

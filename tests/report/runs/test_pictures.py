@@ -283,10 +283,10 @@ def test_damaged_files_are_named(run, name, text, capsys):
     assert name in capsys.readouterr().err
 
 
-def use_real_net(run):
+def use_real_net(run, target="qs3.models.pointnet.pointnet"):
     """A small net of ours in place of the toy's, with features."""
     torch.manual_seed(0)
-    model = {"_target_": "qs3.models.pointnet.pointnet", "num_classes": 3, "variant": "basic"}
+    model = {"_target_": target, "num_classes": 3, "variant": "basic"}
     first, second = (pointnet(num_classes=3, variant="basic").state_dict() for _ in range(2))
     save(first, run / "warmup_selected.pt")
     result = Result(model, CLASSES, 32, 64, "kinectsim10", "z", "unit_ball", {}, second)
@@ -320,6 +320,22 @@ def test_command_line(run, toy_data, tmp_path, capsys):
     shown += [str(out / "clouds.html"), str(out / "index.html")]
     assert capsys.readouterr().out.splitlines() == shown
     assert not_blank(out / "embedding.png")
+
+
+def own_net(num_classes, variant):
+    return pointnet(num_classes=num_classes, variant=variant)
+
+
+def test_features_of_a_net_of_ones_own_are_drawn_if_its_module_is_named(run, tmp_path, capsys):
+    use_real_net(run, f"{__name__}.own_net")
+    words = ["report", "page", f"run={run}", f"out={tmp_path}"]
+    assert main(words) == 0
+    refused = f"no embedding: the file's model is {__name__}.own_net, which is not in qs3.models"
+    assert refused in capsys.readouterr().out
+    assert not (tmp_path / "embedding.png").exists()
+    assert main([*words, f"packages={__name__}"]) == 0
+    assert str(tmp_path / "embedding.png") in capsys.readouterr().out
+    assert not_blank(tmp_path / "embedding.png")
 
 
 def test_damaged_data_cost_their_pictures_and_not_the_page(run, toy_data, tmp_path, capsys):
