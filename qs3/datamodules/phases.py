@@ -20,6 +20,9 @@ from qs3.utils.plural import counted
 LOWER_THETA = "lower selftraining.theta"
 """What selects more where a scheme has nothing else for it, in messages."""
 
+RAISE_SHARE = "raise selftraining.share"
+"""The same of a scheme whose threshold is set by a share."""
+
 
 @dataclass(frozen=True)
 class Phases:
@@ -204,11 +207,13 @@ class SelfTrainingConfig:
             )
 
     @property
-    def more_labels(self) -> str:
-        """What would select more, as messages advise it."""
-        if self.share is not None:
-            return "raise selftraining.share"
-        return getattr(self.selector, "more_labels", None) or LOWER_THETA
+    def more_labels(self) -> tuple[str, ...]:
+        """What would select more, as messages advise it: of the threshold, of the selector."""
+        own = getattr(self.selector, "more_labels", None)
+        if own and self.theta == 0:  # there is no other threshold than the selector's
+            return (own,)
+        threshold = LOWER_THETA if self.share is None else RAISE_SHARE
+        return (threshold, own) if own else (threshold,)
 
     @property
     def instead_of_mu(self) -> str | None:

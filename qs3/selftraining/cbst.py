@@ -65,7 +65,7 @@ class Cbst:
     """
 
     own_thresholds: ClassVar[bool] = True
-    more_labels: ClassVar[str] = f"raise {_KEY}.portion"
+    more_labels: ClassVar[str] = f"raise {_KEY}.portion and .most"
 
     portion: float = 0.2
     step: float = 0.05

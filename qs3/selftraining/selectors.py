@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from qs3.config.checks import check_choice
-from qs3.datamodules.phases import LOWER_THETA
+from qs3.datamodules.phases import LOWER_THETA, RAISE_SHARE
 from qs3.errors import ConfigError, SelectionError
 from qs3.utils.plural import counted
 from qs3.utils.seeding import derive
@@ -278,7 +278,7 @@ def check_selection(
     class_names: Sequence[str],
     round_: int,
     missing_class: str,
-    more: str = LOWER_THETA,
+    more: Sequence[str] = (LOWER_THETA,),
     trainable: bool = True,
     instead_of_mu: str | None = _KEEP_ALL,
     processes: int = 1,
@@ -290,7 +290,8 @@ def check_selection(
         class_names: in label order.
         round_: for messages.
         missing_class: "warn" or "error".
-        more: what would select more, for messages; see `SelfTrainingConfig.more_labels`.
+        more: what would select more, for messages; see `SelfTrainingConfig.more_labels`. Of a
+            threshold that all samples exceed nothing is said.
         trainable: whether the teacher could have been trained for longer.
         instead_of_mu: what selects more where only one class is confident; None where the selector
             has no mu for it; see `SelfTrainingConfig.instead_of_mu`.
@@ -309,14 +310,16 @@ def check_selection(
         )
     )
     facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
+    longer = ["train the teacher longer (protocol.epochs)"] * trainable
+    # Where all are above the threshold, a lower one selects no more.
+    every = int(selection.confident.sum()) >= len(selection.selected)
+    ways = [way for way in more if not (every and way in (LOWER_THETA, RAISE_SHARE))] + longer
     if total <= processes:
         own_mu = selection.mu[selection.confident > 0]
-        longer = ["train the teacher longer (protocol.epochs)"] * trainable
+        why = ""
         if instead_of_mu and len(own_mu) == 1 and own_mu[0] == 0:
             why = "all confident samples are of one class, so its mu is 0; "
-            ways = [more, *longer, instead_of_mu]
-        else:
-            why, ways = "", [more, *longer]
+            ways.append(instead_of_mu)
         if processes > 1:
             why += f"each of {processes} processes needs two; "
             ways.append("give fewer trainer.devices")
@@ -324,8 +327,11 @@ def check_selection(
             f"only {counted(total, 'pseudo-label')} selected in {facts}; {why}{', or '.join(ways)}"
         )
     if missing and missing_class == "error":
+        why = ""
+        if every and not selection.confident[selection.kept == 0].any():
+            why, ways = "the teacher takes no cloud for one; ", longer
+        ways = [*ways, "accept it with selftraining.missing_class=warn"]
         raise SelectionError(
-            f"no pseudo-label for {', '.join(missing)} in {facts}; {more}, or accept it with "
-            "selftraining.missing_class=warn"
+            f"no pseudo-label for {', '.join(missing)} in {facts}; {why}{', or '.join(ways)}"
         )
     return missing

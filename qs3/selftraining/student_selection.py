@@ -90,7 +90,8 @@ class StudentSelection(Callback):
         phases: of the run.
         rule: one of `selection_rules.STUDENT_RULES`.
         classes: names in label order.
-        more: what would select more pseudo-labels, for messages.
+        more: what would select more pseudo-labels, for messages; see
+            `SelfTrainingConfig.more_labels`.
 
     Attributes:
         scores: by epoch, of those of the last round so far; none with `last`.
@@ -104,9 +105,10 @@ class StudentSelection(Callback):
         phases: Phases,
         rule: str,
         classes: Sequence[str],
-        more: str = LOWER_THETA,
+        more: Sequence[str] = (LOWER_THETA,),
     ) -> None:
-        self.folder, self.phases, self.rule, self._more = folder, phases, rule, more
+        self.folder, self.phases, self.rule = folder, phases, rule
+        self._more = ", or ".join(more)
         self.classes = tuple(classes)
         self.scores: dict[int, float] = {}
         self.epoch: int | None = None

@@ -106,11 +106,11 @@ def test_nothing_confident_is_an_error_with_counts():
 
 @pytest.mark.parametrize(
     ("confident", "advice"),
-    [([1, 0, 0], "of one class"), ([0, 9, 0], "of one class"), ([1, 1, 0], "lower selftraining")],
+    [([1, 0, 0], "of one class"), ([0, 8, 0], "of one class"), ([1, 1, 0], "lower selftraining")],
 )
 def test_two_pseudo_labels_are_the_least(confident, advice):
     def chosen(kept):
-        return Selection(np.ones(1, bool), 0.8, np.zeros(3), np.array(confident), np.array(kept))
+        return Selection(np.ones(9, bool), 0.8, np.zeros(3), np.array(confident), np.array(kept))
 
     assert check_selection(chosen([1, 1, 0]), ("x", "y", "z"), 0, "warn") == ["z"]
     with pytest.raises(SelectionError, match=f"only 1 .*{advice}"):
@@ -149,8 +149,9 @@ def test_advice_is_about_the_selector_in_use():
         (Qbst(), 0.8, "so its mu is 0; .*mu=one$"),
         (Qbst(mu="one"), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
         (Spst(), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
-        (Cbst(), 0.0, r"b 0/0; raise selftraining.selector.portion, or train"),
-        (Random(of=Cbst()), 0.0, r"b 0/0; raise selftraining\.selector\.of\.portion, or train"),
+        (Cbst(), 0.0, r"b 0/0; raise selftraining.selector.portion and .most, or train"),
+        (Random(of=Cbst()), 0.0, r"; raise selftraining\.selector\.of\.portion and .most, or"),
+        (Cbst(), 0.95, r"; lower selftraining.theta, or raise selftraining.selector.portion and"),
         (Random(of=Qbst()), 0.8, r"so its mu is 0; .*set selftraining\.selector\.of\.mu=one$"),
         (Random(of=Random(of=Qbst())), 0.8, r"set selftraining\.selector\.of\.of\.mu=one$"),
         (GraphRefined(), 0.8, r"b 0/0; lower selftraining.theta, or train the teacher longer"),
@@ -164,12 +165,41 @@ def test_advice_is_about_the_selector_in_use():
     selection = Qbst().select(teacher, 0.8)
     with pytest.raises(SelectionError, match=r"its mu is 0; raise selftraining.share, or set .*mu"):
         check_selection(selection, ("a", "b"), 0, "warn", more, trainable=False)
-    selection = Qbst(mu="one").select(teacher, 0.5)
+    unsure = TeacherPredictions.of(np.vstack([probabilities, [0.5, 0.5]]), ["a", "b", "c", "d"])
+    selection = Qbst(mu="one").select(unsure, 0.5)
     assert check_selection(selection, ("a", "b"), 0, "warn", more) == ["b"]
     with pytest.raises(
         SelectionError, match=r"no pseudo-label for b .*; raise selftraining.share,"
     ):
         check_selection(selection, ("a", "b"), 0, "error", more)
+
+
+def test_no_lower_threshold_is_advised_where_all_are_above_it():
+    one = TeacherPredictions.of(np.array([[0.9, 0.1], [0.8, 0.2], [0.7, 0.3]]), ["a", "b", "c"])
+    asked = ("a", "b"), 0, "error"
+    longer = r"train the teacher longer \(protocol\.epochs\), or "
+    for scheme, theta in (
+        (SelfTrainingConfig(Spst(), rounds=1, theta=0.5), 0.5),
+        (SelfTrainingConfig(Spst(), rounds=1, share=0.9), 0.5),
+        (SelfTrainingConfig(GraphRefined(), rounds=1, theta=0), 0.0),
+        (SelfTrainingConfig(Cbst(portion=0.5), rounds=1, theta=0), 0.0),
+        (SelfTrainingConfig(Cbst(portion=0.5, most=1.0), rounds=1, theta=0.5), 0.5),
+    ):
+        selection = scheme.selector.select(one, theta)
+        for trainable, ways in ((True, longer), (False, "")):
+            said = rf"for b in .*b 0/0; the teacher takes no cloud for one; {ways}accept it with"
+            if int(selection.kept.sum()) < 2:
+                said = "only 1 pseudo-label"
+            with pytest.raises(SelectionError, match=said):
+                check_selection(selection, *asked, scheme.more_labels, trainable)
+    selection = Qbst().select(one, 0.5)
+    with pytest.raises(SelectionError, match=rf"its mu is 0; {longer}set selftraining\S*mu=one$"):
+        check_selection(selection, *asked)
+    # Of CBST the class has clouds, and its portion is less than one: more of it selects one.
+    two = TeacherPredictions.of(np.array([[0.9, 0.1]] * 4 + [[0.4, 0.6]]), list("abcde"))
+    selection = Cbst(portion=0.5).select(two, 0.0)
+    with pytest.raises(SelectionError, match=r"b 0/1; raise selftraining\.selector\.portion and"):
+        check_selection(selection, *asked, Cbst.more_labels.split(", or "))
 
 
 @pytest.mark.parametrize(
