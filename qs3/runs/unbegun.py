@@ -9,9 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from qs3.errors import Qs3Error
+from qs3.runs.folder import STARTED
 
 _HYDRAS = {".hydra": ("config.yaml", "hydra.yaml", "overrides.yaml")}
 _LOG, _LOCK = "train.log", ".lock"
+_FILES = (_LOG, _LOCK, STARTED)  # of the last nothing is left to go on with before an epoch is done
 
 
 @contextlib.contextmanager
@@ -31,9 +33,9 @@ def is_unbegun(folder: Path) -> bool:
 
 
 def _is_bare(folder: Path) -> bool:
-    """Whether nothing lies there but what a start writes before it looks at anything."""
+    """Whether nothing lies there but what a start writes before it trains."""
     for path in folder.iterdir():
-        known = path.name in (_LOG, _LOCK) and path.is_file()
+        known = path.name in _FILES and path.is_file()
         if path.name in _HYDRAS and path.is_dir() and not path.is_symlink():
             known = all(one.name in _HYDRAS[path.name] for one in path.iterdir())
         if not known:
@@ -56,7 +58,8 @@ def _remove(folder: Path) -> None:
                 (folder / name / file).unlink(missing_ok=True)
             if (folder / name).is_dir():
                 (folder / name).rmdir()
-        (folder / _LOG).unlink(missing_ok=True)
+        for name in (_LOG, STARTED):
+            (folder / name).unlink(missing_ok=True)
         (folder / _LOCK).unlink()
         folder.rmdir()
         folder.parent.rmdir()

@@ -26,6 +26,31 @@ _STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, METRICS)
 _INSTEAD = "or leave ckpt_path out to begin anew"
 
 
+def checkpoint_asked_for(run: Run) -> Path | None:
+    """The checkpoint that `ckpt_path` names; None where the run has its own, or none is asked for.
+
+    Raises:
+        MissingDataError: there is no such checkpoint.
+    """
+    where = run.cfg.ckpt_path
+    own = run.folder / LAST
+    if where is None or own.is_file() or int(os.environ.get("LOCAL_RANK", 0)) > 0:
+        return None
+    if where == _LAST:
+        raise MissingDataError(
+            f"ckpt_path={_LAST}, but {own} is not there: a run with these settings and seed has "
+            "not begun, or was not an epoch old; leave ckpt_path out to begin it"
+        )
+    path = Path(where).expanduser()
+    path = path / LAST if path.is_dir() else path
+    if path.name != LAST or not path.is_file():
+        raise MissingDataError(
+            f"ckpt_path={where}: no {LAST} of a run is there; name a run's folder or the {LAST} in "
+            "it (qs3 predict uses finished runs)"
+        )
+    return path
+
+
 def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
     """Do what `ckpt_path` asks for, before training begins.
 
@@ -48,22 +73,10 @@ def take_checkpoint(run: Run, started: Mapping[str, Any]) -> dict[str, Any]:
         DataError: it was trained on other data, or is damaged.
         Qs3Error: it is still being trained.
     """
-    where = run.cfg.ckpt_path
-    own = run.folder / LAST
-    if where is None or own.is_file() or int(os.environ.get("LOCAL_RANK", 0)) > 0:
+    path = checkpoint_asked_for(run)
+    if path is None:
         return dict(started)
-    if where == _LAST:
-        raise MissingDataError(
-            f"ckpt_path={_LAST}, but {own} is not there: a run with these settings and seed has "
-            "not begun, or was not an epoch old; leave ckpt_path out to begin it"
-        )
-    path = Path(where).expanduser()
-    path = path / LAST if path.is_dir() else path
-    if path.name != LAST or not path.is_file():
-        raise MissingDataError(
-            f"ckpt_path={where}: no {LAST} of a run is there; name a run's folder or the {LAST} in "
-            "it (qs3 predict uses finished runs)"
-        )
+    where = run.cfg.ckpt_path
     other = path.resolve().parent
     begun = runs.read_begun(other)
     if begun is None:
