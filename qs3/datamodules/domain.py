@@ -66,15 +66,16 @@ class DomainData(LightningDataModule):
         labels: False reads no label and keeps none; then there are no validation clouds.
         cache_dir: where farthest points are kept for the next time; None keeps none.
         clouds_a_split: only so many clouds of each split, at even steps; at least 1.
-        clouds_a_class: only the first so many training clouds of each class, which takes labels; at
-            least 1.
+        clouds_a_class: train on the first so many clouds of each class alone, and validate on at
+            most as many, which takes labels; at least 1.
         data_dir: where the dataset of a named domain lies.
         asks: who needs the labels, for the message where there are none; None: the domain.
         twin: one of `beside.SOURCE_TWINS`: load the twins of the training clouds, too.
 
     Attributes:
         train, validation, test: clouds of each part, after `setup`.
-        whole: clouds of the training split before it was divided, without their labels.
+        whole: clouds of the training split before it was divided, without their labels; with
+            `clouds_a_class` those that it leaves.
         twins: of the clouds of `whole`, after `setup`; None if they were not asked for.
         random_views: what is drawn from in place of `whole`, after `setup`; None unless
             `domain.views` says so. Validation and test clouds are those that are stored.
@@ -245,10 +246,12 @@ class DomainData(LightningDataModule):
         if isinstance(train, Unlabelled):
             self.whole = self.train = train
             return
-        if self.clouds_a_class is not None:
-            train = first_of_class(train, self.clouds_a_class)
-        self.whole = Unlabelled(train.clouds, train.ids)
-        chosen, held_out = RULES[self.val](train.ids, train.labels.numpy())
+        labels, left = train.labels.numpy(), train
+        chosen, held_out = RULES[self.val](train.ids, labels)
+        if (few := self.clouds_a_class) is not None:
+            chosen, held_out = (first_of_class(part, labels, few) for part in (chosen, held_out))
+            left = train.at(np.sort(np.concatenate([chosen, held_out])))
+        self.whole = Unlabelled(left.clouds, left.ids)
         self.train, self.validation = train.at(chosen), train.at(held_out)
 
     def _load(self, dataset: PointSet, split: str, starts: int) -> Labelled | Unlabelled:

@@ -316,8 +316,14 @@ def test_a_few_clouds_of_each_split_or_class(data_dir, tmp_path):
     assert few.sha256 == cached.sha256
     assert not list(tmp_path.glob("*.npy"))  # what is cached are whole splits
     assert list((tmp_path / "c").glob("*.npy"))
-    first = made(data_dir, clouds_a_class=5)
-    assert first.whole.ids == tuple(f"{cls}/train/{i:03d}" for cls in CLASSES for i in range(5))
+    whole, first = made(data_dir), made(data_dir, clouds_a_class=5)
+    for all_, some in ((whole.train, first.train), (whole.validation, first.validation)):
+        of_class = [[i for i in all_.ids if i.startswith(cls)] for cls in CLASSES]
+        assert some.ids == tuple(i for ids in of_class for i in ids[:5])
+    assert set(first.whole.ids) == {*first.train.ids, *first.validation.ids}
+    assert len(first.train.ids) == 15
+    fewest = made(data_dir, clouds_a_class=1)  # of too few no rule could hold any out
+    assert (len(fewest.train.ids), len(fewest.validation.ids)) == (3, 3)
     assert len(first.test.ids) == 24
 
 

@@ -29,9 +29,7 @@ from tests.training.watching import interrupt
 def test_overfit_learns_a_few_clouds_by_heart(toy):
     cfg = toy("debug=overfit", "protocol.epochs=100", "selftraining.rounds=0")
     metrics = train(cfg)
-    assert metrics.training == TrainingAccuracy(
-        n=10, accuracy=1.0
-    )  # 12 clouds less 2 for validation
+    assert metrics.training == TrainingAccuracy(n=12, accuracy=1.0)  # four of each class
     assert metrics.selftraining == "none"
     lr = "protocol.optimizer.lr=1e-9"
     cannot = train(toy("debug=overfit", "protocol.epochs=3", "selftraining.rounds=0", lr))
@@ -91,8 +89,11 @@ def test_a_run_of_few_clouds_leaves_no_cache(toy, tmp_path):
 
 def test_ckpt_path_last_insists_on_a_checkpoint(toy, finished):
     cfg = toy("ckpt_path=last")
-    with pytest.raises(MissingDataError, match=r"ckpt_path=last, but .*last\.ckpt is not there"):
-        train(cfg)
+    absent = toy("ckpt_path=last", "data.make_source=true", "paths.data_dir=/nowhere")
+    for one in (cfg, absent):  # before the source is made
+        with pytest.raises(MissingDataError, match=r"ckpt_path=last, but .*last\.ckpt is not"):
+            train(one)
+    assert not (hashing.run_folder(cfg) / "started.json").exists()
     interrupt(toy(), epoch=5)
     train(cfg)
     assert result_of(hashing.run_folder(cfg)) == result_of(finished)
