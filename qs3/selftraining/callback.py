@@ -184,7 +184,7 @@ class SelfTraining(Callback):
             round_,
             self.scheme.missing_class,
             more=self.scheme.more_labels,
-            trainable=not self._given,
+            longer=self._longer(round_),
             instead_of_mu=self.scheme.instead_of_mu,
             processes=trainer.world_size,
         )
@@ -199,6 +199,14 @@ class SelfTraining(Callback):
         self._previous = labels
         if trainer.is_global_zero:
             _log(self.records[-1], len(labels))
+
+    def _longer(self, round_: int) -> str | None:
+        """What trains the teacher of a round for longer: the warm-up's net, then the students."""
+        if round_ == 0 and self._given:
+            return None
+        steps = self.phases.round_steps if round_ else self.phases.warmup_steps
+        group = "selftraining" if round_ else "protocol"
+        return f"{group}.epochs" if steps is None else f"{group}.steps"
 
     def _predictions(
         self, trainer: Trainer, pl_module: Classifier, data: AdaptationData, round_: int

@@ -279,7 +279,7 @@ def check_selection(
     round_: int,
     missing_class: str,
     more: Sequence[str] = (LOWER_THETA,),
-    trainable: bool = True,
+    longer: str | None = "protocol.epochs",
     instead_of_mu: str | None = _KEEP_ALL,
     processes: int = 1,
 ) -> list[str]:
@@ -292,7 +292,7 @@ def check_selection(
         missing_class: "warn" or "error".
         more: what would select more, for messages; see `SelfTrainingConfig.more_labels`. Of a
             threshold that all samples exceed nothing is said.
-        trainable: whether the teacher could have been trained for longer.
+        longer: the setting by which the teacher is trained for longer; None: it was given.
         instead_of_mu: what selects more where only one class is confident; None where the selector
             has no mu for it; see `SelfTrainingConfig.instead_of_mu`.
         processes: that share the samples out, one of them to two where they come out uneven.
@@ -310,10 +310,10 @@ def check_selection(
         )
     )
     facts = f"round {round_} with theta={selection.theta}: selected/confident by class: {table}"
-    longer = ["train the teacher longer (protocol.epochs)"] * trainable
+    better = [] if longer is None else [f"train the teacher longer ({longer})"]
     # Where all are above the threshold, a lower one selects no more.
     every = int(selection.confident.sum()) >= len(selection.selected)
-    ways = [way for way in more if not (every and way in (LOWER_THETA, RAISE_SHARE))] + longer
+    ways = [way for way in more if not (every and way in (LOWER_THETA, RAISE_SHARE))] + better
     if total <= processes:
         own_mu = selection.mu[selection.confident > 0]
         why = ""
@@ -329,7 +329,7 @@ def check_selection(
     if missing and missing_class == "error":
         why = ""
         if every and not selection.confident[selection.kept == 0].any():
-            why, ways = "the teacher takes no cloud for one; ", longer
+            why, ways = "the teacher takes no cloud for one; ", better
         ways = [*ways, "accept it with selftraining.missing_class=warn"]
         raise SelectionError(
             f"no pseudo-label for {', '.join(missing)} in {facts}; {why}{', or '.join(ways)}"

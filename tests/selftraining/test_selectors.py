@@ -164,7 +164,7 @@ def test_advice_is_about_the_selector_in_use():
     more = SelfTrainingConfig(Qbst(), rounds=1, share=0.2).more_labels
     selection = Qbst().select(teacher, 0.8)
     with pytest.raises(SelectionError, match=r"its mu is 0; raise selftraining.share, or set .*mu"):
-        check_selection(selection, ("a", "b"), 0, "warn", more, trainable=False)
+        check_selection(selection, ("a", "b"), 0, "warn", more, longer=None)
     unsure = TeacherPredictions.of(np.vstack([probabilities, [0.5, 0.5]]), ["a", "b", "c", "d"])
     selection = Qbst(mu="one").select(unsure, 0.5)
     assert check_selection(selection, ("a", "b"), 0, "warn", more) == ["b"]
@@ -186,12 +186,12 @@ def test_no_lower_threshold_is_advised_where_all_are_above_it():
         (SelfTrainingConfig(Cbst(portion=0.5, most=1.0), rounds=1, theta=0.5), 0.5),
     ):
         selection = scheme.selector.select(one, theta)
-        for trainable, ways in ((True, longer), (False, "")):
+        for by, ways in (("protocol.epochs", longer), (None, "")):
             said = rf"for b in .*b 0/0; the teacher takes no cloud for one; {ways}accept it with"
             if int(selection.kept.sum()) < 2:
                 said = "only 1 pseudo-label"
             with pytest.raises(SelectionError, match=said):
-                check_selection(selection, *asked, scheme.more_labels, trainable)
+                check_selection(selection, *asked, scheme.more_labels, by)
     selection = Qbst().select(one, 0.5)
     with pytest.raises(SelectionError, match=rf"its mu is 0; {longer}set selftraining\S*mu=one$"):
         check_selection(selection, *asked)

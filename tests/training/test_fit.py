@@ -252,9 +252,24 @@ def test_wrong_setting_names_the_key(toy, override, message):
         train(toy(*override.split(), *alone))
 
 
-def test_empty_selection(toy):
-    with pytest.raises(SelectionError, match=r"round 0 with theta=0\.9999.*ball 0/0.*lower"):
-        train(toy("selftraining.theta=0.9999", "selftraining.epsilon=0"))
+@pytest.mark.parametrize(
+    ("words", "key"), [("selftraining.init=scratch", "epochs"), ("protocol.steps=2", "steps")]
+)
+def test_empty_selection(words, key, toy):
+    """Says what trains the teacher for longer: with a budget in steps more epochs do not."""
+    said = rf"round 0 with theta=0\.9999.*ball 0/0.*lower.*longer \(protocol\.{key}\)"
+    with pytest.raises(SelectionError, match=said):
+        train(
+            toy("selftraining.theta=0.9999", "selftraining.epsilon=0", "protocol.epochs=1", words)
+        )
+
+
+def test_a_student_that_selects_nothing_is_trained_longer_by_its_own_key(toy):
+    said = r"round 1 with theta=0\.9\d+.*lower.*longer \(selftraining\.epochs\)"
+    with pytest.raises(SelectionError, match=said):
+        train(
+            toy("selftraining.theta=0.0001", "selftraining.epsilon=0.9998", "selftraining.epochs=1")
+        )
 
 
 @pytest.mark.parametrize("words", ["selftraining.share=null", "selftraining.share=0.5"])
