@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 from omegaconf import DictConfig, OmegaConf
 
-from qs3.config.hydra import build
+from qs3.config.hydra import build, is_given
 from qs3.data.ensure_source import check_or_make
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
@@ -39,6 +39,7 @@ def train(cfg: DictConfig) -> RunMetrics:
             return _fit(run)
 
     _warn_of_one_domain(run)
+    _warn_of_epochs(run)
     with owned(run.folder):
         # What `force` begins anew stays until its data are open (`note_start`).
         metrics = None if cfg.force else read_metrics(run.folder)
@@ -142,6 +143,24 @@ def _wandb_forgotten() -> Iterator[None]:
         if "wandb" in sys.modules:
             sys.modules["wandb"].finish()
             os.environ.pop("WANDB_MODE", None)  # set by Lightning's logger when offline
+
+
+def _warn_of_epochs(run: Run) -> None:
+    """Of epochs that somebody asked for, of a phase whose budget in steps a file of conf/ sets."""
+    budgets = {"protocol": run.phases.warmup_steps}
+    if run.scheme.rounds:
+        budgets["selftraining"] = run.phases.round_steps
+    for group, steps in budgets.items():
+        if steps is not None and is_given(f"{group}.epochs") and not is_given(f"{group}.steps"):
+            log.warning(
+                "%s.epochs=%s trains neither longer nor shorter: it divides the %d batches of "
+                "%s.steps, which %s.steps=null takes away",
+                group,
+                run.cfg[group].epochs,
+                steps,
+                group,
+                group,
+            )
 
 
 def _warn_of_one_domain(run: Run) -> None:

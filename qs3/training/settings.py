@@ -9,7 +9,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from qs3.config.checks import check_bool, check_choice, check_float, check_int, check_keys
 from qs3.config.compose import choices
-from qs3.config.hydra import component_names, in_multirun
+from qs3.config.hydra import component_names, in_multirun, is_given
 from qs3.config.location import CONF
 from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
@@ -277,12 +277,18 @@ def _check_precision(trainer: DictConfig) -> None:
 
 
 def _check_rounds(run: Run) -> None:
-    """Refuse rounds for the upper bound, and a choice among epochs of rounds there are not."""
+    """Refuse rounds for the upper bound, two thresholds, and a choice among no rounds' epochs."""
     if run.is_upper_bound and run.scheme.rounds:
         raise ConfigError(
             "method=supervised trains on the target's labels and has no use for pseudo-labels; "
             "set selftraining=none"
         )
+    for key in ("selftraining.theta", "selftraining.epsilon"):
+        if run.scheme.rounds and run.scheme.share is not None and is_given(key):
+            raise ConfigError(
+                f"{key} would have no effect: selftraining.share={run.scheme.share} sets the "
+                f"threshold of each round; add selftraining.share=null, or leave {key} out"
+            )
     rule = run.cfg.selection.student
     if rule != LAST and not run.scheme.rounds:
         raise ConfigError(

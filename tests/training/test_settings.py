@@ -7,7 +7,7 @@ import pytest
 from qs3.api import train as train_by_words
 from qs3.config import hashing
 from qs3.config.compose import composed
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, MissingDataError
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
 from qs3.training.settings import check_settings
@@ -100,3 +100,28 @@ def test_copies_of_a_run_are_refused(toy, monkeypatch):
         monkeypatch.setenv(key, value)
     with pytest.raises(ConfigError, match=r"^torchrun starts several .* trainer\.devices=N$"):
         train(toy())
+
+
+@pytest.mark.parametrize("key", ["theta", "epsilon"])
+def test_a_threshold_beside_a_share_is_refused(key):
+    """It changed the run's name alone: a search over thresholds compared copies of one run."""
+    said = rf"selftraining\.{key} would have no effect: selftraining\.share=0\.5 sets"
+    with pytest.raises(ConfigError, match=said):
+        train_by_words("experiment=qs3_nyu", f"selftraining.{key}=0.01")
+
+
+def test_epochs_beside_a_budget_in_steps_are_warned_of(monkeypatch, tmp_path, caplog):
+    monkeypatch.chdir(tmp_path)  # where there are no data, so that nothing is trained
+    for words, warned in (
+        (["protocol.epochs=20"], ["protocol.epochs=20 trains neither"]),
+        (["protocol.epochs=20", "protocol.steps=500"], []),
+        (["protocol.epochs=20", "protocol.steps=null", "selftraining.epochs=5"], ["selftraining"]),
+        (["protocol.epochs=20", "selftraining=none", "debug=overfit"], []),
+        ([], []),
+    ):
+        caplog.clear()
+        with pytest.raises(MissingDataError):
+            train_by_words("experiment=quickstart", *words)
+        found = [one.message for one in caplog.records if "trains neither" in one.message]
+        assert len(found) == len(warned)
+        assert all(word in one for one, word in zip(found, warned, strict=True))
