@@ -6,14 +6,21 @@ from dataclasses import dataclass
 from typing import Any
 
 from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.callbacks import (
+    EarlyStopping,
+    StochasticWeightAveraging,
+    Timer,
+    WeightAveraging,
+)
 from lightning.pytorch.plugins.environments import LightningEnvironment
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
 from qs3.engine.checkpointing import AtomicCheckpointIO, Clock, SaveLast
 from qs3.engine.classifier import Classifier
 from qs3.engine.loggers import CsvHistory, EpochRows
 from qs3.engine.trainer import build_each, let_weights_rest, make_trainer
+from qs3.errors import ConfigError
 from qs3.methods.base import Method
 from qs3.models.norms import DomainNorm, check_has_norms
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
@@ -49,6 +56,7 @@ def build_training(
     to begin with; `began`: when the run started.
     """
     cfg, folder, phases = run.cfg, run.folder, run.phases
+    added = _callbacks(cfg)
     classifier = _classifier(run, method, given)
     classes = loaded.evaluation.classes
     warmup = WarmupSelection(folder, phases, cfg.selection.teacher)
@@ -71,7 +79,7 @@ def build_training(
     trainer = make_trainer(
         cfg,
         max_epochs=phases.total,
-        callbacks=[*build_each(cfg.get("callbacks")), *callbacks],
+        callbacks=[*added, *callbacks],
         logger=[CsvHistory(folder), *build_each(cfg.get("logger"))],
         # In a job of SLURM Lightning would take its tasks, mostly one, for the processes.
         plugins=[AtomicCheckpointIO(), LightningEnvironment()],
@@ -83,6 +91,29 @@ def build_training(
     for logger in trainer.loggers:
         logger.log_hyperparams(settings)
     return Built(trainer, classifier, warmup, rounds, student, shared, clock)
+
+
+def _callbacks(cfg: DictConfig) -> list[Callback]:
+    """Those of config group `callbacks`, beside what training needs.
+
+    Raises:
+        ConfigError: one would end the run before its phases do, or change weights after they have
+            been selected and saved.
+    """
+    added = build_each(cfg.get("callbacks"))
+    for one in added:
+        if isinstance(one, EarlyStopping | Timer):
+            raise ConfigError(
+                f"callbacks: {type(one).__name__} ends a training early, and a run is its warm-up "
+                "and its rounds; set protocol.epochs and protocol.steps, selftraining.rounds, "
+                ".epochs and .steps, or selection.teacher=source_val, which takes the best epoch"
+            )
+        if isinstance(one, StochasticWeightAveraging | WeightAveraging):
+            raise ConfigError(
+                f"callbacks: {type(one).__name__} averages weights beside the net's, and each "
+                "epoch's own are selected, label the target and are reported; leave it out"
+            )
+    return added
 
 
 def _classifier(run: Run, method: Method, given: Given | None) -> Classifier:

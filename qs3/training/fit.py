@@ -85,7 +85,8 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     weights alone, so it is the same after any interruption.
 
     Raises:
-        ConfigError: Lightning cannot do as `trainer` says with these data.
+        ConfigError: Lightning cannot do as `trainer` says with these data, or a callback has ended
+            the training.
     """
     if not run.cfg.force and int(os.environ.get("LOCAL_RANK", 0)) == 0:
         built.shared_warmup.take()
@@ -107,6 +108,11 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
         raise ConfigError(f"trainer: {error}") from error
     except SIGTERMException as error:  # of a worker of a sweep; by itself it would be status 0
         raise SystemExit(TERMINATED) from error
+    if (done := built.trainer.current_epoch) < run.phases.total:  # `trainer.should_stop`
+        raise ConfigError(
+            f"training ended after {done} of {epochs}, as a callback asked for: a run is its "
+            "warm-up and its rounds; leave that callback out"
+        )
     if built.trainer.is_global_zero:
         save(copy_weights(built.classifier.net), run.folder / STUDENT)
     built.trainer.strategy.barrier("student saved")

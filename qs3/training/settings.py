@@ -82,6 +82,7 @@ NOT_TAKEN = {
         "all clouds of the target's test are judged; leave it out",
     ),
     "fast_dev_run": "nothing of it would be saved; set debug=fast",
+    "overfit_batches": "each epoch draws other batches; set debug=overfit",
 }
 """Arguments of Lightning's trainer that no run can have, and what to set instead."""
 
