@@ -66,7 +66,7 @@ def build_training(
         folder, phases, cfg.selection.student, classes, run.scheme.more_labels
     )
     # A warm-up of two versions is nobody else's.
-    sharing = cfg.paths.warmup_dir if is_as_begun(loaded.started) else None
+    sharing = cfg.paths.warmup_dir if is_as_begun(loaded.started, cfg) else None
     shared = SharedWarmup(
         folder, sharing, warmup_sha256(cfg, loaded.started), run.seed, phases.warmup
     )

@@ -56,7 +56,7 @@ def fit(run: Run) -> RunMetrics:
         loaded = replace(loaded, started=take_checkpoint(run, loaded.started))
     if run.cfg.trainer.threads == "auto":
         _take_threads_of(loaded.started)
-    warn_of_changes(loaded.started)
+    warn_of_changes(loaded.started, run.cfg)
     built = build_training(run, method, loaded, given, began)
     _remember(run, loaded, built)
     _fit(run, loaded, built)

@@ -12,6 +12,7 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
+from omegaconf import DictConfig
 
 from qs3.config import hashing
 from qs3.data.store import PointSet
@@ -19,6 +20,7 @@ from qs3.datamodules.fps_cache import remove_old_leftovers
 from qs3.errors import ConfigError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
+from qs3.training.code import code_sha256
 from qs3.training.given import Given
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
@@ -44,6 +46,7 @@ def note_start(
         **({"beside": beside_sha256} if beside_sha256 else {}),
         "versions": versions() | weights,
         "commit": commit(),
+        "code": code_sha256(run.cfg),
         "threads": torch.get_num_threads(),
         "config_sha256": hashing.config_sha256(run.cfg),
     }
@@ -96,14 +99,14 @@ def versions() -> dict[str, str]:
     }
 
 
-def is_as_begun(started: Mapping[str, Any]) -> bool:
-    """Whether versions and torch's number of threads, which orders sums, are those of the start."""
-    return not _changed(started)
+def is_as_begun(started: Mapping[str, Any], cfg: DictConfig) -> bool:
+    """Whether code, versions and torch's threads, which order sums, are those of the start."""
+    return not _changed(started, cfg)
 
 
-def warn_of_changes(started: Mapping[str, Any]) -> None:
-    """Say if a run goes on with other versions or threads than it was begun with."""
-    if changed := _changed(started):
+def warn_of_changes(started: Mapping[str, Any], cfg: DictConfig) -> None:
+    """Say if a run goes on with other code, versions or threads than it was begun with."""
+    if changed := _changed(started, cfg):
         log.warning(
             "begun with %s, continued with %s: the result may differ from an uninterrupted run's",
             ", ".join(f"{name} {was}" for name, (was, _) in changed.items()),
@@ -111,10 +114,12 @@ def warn_of_changes(started: Mapping[str, Any]) -> None:
         )
 
 
-def _changed(started: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _changed(started: Mapping[str, Any], cfg: DictConfig) -> dict[str, tuple[Any, Any]]:
     """What is another than at the start, by name: what it was, what it is."""
     now: dict[str, Any] = versions() | {"threads": torch.get_num_threads()}
     begun = {name: value for name, value in started["versions"].items() if name != "weights"}
     begun["threads"] = started.get("threads") or now["threads"]  # older runs do not say
+    now["code"] = code_sha256(cfg)[:12]
+    begun["code"] = str(started.get("code", now["code"]))[:12]  # nor this
     names = [name for name in {**begun, **now} if begun.get(name) != now.get(name)]
     return {name: (begun.get(name, "none"), now.get(name, "none")) for name in names}

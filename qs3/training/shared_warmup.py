@@ -4,7 +4,7 @@ When a run is one epoch away from the end of its warm-up, its checkpoint is copi
 
     <paths.warmup_dir>/<hash>-seed<seed>/last.ckpt, history.csv, started.json
 
-The hash covers everything that the warm-up depends on, datasets and versions included. A new run
+The hash covers everything that the warm-up depends on, datasets, versions and code included. A run
 of the same hash begins from that copy as if it had been interrupted there: it trains the last
 epoch itself, so teacher, pseudo-labels and result are the same, to the bit, as without it.
 `started.json` is written last and has the hashes of the other two: a copy that has changed since is
@@ -49,6 +49,7 @@ def warmup_sha256(cfg: DictConfig, started: Mapping[str, Any]) -> str:
         OmegaConf.update(before, key, None)
     parts = [hashing.config_sha256(before), started["data"], started["versions"]]
     parts.append(started.get("threads"))  # sums are ordered by them
+    parts.append(started.get("code"))
     if "beside" in started:
         parts.append(started["beside"])
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

@@ -203,7 +203,7 @@ def test_as_many_threads_as_elsewhere(toy, begun, monkeypatch):
     assert taken[-1] == threads + 1
 
 
-@pytest.mark.parametrize("changed", [{}, {"torch": "1.0"}, {"threads": 77}])
+@pytest.mark.parametrize("changed", [{}, {"torch": "1.0"}, {"threads": 77}, {"code": "0" * 64}])
 def test_a_warm_up_of_two_versions_is_given_to_nobody(toy, changed, tmp_path, caplog):
     cfg = toy(f"paths.warmup_dir={tmp_path / 'warmups'}")
     interrupt(cfg, epoch=2)

@@ -1,0 +1,70 @@
+"""What the code of a warm-up was: somebody who works on a method or a net runs it again and again.
+
+The version of qs3 stays while they do, and a checkpoint by code that has been edited since is none
+of the present one's.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+PACKAGES = (
+    *("utils", "geometry", "datamodules", "models", "methods", "evaluation", "engine"),
+    *("selftraining", "training"),
+)
+"""Those of qs3 whose code a warm-up runs."""
+
+_GROUPS = ("data", "model", "method", "protocol", "callbacks")  # what is built of them is trained
+_VERSIONED = ("qs3.", "torch.", "lightning.")  # by `PACKAGES`, or by their versions in started.json
+
+
+def code_sha256(cfg: DictConfig) -> str:
+    """64 hex digits over the Python files that a warm-up of this config runs.
+
+    Those of `PACKAGES`, and of a class of one's own (`model._target_=my_nets.Net`) the file and all
+    that lie in its folder. As they were when this process first asked, which runs them.
+    """
+    own = {_folder(target) for group in _GROUPS for target in _targets(cfg.get(group))}
+    return _sha256(tuple(sorted(folder for folder in own if folder is not None)))
+
+
+@functools.cache
+def _sha256(own: tuple[Path, ...]) -> str:
+    root = Path(__file__).resolve().parents[1]
+    found = [root.joinpath(name).rglob("*.py") for name in PACKAGES]
+    found += [folder.glob("*.py") for folder in own]
+    digest = hashlib.sha256()
+    for folder in found:
+        for file in sorted(folder):
+            digest.update(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
+    return digest.hexdigest()
+
+
+def _targets(node: Any) -> Iterator[str]:
+    """All `_target_` of a part of a config that are somebody's own."""
+    plain = OmegaConf.to_container(node, resolve=False) if OmegaConf.is_config(node) else node
+    if isinstance(plain, dict):
+        for key, value in plain.items():
+            if key == "_target_" and not str(value).startswith(_VERSIONED):
+                yield str(value)
+            yield from _targets(value)
+    elif isinstance(plain, list):
+        for value in plain:
+            yield from _targets(value)
+
+
+def _folder(target: str) -> Path | None:
+    """Where a class lies; None of one that is not written in Python, or cannot be imported."""
+    try:
+        file = inspect.getsourcefile(get_object(target))
+    except Exception:  # whatever its module does; whoever builds it will say so
+        return None
+    return Path(file).resolve().parent if file else None

@@ -1,0 +1,80 @@
+"""A warm-up by code that was edited since is nobody's."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from qs3.config import hashing
+from qs3.training import code
+from qs3.training.code import code_sha256
+from qs3.training.command import train
+from qs3.training.shared_warmup import warmup_sha256
+
+NET = "from tests.training.toy import TinyNet\n\n\nclass Net(TinyNet):\n    pass\n"
+ROOT = Path(code.__file__).parents[1]
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A file with a net, and what a new process would do about it."""
+    file = tmp_path / "nets" / "my_own_nets.py"
+    file.parent.mkdir()
+    file.write_text(NET)
+    monkeypatch.syspath_prepend(file.parent)
+    yield file
+    sys.modules.pop("my_own_nets", None)
+    code._sha256.cache_clear()
+
+
+def of(target: str) -> str:
+    return code_sha256(OmegaConf.create({"model": {"part": [{"_target_": target}]}}))
+
+
+def test_own_files_count_as_they_were_when_the_process_began(own):
+    first = of("my_own_nets.Net")
+    assert first != of("torch.optim.Adam")
+    assert of("torch.optim.Adam") == of("nobody.has.This") == of("qs3.methods.pcm.Pcm")
+    own.with_name("beside.py").write_text("x = 1\n")
+    assert of("my_own_nets.Net") == first
+    code._sha256.cache_clear()
+    second = of("my_own_nets.Net")
+    own.write_text(NET + "# edited\n")
+    code._sha256.cache_clear()
+    assert len({first, second, of("my_own_nets.Net")}) == 3
+
+
+def test_code_of_qs3_counts(monkeypatch):
+    """All that a warm-up runs beside settings, datasets and what draws pictures."""
+    assert {path.parent.name for path in ROOT.glob("*/__init__.py")} - {*code.PACKAGES} == {
+        *("clouds", "cluster", "config", "data", "generation", "inference", "meshes", "report"),
+        *("runs", "sensors", "sweeps", "tools", "tuning"),
+    }
+    before = of("")
+    code._sha256.cache_clear()
+    monkeypatch.setattr(code, "PACKAGES", code.PACKAGES[:-1])
+    assert of("") != before
+    code._sha256.cache_clear()
+
+
+def test_a_warm_up_is_known_by_its_code():
+    started = {"data": 1, "versions": 2, "code": "a"}
+    cfg = OmegaConf.create({"model": {"k": 1}})
+    assert warmup_sha256(cfg, started) != warmup_sha256(cfg, {**started, "code": "b"})
+
+
+def test_a_warm_up_of_a_net_that_was_edited_is_trained_again(own, toy, caplog):
+    """It went on from the old net's checkpoint, even where its run had been deleted."""
+    caplog.set_level("INFO")
+    cfg = toy("model._target_=my_own_nets.Net", "selftraining=none", "protocol.epochs=2")
+    for edit, taken in (("", False), ("", True), ("# edited\n", False)):
+        own.write_text(own.read_text() + edit)
+        code._sha256.cache_clear()
+        caplog.clear()
+        train(cfg)
+        assert ("the warm-up was trained before" in caplog.text) == taken
+        shutil.rmtree(hashing.run_folder(cfg))
