@@ -53,6 +53,22 @@ def check_choice(key: str, value: Any, allowed: Sequence[str]) -> str:
     return value
 
 
+def check_of_use(key: str, value: object, usual: object, used: object, instead: str) -> None:
+    """Refuse a setting that nothing reads, as the others are: its run would be another's copy.
+
+    Args:
+        key: as it stands on the command line.
+        value, usual: as it is given, and what it is by itself: a value that nobody gave.
+        used: whether something reads it.
+        instead: what to set, so that something does.
+
+    Raises:
+        ConfigError: it is not `usual`, and nothing reads it.
+    """
+    if not used and value != usual:
+        raise ConfigError(f"{key}={value} would have no effect; {instead}, or leave it at {usual}")
+
+
 def check_keys(prefix: str, found: Iterable[str], known: Sequence[str]) -> None:
     """Raise ConfigError for the first key after `prefix` that nothing would read: +KEY adds any."""
     for key in found:

@@ -129,24 +129,6 @@ def weight(key: str, value: float) -> float:
     return float(check_float(f"method.{key}", value, ">= 0"))
 
 
-def check_of_use(key: str, value: object, usual: object, used: object, instead: str) -> None:
-    """Refuse a setting that nothing reads, as the others are: its run would be another's copy.
-
-    Args:
-        key: of the method.
-        value, usual: as it is given, and what it is by itself: a value that nobody gave.
-        used: whether something reads it.
-        instead: what to set, so that something does.
-
-    Raises:
-        ConfigError: it is not `usual`, and nothing reads it.
-    """
-    if not used and value != usual:
-        raise ConfigError(
-            f"method.{key}={value} would have no effect; {instead}, or leave it at {usual}"
-        )
-
-
 @torch.no_grad()
 def feature_dims(net: Any) -> tuple[int, int | None]:
     """Widths of a net's features: of a cloud, and of a point (None: it has none per point).

@@ -19,11 +19,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from qs3.config.checks import check_choice, check_float
+from qs3.config.checks import check_choice, check_float, check_of_use
 from qs3.datamodules.beside import SOURCE_TWINS
 from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
-from qs3.methods.base import check_of_use, check_taught, class_loss, weight
+from qs3.methods.base import check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher
 from qs3.models.norms import use_domain
 
@@ -73,9 +73,9 @@ class Twin(MeanTeacher):
         target_temperature: T_t > 0.
 
     Raises:
-        ConfigError: a value is out of its range, a temperature is of a term that is left out, or a
-            teacher of its own learns nothing (twin_weight=0) or teaches nothing (logit_weight=0
-            and feature_weight=0).
+        ConfigError: a value is out of its range, nothing reads it (a temperature of a term that is
+            left out, what a teacher sees who teaches nothing), or a teacher of its own learns
+            nothing (twin_weight=0) or teaches nothing (logit_weight=0 and feature_weight=0).
     """
 
     def __init__(
@@ -114,8 +114,16 @@ class Twin(MeanTeacher):
         )
         self.uses_target = self.target_weight > 0  # type: ignore[misc]
         logits, target = "set method.logit_weight above 0", "set method.target_weight above 0"
-        check_of_use("temperature", temperature, 2.0, self.logit_weight, logits)
-        check_of_use("target_temperature", target_temperature, 0.5, self.target_weight, target)
+        check_of_use("method.temperature", temperature, 2.0, self.logit_weight, logits)
+        key = "method.target_temperature"
+        check_of_use(key, target_temperature, 0.5, self.target_weight, target)
+        of_twins = self.twin_weight or self._distils
+        says = "set method.logit_weight, .feature_weight or .{}_weight above 0"
+        check_of_use("method.sees", sees, "whole", of_twins, says.format("twin"))
+        taught = self._distils or self.uses_target
+        check_of_use("method.teacher", teacher, "mean", taught, says.format("target"))
+        asked = f"{says.format('target')} with method.teacher=mean"
+        check_of_use("method.momentum", momentum, 0.99, self._asks_means, asked)
         self.wants = Wants(
             twin=self.sees if self.twin_weight or self._distils else None,
             again=self.again_weight > 0 or self.view_weight > 0,
@@ -126,6 +134,12 @@ class Twin(MeanTeacher):
     def _distils(self) -> bool:
         return self.logit_weight > 0 or self.feature_weight > 0
 
+    @property
+    def _asks_means(self) -> bool:
+        """Whether running means of the student teach."""
+        distil = self._distils and self.taught_by == "mean"
+        return self.taught_by != "shared" and (self.uses_target or distil)
+
     def prepare(self, net: Any) -> None:
         """A teacher of its own, unless it is shared or says nothing."""
         super().prepare(net)
@@ -133,8 +147,7 @@ class Twin(MeanTeacher):
             check_taught(net, "method.feature_weight", "set method.feature_weight=0")
         if self.taught_by == "own":
             self.expert = copy.deepcopy(net)
-        asked = self.uses_target or (self._distils and self.taught_by == "mean")
-        if self.taught_by == "shared" or not asked:
+        if not self._asks_means:
             self.teacher = None
 
     def loss(

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.config.checks import check_choice, check_float, check_ranges
+from qs3.config.checks import check_choice, check_float, check_of_use, check_ranges
 from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, TeacherPredictions
 
@@ -82,6 +82,8 @@ class Cbst:
                 f"{_KEY}: 0 < portion <= most <= 1, got portion={self.portion}, most={self.most}"
             )
         check_ranges(self, f"{_KEY}.", step=">= 0", alpha="> 0")
+        soft = self.labels == "lrent"
+        check_of_use(f"{_KEY}.alpha", self.alpha, 0.25, soft, f"set {_KEY}.labels=lrent")
 
     def portion_of(self, round_: int) -> float:
         """min(portion + round step, most), in decimal arithmetic."""

@@ -17,11 +17,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_choice, check_float
+from qs3.config.checks import check_choice, check_float, check_of_use
 from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
-from qs3.methods.base import Method, check_of_use, check_taught, class_loss, weight
+from qs3.methods.base import Method, check_taught, class_loss, weight
 from qs3.methods.mean_teacher import move_towards
 from qs3.models.norms import begin_target_norms, use_domain
 from qs3.selftraining.selectors import (
@@ -109,8 +109,8 @@ class Pcfea(Method):
                 "QBST's or SPST's"
             )
         chooses = "set method.selector, as method=pcfea_qbst and pcfea_spst do"
-        check_of_use("theta", theta, 0.8, selector, chooses)
-        check_of_use("rank", rank, "label", pool == "share", "set method.pool=share")
+        check_of_use("method.theta", theta, 0.8, selector, chooses)
+        check_of_use("method.rank", rank, "label", pool == "share", "set method.pool=share")
         self.selector = selector
         self.styled = False  # whether there is a pool
         self.teacher: Any = None  # the running mean, if there is one

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_bool, check_int, check_ranges
+from qs3.config.checks import check_bool, check_int, check_of_use, check_ranges
 from qs3.errors import ConfigError
 from qs3.selftraining.selectors import Selection, TeacherPredictions, doubts, most_confident
 from qs3.utils.seeding import derive
@@ -65,6 +65,9 @@ class GraphRefined:
         check_ranges(self, f"{_KEY}.", growth="(0, 1]", unsure="[0, 1]", correlation="[-1, 1)")
         for key in ("neighbours", "steps"):
             check_int(f"{_KEY}.{key}", getattr(self, key), 1)
+        for key, usual in (("correlation", 0.95), ("neighbours", 10), ("steps", 1000)):
+            value = getattr(self, key)
+            check_of_use(f"{_KEY}.{key}", value, usual, self.graph, f"set {_KEY}.graph=true")
 
     @property
     def needs_features(self) -> bool:

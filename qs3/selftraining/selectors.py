@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from qs3.config.checks import check_choice
+from qs3.config.checks import check_choice, check_of_use
 from qs3.datamodules.phases import LOWER_THETA, RAISE_SHARE
 from qs3.errors import ConfigError, SelectionError
 from qs3.utils.plural import counted
@@ -133,6 +133,10 @@ class Qbst:
         check_choice("selftraining.selector.mu", self.mu, ("balanced", "one"))
         check_choice("selftraining.selector.order", self.order, ("descending", "ascending"))
         check_choice("selftraining.selector.counts", self.counts, ("confident", "all"))
+        some = self.mu == "balanced"  # else all that are confident are kept
+        for key, usual in (("order", "descending"), ("counts", "confident")):
+            key, value = f"selftraining.selector.{key}", getattr(self, key)
+            check_of_use(key, value, usual, some, "set selftraining.selector.mu=balanced")
 
     def select(self, teacher: TeacherPredictions, theta: float, round_: int = 0) -> Selection:
         """As `Selector.select`; looks at the predicted classes and how sure of them it is."""

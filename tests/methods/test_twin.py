@@ -231,6 +231,35 @@ def test_a_temperature_that_nothing_reads_is_refused(key: str, value: float, wei
     assert getattr(Twin(**{key: value, weight: 1.0}), key) == value
 
 
+@pytest.mark.parametrize(
+    ("settings", "read"),
+    [
+        ({"sees": "clean"}, {"twin_weight": 1.0}),
+        ({"sees": "scan"}, {"feature_weight": 1.0}),
+        ({"teacher": "shared"}, {"target_weight": 1.0}),
+        ({"teacher": "shared"}, {"logit_weight": 1.0}),
+        ({"momentum": 0.9}, {"target_weight": 1.0}),
+        ({"momentum": 0.9}, {"logit_weight": 1.0}),
+    ],
+)
+def test_what_a_teacher_who_teaches_nothing_would_see_is_refused(
+    settings: dict[str, Any], read: dict[str, float]
+) -> None:
+    (key,) = settings
+    with pytest.raises(ConfigError, match=rf"method.{key}=\S+ would have no effect; set method\."):
+        Twin(**settings)
+    Twin(**settings, **read)
+
+
+@pytest.mark.parametrize("teacher", ["shared", "own"])
+def test_a_momentum_of_no_means_is_refused(teacher: str) -> None:
+    on = {"twin_weight": 1.0, "logit_weight": 1.0, "teacher": teacher}
+    with pytest.raises(ConfigError, match=r"method.momentum=0.9 would .* method.teacher=mean, or"):
+        Twin(**on, momentum=0.9)
+    if teacher == "own":  # of target clouds the means teach beside it
+        Twin(**on, target_weight=1.0, momentum=0.9)
+
+
 @pytest.mark.slow
 def test_a_cut_target_cloud_is_taken_for_what_it_was_before_the_cut() -> None:
     """The source's left side says nothing of the class, the target's another corner than the right.

@@ -299,3 +299,22 @@ def test_what_a_selector_of_one_s_own_returns_is_looked_at(returned, said):
     with pytest.raises(ConfigError, match=r"^Own\.select must return a Selection") as told:
         chosen_by(Own(), teacher, 0.5, 0)
     assert f"each of 2 samples; it is {said}" in str(told.value).replace("of type ", "")
+
+
+@pytest.mark.parametrize(
+    ("selector", "setting", "instead"),
+    [
+        (Qbst, {"mu": "one", "order": "ascending"}, r"set \S+mu=balanced, or leave it at desc"),
+        (Qbst, {"mu": "one", "counts": "all"}, r"set \S+mu=balanced, or leave it at confident"),
+        (Cbst, {"labels": "hard", "alpha": 0.5}, r"set \S+labels=lrent, or leave it at 0\.25"),
+        (GraphRefined, {"graph": False, "correlation": 0.5}, r"set \S+graph=true, or .* 0\.95"),
+        (GraphRefined, {"graph": False, "neighbours": 3}, r"set \S+graph=true, or .* 10"),
+        (GraphRefined, {"graph": False, "steps": 3}, r"set \S+graph=true, or .* 1000"),
+    ],
+)
+def test_a_setting_that_nothing_reads_is_refused(selector, setting, instead):
+    """Its run would be another's copy under a name of its own."""
+    *_, key = setting
+    with pytest.raises(ConfigError, match=rf"selector\.{key}=\S+ would have no effect; {instead}"):
+        selector(**setting)
+    selector(**{key: setting[key]}, **({"labels": "lrent"} if selector is Cbst else {}))
