@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lightning.pytorch import LightningDataModule
 from torch import Generator, Tensor
 
@@ -23,6 +24,7 @@ from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.datamodules.twins import Wants, augmented
 from qs3.errors import ConfigError
+from qs3.utils.seeding import derive
 
 
 class AdaptationData(LightningDataModule):
@@ -186,9 +188,17 @@ class AdaptationData(LightningDataModule):
         )
 
     def val_dataloader(self) -> Batches:
-        """Validation clouds of the labelled domain, all of them in every process."""
-        labels = {f"y_{self.owner}": self.validation.labels}
-        return self._in_order("source", Table(self.validation.clouds, labels))
+        """Validation clouds of the labelled domain, all of them in every process.
+
+        In the order of their ids, which begin with the class; or, where the trainer takes the first
+        batches alone, in one that knows no class: else a teacher would be chosen by the first ones.
+        """
+        part = self.validation
+        limit = 1.0 if self.trainer is None else self.trainer.limit_val_batches
+        if isinstance(limit, int) or limit != 1.0:  # 1 is one batch, 1.0 are all
+            lot = [derive(0, "validation order", name) for name in part.ids]
+            part = part.at(np.argsort(np.array(lot)))
+        return self._in_order("source", Table(part.clouds, {f"y_{self.owner}": part.labels}))
 
     def predict_dataloader(self) -> Batches:
         """The target's training clouds, in order and without labels."""

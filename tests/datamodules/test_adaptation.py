@@ -87,3 +87,22 @@ def test_the_adaptation_has_the_source_s_labels_and_no_test_clouds(data_dir):
     bound = adaptation(data_dir, owner="target_train")
     assert bound.labelled_domain.domain.name == "kinectsim10"
     assert isinstance(bound.target_domain.train, Unlabelled)
+
+
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")  # Lightning's on trainers without a loader
+@pytest.mark.parametrize("limit", [1, 0.5])
+def test_a_part_of_the_validation_clouds_is_of_all_classes(data_dir, limit):
+    """They are sorted by class: a teacher was chosen by its accuracy on the first ones alone."""
+    data = adaptation(data_dir, eval_batch_size=4)
+    given: list[torch.Tensor] = []
+    for settings in ({}, {"limit_val_batches": limit}):
+        data.trainer = Trainer(accelerator="cpu", devices=1, logger=False, **settings)
+        batches = [batch["source"] for batch in data.val_dataloader()]
+        given.append(torch.cat([batch["y_source"] for batch in batches]))
+        points = torch.cat([batch["points"] for batch in batches])
+        order = [data.validation.clouds.all().tolist().index(cloud) for cloud in points.tolist()]
+        assert data.validation.labels[order].tolist() == given[-1].tolist()
+        assert sorted(order) == list(range(len(data.validation.ids)))
+    assert given[0].equal(data.validation.labels)
+    assert set(given[0][:4].tolist()) == {0}
+    assert len(set(given[1][:4].tolist())) > 1
