@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from qs3.config.hydra import build
 from qs3.data.domain import Domain
@@ -80,6 +83,7 @@ def load_data(run: Run, method: Method, given: Given | None = None) -> Loaded:
     of_target = run.target.made_of(target)
     labelled = run.source.made_of(source) if data.owner == "source" else of_target
     data.setup("fit")
+    _warn_of_untrained(data, target.classes)
     _check_norms(run, len(data.target.ids))
     _check_rounds(run, len(data.target.ids))
     learnt = drawn = class_shares.of_labelled(data, len(target.classes))
@@ -122,6 +126,26 @@ def _check_classes(source: PointSet, target: PointSet, num_classes: int) -> None
             f"num_classes is {num_classes}, but {source.name} has {len(source.classes)} classes; "
             f"set num_classes={len(source.classes)}"
         )
+
+
+def _warn_of_untrained(data: AdaptationData, classes: Sequence[str]) -> None:
+    """Of classes that no cloud teaches: a net cannot name them."""
+    train, held_out = (
+        np.bincount(part.labels.numpy(), minlength=len(classes))
+        for part in (data.labelled, data.validation)
+    )
+    for no_clouds, why in (
+        ((train == 0) & (held_out == 0), "it has none"),
+        (
+            (train == 0) & (held_out > 0),
+            f"data.val={data.labelled_domain.val} holds out all that it has; set "
+            "data.val=stratified, which leaves each class one",
+        ),
+    ):
+        if no_clouds.any():
+            names = ", ".join(np.array(classes)[no_clouds])
+            name = data.labelled_domain.domain.name
+            log.warning("%s: nothing is trained of %s: %s", name, names, why)
 
 
 def _check_norms(run: Run, clouds: int) -> None:

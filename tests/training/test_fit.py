@@ -278,6 +278,26 @@ def test_a_diverged_teacher_labels_nothing(toy, words):
         train(toy("protocol.optimizer.lr=1e30", "protocol.epochs=1", words))
 
 
+@pytest.mark.parametrize(
+    ("train_clouds", "val", "said"),
+    [
+        ((4, 4, 2), "lineage", "nothing is trained of slab: data.val=lineage holds out all"),
+        ((4, 4, 2), "stratified", ""),
+        ((8, 8, 0), "stratified", "nothing is trained of slab: it has none"),
+    ],
+)
+def test_classes_that_nothing_teaches_are_named(train_clouds, val, said, toy, tmp_path, caplog):
+    """Of one mesh of each of ten classes two were held out, and no accuracy could exceed 0."""
+    for name, each in (("specklenet10", train_clouds), ("kinectsim10", 6)):
+        write_domain(tmp_path, name, noise=0.1, train=each, test=2)
+    words = f"paths.data_dir={tmp_path}", f"data.val={val}", "protocol.epochs=1"
+    with caplog.at_level(logging.WARNING):
+        train(toy("selftraining=none", *words))
+    found = [one.message for one in caplog.records if "nothing is trained" in one.message]
+    assert len(found) == bool(said)
+    assert all(said in one for one in found)
+
+
 def test_missing_class_is_logged_and_recorded(toy, caplog, monkeypatch):
     def only_two(net, points, batch_size, device="cpu"):
         table = np.full((len(points), 3), 0.02)
