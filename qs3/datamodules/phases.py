@@ -210,10 +210,9 @@ class SelfTrainingConfig:
     def more_labels(self) -> tuple[str, ...]:
         """What would select more, as messages advise it: of the threshold, of the selector."""
         own = getattr(self.selector, "more_labels", None)
-        if own and self.theta == 0:  # there is no other threshold than the selector's
-            return (own,)
         threshold = LOWER_THETA if self.share is None else RAISE_SHARE
-        return (threshold, own) if own else (threshold,)
+        # At 0 there is no other threshold than the selector's, if it has any.
+        return tuple(way for way in (threshold if self.theta else None, own) if way)
 
     @property
     def instead_of_mu(self) -> str | None:

@@ -130,15 +130,16 @@ def weight(key: str, value: float) -> float:
 
 
 @torch.no_grad()
-def feature_dims(net: Any) -> tuple[int, int | None]:
+def feature_dims(net: Any, asks: str = "this method") -> tuple[int, int | None]:
     """Widths of a net's features: of a cloud, and of a point (None: it has none per point).
 
-    Asked of the net itself, with two clouds in eval mode: nothing in it changes.
+    Asked of the net itself, with two clouds in eval mode: nothing in it changes. `asks`: who needs
+    them, for the message.
 
     Raises:
         ConfigError: the model is not a backbone with a head.
     """
-    features = _of_two_clouds(net)
+    features = _of_two_clouds(net, asks)
     per_point = features.per_point
     return features.global_.shape[1], None if per_point is None else per_point.shape[2]
 
@@ -165,11 +166,11 @@ def check_taught(net: Any, key: str, instead: str) -> None:
         )
 
 
-def _of_two_clouds(net: Any) -> Features:
+def _of_two_clouds(net: Any, asks: str = "this method") -> Features:
     if not hasattr(net, "features"):
         raise ConfigError(
-            f"this method puts heads on a model's features, but {type(net).__name__} has none; "
-            "choose e.g. model=dgcnn or model=pointnet"
+            f"{asks} needs a model's features, but {type(net).__name__} has none; choose e.g. "
+            "model=dgcnn or model=pointnet"
         )
     parameter = next(net.parameters())
     points = torch.linspace(-1, 1, 2 * 64 * 3, device=parameter.device, dtype=parameter.dtype)

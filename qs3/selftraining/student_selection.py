@@ -108,7 +108,7 @@ class StudentSelection(Callback):
         more: Sequence[str] = (LOWER_THETA,),
     ) -> None:
         self.folder, self.phases, self.rule = folder, phases, rule
-        self._more = ", or ".join(more)
+        self._ways = ", or ".join([*more, f"set selection.student={LAST}"])
         self.classes = tuple(classes)
         self.scores: dict[int, float] = {}
         self.epoch: int | None = None
@@ -180,15 +180,13 @@ class StudentSelection(Callback):
             found = ", ".join(f"{n} {c}" for n, c in zip(self.classes, counts, strict=True))
             raise SelectionError(
                 f"round {round_}: selection.student={PSEUDO_VAL} holds out a fifth of each class's "
-                f"pseudo-labels, but no class has three ({found}); {self._more}, or set "
-                f"selection.student={LAST}"
+                f"pseudo-labels, but no class has three ({found}); {self._ways}"
             )
         if (left := int((~held).sum())) <= processes:
             raise SelectionError(
                 f"round {round_}: selection.student={PSEUDO_VAL} leaves "
                 f"{counted(left, 'pseudo-label')} to train on, and each of {processes} processes "
-                f"needs two; {self._more}, give fewer trainer.devices, or set "
-                f"selection.student={LAST}"
+                f"needs two; give fewer trainer.devices, or {self._ways}"
             )
         mask = torch.from_numpy(held)
         self.held_out = (index[mask], hard[mask])

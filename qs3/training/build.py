@@ -21,7 +21,7 @@ from qs3.engine.classifier import Classifier
 from qs3.engine.loggers import CsvHistory, EpochRows
 from qs3.engine.trainer import build_each, let_weights_rest, make_trainer
 from qs3.errors import ConfigError
-from qs3.methods.base import Method
+from qs3.methods.base import Method, feature_dims
 from qs3.models.norms import DomainNorm, check_has_norms
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.student_loss import Student
@@ -134,6 +134,8 @@ def _classifier(run: Run, method: Method, given: Given | None) -> Classifier:
     )
     if cfg.evaluation.norms != "trained":
         check_has_norms(classifier.net, cfg.evaluation.norms)
+    if scheme.rounds and getattr(scheme.selector, "needs_features", False):
+        feature_dims(classifier.net, f"selftraining.selector ({type(scheme.selector).__name__})")
     if cfg.compile:
         classifier.net.compile()  # in place; nets that are only evaluated stay as they are
     return classifier

@@ -245,3 +245,15 @@ def test_without_steps_an_epoch_is_one_pass():
 def test_an_epoch_without_a_step_is_refused(steps, message):
     with pytest.raises(ConfigError, match=message):
         Phases(3, 2, 4, *steps)
+
+
+def test_no_threshold_of_0_is_advised_to_be_lowered():
+    for selector, theta, share, ways in (
+        (GraphRefined(), 0.0, None, ()),
+        (GraphRefined(), 0.3, None, ("lower selftraining.theta",)),
+        (GraphRefined(), 0.3, 0.5, ("raise selftraining.share",)),
+        (Cbst(), 0.0, None, (Cbst.more_labels,)),
+        (Cbst(), 0.3, 0.5, ("raise selftraining.share", Cbst.more_labels)),
+    ):
+        scheme = SelfTrainingConfig(selector, rounds=1, theta=theta, share=share)
+        assert scheme.more_labels == ways

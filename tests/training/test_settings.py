@@ -125,3 +125,11 @@ def test_epochs_beside_a_budget_in_steps_are_warned_of(monkeypatch, tmp_path, ca
         found = [one.message for one in caplog.records if "trains neither" in one.message]
         assert len(found) == len(warned)
         assert all(word in one for one, word in zip(found, warned, strict=True))
+
+
+def test_a_net_without_features_is_refused_before_the_warm_up(toy):
+    """By rounds that look at them, too."""
+    cfg = toy("selftraining=sd", "selftraining.theta=0", "selftraining.rounds=1")
+    with pytest.raises(ConfigError, match=r"selector \(GraphRefined\) needs .*TinyNet has none"):
+        train(cfg)
+    assert not (hashing.run_folder(cfg) / "history.csv").exists()

@@ -298,8 +298,19 @@ def test_each_process_has_two_to_train_on(tmp_path):
     callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val", CLASSES)
     callback._hold_out(data, processes=3)
     assert len(callback.held_out[0]) == 1
-    with pytest.raises(SelectionError, match=r"leaves 4 pseudo-labels .* each of 4 .*=last"):
+    with pytest.raises(SelectionError, match=r"leaves 4 pseudo-labels .* each of 4 .*=last$"):
         callback._hold_out(data, processes=4)
+
+
+def test_without_a_threshold_none_is_advised_to_be_lowered(tmp_path):
+    data = SimpleNamespace(
+        pseudo=(torch.arange(2), torch.zeros(2, dtype=torch.int64)),
+        seed=0,
+        target=SimpleNamespace(ids=["a", "b"]),
+    )
+    callback = StudentSelection(tmp_path, Phases(1, 1, 1), "pseudo_val", CLASSES, more=())
+    with pytest.raises(SelectionError, match=r"\(ball 2, .*\); set selection\.student=last$"):
+        callback._hold_out(data)
 
 
 def test_too_few_to_hold_out(toy, monkeypatch):
