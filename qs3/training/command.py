@@ -40,6 +40,7 @@ def train(cfg: DictConfig) -> RunMetrics:
 
     _warn_of_one_domain(run)
     _warn_of_epochs(run)
+    _warn_of_a_warmup_for_nothing(run)
     with owned(run.folder):
         # What `force` begins anew stays until its data are open (`note_start`).
         metrics = None if cfg.force else read_metrics(run.folder)
@@ -161,6 +162,16 @@ def _warn_of_epochs(run: Run) -> None:
                 group,
                 group,
             )
+
+
+def _warn_of_a_warmup_for_nothing(run: Run) -> None:
+    """Of steps before the rounds, which begin with a classifier that was given."""
+    if run.cfg.selection.teacher == "given" and run.scheme.rounds and run.phases.warmup_steps != 1:
+        log.warning(
+            "selection.teacher=given: the classifier of weights= labels the target as it is, and "
+            "what the warm-up trains is used for nothing; protocol.epochs=1 protocol.steps=1 is "
+            "the shortest"
+        )
 
 
 def _warn_of_one_domain(run: Run) -> None:

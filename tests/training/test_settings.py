@@ -7,7 +7,7 @@ import pytest
 from qs3.api import train as train_by_words
 from qs3.config import hashing
 from qs3.config.compose import composed
-from qs3.errors import ConfigError, MissingDataError
+from qs3.errors import ConfigError, MissingDataError, Qs3Error
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
 from qs3.training.settings import check_settings
@@ -133,3 +133,20 @@ def test_a_net_without_features_is_refused_before_the_warm_up(toy):
     with pytest.raises(ConfigError, match=r"selector \(GraphRefined\) needs .*TinyNet has none"):
         train(cfg)
     assert not (hashing.run_folder(cfg) / "history.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "warned"),
+    [
+        ("experiment=own_scans", False),
+        ("experiment=own_scans protocol.steps=100", True),
+        ("experiment=own_scans protocol.steps=null", True),
+        ("experiment=own_scans selection.teacher=last protocol.steps=9", False),
+        ("experiment=own_scans selftraining=none protocol.steps=9", False),  # said after loading
+    ],
+)
+def test_a_warm_up_for_nothing_is_warned_of(words, warned, monkeypatch, tmp_path, caplog):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(Qs3Error):  # no scans are there
+        train_by_words(*words.split(), "data.target.published.folder=scans")
+    assert ("what the warm-up trains is used for nothing" in caplog.text) == warned
