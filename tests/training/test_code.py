@@ -43,9 +43,16 @@ def test_own_files_count_as_they_were_when_the_process_began(own):
     assert of("my_own_nets.Net") == first
     code._sha256.cache_clear()
     second = of("my_own_nets.Net")
-    own.write_text(NET + "# edited\n")
+    own.write_text(NET.replace("pass", "dropout = 0.1"))
     code._sha256.cache_clear()
-    assert len({first, second, of("my_own_nets.Net")}) == 3
+    third = of("my_own_nets.Net")
+    assert len({first, second, third}) == 3
+    own.write_text("# edited\n" + NET.replace("pass", "dropout = 0.1  # a note"))
+    code._sha256.cache_clear()
+    assert of("my_own_nets.Net") == third  # it does the same
+    own.with_name("beside.py").write_text("x = \n")  # half-written, and nobody imports it
+    code._sha256.cache_clear()
+    assert of("my_own_nets.Net") != third
 
 
 def test_code_of_qs3_counts(monkeypatch):
@@ -71,7 +78,7 @@ def test_a_warm_up_of_a_net_that_was_edited_is_trained_again(own, toy, caplog):
     """It went on from the old net's checkpoint, even where its run had been deleted."""
     caplog.set_level("INFO")
     cfg = toy("model._target_=my_own_nets.Net", "selftraining=none", "protocol.epochs=2")
-    for edit, taken in (("", False), ("", True), ("# edited\n", False)):
+    for edit, taken in (("", False), ("", True), ("    width = 3\n", False)):
         own.write_text(own.read_text() + edit)
         code._sha256.cache_clear()
         caplog.clear()
