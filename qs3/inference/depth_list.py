@@ -233,7 +233,11 @@ def _row(row: Mapping[str, Any], path: Path, number: int, common: Shown) -> Show
             words = ",".join(map(str, words)) if isinstance(words, list) else str(words)
             shown = replace(shown, intrinsics=words, folder=folder)
     except (ConfigError, TypeError, ValueError, OverflowError) as error:
-        return Shown(name, wrong=f"{path.name}, row {number}: {error}")
+        # Its camera and label may be known all the same: neither is what is missing.
+        camera, label = str(given.get("intrinsics", common.intrinsics)), given.get("label", "")
+        label = str(label) if _plain(label) and not isinstance(label, list) else ""
+        wrong = f"{path.name}, row {number}: {error}"
+        return Shown(name, intrinsics=camera, folder=folder, label=label, wrong=wrong)
     if not shown.intrinsics:
         return replace(shown, wrong=f"{path.name}, row {number}: no intrinsics")
     return shown

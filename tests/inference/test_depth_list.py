@@ -8,6 +8,7 @@ import pytest
 
 from qs3.errors import DataError
 from qs3.inference.depth_list import Shown, find_shown
+from tests.commands import main
 
 CAMERA = "525,525,319.5,239.5"
 
@@ -81,3 +82,16 @@ def test_rows_of_a_list_with_numbers_without_end_are_told(tmp_path):
     (tmp_path / "a.yaml").write_text("- depth: 2020-99-99\n")
     with pytest.raises(DataError, match=r"a\.yaml is not readable: month must be"):
         find_shown(str(tmp_path / "a.yaml"), "", Shown(""))
+
+
+def test_a_list_of_wrong_rows_alone_says_what_is_wrong_with_them(tmp_path, capsys):
+    """And not that intrinsics are missing, which were given: in the list, or beside it."""
+    rows = "- {depth: a.png, mask: m.png, object: [20, 30], label: chair}\n"
+    (tmp_path / "a.yaml").write_text(rows)
+    (tmp_path / "b.yaml").write_text(rows.replace("label", "intrinsics: k.yaml, label"))
+    for name, beside in (("a", [f"intrinsics={CAMERA}"]), ("b", [])):
+        words = [f"depth={tmp_path / name}.yaml", *beside, f"out={tmp_path / name}.csv"]
+        assert main(["predict", "ckpt=pointnet-speckle", *words, "page=false"]) == 1
+        assert f"{name}.yaml, row 1: object=[20, 30]: expected" in capsys.readouterr().out
+        (row,) = csv.DictReader((tmp_path / f"{name}.csv").read_text().splitlines())
+        assert (row["status"], row["label"]) == ("failed", "chair")

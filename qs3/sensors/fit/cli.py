@@ -99,7 +99,7 @@ def fit(
     from qs3.sensors.fit.bias import find_bias
     from qs3.sensors.fit.doubts import check_walls
     from qs3.sensors.fit.fill import find_fill
-    from qs3.sensors.fit.frames import read_camera, read_frame
+    from qs3.sensors.fit.frames import check_field, off_centre, read_camera, read_frame
     from qs3.sensors.fit.noise import find_noise
     from qs3.sensors.fit.planes import find_wall
     from qs3.sensors.fit.preset import FittedPreset
@@ -122,6 +122,9 @@ def fit(
         camera = Intrinsics.centred(width, height, focal)
     else:
         raise ConfigError("give the camera: intrinsics=fx,fy,cx,cy, or focal=PIXELS")
+    check_field(camera)
+    if unsure := off_centre(camera):
+        print(unsure)
     if baseline is not None and not 0 < abs(baseline) < _LONGEST_M:
         hint = f"; if these are millimetres, give {baseline / 1000:g}"
         raise ConfigError(
@@ -226,7 +229,11 @@ FIT = Command(
     (
         Option("out", text("FILE"), "the preset, conf/sensor/NAME.yaml", required=True),
         Option("plot", text("FILE"), ".png (default: next to the preset)"),
-        Option("intrinsics", text("fx,fy,cx,cy"), "in px, or a JSON file with these keys"),
+        Option(
+            "intrinsics",
+            text("fx,fy,cx,cy"),
+            "in px, or a .json or .yaml as ROS, librealsense or Open3D write it",
+        ),
         Option(
             "focal",
             NUMBER,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +16,15 @@ from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.cameras import Intrinsics
 from qs3.utils.memory import JSON_PEAK, read_whole
 from qs3.utils.pictures import png_bytes, read_png
+from qs3.utils.yamls import load_yaml
 
 _MAX_PIXELS = 1 << 26
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
 _FAR_M = 100.0  # no wall that somebody measures
 _INVALID = 65535  # of 16 bits; 0 is the usual mark
+_FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the focal length is not in pixels
+_DOCUMENT = re.compile(r"^---\s*$", re.MULTILINE)
+_OFF = 0.2  # of a side, from the middle of a picture that is none of a crop
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +45,10 @@ class DepthImage:
 
 
 def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
-    """`fx,fy,cx,cy`, or a JSON file with fx, fy, cx, cy (also ppx, ppy, K or intrinsic_matrix).
+    """`fx,fy,cx,cy`, or a JSON or YAML file with fx, fy, cx, cy.
+
+    Or with ppx and ppy, as librealsense calls them, or a matrix: ROS's K, k or camera_matrix,
+    Open3D's intrinsic_matrix.
 
     Raises:
         ConfigError: it is neither, pixels are not square, the principal point lies outside of the
@@ -47,14 +56,9 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
         MissingDataError: there is no such file.
         DataError: the file does not hold them.
     """
-    if text.lower().endswith(".json"):
-        try:
-            found = json.loads(read_whole(Path(text), JSON_PEAK))
-            values = _four(found)
-        except OSError as error:
-            raise MissingDataError(f"intrinsics={text}: {error.strerror or error}") from error
-        except (ValueError, RecursionError) as error:
-            raise DataError(f"intrinsics={text} is not JSON: {error}") from error
+    if text.lower().endswith((".json", ".yaml", ".yml")):
+        found = _mapping(text)
+        values = _four(found)
         if values is None:
             raise DataError(
                 f"intrinsics={text} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
@@ -66,7 +70,9 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
         except ValueError:
             values = []
         if len(values) != 4:
-            raise ConfigError(f"intrinsics={text!r}: write fx,fy,cx,cy in pixels, or a .json file")
+            raise ConfigError(
+                f"intrinsics={text!r}: write fx,fy,cx,cy in pixels, or a .json or .yaml file"
+            )
     fx, fy, cx, cy = values
     if not (fx > 0 and fy > 0 and np.isfinite(values).all()):
         raise ConfigError(
@@ -83,6 +89,30 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
     return Intrinsics(width_px, height_px, (fx + fy) / 2, cx, cy)
 
 
+def check_field(camera: Intrinsics) -> None:
+    """Raise ConfigError if no depth camera sees so little or so much."""
+    side = max(camera.width_px, camera.height_px)
+    field = math.degrees(2 * math.atan(side / 2 / camera.focal_px))
+    if not _FIELD_DEG[0] <= field <= _FIELD_DEG[1]:
+        raise ConfigError(
+            f"a focal length of {camera.focal_px:g} px with {side} px makes a field of view of "
+            f"{field:.1f}°; give it in pixels"
+        )
+
+
+def off_centre(camera: Intrinsics) -> str:
+    """That the principal point lies far from the middle, in words; "" where it does not."""
+    x = abs(camera.cx_px - (camera.width_px - 1) / 2) / camera.width_px
+    y = abs(camera.cy_px - (camera.height_px - 1) / 2) / camera.height_px
+    if max(x, y) <= _OFF:
+        return ""
+    return (
+        f"the principal point ({camera.cx_px:g}, {camera.cy_px:g}) lies {max(x, y):.0%} of a side "
+        f"from the middle of the frames of {camera.width_px} x {camera.height_px} px: unless they "
+        "are a crop, the intrinsics are those of another resolution"
+    )
+
+
 def _check_size(found: dict[str, object], width_px: int, height_px: int, text: str) -> None:
     for keys in (("width", "height"), ("image_width", "image_height")):
         size = [found.get(key) for key in keys]
@@ -93,16 +123,42 @@ def _check_size(found: dict[str, object], width_px: int, height_px: int, text: s
             )
 
 
-def _four(found: object) -> list[float] | None:
+def _mapping(text: str) -> dict[str, object]:
+    """What a file holds, and what stands in it under `intrinsics` or about a matrix; or nothing."""
+    try:
+        data = read_whole(Path(text), JSON_PEAK)
+        if text.lower().endswith(".json"):
+            found = json.loads(data)
+        else:  # `rostopic echo` ends a message as YAML does a document
+            documents = _DOCUMENT.split(data.decode())
+            found = load_yaml(next(filter(str.strip, documents), ""), f"intrinsics={text}")
+    except OSError as error:
+        raise MissingDataError(f"intrinsics={text}: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        kind = "JSON" if text.lower().endswith(".json") else "YAML"
+        raise DataError(f"intrinsics={text} is not {kind}: {error}") from error
     if not isinstance(found, dict):
-        return None
+        return {}
+    inner = found.get("intrinsics")
+    found = {**found, **inner} if isinstance(inner, dict) else found
+    data_of = {key: one["data"] for key, one in found.items() if _is_matrix(one)}
+    return {**found, **data_of}
+
+
+def _is_matrix(found: object) -> bool:
+    """Whether it is one in ROS's and OpenCV's words: rows, cols and data."""
+    return isinstance(found, dict) and "data" in found
+
+
+def _four(found: dict[str, object]) -> list[float] | None:
+    values: Any = found
     try:
         for keys in (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy")):  # librealsense
-            if all(key in found for key in keys):
-                return [float(found[key]) for key in keys]
-        for key in ("K", "intrinsic_matrix", "camera_matrix"):
-            if key in found:
-                k = np.asarray(found[key], dtype=np.float64).reshape(-1)
+            if all(key in values for key in keys):
+                return [float(values[key]) for key in keys]
+        for key in ("K", "k", "intrinsic_matrix", "camera_matrix"):
+            if key in values:
+                k = np.asarray(values[key], dtype=np.float64).reshape(-1)
                 if len(k) != 9:
                     return None
                 # Row by row has 0 0 1 at its end; column by column has cx there (Open3D).
@@ -124,6 +180,8 @@ def read_frame(path: str | Path, unit: str | None = None) -> DepthImage:
         DataError: it is not a depth image, or its unit cannot be told.
     """
     path = Path(path)
+    if path.is_dir():
+        raise MissingDataError(f"{path} is a folder: name its frames, {path}/*.png")
     if not path.is_file():
         raise MissingDataError(f"{path}: there is no such file")
     suffix = path.suffix.lower()

@@ -5,6 +5,7 @@ import os
 import numpy as np
 import pytest
 
+from qs3.data.frames.given import read_intrinsics
 from qs3.errors import ConfigError, DataError
 from qs3.sensors.fit.frames import read_camera
 from tests.commands import main
@@ -31,11 +32,15 @@ from tests.commands import main
         (np.full((200, 300), 2.0), ["baseline=nan"], "metres from camera to projector"),
         (np.full((200, 300), 2.0), ["intrinsics=1,2,3"], "fx,fy,cx,cy"),
         (np.zeros((5, 5, 3)), [], "not a depth image"),
+        (np.full((200, 300), 2.0), ["focal=3"], "3 px with 300 px makes a field of view of 177.7°"),
+        (np.full((200, 300), 2.0), ["focal=58000"], "field of view of 0.3°; give it in pixels"),
+        (np.full((200, 300), 2.0), ["intrinsics=3,3,149,99"], "a field of view of 177.7°"),
     ],
 )
 def test_errors_say_what_to_do(image, arguments, message, tmp_path, capsys):
     np.save(tmp_path / "a.npy", image)
-    camera = [] if "intrinsics=1,2,3" in arguments else ["focal=300"]
+    given = any(word.startswith(("intrinsics=", "focal=")) for word in arguments)
+    camera = [] if given else ["focal=300"]
     out = [f"out={tmp_path / 'x.yaml'}"]
     assert main(["fit", str(tmp_path / "a.npy"), *camera, *out, *arguments]) == 1
     assert message in capsys.readouterr().err
@@ -66,6 +71,43 @@ def test_cameras_of_other_words_and_of_another_resolution(tmp_path):
     assert read_camera(str(path), 848, 480).focal_px == 580
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.yaml", "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\n"),
+        ("a.yml", "header:\n  seq: 1\nheight: 480\nwidth: 640\nK: {k}\n---\nK: [1]\n---\n"),
+        ("a.yaml", "k: {k}\nd: [0, 0, 0, 0, 0]\n"),
+        ("a.json", '{{"intrinsics": {{"width": 640, "height": 480, "fx": 575, "fy": 575, '
+        '"ppx": 319.5, "ppy": 239.5}}}}'),
+    ],
+)  # fmt: skip
+def test_a_camera_as_ros_and_librealsense_write_it(name, text, tmp_path):
+    """The files that `qs3 predict` takes."""
+    (tmp_path / name).write_text(text.format(k="[575, 0, 319.5, 0, 575, 239.5, 0, 0, 1]"))
+    found = read_camera(str(tmp_path / name), 640, 480)
+    assert (found.focal_px, found.cx_px, found.cy_px) == (575, 319.5, 239.5)
+    given = read_intrinsics(str(tmp_path / name)).camera
+    assert (given.fx_px, given.cx_px, given.cy_px) == (575, 319.5, 239.5)
+    with pytest.raises(ConfigError, match=r"of pictures of 640 x|outside of the frames"):
+        read_camera(str(tmp_path / name), 320, 239)
+
+
+@pytest.mark.parametrize("text", ["a: [", "", "- 1", "intrinsics: 5", "K: {data: 5}", "\xff"])
+def test_yaml_without_intrinsics_is_told(text, tmp_path):
+    (tmp_path / "a.yaml").write_bytes(text.encode("latin-1"))
+    with pytest.raises(DataError, match=r"a\.yaml (is not|has neither)"):
+        read_camera(str(tmp_path / "a.yaml"), 640, 480)
+
+
+def test_a_principal_point_in_a_corner_is_said(tmp_path, capsys):
+    np.save(tmp_path / "a.npy", np.full((200, 300), 2.0))
+    words = ["fit", str(tmp_path / "a.npy"), f"out={tmp_path / 'x.yaml'}"]
+    main([*words, "intrinsics=300,300,0,0"])
+    assert "(0, 0) lies 50% of a side from the middle of the frames" in capsys.readouterr().out
+    main([*words, "intrinsics=300,300,160,90"])
+    assert "principal" not in capsys.readouterr().out
+
+
 def test_a_camera_that_is_given_twice_and_a_preset_of_another_ending(tmp_path, capsys):
     np.save(tmp_path / "a.npy", np.full((200, 300), 2.0))
     frame, twice = str(tmp_path / "a.npy"), ["intrinsics=300,300,150,100", "focal=300"]
@@ -91,6 +133,9 @@ def test_damaged_and_large_arrays_are_refused_by_their_headers(tmp_path, capsys)
 
 def test_a_file_that_is_missing_and_frames_of_two_sizes(tmp_path, capsys):
     assert main(["fit", str(tmp_path / "no.npy"), "focal=300", "out=x.yaml"]) == 1
+    assert "no.npy: there is no such file" in capsys.readouterr().err
+    assert main(["fit", str(tmp_path), "focal=300", "out=x.yaml"]) == 1
+    assert f"is a folder: name its frames, {tmp_path}/*.png" in capsys.readouterr().err
     np.save(tmp_path / "a.npy", np.full((100, 100), 2.0))
     np.save(tmp_path / "b.npy", np.full((90, 100), 2.0))
     files = [str(tmp_path / name) for name in ("a.npy", "b.npy")]
