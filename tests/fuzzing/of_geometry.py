@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 from pathlib import Path
@@ -197,7 +198,9 @@ def _read_intrinsics(path: Path) -> None:
     try:
         read_intrinsics(str(path))
     except Qs3Error:
-        read_camera(str(path), 640, 480)
+        with contextlib.suppress(Qs3Error):
+            read_camera(str(path), 640, 480)
+        read_camera(str(path.rename(path.with_suffix(".yaml"))), 640, 480)
 
 
 def _lists(folder: Path) -> list[bytes]:

@@ -130,7 +130,8 @@ def _mapping(text: str) -> dict[str, object]:
         if text.lower().endswith(".json"):
             found = json.loads(data)
         else:  # `rostopic echo` ends a message as YAML does a document
-            documents = _DOCUMENT.split(data.decode())
+            plain = data.decode().removeprefix("%YAML:1.0").replace("!!opencv-matrix", "")
+            documents = _DOCUMENT.split(plain)
             found = load_yaml(next(filter(str.strip, documents), ""), f"intrinsics={text}")
     except OSError as error:
         raise MissingDataError(f"intrinsics={text}: {error.strerror or error}") from error

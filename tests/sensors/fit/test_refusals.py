@@ -77,11 +77,12 @@ def test_cameras_of_other_words_and_of_another_resolution(tmp_path):
         ("a.yaml", "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: {k}\n"),
         ("a.yml", "header:\n  seq: 1\nheight: 480\nwidth: 640\nK: {k}\n---\nK: [1]\n---\n"),
         ("a.yaml", "k: {k}\nd: [0, 0, 0, 0, 0]\n"),
+        ("a.yml", "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  data: {k}\n"),
         ("a.json", '{{"intrinsics": {{"width": 640, "height": 480, "fx": 575, "fy": 575, '
         '"ppx": 319.5, "ppy": 239.5}}}}'),
     ],
 )  # fmt: skip
-def test_a_camera_as_ros_and_librealsense_write_it(name, text, tmp_path):
+def test_a_camera_as_ros_opencv_and_librealsense_write_it(name, text, tmp_path):
     """The files that `qs3 predict` takes."""
     (tmp_path / name).write_text(text.format(k="[575, 0, 319.5, 0, 575, 239.5, 0, 0, 1]"))
     found = read_camera(str(tmp_path / name), 640, 480)
