@@ -31,6 +31,12 @@ def folder_of(name: str | Path) -> Path | None:
     return FOLDER / name if str(name) in names() and not Path(name).exists() else None
 
 
+def name_of(file: Path) -> str | None:
+    """Whose file of weights that is; None: of none of them."""
+    folder = file.resolve().parent
+    return folder.name if folder.parent == FOLDER and folder.name in names() else None
+
+
 def other_than(name: str) -> str:
     """Which one is asked beside it where nobody names one; "none" if there is no other net."""
     return SECOND if name != SECOND and SECOND in names() else "none"

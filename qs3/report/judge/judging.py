@@ -20,6 +20,7 @@ from qs3.config.checks import check_float
 from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.prior import POWER, check_told
+from qs3.inference.pretrained import name_of
 from qs3.report.judge.answers import (
     Answers,
     answers_of,
@@ -69,7 +70,8 @@ class Family:
     """Runs of one config, one a seed.
 
     Attributes:
-        name: of the experiment with the config's hash, or the run's path.
+        name: of the experiment with the config's hash; or of a classifier that comes with qs3; or
+            the run's path.
         runs: their result files.
         seeds: theirs; empty where not known.
         points: of a cloud as the nets see it.
@@ -311,7 +313,7 @@ def _families(files: Sequence[Path]) -> list[_Known]:
     for file in files:
         metrics = read_metrics(file.parent)
         if metrics is None:
-            found[(str(file),)] = _Known(str(file), (file,))
+            found[(str(file),)] = _Known(name_of(file) or str(file), (file,))
             continue
         key = (metrics.experiment, metrics.hash, *metrics.seen.values())
         of = members.setdefault(key, {})

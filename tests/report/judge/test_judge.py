@@ -18,7 +18,7 @@ from qs3.models.pointnet import pointnet
 from qs3.report.clustered import weights
 from qs3.report.judge.answers import find_runs
 from qs3.report.judge.intervals import difference, share
-from qs3.report.judge.judging import judge
+from qs3.report.judge.judging import _families, judge
 from qs3.report.judge.text import text
 from qs3.report.tables.paired import interval
 from qs3.utils.version import VERSION, commit, in_words
@@ -154,6 +154,14 @@ def test_runs_are_found(logs, tmp_path):
     for words in (str(tmp_path / "nothing"), f"{logs}/no*", str(tmp_path)):
         with pytest.raises(MissingDataError):
             find_runs([words])
+
+
+def test_classifiers_that_come_with_qs3_have_their_names(tmp_path):
+    """As they were typed; a row was called as the file in which the package keeps its weights."""
+    files = find_runs(["dgcnn-rooms", str(add_net(tmp_path, 0))])
+    assert [file.name for file in files] == ["model.safetensors", "result.pt"]
+    names = [family.name for family in _families(files)]
+    assert names == ["dgcnn-rooms", str(tmp_path / "result.pt")]
 
 
 def test_the_same_run_twice(archive, logs, tmp_path):
