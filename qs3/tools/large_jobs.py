@@ -7,6 +7,7 @@ question, the course over many nodes from a simulation (`qs3.cluster.simulation`
 from __future__ import annotations
 
 import csv
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.utils.cli import NUMBER, Command, Option, one_of, path, several, whole
 from qs3.utils.plural import counted
+from qs3.utils.text_table import three_digits
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 ENGINES = ("local", "ray", "slurm")
 _FEW = 30  # objects; of fewer the long ones may be missing
+_MOST = 10_000_000  # objects: a simulation has each of them in memory
 _PART_BYTES = 3000  # an object's file beside its arrays: names, a note, a zip's list
 _HEADER = ("id", "seconds", "peak_memory_mb")
 
@@ -142,22 +145,31 @@ def _plan(
 
     if not speed > 0:
         raise ConfigError(f"speed must be above 0, got {speed:g}")
+    if objects > _MOST:
+        raise ConfigError(
+            f"objects={objects}: at most {_MOST:,} are simulated, one by one; plan for that many, "
+            "and take hours, disk and cost in proportion"
+        )
     of = measured(data)
     rng = np.random.default_rng(0)
-    rows = []
-    for number in shown(nodes, "simulating", total=len(nodes)):
-        machines = Nodes(number, workers, start_s, life_h, repair_min, slow_share, slow_times)
-        courses = [
-            simulate(
-                rng.choice(of.seconds, objects) / speed,
-                machines,
-                tasks_per_job=tasks_per_job if engine == "slurm" else 1,
-                start_each_job=engine == "slurm",
-                seed=trial,
-            )
-            for trial in range(trials)
-        ]
-        rows.append(simulated(courses, machines))
+    courses = []
+    kinds = [
+        Nodes(number, workers, start_s, life_h, repair_min, slow_share, slow_times)
+        for number in nodes
+    ]
+    for machines, trial in shown(list(itertools.product(kinds, range(trials))), "simulating"):
+        course = simulate(
+            rng.choice(of.seconds, objects) / speed,
+            machines,
+            tasks_per_job=tasks_per_job if engine == "slurm" else 1,
+            start_each_job=engine == "slurm",
+            seed=trial,
+        )
+        courses.append(course)
+    rows = [
+        simulated(courses[i * trials : (i + 1) * trials], machines)
+        for i, machines in enumerate(kinds)
+    ]
     for line in _about(of, objects, workers, speed, node_gb):
         print(line)
     header = ["nodes", "hours", "95 %", "node hours", "lost %", "idle %", "failures"]
@@ -187,11 +199,13 @@ def _about(
     needed = workers * np.quantile(of.memory_mb, 0.99) / 1e3
     views = objects * of.view_bytes / 1e9
     lines = [
-        f"measured on {counted(n, 'object')}: {np.median(of.seconds):.3g} s in the middle, "
-        f"{of.seconds.mean():.3g} on average, at most {of.seconds.max():.3g}; "
+        f"measured on {counted(n, 'object')}: {three_digits(np.median(of.seconds))} s in the "
+        f"middle, {three_digits(of.seconds.mean())} on average, at most "
+        f"{three_digits(of.seconds.max())}; "
         f"at most {of.memory_mb.max():.0f} MB a process",
-        f"{objects:,} objects: {total / 3600:.3g} core-hours; {gigabytes:.3g} GB when it is done, "
-        f"{during:.3g} GB on the way" + (f", and {views:.3g} GB of views" if views else ""),
+        f"{objects:,} objects: {three_digits(total / 3600)} core-hours; {three_digits(gigabytes)} "
+        f"GB when it is done, {three_digits(during)} GB on the way"
+        + (f", and {three_digits(views)} GB of views" if views else ""),
         f"a node with {counted(workers, 'worker')}: {needed:.2g} GB of memory",
     ]
     if n < _FEW:
@@ -207,9 +221,9 @@ def _about(
 def _words(row: Row, price: float | None) -> list[str]:
     words = [
         str(row.nodes),
-        f"{row.hours:.3g}",
-        f"{row.hours_95:.3g}",
-        f"{row.hours * row.nodes:.3g}",
+        three_digits(row.hours),
+        three_digits(row.hours_95),
+        three_digits(row.hours * row.nodes),
         f"{100 * row.lost_share:.1f}",
         f"{100 * row.idle_share:.1f}",
         f"{row.failures:.1f}",

@@ -126,3 +126,13 @@ def test_what_is_missing_is_said(tmp_path):
         measured(data)
     with pytest.raises(ConfigError, match="speed must be above 0"):
         PLAN([f"data={small(tmp_path / 'e', [1.0])}", "objects=1", "speed=0"])
+
+
+def test_so_many_objects_that_no_simulation_ends_are_refused(tmp_path, capsys):
+    """A hundred million ran for hours without a word, and took 10 GB."""
+    data = small(tmp_path / "d", [3600.0] * 30)
+    with pytest.raises(ConfigError, match="at most 10,000,000 are simulated"):
+        PLAN([f"data={data}", "objects=100000000"])
+    text = said(capsys, f"data={data}", "objects=20000", "nodes=2", "workers=1", "trials=1")
+    assert "20,000 objects: 20000 core-hours; 0.48 GB" in text
+    assert re.search(r"^2 +10000 +10000 +20000 ", text, re.M)  # none of them as 1e+04

@@ -23,6 +23,7 @@ VOXEL = 0.125
 
 _OUTLIER = 5.0  # a point is lonely if its 4th neighbour is so many times the cloud's median away
 _ODD_SIZE = 5.0  # an object's size is odd so many robust standard deviations from its class
+_USUAL = 8  # clouds of a class, to say what is usual: of three one is soon far from the two others
 
 _SPACED = (
     *("nn_low", "nn_median", "nn_high", "nn_variation", "voxel_variation", "lonely"),
@@ -63,7 +64,10 @@ def extents(data: PointSet, chosen: np.ndarray) -> Numbers:
         logs = np.log(np.maximum(size[rows].max(axis=1), 1e-12))
         spread = max(1.4826 * float(np.median(np.abs(logs - np.median(logs)))), 0.02)
         far = np.abs(logs - np.median(logs)) / spread
-        odd += [(float(far[j]), data.ids[chosen[rows[j]]]) for j in np.flatnonzero(far > _ODD_SIZE)]
+        if len(rows) >= _USUAL:
+            odd += [
+                (float(far[j]), data.ids[chosen[rows[j]]]) for j in np.flatnonzero(far > _ODD_SIZE)
+            ]
         by_class[name] = {
             "size_median": np.median(size[rows], axis=0).tolist(),
             "largest_side_min": float(largest[rows].min()),

@@ -9,6 +9,7 @@ from qs3.data.inspection import columns
 from qs3.data.inspection.gap import PLATE_M
 from qs3.utils import text_table
 from qs3.utils.plural import counted
+from qs3.utils.text_table import three_digits
 
 Numbers = dict[str, Any]
 
@@ -47,12 +48,13 @@ def of_domain(facts: Numbers) -> str:
         "stored; cv: standard deviation over mean of the spacing, and of the points in a voxel of "
         "1/8; seen: share of 72 directions from the centroid with a point, of the lowest 24; "
         "lonely: share of points far from all others",
-        f"centroid off the origin {extents['centroid_offset_median']:.3g}, floor at "
-        f"{extents['floor_median']:.3g} (medians)",
+        f"centroid off the origin {three_digits(extents['centroid_offset_median'])}, floor at "
+        f"{three_digits(extents['floor_median'])} (medians)",
     ]
     if odd := extents["odd_sizes"]:
         more = ", ..." * (len(odd) > 5)
-        parts.append(f"odd sizes for their class: {len(odd)}: {', '.join(odd[:5])}{more}")
+        beside = " for their class" * (counts["unlabelled"] < counts["clouds"])
+        parts.append(f"odd sizes{beside}: {len(odd)}: {', '.join(odd[:5])}{more}")
     parts += ["", "which way is up, by the shape", *_ups(facts["gravity"])]
     parts += ["", "copies", *_copies(facts["copies"], spacing["all"]["copies"])]
     return "\n".join(parts)
@@ -127,19 +129,20 @@ def _sizes(extents: Numbers, spacing: Numbers) -> str:
     heads = ["x", "y", "z", "largest side", "spacing", "as stored", "cv", "cv voxel", "seen"]
     rows = [["class", *heads, "below", "lonely"]]
     for cls, size in extents["by_class"].items():
-        side = f"{size['largest_side_min']:.3g}..{size['largest_side_max']:.3g}"
+        ends = (three_digits(size[f"largest_side_{end}"]) for end in ("min", "max"))
+        side = "..".join(ends)
         rows.append([cls, *_sides(size), side, *_spaced(spacing["by_class"][cls])])
     return _table([*rows, ["all", *_sides(extents), "", *_spaced(spacing["all"])]])
 
 
 def _sides(size: Numbers) -> list[str]:
-    return [f"{side:.3g}" for side in size["size_median"]]
+    return [three_digits(side) for side in size["size_median"]]
 
 
 def _spaced(of: Numbers) -> list[str]:
     return [
         f"{of['nn_low']:.3f} {of['nn_median']:.3f} {of['nn_high']:.3f}",
-        f"{of['nn_median_raw']:.3g}",
+        three_digits(of["nn_median_raw"]),
         f"{of['nn_variation']:.2f}",
         f"{of['voxel_variation']:.2f}",
         f"{of['directions']:.0%}",

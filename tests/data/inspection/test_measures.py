@@ -78,6 +78,27 @@ def test_a_cloud_in_train_and_test_is_a_leak(tmp_path):
     assert (found["meshes"], found["leaking_meshes"]) == (2, 1)
 
 
+def test_a_size_is_odd_beside_many_alike(tmp_path):
+    """Of three clouds of any kind none is: two that happen to be alike say nothing of the third."""
+    rng = np.random.default_rng(0)
+    sizes = np.array([1, 1.01, 1.3, *rng.uniform(0.9, 1.1, 8), 1000])
+    clouds = rng.uniform(-1, 1, (12, 64, 3)) * sizes[:, None, None]
+    clouds = clouds.astype(np.float32)
+    for count, odd in ((3, []), (12, ["11"])):
+        ids = [str(i) for i in range(count)]
+        rows = [ManifestRow(i, "", "train") for i in ids]
+        arrays = {"points": clouds[:count]}
+        data = write_pointset(
+            tmp_path / str(count), name="s", classes=["a"], arrays=arrays, rows=rows, meta={}
+        )
+        assert measures.extents(data, np.arange(count))["odd_sizes"] == odd
+    out = tmp_path / "said"
+    assert main(["inspect", str(tmp_path / "12"), f"out={out}", "sheets=0"]) == 0
+    said = (out / "inspection.txt").read_text()
+    assert "odd sizes: 1: 11" in said  # of no class: nothing of "their class"
+    assert f"..{np.ptp(clouds[11], axis=0).max():.0f} " in said  # millimetres, not 2e+03
+
+
 def distances(points, mesh):
     """[n] distance of each point from a mesh, by that from every triangle."""
     corners = mesh.vertices[mesh.faces]  # [f, 3, 3]
