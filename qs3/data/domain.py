@@ -17,7 +17,7 @@ from qs3.classes import class_list
 from qs3.config.checks import check_choice, check_float
 from qs3.config.compose import choices, composed
 from qs3.config.location import typed
-from qs3.data.importers import Importer, import_into
+from qs3.data.importers import Importer, import_into, lie_deeper
 from qs3.data.made_of import MadeOf
 from qs3.data.manifest import read_manifest
 from qs3.data.store import (
@@ -212,6 +212,7 @@ class Domain:
             f"  {self.folder / 'meta.yaml'}{'   (begun but not finished)' * unfinished}",
             *([f"  {Path(self.twin_of).absolute() / self.variant}.npy"] if self.twin_of else []),
             *(f"  {pattern}" for pattern in (importer.looks_for() if importer else [])),
+            *lie_deeper(importer),
         ]
         if self.how_to_get:
             lines.append(f"Where to get it: {self.how_to_get.strip()}")

@@ -78,7 +78,7 @@ def prepare(
     cache = cache_dir / f"{key}-{count}x{starts}-v{_VERSION}.npy"
     name = f"{key} {count} of {stored}, v{_VERSION}, fpsample {version('fpsample')}"
     shape = (n, starts, count)
-    order = read_array(cache, shape, name)
+    order = read_array(cache, shape, name, silent=True)  # what is wrong with it is said below
     if order is None:
         with _alone(cache_dir):  # seeds that start at the same time wait for the first
             order = read_array(cache, shape, name)
@@ -98,8 +98,14 @@ def remove_old_leftovers(cache_dir: Path) -> None:
 # The cache's file is an .npy with 32 bytes after it: SHA-256 of what it is and of what it holds.
 
 
-def read_array(path: Path, shape: tuple[int, ...], name: str) -> np.ndarray | None:
-    """A cached array as a memmap; None if it is not there or not what it should be."""
+def read_array(
+    path: Path, shape: tuple[int, ...], name: str, *, silent: bool = False
+) -> np.ndarray | None:
+    """A cached array as a memmap; None if it is not there or not what it should be.
+
+    The latter is a warning, unless `silent`.
+    """
+    warn = log.debug if silent else log.warning
     if not path.is_file():
         return None
     try:
@@ -108,10 +114,10 @@ def read_array(path: Path, shape: tuple[int, ...], name: str) -> np.ndarray | No
             file.seek(-_DIGEST, os.SEEK_END)
             digest = file.read()
     except Exception as error:  # numpy's parser of headers raises whatever Python's does
-        log.warning("%s cannot be read (%s); made again", path, error)
+        warn("%s cannot be read (%s); made again", path, error)
         return None
     if array.shape != shape or digest != _digest(array, name):
-        log.warning("%s is damaged or of another version; made again", path)
+        warn("%s is damaged or of another version; made again", path)
         return None
     return array
 

@@ -1,6 +1,7 @@
 """Domains as Hydra makes them from conf/domain, on fixtures in the published formats."""
 
 import multiprocessing
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,37 @@ def test_what_comes_with_qs3_opens_without_more(tmp_path):
 
 def test_fixtures_cover_every_domain():
     assert sorted(fixtures._writers(Path(), SPLITS, True)) == NAMES
+
+
+@pytest.mark.parametrize("name", ["scannet10", "scanobjectnn", "modelnet40_meshes"])
+def test_files_that_lie_deeper_are_pointed_to(tmp_path, name):
+    """As an archive unpacks that has a folder of its own; only what is looked for was said."""
+    fixtures.write_domain(name, tmp_path, SPLITS)
+    root = domain(name, tmp_path).importer().root
+    inner = root / "archive" / "PointDA_data"
+    root.rename(tmp_path / "unpacked")
+    inner.parent.mkdir(parents=True)
+    (root / "empty").mkdir()
+    (tmp_path / "unpacked").rename(inner)
+    with pytest.raises(MissingDataError) as caught:
+        domain(name, tmp_path).check()
+    line = f"\nSuch files lie deeper, in {inner}: move what it holds to {root}\n"
+    assert line in str(caught.value)
+    shutil.rmtree(inner)
+    with pytest.raises(MissingDataError) as caught:
+        domain(name, tmp_path).check()
+    assert "lie deeper," not in str(caught.value)
+
+
+def test_a_tree_that_lies_deeper_is_pointed_to(tmp_path):
+    fixtures.write_domain("shapenet10", tmp_path, SPLITS)
+    root = domain("shapenet10", tmp_path).importer().root
+    root.rename(tmp_path / "unpacked")
+    root.mkdir()
+    (tmp_path / "unpacked").rename(root / "shapenet")
+    message = rf"unknown class 'shapenet'; .*; {root}/shapenet holds them: move them to {root}$"
+    with pytest.raises(DataError, match=message):
+        domain("shapenet10", tmp_path).open()
 
 
 @pytest.mark.parametrize("name", NAMES)

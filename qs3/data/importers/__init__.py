@@ -7,6 +7,7 @@ only the axes are turned so that z is up.
 
 from qs3.data.importers.arrays import NamedArrays
 from qs3.data.importers.base import Importer, import_into
+from qs3.data.importers.deeper import lie_deeper
 from qs3.data.importers.folders import CloudFolder
 from qs3.data.importers.graspnet import GraspNetPC
 from qs3.data.importers.pointda_h5 import PointDAH5
@@ -23,4 +24,5 @@ __all__ = [
     "ScanObjectNN",
     "XyzTree",
     "import_into",
+    "lie_deeper",
 ]

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from qs3.classes import CLASSES
+from qs3.classes import CLASSES, known_as
 from qs3.clouds.files import parse_cloud
 from qs3.config.checks import check_choice, check_words
 from qs3.data.importers.base import (
@@ -77,9 +77,19 @@ class TreeImporter(Importer):
                 f"published.up_z_classes names {', '.join(unknown)}, but the classes are "
                 f"{', '.join(classes)}"
             )
-        found = list_tree(self.root, self.suffix, lambda name: class_of(name, classes, self.root))
+        found = list_tree(self.root, self.suffix, lambda name: self._class_of(name, classes))
         order = sorted(found, key=lambda f: (SPLITS.index(f[2]), classes.index(f[1]), f[0].name))
         return unique(file_item(path, self.root, c, s, parse_cloud) for path, c, s in order)
+
+    def _class_of(self, name: str, classes: Sequence[str]) -> str:
+        """See `class_of`; where a folder that is none holds classes the tree lies deeper."""
+        try:
+            return class_of(name, classes, self.root)
+        except DataError as error:
+            inner = self.root / name
+            if any(known_as(folder.name, classes) for folder in folders_in(inner, self.root)):
+                raise DataError(f"{error}; {inner} holds them: move them to {self.root}") from error
+            raise
 
     def turn(self, cloud: np.ndarray, cls: str) -> np.ndarray:
         """See `Importer`."""
