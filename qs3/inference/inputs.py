@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,12 +35,14 @@ from qs3.inference.depth_list import IMAGES, Shown
 from qs3.inference.table import Row
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.meshes.io import is_mesh, load_mesh
+from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
 
 ALL = "all"
 """For `part=`: every object of an archive."""
 
 Z = "z"
+_ENDINGS = 10  # of files that are passed over, by name
 _ON_MESH = 8192  # points; nets take some of them, as far apart as can be
 
 
@@ -125,6 +127,18 @@ def find_files(
     if not found:
         raise MissingDataError(f"{key}{place} holds no file of {' '.join(suffixes)}")
     return sorted(found), place, others
+
+
+def passed_over(others: Mapping[str, int]) -> str:
+    """Files of kinds that are not read, by their endings; meshes with what to do."""
+    most = Counter(others).most_common()
+    shown = ", ".join(
+        f"{printable_name(suffix) or 'without ending'} {n}" for suffix, n in most[:_ENDINGS]
+    )
+    shown += ", ..." * (len(most) > _ENDINGS)
+    files = counted(sum(others.values()), "file of another kind", "files of other kinds")
+    scan = "; meshes are scanned first: qs3-generate meshes=FOLDER"
+    return f"{files} passed over: {shown}" + scan * any(suffix in MESHES for suffix in others)
 
 
 def _unreadable(error: OSError) -> None:

@@ -10,13 +10,12 @@ from qs3.config.location import typed
 from qs3.data.frames.pointed import LEVEL, PLANES
 from qs3.data.with_depth import NOTHING
 from qs3.evaluation.ood import OTHER_UNITS
-from qs3.inference.inputs import printable_name
+from qs3.inference.inputs import passed_over
 from qs3.inference.predictor import Predictor
 from qs3.inference.pretrained import HEIGHTS
 from qs3.inference.scores import Count, disputed, right, scores
 from qs3.inference.settings import Inputs, Settings, Source
 from qs3.inference.table import Row
-from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.utils.plural import counted
 
 _SHOWN = 10  # failures in the text for the terminal
@@ -77,7 +76,7 @@ def told(
     if predictor.result.gravity == "none" and inputs.kind != "depth images":
         lines.append("the classifier was trained on clouds in the frame of their camera, not z up")
     if inputs.others:
-        lines.append(_passed_over(inputs.others))
+        lines.append(passed_over(inputs.others))
     if failed:
         lines.append(f"{len(failed)} failed:")
         lines += [f"  {one['file']}: {one['reason']}" for one in failed[:_SHOWN]]
@@ -111,18 +110,6 @@ def _other_units(good: Sequence[Mapping[str, Any]]) -> list[str]:
         "divide millimetres by 1000, centimetres by 100 and inches by 39.37, or leave out points "
         "far from the object"
     ]
-
-
-def _passed_over(others: Mapping[str, int]) -> str:
-    """Files of kinds that are not read, by their endings; meshes with what to do."""
-    most = Counter(others).most_common()
-    shown = ", ".join(
-        f"{printable_name(suffix) or 'without ending'} {n}" for suffix, n in most[:_SHOWN]
-    )
-    shown += ", ..." * (len(most) > _SHOWN)
-    files = counted(sum(others.values()), "file of another kind", "files of other kinds")
-    scan = "; meshes are scanned first: qs3-generate meshes=FOLDER"
-    return f"{files} passed over: {shown}" + scan * any(suffix in MESHES for suffix in others)
 
 
 def _several(rows: Sequence[Row], inputs: Inputs) -> list[str]:

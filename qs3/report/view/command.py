@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.files import SUFFIXES, parse_clouds
+from qs3.clouds.files import SUFFIXES, CloudFile, parse_clouds
 from qs3.clouds.finite import checked
 from qs3.config.checks import check_choice
 from qs3.config.compose import choices
@@ -25,7 +25,7 @@ from qs3.data.viewer.page import Part, Shown, captions, page, points_each, thinn
 from qs3.data.with_depth import with_depth
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import surface_sample
-from qs3.inference.inputs import find_files, reason_of
+from qs3.inference.inputs import find_files, passed_over, reason_of
 from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from qs3.meshes.io import SUFFIXES as MESHES
 from qs3.report.runs.data import is_run, read_run
@@ -37,6 +37,7 @@ from qs3.utils.progress import progress_bar
 from qs3.utils.text_table import printable
 
 _KNOWN = tuple(dict.fromkeys((*SUFFIXES, *MESHES)))
+_PARTS = (".mtl", ".bin", ".png", ".jpg", ".jpeg")  # of meshes beside them
 
 
 @dataclass(frozen=True)
@@ -155,30 +156,46 @@ def _archive(path: Path, most: int, settings: Settings) -> Part:
 
 
 def _files(place: Path, most: int, settings: Settings) -> Part:
-    files, root, _ = find_files(place, key="", suffixes=_KNOWN)
+    files, root, others = find_files(place, key="", suffixes=_KNOWN)
     names = [path.relative_to(root).as_posix() for path in files]
     there = np.flatnonzero([settings.match in name for name in names])
     _nothing_if(not len(there), settings, str(place))
     shown: list[Shown] = []
     failed: list[str] = []
-    few = drawn(there, most)
+    for suffix in (
+        ".html",
+        *(_PARTS if any(path.suffix.lower() in MESHES for path in files) else ()),
+    ):
+        others.pop(suffix, None)
+    few, clouds = drawn(there, most), 0
     with progress_bar("files", total=len(few)) as advance:
         for i in few:
             name = printable(names[i])
             if is_mesh(files[i]):
-                found = _of_mesh(files[i], name, settings, len(few))
+                count, each = 1, _of_mesh(files[i], name, settings, len(few))
             else:
-                found = _of_file(files[i], name, most, settings.up)
-            for one in found:
+                count, each = _of_file(files[i], name, most, settings.up)
+            clouds += count
+            for one in each:
                 if isinstance(one, Shown):
                     shown.append(one)
                 else:
                     failed.append(one)
+                    clouds -= 1
             advance()
     shown = [shown[i] for i in drawn(np.arange(len(shown)), most)]
-    about = f"{len(few)} of {len(files)} files in {place.name}" if place.is_dir() else place.name
-    clouds = f", {counted(len(shown), 'cloud')}" if len(shown) != len(few) else ""
-    return Part(shown, about + clouds, failed=failed)
+    about = (
+        f"{len(few)} of {len(files)} files in {place.absolute().name}"
+        if place.is_dir()
+        else place.name
+    )
+    if len(shown) < clouds:
+        about += f", {len(shown)} of {clouds} clouds"
+    elif clouds != len(few):
+        about += f", {counted(clouds, 'cloud')}"
+    if others:
+        about += f"; {passed_over(others)}"
+    return Part(shown, about, failed=failed)
 
 
 def _of_mesh(path: Path, name: str, settings: Settings, files: int) -> Iterator[Shown | str]:
@@ -198,16 +215,19 @@ def _of_mesh(path: Path, name: str, settings: Settings, files: int) -> Iterator[
     )
 
 
-def _of_file(path: Path, name: str, most: int, up: str) -> Iterator[Shown | str]:
-    """The clouds of a file, some of many; or why one cannot be shown.
+def _of_file(path: Path, name: str, most: int, up: str) -> tuple[int, Iterator[Shown | str]]:
+    """How many clouds a file has, and some of many; or why one cannot be shown.
 
     A cloud's class is that of its file, else the name of the folder that the file is in.
     """
     try:
         found = parse_clouds(path)
     except DataError as error:
-        yield f"{name}: {reason_of(error, str(path))}"
-        return
+        return 1, iter([f"{name}: {reason_of(error, str(path))}"])
+    return len(found.clouds), _clouds(found, name, most, up)
+
+
+def _clouds(found: CloudFile, name: str, most: int, up: str) -> Iterator[Shown | str]:
     for i in drawn(np.arange(len(found.clouds)), most):
         own = f"{name}[{i}]" if found.many else name
         label = _folder(name) if found.labels is None else _words(found.labels[i])

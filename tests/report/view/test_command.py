@@ -54,7 +54,7 @@ def test_files_of_all_kinds_with_their_labels(view, tmp_path):
     (folder / "notes.pdf").touch()
     status, said, data = view("scans")
     assert status == 0
-    assert "4 of 4 files in scans, 5 clouds" in said
+    assert "4 of 4 files in scans, 5 clouds; 1 file of another kind passed over: .pdf 1" in said
     assert "saved view.html" in said
     assert [(c["name"], c["label"], c["note"]) for c in data["clouds"]] == [
         ("c.npz[0]", "sofa", ""), ("chair/a.xyz", "chair", ""),
@@ -120,6 +120,9 @@ def test_several_paths_share_the_page(view, tmp_path):
     assert len(data["clouds"]) == 8
     assert {name[0] for name in names(data)} == {"a", "b"}
     assert {(c["count"], c["of"]) for c in data["clouds"]} == {(5, 12)}
+    assert "a.npy, 4 of 30 clouds\nb.npy, 4 of 30 clouds\n" in said
+    assert "a.npy, 4 of 30 clouds" in (tmp_path / "view.html").read_text()
+    assert f"2 of 2 files in {tmp_path.name}, 7 of 60 clouds\n" in view(".", "clouds=7")[1]
     assert "at most 5 points of a cloud are shown" in said
 
 
