@@ -15,6 +15,13 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">8sI4sIIBBBBB")
 _END = b"\0\0\0\0IEND\xaeB`\x82"
 _GREY = 0
+_KINDS = {
+    _GREY: "grey",
+    2: "in colours",
+    3: "in the colours of a palette",
+    4: "grey with transparency",
+    6: "in colours with transparency",
+}
 
 
 def png_bytes(path: Path) -> bytes:
@@ -39,7 +46,10 @@ def read_png(data: bytes, where: str) -> np.ndarray:
     """
     width, height, bits, colour = png_header(data, where)
     if colour != _GREY or bits not in (8, 16):
-        raise DataError(f"{where}: expected grey with 8 or 16 bits, not type {colour}, {bits}")
+        kind = _KINDS.get(colour, f"of type {colour}")
+        raise DataError(
+            f"{where}: the PNG is {kind}, with {bits} bits; expected grey with 8 or 16 bits"
+        )
     import cv2
 
     try:

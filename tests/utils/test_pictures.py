@@ -50,6 +50,14 @@ def test_a_part_that_promises_more_than_there_is_takes_no_memory(tmp_path):
         _png(path)
 
 
+def test_a_picture_of_another_kind_is_named_in_words():
+    colours = r"here: the PNG is in colours{}, with 8 bits; expected grey with 8 or 16 bits"
+    with pytest.raises(DataError, match=colours.format("")):
+        read_png(png(4, 5, 3), "here")
+    with pytest.raises(DataError, match=colours.format(" with transparency")):
+        read_png(png(4, 5, 4), "here")
+
+
 @pytest.mark.parametrize("size", [(60_000, 60_000), (0, 5), (2**31 - 1, 1), (4097, 2)])
 def test_a_picture_too_large_is_refused_by_its_header(size):
     tracemalloc.start()

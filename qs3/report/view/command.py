@@ -162,10 +162,8 @@ def _files(place: Path, most: int, settings: Settings) -> Part:
     _nothing_if(not len(there), settings, str(place))
     shown: list[Shown] = []
     failed: list[str] = []
-    for suffix in (
-        ".html",
-        *(_PARTS if any(path.suffix.lower() in MESHES for path in files) else ()),
-    ):
+    meshes = any(path.suffix.lower() in MESHES for path in files)
+    for suffix in (".html", *(_PARTS if meshes else ())):
         others.pop(suffix, None)
     few, clouds = drawn(there, most), 0
     with progress_bar("files", total=len(few)) as advance:
