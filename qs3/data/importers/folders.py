@@ -189,9 +189,11 @@ class CloudFolder(Importer):
             return "split/class"
         known = [f for f in folders if known_as(f.name, classes) is not None]
         if len(known) < len(folders):
-            unknown = ", ".join(sorted(f.name for f in folders if f not in known))
+            unknown = sorted(f.name for f in folders if f not in known)
+            one = len(unknown) == 1
+            are = "is neither a class nor a split" if one else "are neither classes nor splits"
             raise DataError(
-                f"{self.root}: {unknown} is neither a class nor a split; the classes are "
+                f"{self.root}: {', '.join(unknown)} {are}; the classes are "
                 f"{', '.join(classes)} (`classes` of the domain), or read all files without labels "
                 "with published.layout=none"
             )

@@ -171,6 +171,9 @@ def test_wrong_folders_and_names(tmp_path: Path) -> None:
     write(tmp_path / "boat" / "a.xyz")
     with pytest.raises(DataError, match=r"boat is neither a class nor a split.*layout=none"):
         CloudFolder(tmp_path, points=4).read(TWO)
+    write(tmp_path / "ship" / "a.xyz")
+    with pytest.raises(DataError, match=r"boat, ship are neither classes nor splits; the classes"):
+        CloudFolder(tmp_path, points=4).read(TWO)
     write(tmp_path / "b" / "bed" / "a.xyz")
     write(tmp_path / "b" / "bed" / "a.ply")
     with pytest.raises(DataError, match=r"a\.(xyz|ply) and .*a\.(xyz|ply) have one name"):
