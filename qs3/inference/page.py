@@ -134,10 +134,11 @@ def page(
     if found:
         parts.append(f'<div class="side">{_why(found)}{_matrix(found, classes)}</div>')
     shown = gallery.shown()
+    unlabelled = "Without a label" + " that is a class of the net" * bool(found and found.unknown)
     for heading, note, wanted in (
         ("Wrong", "the most confident first", False),
         ("Right", "the least confident first", True),
-        ("Without a label" if found else "Predicted", "what is in doubt first", None),
+        (unlabelled if found else "Predicted", "what is in doubt first", None),
     ):
         cards = [
             _card(row, of, classes, floor_m) for row, of in shown if right(row, classes) is wanted

@@ -69,3 +69,17 @@ def test_the_page_says_why_nothing_was_judged(label: str, said: str) -> None:
     text = page("x", [row], gallery, ("a", "b"))
     assert said in text
     assert text.count("so nobody knows which are right") == 1
+
+
+@pytest.mark.parametrize("third", ["", "mug"])
+def test_what_has_a_label_of_another_class_is_not_called_unlabelled(third: str) -> None:
+    """Its heading counted it; the line above, which counts what has none, did not."""
+    gallery, rows = Gallery(("a", "b")), []
+    for name, label in (("x", "a"), ("y", ""), ("z", third)):
+        sample = Sample(name, np.eye(3), 0, label=label)
+        rows.append(sample.row("", np.array([0.75, 0.25])))
+        gallery.add(rows[-1], sample)
+    text = page("x", rows, gallery, ("a", "b"))
+    assert f"Without a label, not counted: {1 if third else 2}<" in text
+    heading = "Without a label that is a class of the net" if third else "Without a label"
+    assert f"<h2>{heading}: 2 <" in text
