@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 from dataclasses import dataclass
@@ -18,11 +19,14 @@ from qs3.utils.memory import JSON_PEAK, read_whole
 from qs3.utils.pictures import png_bytes, read_png
 from qs3.utils.yamls import load_yaml
 
+log = logging.getLogger(__name__)
+
 _MAX_PIXELS = 1 << 26
 _RESOLUTIONS_M = (0.01, 0.001, 0.0001)
 _FAR_M = 100.0  # no wall that somebody measures
 _INVALID = 65535  # of 16 bits; 0 is the usual mark
 _FIELD_DEG = (2.0, 170.0)  # of view: less or more, and the focal length is not in pixels
+_BENT = ("D", "d", "coeffs", "distortion_coefficients")
 _DOCUMENT = re.compile(r"^---\s*$", re.MULTILINE)
 _OFF = 0.2  # of a side, from the middle of a picture that is none of a crop
 
@@ -64,6 +68,9 @@ def read_camera(text: str, width_px: int, height_px: int) -> Intrinsics:
                 f"intrinsics={text} has neither fx, fy, cx, cy nor a matrix K or intrinsic_matrix"
             )
         _check_size(found, width_px, height_px, text)
+        bent = next((found[key] for key in _BENT if key in found), None)
+        if isinstance(bent, list) and any(one != 0 for one in bent):
+            log.warning("intrinsics=%s: the lens's distortion is known and not corrected", text)
     else:
         try:
             values = [float(word) for word in text.split(",")]

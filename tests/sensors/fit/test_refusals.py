@@ -93,6 +93,16 @@ def test_a_camera_as_ros_opencv_and_librealsense_write_it(name, text, tmp_path):
         read_camera(str(tmp_path / name), 320, 239)
 
 
+@pytest.mark.parametrize("bent", ["[0, 0, 0]", "[0.1, -0.2, 0]"])
+def test_a_distortion_that_is_not_corrected_is_said(bent, tmp_path, caplog):
+    k = "[575, 0, 319.5, 0, 575, 239.5, 0, 0, 1]"
+    for text in (f"K: {k}\nD: {bent}\n", f"k: {k}\ndistortion_coefficients: {{data: {bent}}}\n"):
+        (tmp_path / "a.yaml").write_text(text)
+        read_camera(str(tmp_path / "a.yaml"), 640, 480)
+    said = "a.yaml: the lens's distortion is known and not corrected"
+    assert caplog.text.count(said) == (2 if "-0.2" in bent else 0)
+
+
 @pytest.mark.parametrize("text", ["a: [", "", "- 1", "intrinsics: 5", "K: {data: 5}", "\xff"])
 def test_yaml_without_intrinsics_is_told(text, tmp_path):
     (tmp_path / "a.yaml").write_bytes(text.encode("latin-1"))
