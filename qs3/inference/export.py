@@ -25,6 +25,7 @@ from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.inference.judgement import read_judgement
 from qs3.inference.model_card import card, carried
 from qs3.inference.model_file import (
+    EXPORTED,
     PACKAGES,
     build_net,
     find_result,
@@ -44,7 +45,7 @@ from qs3.utils.yamls import load_yaml
 
 ALLOWED = 1e-4  # difference of logits
 ALLOWED_ODD = 0.1  # share of clouds that may differ by more, see `Comparison`
-SUFFIXES = (".onnx", ".pt2")
+SUFFIXES = EXPORTED
 INPUT, OUTPUT = "points", "logits"
 _CHECKED = 32  # clouds to compare on
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20

@@ -31,6 +31,9 @@ from qs3.utils.text_table import printable
 from qs3.utils.version import VERSION
 
 FILE = "result.pt"
+EXPORTED = (".onnx", ".pt2")
+"""What `qs3 export` writes for other programs."""
+
 PACKAGES = ("qs3.models",)
 """Packages that a file may take its net from."""
 
@@ -176,8 +179,14 @@ def find_result(path: str | Path) -> Path:
 
     Raises:
         MissingDataError: there is none; says what lies there instead.
+        ConfigError: a net that `qs3 export` wrote as one file.
     """
     path = pretrained.folder_of(path) or Path(path).expanduser()
+    if path.suffix.lower() in EXPORTED and path.is_file():
+        raise ConfigError(
+            f"{path} is a net for other programs, without what prepares its clouds; give the run "
+            "or the classifier that it was exported from"
+        )
     if path.is_file():
         return path
     if not path.is_dir():

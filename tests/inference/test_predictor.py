@@ -256,6 +256,9 @@ def test_missing_runs_are_told_apart(run, tmp_path):
         qs3.load(run.parent)
     with pytest.raises(MissingDataError, match=r"has no result\.pt"):
         qs3.load(tmp_path)
+    (tmp_path / "model.onnx").write_bytes(b"a net")
+    with pytest.raises(ConfigError, match=r"model\.onnx is a net for other.* exported from"):
+        qs3.load(tmp_path / "model.onnx")
     (tmp_path / "started.json").write_text("{}")
     with pytest.raises(MissingDataError, match="not finished"):
         qs3.load(tmp_path)

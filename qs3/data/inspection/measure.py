@@ -92,7 +92,9 @@ def compare(a: Opened, b: Opened, bounds: Bounds, advance: Advance = lambda: Non
         cls for cls in a.data.classes if a.data.members(cls).size and b.data.members(cls).size
     ]
     if not common:
-        raise ConfigError(f"{a.label} and {b.label} have no class in common")
+        bare = " and ".join(one.label for one in (a, b) if (one.data.labels < 0).all())
+        why = f": the clouds of {bare} have no labels, and classes are what is compared"
+        raise ConfigError(f"{a.label} and {b.label} have no class in common" + why * bool(bare))
     count = min(NET_POINTS, a.data.points.shape[1], b.data.points.shape[1])
     found: Numbers = {
         "a": a.label,

@@ -99,6 +99,21 @@ def test_a_size_is_odd_beside_many_alike(tmp_path):
     assert f"..{np.ptp(clouds[11], axis=0).max():.0f} " in said  # millimetres, not 2e+03
 
 
+def test_clouds_without_labels_cannot_be_compared_and_that_is_said(tmp_path, capsys):
+    points = np.random.default_rng(0).normal(size=(2, 32, 3)).astype(np.float32)
+    for name, cls in (("a", "bed"), ("b", ""), ("c", "")):
+        rows = [ManifestRow(f"{name}/{i}", cls, "train") for i in range(2)]
+        arrays = {"points": points}
+        write_pointset(
+            tmp_path / name, name=name, classes=["bed"], arrays=arrays, rows=rows, meta={}
+        )
+    for others, bare in (("ab", "b"), ("cb", "c and b")):
+        words = [str(tmp_path / one) for one in others]
+        assert main(["compare", *words, f"out={tmp_path / 'out'}"]) == 1
+        said = capsys.readouterr().err
+        assert f"have no class in common: the clouds of {bare} have no labels" in said
+
+
 def distances(points, mesh):
     """[n] distance of each point from a mesh, by that from every triangle."""
     corners = mesh.vertices[mesh.faces]  # [f, 3, 3]
