@@ -9,7 +9,7 @@ cloud inside all ranges can still show an object of no known class, and get a co
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import torch
@@ -120,6 +120,19 @@ def ood_reasons(measured: Mapping[str, float], usual: Mapping[str, list[float]])
         unit = f", {OTHER_UNITS}" * (name in OF_METRES and value > _NO_METRES * high)
         reasons.append(f"{name} {value:.4g} is {limit}{unit}")
     return reasons
+
+
+def other_units(reasons: Iterable[str]) -> str:
+    """For whoever reads the answers: clouds of whose reasons one says other units; or ""."""
+    count = sum(OTHER_UNITS in each for each in reasons)
+    if not count:
+        return ""
+    they = "it was" if count == 1 else "they were"
+    return (
+        f"{count} of them as large as if {they} not in metres, so these answers mean nothing: "
+        "divide millimetres by 1000, centimetres by 100 and inches by 39.37, or leave out points "
+        "far from the object"
+    )
 
 
 def ood_reasons_of_all(

@@ -17,6 +17,7 @@ probabilities of its predictions.csv; with `evaluation.prior` if `load` is told 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,7 +37,7 @@ from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
-from qs3.evaluation.ood import measure_one, ood_reasons, relax_min_points
+from qs3.evaluation.ood import measure_one, ood_reasons, other_units, relax_min_points
 from qs3.evaluation.prior import POWER, Prior, check_told, read_prior, shares_of
 from qs3.evaluation.trust import COMPARED, Known
 from qs3.inference.depth_image import DepthPrediction, objects_of
@@ -51,6 +52,8 @@ from qs3.inference.held_out import known_of
 from qs3.inference.model_file import PACKAGES, Result, build_net, read_result
 from qs3.utils.allocator import keep_freed_memory
 from qs3.utils.plural import counted
+
+log = logging.getLogger(__name__)
 
 BATCH = 32  # clouds: more are no faster on a CPU
 DIVERGED = "the classifier's answer is no number: its training has diverged"
@@ -218,6 +221,8 @@ class Predictor:
     ) -> Float[np.ndarray, "n c"]:
         """Class probabilities of clouds, float64, a row a cloud; NaN if its training has diverged.
 
+        Of clouds that are as large as if they were in other units than the net's metres is warned.
+
         Args:
             clouds: [N, P, 3], or a list of clouds with different numbers of points; their unit as
                 in `prepare`.
@@ -248,8 +253,10 @@ class Predictor:
         if not arrays:
             return np.empty((0, len(self.classes)))
         pairs = zip(arrays, names, strict=True)
-        ready = [self.prepare(cloud, name, up, floor).points for cloud, name in pairs]
-        return self.probabilities(torch.stack(ready), batch_size)
+        ready = [self.prepare(cloud, name, up, floor) for cloud, name in pairs]
+        if words := other_units("; ".join(one.strange) for one in ready):
+            log.warning("%s: %s", counted(len(ready), "cloud"), words)
+        return self.probabilities(torch.stack([one.points for one in ready]), batch_size)
 
     def predict_depth(
         self,

@@ -9,7 +9,7 @@ from typing import Any
 from qs3.config.location import typed
 from qs3.data.frames.pointed import LEVEL, PLANES
 from qs3.data.with_depth import NOTHING
-from qs3.evaluation.ood import OTHER_UNITS
+from qs3.evaluation.ood import OTHER_UNITS, other_units
 from qs3.inference.inputs import passed_over
 from qs3.inference.predictor import Predictor
 from qs3.inference.pretrained import HEIGHTS
@@ -47,7 +47,7 @@ def told(
         lines += _no_class(rows, predictor.classes)
         strange = sum(one["out_of_range"] for one in good)
         lines.append(f"{strange} of them out of range (column out_of_range)")
-        lines += _other_units(good)
+        lines += filter(None, [other_units(one["reason"] for one in good)])
         lines += _several(rows, inputs)
     if cautioned := sum(one["caution"] is not None for one in good):
         lines.append(f"{cautioned} of them with a caution (column caution)")
@@ -97,19 +97,6 @@ def _scored(rows: Sequence[Row], classes: Sequence[str]) -> list[str]:
     label, times = found.majority
     balanced = f", balanced {found.balanced:.1%}"
     return [f"right {of(found.all)}{balanced}{tiers}; always {label}: {times / found.all.of:.1%}"]
-
-
-def _other_units(good: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Clouds of which the size says so."""
-    count = sum(OTHER_UNITS in one["reason"] for one in good)
-    if not count:
-        return []
-    they = "it was" if count == 1 else "they were"
-    return [
-        f"{count} of them as large as if {they} not in metres, so these answers mean nothing: "
-        "divide millimetres by 1000, centimetres by 100 and inches by 39.37, or leave out points "
-        "far from the object"
-    ]
 
 
 def _several(rows: Sequence[Row], inputs: Inputs) -> list[str]:

@@ -334,6 +334,20 @@ def test_what_is_wrong_with_a_net_of_ones_own_is_said(run, tmp_path):
             load(file, packages=packages)
 
 
+def test_millimetres_are_told_to_python_too(metric_run, run, test_clouds, caplog):
+    """A net of metres gave them all one class, with confidence and without a word."""
+    clouds = [test_clouds[0], 1000 * test_clouds[1], 100 * test_clouds[2]]
+    qs3.load(run)(clouds)
+    qs3.load(metric_run)(clouds[:1])
+    assert not caplog.records
+    qs3.load(metric_run)(clouds)
+    assert caplog.messages == [
+        "3 clouds: 2 of them as large as if they were not in metres, so these answers mean "
+        "nothing: divide millimetres by 1000, centimetres by 100 and inches by 39.37, or leave "
+        "out points far from the object"
+    ]
+
+
 @pytest.mark.parametrize("package", ["tests.training", "tests.training.toy"])
 def test_a_net_of_ones_own_is_asked_for_by_package_or_module(run, tmp_path, package):
     from tests.training.toy import TinyNet
