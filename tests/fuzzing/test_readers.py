@@ -41,6 +41,7 @@ OWN = {
     "sensors/renderers/llvm.py": "what a child has just said",
     "sweeps/listed_jobs.py": "what the parent has just written",
     "tools/large_jobs.py": "sizes; costs.csv is read whole by utils/memory.py, and numbers parsed",
+    "training/code.py": "Python that trains; its bytes are hashed, and parsed if they can be",
     "utils/files.py": "bytes that are hashed",
     "utils/locks.py": "nothing is read",
     "utils/memory.py": "bytes, for those that read them",

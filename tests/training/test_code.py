@@ -35,7 +35,8 @@ def of(target: str) -> str:
     return code_sha256(OmegaConf.create({"model": {"part": [{"_target_": target}]}}))
 
 
-def test_own_files_count_as_they_were_when_the_process_began(own):
+def test_own_files_count_as_they_were_when_the_process_began(own, monkeypatch):
+    monkeypatch.setattr(code, "PACKAGES", ("methods",))  # which is quicker
     first = of("my_own_nets.Net")
     assert first != of("torch.optim.Adam")
     assert of("torch.optim.Adam") == of("nobody.has.This") == of("qs3.methods.pcm.Pcm")

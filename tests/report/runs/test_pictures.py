@@ -311,31 +311,21 @@ def test_embedding_needs_data_and_a_net(run, tmp_path):
     assert "config.yaml" in why_no_embedding(run)
 
 
-def test_command_line(run, toy_data, tmp_path, capsys):
-    use_real_net(run)
+def own_net(num_classes, variant):
+    return pointnet(num_classes=num_classes, variant=variant)
+
+
+def test_command_line_with_a_net_of_ones_own(run, toy_data, tmp_path, capsys):
+    use_real_net(run, f"{__name__}.own_net")
+    assert f"{__name__}.own_net, which is not in qs3.models" in why_no_embedding(run)
     out = tmp_path / "out"
-    assert main(["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]) == 0
+    words = ["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]
+    assert main([*words, f"packages={__name__}"]) == 0
     named = [*ALL[:5], "embedding", *ALL[5:]]
     shown = [str(out / f"{name}.png") for name in named]
     shown += [str(out / "clouds.html"), str(out / "index.html")]
     assert capsys.readouterr().out.splitlines() == shown
     assert not_blank(out / "embedding.png")
-
-
-def own_net(num_classes, variant):
-    return pointnet(num_classes=num_classes, variant=variant)
-
-
-def test_features_of_a_net_of_ones_own_are_drawn_if_its_module_is_named(run, tmp_path, capsys):
-    use_real_net(run, f"{__name__}.own_net")
-    words = ["report", "page", f"run={run}", f"out={tmp_path}"]
-    assert main(words) == 0
-    refused = f"no embedding: the file's model is {__name__}.own_net, which is not in qs3.models"
-    assert refused in capsys.readouterr().out
-    assert not (tmp_path / "embedding.png").exists()
-    assert main([*words, f"packages={__name__}"]) == 0
-    assert str(tmp_path / "embedding.png") in capsys.readouterr().out
-    assert not_blank(tmp_path / "embedding.png")
 
 
 def test_damaged_data_cost_their_pictures_and_not_the_page(run, toy_data, tmp_path, capsys):
