@@ -88,7 +88,9 @@ def write_toy(folder: Path) -> None:
 
 def overrides(root: Path, *more: str) -> list[str]:
     """What turns conf/experiment/quickstart.yaml into a toy run in `root`."""
-    rounds = ["rounds=2", "epochs=3", "steps=null", "batch_size=8", "theta=0.4"]
+    rounds = ["rounds=2", "epochs=3", "steps=null", "batch_size=8"]
+    if not any(word.startswith("selftraining.share=0") for word in more):  # which sets it
+        rounds.append("theta=0.4")
     return [
         "experiment=quickstart",
         f"paths.data_dir={root / 'data'}",
