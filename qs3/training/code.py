@@ -40,17 +40,23 @@ def code_sha256(cfg: DictConfig) -> str:
 @functools.cache
 def _sha256(own: tuple[Path, ...]) -> str:
     root = Path(__file__).resolve().parents[1]
-    found = [root.joinpath(name).rglob("*.py") for name in PACKAGES]
-    found += [folder.glob("*.py") for folder in own]
     digest = hashlib.sha256()
-    for folder in found:
-        for file in sorted(folder):
-            digest.update(f"{file.name} {hashlib.sha256(_does(file)).hexdigest()}\n".encode())
+    # Of qs3 the bytes: to parse its 140 files would take a third of a second of each start.
+    for name in PACKAGES:
+        for file in sorted(root.joinpath(name).rglob("*.py")):
+            _add(digest, file, file.read_bytes())
+    for folder in own:
+        for file in sorted(folder.glob("*.py")):
+            _add(digest, file, _does(file))
     return digest.hexdigest()
 
 
+def _add(digest: Any, file: Path, does: bytes) -> None:
+    digest.update(f"{file.name} {hashlib.sha256(does).hexdigest()}\n".encode())
+
+
 def _does(file: Path) -> bytes:
-    """What a file says to Python: a comment or a line break more trains nothing anew."""
+    """What one's own file says to Python: a comment or a line break more trains nothing anew."""
     data = file.read_bytes()
     try:
         return ast.dump(ast.parse(data)).encode()
