@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,10 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.utils.plural import counted
 from qs3.utils.yamls import load_yaml
+
+log = logging.getLogger(__name__)
 
 LISTS = (".csv", ".json", ".yaml", ".yml")
 IMAGES = (".png", ".npy")
@@ -154,6 +158,10 @@ def _of_folder(place: Path, mask: str, common: Shown) -> tuple[list[Shown], Coun
         found.append(replace(common, name=path.name, depth=path, mask=of, wrong=wrong))
     if not found:
         raise MissingDataError(f"depth={place} holds no .png and no .npy")
+    if alone := sorted({*by_stem} - {one.depth.stem for one in found}):
+        first = by_stem[alone[0]].name
+        few = counted(len(alone), "mask has", "masks have")
+        log.warning("mask=%s: %s no depth image of the name, such as %s", mask, few, first)
     return found, others
 
 
@@ -166,6 +174,7 @@ def _of_list(path: Path, common: Shown) -> list[Shown]:
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read ({error})") from error
     rows = _table(text, path) if path.suffix.lower() == ".csv" else _mappings(text, path)
+    rows = [_by_column(row) for row in rows]
     if not rows:
         raise DataError(f"{path} lists no pictures")
     unknown = sorted({str(key) for row in rows for key in row} - {*_COLUMNS})
@@ -191,6 +200,15 @@ def _table(text: str, path: Path) -> list[Mapping[str, Any]]:
             '"210,95,480,430"'
         )
     return [{key: value or "" for key, value in row.items()} for row in rows]
+
+
+def _by_column(row: Mapping[str, Any]) -> dict[str, Any]:
+    """With columns as this module names them: spreadsheets write Depth, and a blank behind."""
+    named: dict[str, Any] = {}
+    for key, value in row.items():
+        plain = str(key).strip().lower()
+        named[plain if plain in _COLUMNS and plain not in row else key] = value
+    return named
 
 
 def _mappings(text: str, path: Path) -> list[Mapping[str, Any]]:

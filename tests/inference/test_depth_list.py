@@ -42,6 +42,27 @@ def test_a_list_as_spreadsheets_write_it(tmp_path, mark):
     assert find_shown(str(tmp_path / "b.csv"), "", common)[0] == [first, second]
 
 
+def test_columns_have_any_case_and_blanks(tmp_path):
+    (tmp_path / "a.csv").write_text("Depth ,MASK,Label\na.png,m.png,chair\n")
+    ((one,), _) = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+    assert (one.wrong, one.mask, one.label) == ("", tmp_path / "m.png", "chair")
+    (tmp_path / "a.csv").write_text("Depth,depth,mask\na.png,b.png,m.png\n")
+    with pytest.raises(DataError, match="unknown columns Depth; known"):  # which of the two?
+        find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+
+
+def test_masks_without_a_depth_image_are_told(tmp_path, caplog):
+    frames, masks = tmp_path / "frames", tmp_path / "masks"
+    for folder, names in ((frames, "ab"), (masks, "bcd")):
+        folder.mkdir()
+        for name in names:
+            (folder / f"{name}.png").touch()
+    (first, second), _ = find_shown(str(frames), str(masks), Shown("", intrinsics=CAMERA))
+    assert "no mask of its name" in first.wrong
+    assert second.mask == masks / "b.png"
+    assert f"mask={masks}: 2 masks have no depth image of the name, such as c.png" in caplog.text
+
+
 def test_numbers_as_pandas_writes_them_and_homes_are_taken(tmp_path, monkeypatch):
     """A column of whole numbers with an empty cell is one of floats there: 3.0."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
