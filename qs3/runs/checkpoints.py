@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -16,8 +17,9 @@ from typing import Any, BinaryIO
 
 import torch
 from torch import nn
+from torch.serialization import get_unsafe_globals_in_checkpoint
 
-from qs3.errors import DataError
+from qs3.errors import ConfigError, DataError
 from qs3.utils.files import atomic_path
 from qs3.utils.memory import check_memory
 
@@ -28,6 +30,7 @@ def save(value: Any, path: str | os.PathLike[str]) -> None:
     """Save tensors and plain values to `path`, atomically.
 
     Raises:
+        ConfigError: there is another value among them, such as numpy's: `load` would refuse it.
         Qs3Error: the file cannot be written (permission, full disk).
     """
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -37,6 +40,14 @@ def save(value: Any, path: str | os.PathLike[str]) -> None:
             if isinstance(error.__context__, OSError):
                 raise error.__context__ from error
             raise
+        file.flush()
+        if get_unsafe_globals_in_checkpoint(temporary):
+            place, kind = _not_plain(value)
+            raise ConfigError(
+                f"{place} is of type {kind}, and what a run goes on from has tensors and plain "
+                "values alone, so that reading it runs no code: it could not be read again. Keep "
+                "it as a number, text, list, dict or tensor, with float(...) say"
+            )
 
 
 def load(
@@ -69,6 +80,19 @@ def weights_sha256(weights: Mapping[str, torch.Tensor]) -> str:
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}\n".encode())
         digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
     return digest.hexdigest()
+
+
+def _not_plain(value: Any) -> tuple[str, str]:
+    """Where in nested dicts and lists the first value is that `load` refuses, and its type."""
+    pairs: Any = value.items() if isinstance(value, dict) else ()
+    for key, one in enumerate(value) if isinstance(value, list | tuple) else pairs:
+        file = io.BytesIO()
+        torch.save(one, file)
+        file.seek(0)
+        if get_unsafe_globals_in_checkpoint(file):
+            place, kind = _not_plain(one)
+            return f"{key}.{place}" if place else str(key), kind
+    return "", f"{type(value).__module__}.{type(value).__qualname__}"
 
 
 @contextlib.contextmanager

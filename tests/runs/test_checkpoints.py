@@ -5,11 +5,13 @@ from __future__ import annotations
 import resource
 import signal
 import zipfile
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from qs3.errors import DataError, Qs3Error
+from qs3.errors import ConfigError, DataError, Qs3Error
 from qs3.runs.checkpoints import check, load, save
 from tests.fixtures.harm import Harm
 from tests.training.conftest import finished, toy_data  # noqa: F401 (fixtures)
@@ -37,6 +39,20 @@ def test_student_result_and_checkpoint_have_the_same_weights(finished):  # noqa:
     for name, value in student.items():
         assert torch.equal(result[name], value)
         assert torch.equal(last[f"net.{name}"], value)
+
+
+@pytest.mark.parametrize(
+    ("best", "kind"), [(np.float64(0.5), "numpy.float64"), (Path("a"), "pathlib.PosixPath")]
+)
+def test_what_could_not_be_read_again_is_not_written(best, kind, tmp_path):
+    """A run with such a callback of somebody's own could not go on after an interruption."""
+    file = tmp_path / "last.ckpt"
+    save({"epoch": 3}, file)
+    state = {"w": torch.zeros(2), "callbacks": {"Best": {"of": [0.25, best]}}}
+    with pytest.raises(ConfigError, match=rf"^callbacks\.Best\.of\.1 is of type {kind}, and what"):
+        save(state, file)
+    assert load(file) == {"epoch": 3}
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(tmp_path):
