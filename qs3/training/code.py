@@ -10,7 +10,7 @@ import ast
 import functools
 import hashlib
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ PACKAGES = (
 """Those of qs3 whose code a warm-up runs."""
 
 _GROUPS = ("data", "model", "method", "protocol", "callbacks")  # what is built of them is trained
+_QS3 = "qs3's code"
 _VERSIONED = ("qs3.", "torch.", "lightning.")  # by `PACKAGES`, or by their versions in started.json
 
 
@@ -33,16 +34,40 @@ def code_sha256(cfg: DictConfig) -> str:
     Those of `PACKAGES`, and of a class of one's own (`model._target_=my_nets.Net`) the file and all
     that lie in its folder. As they were when this process first asked, which runs them.
     """
-    own = {_folder(target) for group in _GROUPS for target in _targets(cfg.get(group))}
-    return _sha256(tuple(sorted(folder for folder in own if folder is not None)))
+    return _sha256(_own(cfg, _GROUPS), PACKAGES)
+
+
+def files_sha256(cfg: DictConfig) -> dict[str, str]:
+    """Hashes of all code that a run runs: of `PACKAGES`, of each folder of one's own.
+
+    A selector's is among them, which no warm-up runs.
+    """
+    own = _own(cfg, (*_GROUPS, "selftraining"))
+    return {_QS3: _sha256((), PACKAGES)} | {str(one): _sha256((one,), ()) for one in own}
+
+
+def changed_files(known: Mapping[str, str]) -> dict[str, str]:
+    """What was edited of `files_sha256`, and its hash now; nothing of one's own is imported."""
+    now = {
+        name: _sha256((), PACKAGES) if name == _QS3 else _sha256((Path(name),), ())
+        for name in known
+        if name == _QS3 or Path(name).is_dir()  # else it was on another machine
+    }
+    return {name: sha256 for name, sha256 in now.items() if sha256 != known[name]}
+
+
+def _own(cfg: DictConfig, groups: Iterable[str]) -> tuple[Path, ...]:
+    """Folders of what is somebody's own in these groups."""
+    own = {_folder(target) for group in groups for target in _targets(cfg.get(group))}
+    return tuple(sorted(folder for folder in own if folder is not None))
 
 
 @functools.cache
-def _sha256(own: tuple[Path, ...]) -> str:
+def _sha256(own: tuple[Path, ...], packages: tuple[str, ...]) -> str:
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     # Of qs3 the bytes: to parse its 140 files would take a third of a second of each start.
-    for name in PACKAGES:
+    for name in packages:
         for file in sorted(root.joinpath(name).rglob("*.py")):
             _add(digest, file, file.read_bytes())
     for folder in own:

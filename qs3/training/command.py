@@ -13,11 +13,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build, is_given
 from qs3.data.ensure_source import check_or_make
-from qs3.errors import ConfigError
+from qs3.errors import ConfigError, DataError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import chosen_in_words
+from qs3.runs.folder import read_started
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
+from qs3.training.code import changed_files
 from qs3.training.reuse import refuse_changed
 from qs3.training.run import Run, run_of
 from qs3.training.settings import check_run, check_settings
@@ -52,12 +54,20 @@ def train(cfg: DictConfig) -> RunMetrics:
                 _report(run)
         else:
             refuse_changed(run, metrics)
-            log.info("already finished (force=true repeats it)")
+            log.info("already finished%s (force=true repeats it)", _by_other_code(run))
     log.info("%s", headline(metrics) if cfg.objective is None else judged(cfg, metrics))
     if (run.folder / OF_FILES).is_file():
         log.info("the class of each file: %s", run.folder / OF_FILES)
     log.info("see %s", run.folder / METRICS)
     return metrics
+
+
+def _by_other_code(run: Run) -> str:
+    """Whether code that a finished run ran has been edited since, as far as anybody knows."""
+    with contextlib.suppress(DataError):
+        edited = changed_files((read_started(run.folder) or {}).get("files", {}))
+        return f", before an edit of {' and '.join(edited)}" if edited else ""
+    return ""
 
 
 def objective_of(cfg: DictConfig, metrics: RunMetrics) -> float | None:

@@ -20,7 +20,7 @@ from qs3.datamodules.fps_cache import remove_old_leftovers
 from qs3.errors import ConfigError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
-from qs3.training.code import code_sha256
+from qs3.training.code import changed_files, code_sha256, files_sha256
 from qs3.training.given import Given
 from qs3.training.run import Run
 from qs3.utils.files import remove_leftovers
@@ -47,6 +47,7 @@ def note_start(
         "versions": versions() | weights,
         "commit": commit(),
         "code": code_sha256(run.cfg),
+        "files": files_sha256(run.cfg),
         "threads": torch.get_num_threads(),
         "config_sha256": hashing.config_sha256(run.cfg),
     }
@@ -100,8 +101,11 @@ def versions() -> dict[str, str]:
 
 
 def is_as_begun(started: Mapping[str, Any], cfg: DictConfig) -> bool:
-    """Whether code, versions and torch's threads, which order sums, are those of the start."""
-    return not _changed(started, cfg)
+    """Whether code, versions and torch's threads, which order sums, are those of the start.
+
+    As far as a warm-up goes, in which no selector has a part.
+    """
+    return not {*_changed(started, cfg)} - {*started.get("files", {})}
 
 
 def warn_of_changes(started: Mapping[str, Any], cfg: DictConfig) -> None:
@@ -121,5 +125,10 @@ def _changed(started: Mapping[str, Any], cfg: DictConfig) -> dict[str, tuple[Any
     begun["threads"] = started.get("threads") or now["threads"]  # older runs do not say
     now["code"] = code_sha256(cfg)[:12]
     begun["code"] = str(started.get("code", now["code"]))[:12]  # nor this
+    if begun["code"] == now["code"]:  # else it has been said
+        files = started.get("files", {})
+        edited = changed_files(files)
+        now |= {name: sha256[:12] for name, sha256 in edited.items()}
+        begun |= {name: files[name][:12] for name in edited}
     names = [name for name in {**begun, **now} if begun.get(name) != now.get(name)]
     return {name: (begun.get(name, "none"), now.get(name, "none")) for name in names}

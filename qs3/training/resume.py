@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 _LAST = "last"
 _ROLES = ("source", "target")
-_OF_BEGINNING = ("versions", "threads", "commit", "code")  # of what was trained there
+_OF_BEGINNING = ("versions", "threads", "commit", "code", "files")  # of what was trained there
 _STAYS = (".hydra", ".lock", "wandb", "pictures", runs.STARTED, METRICS)
 _INSTEAD = "or leave ckpt_path out to begin anew"
 

@@ -11,8 +11,9 @@ from omegaconf import OmegaConf
 
 from qs3.config import hashing
 from qs3.training import code
-from qs3.training.code import code_sha256
+from qs3.training.code import code_sha256, files_sha256
 from qs3.training.command import train
+from qs3.training.provenance import is_as_begun, versions, warn_of_changes
 from qs3.training.shared_warmup import warmup_sha256
 
 NET = "from tests.training.toy import TinyNet\n\n\nclass Net(TinyNet):\n    pass\n"
@@ -86,3 +87,35 @@ def test_a_warm_up_of_a_net_that_was_edited_is_trained_again(own, toy, caplog):
         train(cfg)
         assert ("the warm-up was trained before" in caplog.text) == taken
         shutil.rmtree(hashing.run_folder(cfg))
+
+
+SELECTOR = "from qs3.selftraining.selectors import Spst\n\n\nclass Mine(Spst):\n    pass\n"
+
+
+def test_a_finished_run_says_that_code_has_changed_since(own, toy, caplog):
+    """Its result is that of the code before; and a selector is run by no warm-up."""
+    caplog.set_level("INFO")
+    own.write_text(SELECTOR)
+    one_round = ("selftraining=spst", "selftraining.rounds=1", "selftraining.epochs=1")
+    mine = "selftraining.selector._target_=my_own_nets.Mine"
+    cfg = toy(*one_round, mine, "protocol.epochs=1", "selftraining.theta=0.01")
+    for edit, said in (("", "already finished (force"), ("    a = 1\n", "before an edit of {} (")):
+        train(cfg)
+        own.write_text(own.read_text() + edit)
+        code._sha256.cache_clear()
+        caplog.clear()
+        train(cfg)
+        assert said.format(own.parent) in caplog.text
+
+
+def test_a_run_that_goes_on_by_another_selector_says_so(own, caplog):
+    own.write_text(SELECTOR)
+    cfg = OmegaConf.create({"selftraining": {"selector": {"_target_": "my_own_nets.Mine"}}})
+    started = {"versions": versions(), "code": code_sha256(cfg), "files": files_sha256(cfg)}
+    warn_of_changes(started, cfg)
+    assert not caplog.text
+    own.write_text(SELECTOR.replace("pass", "a = 1"))
+    code._sha256.cache_clear()
+    warn_of_changes(started, cfg)
+    assert f"begun with {own.parent} " in caplog.text
+    assert is_as_begun(started, cfg)  # the warm-up is the same
