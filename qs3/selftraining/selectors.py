@@ -226,17 +226,20 @@ def most_confident(
 def chosen_by(
     selector: Selector, teacher: TeacherPredictions, theta: float, round_: int
 ) -> Selection:
-    """What a selector, perhaps a user's, chooses.
+    """What a selector, perhaps a user's, chooses; `kept` counted anew by its mask and its labels.
 
     Raises:
         ConfigError: it is no `Selection`, or does not say of each sample whether it is kept: places
-            in place of a mask would be taken for other samples.
+            in place of a mask would be taken for other samples. Or a label is none of a class, or
+            a figure not one of each class.
     """
     found = selector.select(teacher, theta, round_)
     mask, n = getattr(found, "selected", None), len(teacher.ids)
     if isinstance(found, Selection) and isinstance(mask, np.ndarray):
         if mask.dtype == np.bool_ and mask.shape == (n,):
-            return found
+            _check_figures(type(selector).__name__, found, n, teacher.classes)
+            labels = teacher.predicted if found.labels is None else found.labels
+            return replace(found, kept=np.bincount(labels[mask], minlength=teacher.classes))
         what = f"{mask.dtype} {list(mask.shape)}"
     else:
         what = f"of type {type(found if mask is None else mask).__name__}"
@@ -245,6 +248,29 @@ def chosen_by(
         f"whose `selected` is an array of True or False for each of {counted(n, 'sample')}; it is "
         f"{what}"
     )
+
+
+def _check_figures(name: str, found: Selection, n: int, classes: int) -> None:
+    """Refuse labels that are no classes, and figures of another shape or kind than is recorded."""
+    for key, shape, kinds in (
+        ("mu", (classes,), "iuf"),
+        ("confident", (classes,), "iu"),
+        ("labels", (n,), "iu"),
+        ("soft", (n, classes), "f"),
+        ("thresholds", (classes,), "iuf"),
+    ):
+        value = getattr(found, key)
+        if value is None and key not in ("mu", "confident"):
+            continue
+        value = np.asarray(value)
+        if value.shape != shape or value.dtype.kind not in kinds:
+            of = "numbers" if "f" in kinds else "whole numbers"
+            raise ConfigError(
+                f"{name}.select: `{key}` must be an array {list(shape)} of {of}, it is "
+                f"{value.dtype} {list(value.shape)}"
+            )
+        if key == "labels" and not ((value >= 0) & (value < classes)).all():
+            raise ConfigError(f"{name}.select: `labels` must lie in 0 to {classes - 1}")
 
 
 def keep_all(selection: Selection, labels: Int[np.ndarray, " n"]) -> Selection:

@@ -302,6 +302,41 @@ def test_what_a_selector_of_one_s_own_returns_is_looked_at(returned, said):
 
 
 @pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"labels": np.array([0, 2])}, "`labels` must lie in 0 to 1"),
+        ({"labels": np.array([0.0, 1.0])}, "`labels` must be an array [2] of whole numbers"),
+        ({"soft": np.array([0.5, 0.5])}, "`soft` must be an array [2, 2] of numbers, it is"),
+        ({"confident": np.array([1.0, 1.0])}, "`confident` must be an array [2] of whole numbers"),
+        ({"mu": None}, "`mu` must be an array [2] of numbers, it is object []"),
+    ],
+)
+def test_figures_of_a_selector_of_one_s_own_are_looked_at(changes, said):
+    teacher = TeacherPredictions.of(np.array([[0.9, 0.1], [0.4, 0.6]]), ["a", "b"])
+    good = Spst().select(teacher, 0.5)
+
+    class Own:
+        def select(self, teacher, theta, round_=0):
+            return replace(good, **changes)
+
+    with pytest.raises(ConfigError) as told:
+        chosen_by(Own(), teacher, 0.5, 0)
+    assert str(told.value).startswith(f"Own.select: {said}")
+
+
+def test_what_is_kept_is_counted_by_the_mask():
+    """A selector that counts before its last rule made metrics.json differ from what is trained."""
+    teacher = TeacherPredictions.of(np.array([[0.9, 0.1], [0.4, 0.6], [0.3, 0.7]]), "abc")
+
+    class Own:
+        def select(self, teacher, theta, round_=0):
+            mask = np.array([False, True, True])
+            return replace(Spst().select(teacher, theta), selected=mask)
+
+    assert chosen_by(Own(), teacher, 0.5, 0).kept.tolist() == [0, 2]
+
+
+@pytest.mark.parametrize(
     ("selector", "setting", "instead"),
     [
         (Qbst, {"mu": "one", "order": "ascending"}, r"set \S+mu=balanced, or leave it at desc"),
