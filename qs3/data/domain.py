@@ -118,7 +118,8 @@ class Domain:
                 raise ConfigError(
                     f"domain {self.name}: expected_counts.{split} has "
                     f"{counted(len(counts), 'number')} for "
-                    f"{counted(len(classes), 'class', 'classes')}"
+                    f"{counted(len(classes), 'class', 'classes')}: give one for each class, or "
+                    "expected_counts=null"
                 )
 
     @property
