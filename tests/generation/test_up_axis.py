@@ -1,6 +1,7 @@
 """Meshes whose files do not say which axis is up: given, judged, and where nothing tells."""
 
 import logging
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -80,6 +81,20 @@ def test_the_surfaces_of_turned_meshes_are_found_again(made, folders):
     mesh = surfaces.mesh(open_named(str(folder), {}).kept[0])
     assert mesh is not None, why
     assert distance_to_mesh(data.points[0], mesh, np.random.default_rng(0)).max() < 1e-4
+
+
+def test_the_surfaces_of_other_classes_are_found_again(folders, tmp_path):
+    """A folder of brackets and valves was asked for bathtubs."""
+    root = tmp_path / "parts"
+    for ours, cls in (("bracket", "chair"), ("valve", "lamp")):
+        shutil.copytree(folders["z"] / cls, root / ours)
+    words = ("+domain.classes=[bracket,valve]", "domain.expected_counts=null", "classes=null")
+    cfg = config(tmp_path / "data", root, *words, "up=z", *QUICK, domain="modelnet10")
+    data = generate(cfg)
+    surfaces, why = surfaces_of(dict(data.meta), root)
+    row = open_named(str(tmp_path / "data" / "modelnet10"), {}).kept[0]
+    assert row.cls == "bracket"
+    assert surfaces.mesh(row) is not None, why
 
 
 def test_scans_of_meshes_with_y_up_are_those_with_z_up(folders):

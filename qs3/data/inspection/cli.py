@@ -14,9 +14,6 @@ _COMMON = (
     ),
     Option("sample", whole(), "clouds measured one by one; larger sets are drawn from", 3000),
     Option("seed", whole(0), "of all random draws (default 0)", 0),
-    Option(
-        "meshes", path("FOLDER"), "meshes that it was generated from (default: the catalogue's)"
-    ),
 )
 _KEYS = "of the domain's config, e.g. variant=points_clean path=PATH published.folder=PATH"
 
@@ -97,6 +94,11 @@ COMPARE = Command(
     _compare,
     (
         *_COMMON,
+        Option(
+            "meshes",
+            path("FOLDER"),
+            "meshes that they were generated from (default: the catalogue's)",
+        ),
         Option("out", text("FOLDER"), "where text and pictures go (default out/inspection/A-B)"),
     ),
     (

@@ -81,6 +81,7 @@ def surfaces_of(meta: dict[str, Any], meshes: Path | None = None) -> tuple[Surfa
         keys["keep_colliders"] = settings["colliders"] == "keep"
         keys["up"] = settings["up"]
         keys["classes"] = config.get("classes") or None
+        keys["known"] = tuple(meta["classes"])
         items = MeshFolder(path=meshes, **keys).items()
     elif isinstance(source, dict) and source.get("_target_") == _CATALOGUE:
         values = {key: value for key, value in source.items() if key != "_target_"}

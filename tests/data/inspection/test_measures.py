@@ -178,6 +178,11 @@ def test_samples_of_a_surface_lie_on_it(generated):
         assert distance_to_mesh(cloud, wrong, np.random.default_rng(0)).mean() > 1e-3
 
 
+def test_inspect_takes_no_meshes_of_which_it_measures_nothing(generated, tmp_path, capsys):
+    assert main(["inspect", str(generated), f"meshes={tmp_path}"]) == 1
+    assert "meshes" in capsys.readouterr().err
+
+
 def test_only_known_targets_are_made_from_a_store():
     evil = {"seed": 0, "recipe": {"placing": {"_target_": "os.system", "command": "false"}}}
     assert surfaces_of({"settings": {**evil, "meshes": CATALOGUE}})[0] is None
