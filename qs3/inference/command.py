@@ -16,6 +16,7 @@ import torch
 from qs3.data.importers.object_archive import read_archive
 from qs3.data.place import is_archive
 from qs3.errors import ConfigError, DataError
+from qs3.evaluation.prior import read_prior
 from qs3.inference import pretrained
 from qs3.inference.depth_list import Shown, direction, find_shown, numbers
 from qs3.inference.draw import clouds_in, draw, objects_in
@@ -32,7 +33,7 @@ from qs3.inference.inputs import (
 )
 from qs3.inference.model_file import PACKAGES, find_result
 from qs3.inference.page import Gallery, page
-from qs3.inference.predictor import Predictor, load
+from qs3.inference.predictor import Predictor, learnt_of, load
 from qs3.inference.settings import Inputs, Settings, Source
 from qs3.inference.table import Row, as_csv, as_json, record
 from qs3.inference.told import agreement, chosen, told
@@ -223,7 +224,7 @@ def _second(settings: Settings, ckpt: str, first: Predictor) -> Predictor | None
     name = settings.second or ("none" if settings.ckpt else pretrained.other_than(ckpt))
     if name == "none":
         return None
-    second = _loaded(name, settings)
+    second = _loaded(name, replace(settings, prior=""))  # which is of the first one's classes
     if sorted(second.classes) != sorted(first.classes):
         raise ConfigError(
             f"second={name} tells {', '.join(second.classes)} apart, the first classifier "
@@ -233,7 +234,11 @@ def _second(settings: Settings, ckpt: str, first: Predictor) -> Predictor | None
         raise ConfigError(f"second={name} wants clouds in another frame than the first classifier")
     if second.needs_floor and settings.floor is None and settings.camera_height is None:
         raise ConfigError(f"second={name} knows heights: give floor= or camera_height=")
-    return second
+    if not settings.prior:
+        return second
+    learnt = learnt_of(second.result)
+    prior = read_prior(settings.prior, second.classes, learnt, settings.prior_power)
+    return replace(second, prior=prior)
 
 
 def _check_heights(settings: Settings, heights: bool, ckpt: str) -> None:

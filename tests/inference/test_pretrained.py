@@ -60,8 +60,11 @@ def test_a_second_classifier_is_asked_and_counted(own, run, capsys):
     assert re.search(rf"{DISPUTED}\|+3 of 6 \(50%\)\|+0 of 0", cells)
     assert "second classifier" not in said(capsys, *words)
     write_result(own / "more.pt", replace(other, classes=("slab", "ball", "cup")))
-    assert main(["predict", *words, "second=more.pt"]) == 1
-    assert "second=more.pt tells slab, ball, cup apart" in capsys.readouterr().err
+    for prior in ([], ["prior=rod:3"]):
+        assert main(["predict", *words, "second=more.pt", *prior]) == 1
+        assert "second=more.pt tells slab, ball, cup apart" in capsys.readouterr().err
+    text = said(capsys, *words, f"second={run}", "prior=ball:0")
+    assert "says the same of 6 of 6" in text  # the second classifier never says it either
     assert main(["predict", *words, "second=dgcnn-rooms"]) == 1
     assert "second=dgcnn-rooms knows heights: give floor=" in capsys.readouterr().err
 
