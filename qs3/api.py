@@ -44,6 +44,7 @@ def train(*overrides: str) -> Path:
     from qs3.training.settings import check_complete
     from qs3.utils.files import write_text
 
+    _check_words(overrides)
     if any(word.lstrip("+").startswith("hparams_search=") for word in overrides):
         raise ConfigError("hparams_search= is many runs: search with python train.py, or qs3-train")
     with _as_hydra("train", overrides) as cfg:
@@ -91,7 +92,9 @@ def generate(*arguments: Any) -> Any:
         MeshError, DataError: a mesh is empty or gives too few points; names its id.
         RenderError: the renderer cannot be used here.
     """
-    if not arguments or isinstance(arguments[0], str):
+    of_meshes = bool(arguments) and not isinstance(arguments[0], str)
+    _check_words(arguments[of_meshes:])
+    if not of_meshes:
         from qs3.generation.command import generate as made
         from qs3.generation.materials_file import with_materials
 
@@ -151,6 +154,17 @@ def load(
     from qs3.inference.predictor import load as load_result
 
     return load_result(run, device=device, packages=packages, prior=prior, prior_power=prior_power)
+
+
+def _check_words(words: Sequence[Any]) -> None:
+    """Raise ConfigError for the first that is no text, such as a list of them."""
+    from qs3.errors import ConfigError
+
+    if wrong := [word for word in words if not isinstance(word, str)]:
+        raise ConfigError(
+            f'{wrong[0]!r} is no word: each is a text of its own, such as "seed=1"; those of a '
+            "list are given with *words"
+        )
 
 
 @contextlib.contextmanager

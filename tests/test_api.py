@@ -82,6 +82,9 @@ def test_wrong_words_are_errors_for_people(word):
             "'chairs/a.off' cannot be read: words are key=value; a mesh is given as "
             "trimesh.load(path)",
         ),
+        (train, [["seed=1", "method=pcm"]], "['seed=1', 'method=pcm'] is no word: each is a text"),
+        (generate, ["domain=specklenet10", ("limit=1",)], "given with *words"),
+        (generate, [[], ["domain=specklenet10"]], "given with *words"),
     ],
 )
 def test_wrong_words_have_the_hints_of_the_commands(call, words, advice):
