@@ -308,6 +308,8 @@ def read_archive(path: Path) -> Archive:
         MissingDataError: there is no such file.
         DataError: damaged, too large, an array missing or of another kind; says which.
     """
+    if path.is_dir():
+        raise MissingDataError(f"{path} is a folder; an archive of objects is one file, .npz")
     if not path.is_file():
         raise MissingDataError(f"there is no {path}")
     found = plain_arrays(path, _REQUIRED, _OPTIONAL)

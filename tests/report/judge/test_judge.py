@@ -128,6 +128,8 @@ def test_runs_of_other_classes_are_judged_on_what_all_know(archive, logs, tmp_pa
     assert "the floor lies at -1.2 m" in text(low)
     with pytest.raises(MissingDataError, match=r"none\.npz"):
         judge([str(standing)], tmp_path / "none.npz")
+    with pytest.raises(MissingDataError, match=r"is a folder; an archive .* one file, \.npz"):
+        judge([str(standing)], tmp_path)
     with pytest.raises(ConfigError, match="part=x"):
         judge([str(standing)], archive, part="x")
     camera = add_net(tmp_path, 3, gravity="none")
