@@ -28,10 +28,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.config.checks import check_int
+from qs3.config.checks import check_choice, check_int
 from qs3.data.frames.images import Pinhole
 from qs3.data.frames.pointed import Pointed
-from qs3.data.importers.base import check_cloud
+from qs3.data.importers.base import UP_AXES, check_cloud
 from qs3.data.importers.folders import CloudFolder
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
@@ -154,8 +154,9 @@ class Predictor:
 
         Raises:
             DataError: no points, NaN or infinite coordinates, or no cloud; says which.
-            ConfigError: `floor` is no length in metres, or nobody knows it.
+            ConfigError: `up` is no axis; `floor` is no length in metres, or nobody knows it.
         """
+        check_choice("up", up, UP_AXES)
         cloud = given_cloud(cloud, name)
         # By the importer of one's own clouds, so that both ways give the same bits.
         rules = CloudFolder(".", points=self.result.stored_points, up=up)

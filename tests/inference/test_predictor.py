@@ -190,7 +190,7 @@ def test_bad_clouds_are_named(predictor):
         predictor([good.T])
     with pytest.raises(DataError, match=r"cloud 0: .*looks like a depth image, 64 x 48 px"):
         predictor([np.ones((48, 64))])
-    with pytest.raises(ConfigError, match="up"):
+    with pytest.raises(ConfigError, match=r"^up must be one of"):
         predictor([good], up="w")
     assert predictor([]).shape == (0, 3)
 
