@@ -13,7 +13,9 @@ from typing import Any
 
 import torch
 
+from qs3.data.frames.given import read_intrinsics
 from qs3.data.importers.object_archive import read_archive
+from qs3.data.meta import is_finished
 from qs3.data.place import is_archive
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.prior import read_prior
@@ -285,6 +287,11 @@ def saved(out: str | Path, replaces: bool) -> str:
 
 def _clouds(settings: Settings) -> Source:
     """Clouds of files or of an archive; what is not there is told before the net is read."""
+    if is_finished(Path(settings.input).expanduser()):
+        raise ConfigError(
+            f"input={settings.input} is a dataset of qs3, with other arrays beside its clouds: "
+            f"give input={Path(settings.input, 'points.npy')}"
+        )
     files, root, others = find_files(settings.input)
     if len(files) == 1 and files[0].is_file() and is_archive(files[0]):
         return _archive(files[0], settings)
@@ -324,6 +331,8 @@ def _depth_images(settings: Settings) -> Source:
     )
     if settings.part:
         raise ConfigError(f"part={settings.part} is for an archive of objects, input=FILE.npz")
+    if settings.intrinsics:  # else all objects would fail, over a table that may be there
+        read_intrinsics(settings.intrinsics)
     shown, others = find_shown(settings.depth, settings.mask, common)
     _check_out(settings, *(one.folder / Path(one.intrinsics).expanduser() for one in shown))
     if not any(one.intrinsics for one in shown):

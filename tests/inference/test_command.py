@@ -404,12 +404,15 @@ def test_up_and_flags(run, clouds, tmp_path):
         (["predict", "ckpt={run}", "input={other}.png"], "For depth images there is depth=FILE"),
         (["predict", "ckpt={run}", "input={other}.csv"], "Rows of x y z are .txt or .xyz"),
         (["predict", "ckpt={run}/nothing", "input={clouds}"], "is not there"),
+        (["predict", "ckpt={run}", "{dataset}"], "give input={dataset}/points.npy"),
         (["export", "ckpt={run}", "out=model.h5"], "must end in .onnx or .pt2"),
         (["export"], "ckpt=RUN is missing"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
-def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, words, message):
+def test_mistakes_are_told_in_words(
+    run, data_dir, clouds, tmp_path, capsys, monkeypatch, words, message
+):
     monkeypatch.chdir(tmp_path)
     for folder in ("empty", "a.csv", "b.html"):
         (tmp_path / folder).mkdir()
@@ -417,7 +420,7 @@ def test_mistakes_are_told_in_words(run, clouds, tmp_path, capsys, monkeypatch, 
     for suffix in (".stl", ".png", ".csv"):
         (tmp_path / f"other{suffix}").touch()
     places = {"run": run, "clouds": tmp_path / "a.xyz", "empty": tmp_path / "empty"}
-    places["other"] = tmp_path / "other"
+    places |= {"other": tmp_path / "other", "dataset": data_dir / "kinectsim10"}
     threads = torch.get_num_threads()
     assert main([word.format(**places) for word in words]) == 1
     assert torch.get_num_threads() == threads

@@ -291,6 +291,7 @@ def test_two_folders_go_together_by_name(run, frame):
         (["depth={at}/depth.png", "mask={at}/gone.png", "intrinsics=5,5,5,5"], "gone.png is not"),
         (["depth={at}/gone.png", "mask={at}/mask.png"], "gone.png is not there"),
         (["depth={at}", "intrinsics=5,5,5,5"], "give mask=FOLDER"),
+        (["depth={at}/depths", "mask={at}/masks", "intrinsics={at}/k.yml"], "k.yml is not there"),
         (["depth={at}/depth.png", "up=z"], "up=z: expected 3 numbers"),
         (["input={at}", "mask={at}/mask.png"], "mask= is for depth images"),
         (["input={at}", "depth={at}/depth.png"], "give input=PATH for clouds, or depth="),
