@@ -15,6 +15,7 @@ import torch
 import yaml
 
 from tests.commands import main
+from tests.composing import compose
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("*.md")])
@@ -238,6 +239,21 @@ def test_the_example_of_gradients_runs():
     slope = names["settings"]["ambient"].grad
     assert torch.isfinite(slope)
     assert slope != 0
+
+
+def test_the_words_that_take_out_a_threshold_fit_the_experiments_that_the_page_names():
+    page = (ROOT / "docs/reference/methods.md").read_text("utf-8")
+    found = re.findall(r"\(as by ([^)]*)\)[^`]*add\s`([^`]+)`", page)
+    assert [word for _, word in found] == ["selftraining.theta=0", "selftraining.share=null"]
+    for names, word in found:
+        for name in re.findall(r"`(\w+)`", names):
+            for scheme in ("cbst", "sd"):
+                words = [f"experiment={name}", f"selftraining={scheme}"]
+                keys = compose("train", [*words, word]).selftraining
+                assert not keys.theta
+                assert keys.get("share") is None
+                key = word.partition("=")[0].removeprefix("selftraining.")
+                assert compose("train", words).selftraining[key]  # it is set without the word
 
 
 def test_the_readme_is_short():
