@@ -1,12 +1,14 @@
-"""Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
+r"""Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
 
     from qs3.data.pyg import from_pyg, knn_graph, to_pyg
 
-    train = to_pyg("specklenet10", "train", transform=SamplePoints(1024))  # a domain of conf/domain
-    loader = DataLoader(train, batch_size=32, shuffle=True)                # PyG's own
+    train = to_pyg("specklenet10", "train", transform=FixedPoints(1024))  # a domain of conf/domain
+    loader = DataLoader(train, batch_size=32, shuffle=True)               # PyG's own
     from_pyg({"train": mine, "test": my_test}, "data/mine", classes=["box", "cup"])
 
-    python train.py domain@data.target=own data.target.path=data/mine data.target.classes=[box,cup]
+    python train.py num_classes=2 domain@data.source=own data.source.path=data/mine \
+        data.source.classes=[box,cup] domain@data.target=own data.target.path=data/theirs \
+        data.target.classes=[box,cup]
 
 PyG is imported here and by nobody else in qs3.data: import this module when you want it. Its own
 neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges from ours.

@@ -1,19 +1,24 @@
 """Datasets of ours in PyTorch Geometric's hands, and theirs in ours."""
 
 import pickle
+import re
+import shlex
 
 import numpy as np
 import pytest
 import torch
+from torch_geometric import transforms
 from torch_geometric.data import Data, InMemoryDataset
 from torch_geometric.loader import DataLoader
 from torch_geometric.transforms import NormalizeScale, SamplePoints
 
 from qs3.classes import MODELNET40
+from qs3.data import pyg
 from qs3.data.domain import Domain
 from qs3.data.pyg import from_pyg, knn_graph, to_pyg
 from qs3.data.store import ManifestRow, write_pointset
 from qs3.errors import ConfigError, DataError
+from tests.composing import compose
 
 CLASSES = ("box", "cup", "pen")
 RNG = np.random.default_rng(0)
@@ -40,6 +45,16 @@ def ours(tmp_path):
 
 def domain(folder, classes=CLASSES):
     return Domain("mine", "X", "mine", folder, classes=classes)
+
+
+def test_the_examples_of_the_module_are_for_clouds_and_for_classes_of_ones_own(ours):
+    (name, count) = re.search(r"transform=(\w+)\((\d+)\)", pyg.__doc__).groups()
+    thinned = to_pyg(ours, "train", transform=getattr(transforms, name)(int(count)))
+    assert thinned[0].pos.shape == (int(count), 3)
+    line = re.search(r"python train.py(.*?)\n\n", pyg.__doc__, re.DOTALL)[1]
+    cfg = compose("train", shlex.split(line.replace("\\\n", " ")))
+    assert cfg.num_classes == len(cfg.data.source.classes)
+    assert cfg.data.source.classes == cfg.data.target.classes
 
 
 def test_a_split_as_pyg_has_it(ours):
