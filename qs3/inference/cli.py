@@ -65,7 +65,7 @@ PREDICT = Command(
         Option("floor", NUMBER, "clouds: where the floor is on that axis, in metres"),
         Option("camera_height", NUMBER, "depth: of the camera above the floor, in metres"),
         Option("prior", text("rooms|C:N,C:N"), "how common classes are there (see below)", ""),
-        Option("prior_power", NUMBER, "how much of that is believed, 0 to 1", 0.5),
+        Option("prior_power", NUMBER, "how much of that is believed: 0 nothing, 1 all", 0.5),
         Option("part", text("NAME"), "of an archive of objects (default: adapt; or all)", ""),
         Option("sample", whole(), "only so many objects, drawn at random, always the same"),
         Option("out", text("FILE"), ".csv or .json", "predictions.csv"),

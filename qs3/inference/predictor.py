@@ -236,7 +236,8 @@ class Predictor:
         Raises:
             DataError: no list of clouds, or not as many names; or names the cloud that is empty or
                 not finite.
-            ConfigError: `floor` is needed, as `prepare` says; `batch_size` is no number of clouds.
+            ConfigError: `up` is no axis; `floor` is needed, as `prepare` says; `batch_size` is no
+                number of clouds.
         """
         if clouds is None or isinstance(clouds, str | bytes) or not hasattr(clouds, "__iter__"):
             raise DataError(f"got {clouds!r:.60}; give a list of clouds, [n, 3] arrays")

@@ -46,7 +46,7 @@ JUDGE = Command(
         Option("inliers_only", FLAG, "leave out points that the archive marks as stray", True),
         Option("floor", NUMBER, "its z in metres: minus the camera's height (default: each run's)"),
         Option("prior", text("rooms|C:N,C:N"), "also with classes as common: see qs3 predict", ""),
-        Option("prior_power", NUMBER, "how much of that is believed, 0 to 1", 0.5),
+        Option("prior_power", NUMBER, "how much of that is believed: 0 nothing, 1 all", 0.5),
         Option("device", text("DEVICE"), "cpu, cuda or cuda:1", "cpu"),
         Option("out", path("FILE"), ".csv or .json, with all digits"),
         Option("keep", path("FOLDER"), "gets each net's answers, for runs= without its weights"),
