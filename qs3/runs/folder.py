@@ -21,6 +21,7 @@ written last, and atomically: it is the mark of a finished run.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -69,6 +70,15 @@ def read_begun(folder: str | Path) -> dict[str, Any] | None:
                 "it or run with force=true"
             )
     return started
+
+
+def read_code(folder: str | Path) -> dict[str, str]:
+    """Hashes of the code that a run was begun with, by name; {} where nobody knows."""
+    with contextlib.suppress(DataError):
+        found = (read_started(folder) or {}).get("files")
+        if isinstance(found, dict):
+            return {str(name): str(sha256) for name, sha256 in found.items()}
+    return {}
 
 
 def write_started(folder: str | Path, started: Mapping[str, Any]) -> None:

@@ -13,10 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build, is_given
 from qs3.data.ensure_source import check_or_make
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import chosen_in_words
-from qs3.runs.folder import read_started
+from qs3.runs.folder import read_code
 from qs3.runs.metrics import METRICS, RunMetrics, read_metrics, write_metrics
 from qs3.runs.predictions import OF_FILES
 from qs3.training.code import changed_files
@@ -64,10 +64,8 @@ def train(cfg: DictConfig) -> RunMetrics:
 
 def _by_other_code(run: Run) -> str:
     """Whether code that a finished run ran has been edited since, as far as anybody knows."""
-    with contextlib.suppress(DataError):
-        edited = changed_files((read_started(run.folder) or {}).get("files", {}))
-        return f", before an edit of {' and '.join(edited)}" if edited else ""
-    return ""
+    edited = changed_files(read_code(run.folder))
+    return f", before an edit of {' and '.join(edited)}" if edited else ""
 
 
 def objective_of(cfg: DictConfig, metrics: RunMetrics) -> float | None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from qs3.data.importers.object_archive import TIERS
 from qs3.data.made_of import MadeOf
 from qs3.errors import DataError
+from qs3.runs.folder import read_code
 from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, Scores, read_metrics
 from qs3.utils.text_table import aligned
 
@@ -219,7 +220,25 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
                 continue
             comparable = False
             problems.append(f"{what} ({seen}): not averaged")
+    notes += _other_code(finished)
     return Group(*key, tuple(finished), tuple(problems), comparable, tuple(notes))
+
+
+def _other_code(runs: Sequence[Run]) -> list[str]:
+    """Which code was edited between seeds, as far as the runs say what theirs was.
+
+    What is called alike is compared: another machine has one's own nets in another folder.
+    """
+    seeds: defaultdict[str, defaultdict[str, list[int | None]]]
+    seeds = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        for name, sha256 in read_code(run.folder).items():
+            seeds[name][sha256].append(run.seed)
+    return [
+        f"{name} was edited between seeds {' and '.join(map(_list, by_code.values()))}: averaged"
+        for name, by_code in seeds.items()
+        if len(by_code) > 1
+    ]
 
 
 _DATASETS = ("source", "target")

@@ -1,5 +1,6 @@
 """Mean and SEM, and above all what must not be averaged."""
 
+import json
 import math
 import re
 import statistics
@@ -169,6 +170,19 @@ def test_one_recipe_on_two_machines_is_averaged_and_said(tmp_path, role):
     (found,) = group(r for r in load_runs(tmp_path) if r.seed in (0, 2))
     assert found.stat("accuracy").n == 2  # the same bytes, whoever made them
     assert found.problems == ()
+
+
+def test_code_that_was_edited_between_seeds_is_said(tmp_path):
+    """An edited net's seeds were one row with the old net's, without a word."""
+    for seed, own in enumerate(("a", "a", "b", None, 5, 6)):
+        write_run(tmp_path, seed=seed)
+        files = {"qs3's code": "q", "/nets": own} if own in ("a", "b") else own
+        started = tmp_path / "exp" / f"seed{seed}-0123abcd" / "started.json"
+        started.write_text(json.dumps({"files": files}))
+    started.write_text("{")  # damaged: nobody knows
+    (found,) = group(load_runs(tmp_path))
+    assert found.comparable
+    assert found.notes == ("/nets was edited between seeds 0, 1 and 2: averaged",)
 
 
 def test_scores_that_a_seed_lacks_have_no_mean(tmp_path):
