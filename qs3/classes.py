@@ -4,6 +4,7 @@ PointDA-10 (Qin et al., NeurIPS 2019) fixed the order; DefRec, GAST and QS3 kept
 `cabinet` holds ModelNet's `night_stand` and ScanNet's cabinets.
 """
 
+import unicodedata
 from collections.abc import Sequence
 
 CLASSES: tuple[str, ...] = (
@@ -61,4 +62,5 @@ def known_as(name: str, classes: Sequence[str]) -> str | None:
 
 
 def _plain(name: str) -> str:
-    return name.casefold().replace("-", "_").replace(" ", "_")
+    whole = unicodedata.normalize("NFC", name)  # macOS writes an umlaut as two characters
+    return whole.casefold().replace("-", "_").replace(" ", "_")

@@ -37,7 +37,7 @@ from qs3.generation.disk import check_folder, disk_errors_explained
 from qs3.generation.made_of import made_of
 from qs3.generation.materials import DRAWN
 from qs3.generation.mesh_sizes import warn_of_sizes
-from qs3.generation.object_parts import InParts, Parts
+from qs3.generation.object_parts import ELSEWHERE, InParts, Parts
 from qs3.generation.objects import left_alone, mesh_folder, mesh_items, mesh_root
 from qs3.generation.plan import benchmark, describe, keep, stated_hash, stored_config
 from qs3.generation.provenance import PROVENANCE
@@ -91,7 +91,7 @@ def generate(cfg: DictConfig) -> PointSet:
     )
     check_recipe(job.recipe, cfg)
     check_folder(folder, cfg.paths.data_dir)
-    other = "wait for it, or give another paths.data_dir"
+    other = f"wait for it, or give another {ELSEWHERE}"
     with (
         owned(folder, doing="making the dataset in", advice=other),
         disk_errors_explained(folder, lambda: parts.state(len(items))),
@@ -146,7 +146,7 @@ def _warn_of_meshes(cfg: DictConfig, job: Job, items: list[MeshItem]) -> None:
 def _check_place(domain: Domain, force: bool) -> None:
     """Raise where the dataset would replace, or pass for, one that was not made here."""
     try:
-        check_ours(domain.folder, "generate.py", "paths.data_dir")
+        check_ours(domain.folder, "generate.py", ELSEWHERE)
         domain.check_unpublished()
     except OSError as error:  # a name that no folder can have
         raise ConfigError(

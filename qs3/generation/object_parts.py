@@ -20,6 +20,9 @@ from qs3.generation.workers import Outcome
 from qs3.utils.files import write_text
 from qs3.utils.memory import read_whole
 
+ELSEWHERE = "paths.data_dir (or domain.path, where that is given)"
+"""Settings that name another folder, for messages."""
+
 _PREVIEW = "preview_"
 _CODE = "code.txt"
 
@@ -28,7 +31,7 @@ class Parts(PartFiles):
     """The parts of one dataset's folder; an object's file is named by the hash of its id."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder, elsewhere="paths.data_dir")
+        super().__init__(folder, elsewhere=ELSEWHERE)
 
     def begin_by(self, code: str, recipe: Mapping[str, Any]) -> None:
         """Start, or continue what the same code made with the same recipe.
@@ -45,7 +48,7 @@ class Parts(PartFiles):
             raise ConfigError(
                 f"{self.folder} was begun with another version of qs3's code, which may make other "
                 f"clouds, and mixing them is refused: finish it with that version "
-                f"({self.count()} objects are done), give another paths.data_dir, or force=true to "
+                f"({self.count()} objects are done), give another {ELSEWHERE}, or force=true to "
                 "start over"
             )
         write_text(self._parts / _CODE, code)

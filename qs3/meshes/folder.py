@@ -158,9 +158,12 @@ class MeshFolder:
                 f"{self.path} has no folder of {', '.join(missing)}: "
                 + (rest if there else self._other_layout() or LAYOUTS)
                 + f". Its folders of other names: {others}; known names are "
-                f"{', '.join((*self.known, *ALIASES))}" * bool(others)
+                f"{', '.join((*self.known, *self._aliases()))}" * bool(others)
             )
         return folders
+
+    def _aliases(self) -> list[str]:
+        return [name for name, cls in ALIASES.items() if cls in self.known]
 
     def _other_layout(self) -> str:
         """What to do where the meshes lie in a layout that people have and that is not read."""

@@ -46,11 +46,11 @@ class Mesh:
             bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
             raise MeshError(f"vertex {bad} is not finite")
         if faces.min() < 0 or faces.max() >= len(vertices):
-            raise MeshError(
-                f"a face refers to vertex {int(faces.max())}, but there are {len(vertices)}"
-            )
+            wrong = int(faces.min() if faces.min() < 0 else faces.max())
+            raise MeshError(f"a face refers to vertex {wrong}, but there are {len(vertices)}")
         if self.finishes is not None and len(self.finishes.of_face) != len(faces):
             raise MeshError(f"has materials of {len(self.finishes.of_face)} of {len(faces)} faces")
+        vertices, faces = vertices.view(), faces.view()  # the caller's stay as they are
         vertices.flags.writeable = False
         faces.flags.writeable = False
         object.__setattr__(self, "vertices", vertices)

@@ -18,6 +18,7 @@ def test_names():
     assert known_as("Night-Stand", MODELNET40) == "night_stand"
     assert known_as("night stand", CLASSES) == "cabinet"
     assert known_as("airplane", CLASSES) is None
+    assert known_as("Tra\u0308ger", ("Tr\u00e4ger",)) == "Tr\u00e4ger"  # as macOS writes it
     assert class_list(None) == CLASSES
     assert class_list("modelnet40") == MODELNET40
     assert class_list(["b", "a"]) == ("b", "a")

@@ -148,7 +148,7 @@ def test_an_imported_dataset_is_never_replaced(meshes, tmp_path):
         said = str(error.value)
         assert f"{tmp_path / 'specklenet10'} holds a dataset that generate.py did not make" in said
         assert "(published files)" in said
-        assert "give another paths.data_dir" in said
+        assert "give another paths.data_dir (or domain.path, where that is given)" in said
     assert domain("specklenet10", tmp_path).open().sha256 == before
 
 

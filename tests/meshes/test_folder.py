@@ -88,6 +88,12 @@ def test_unknown_folders(tmp_path):
     assert len(MeshFolder(tmp_path, classes=("chair",)).left_alone()) == 11
 
 
+def test_names_of_other_classes_are_not_offered(tmp_path):
+    make(tmp_path, "screws/a.off")
+    with pytest.raises(MissingDataError, match=r"known names are bracket, sofa, couch$"):
+        MeshFolder(tmp_path, classes=("bracket",), known=("bracket", "sofa")).items()
+
+
 def test_the_folder_that_an_archive_unpacks_to_is_named(tmp_path):
     make(tmp_path, "raw/chair/train/a.off", "raw/airplane/train/a.off", "notes/chairs/a.txt")
     with pytest.raises(MissingDataError, match=r"but in .*raw: give that one"):

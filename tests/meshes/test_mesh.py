@@ -19,6 +19,21 @@ def test_there_and_back_nothing_changes():
     assert mesh.vertices.max() == largest
 
 
+def test_arrays_of_the_caller_stay_its_own():
+    """Its vertices could not be written to any more."""
+    vertices, faces = PYRAMID.vertices.copy(), PYRAMID.faces.astype(np.int32)
+    mesh = Mesh(vertices, faces)
+    assert not mesh.vertices.flags.writeable
+    assert vertices.flags.writeable
+    assert faces.flags.writeable
+
+
+@pytest.mark.parametrize("wrong", [-1, 5])
+def test_the_vertex_that_is_not_there_is_named(wrong):
+    with pytest.raises(MeshError, match=f"refers to vertex {wrong}, but there are 5"):
+        Mesh(PYRAMID.vertices, [[0, 1, wrong], [0, 1, 4]])
+
+
 def test_vertices_that_no_face_uses_are_left_out():
     def of(stray):
         around = [[9, 9, 9], *PYRAMID.vertices, stray]
