@@ -252,12 +252,13 @@ def _difference(name: str, pairs: Sequence[tuple[Cell, Cell]], tiers: _Tiers) ->
 
 
 def _not_run(pairs: Sequence[tuple[Cell, Cell]]) -> str:
-    """Whether it is the first ones that have no run, or which of those they are compared with."""
-    lacking = [[not (cell.group and cell.group.finished) for cell in pair] for pair in pairs]
-    if any(ours for ours, _ in lacking):
+    """Which cells have no run: of one pair the base's by name, of several all unless none has."""
+    cells = [cell for pair in pairs for cell in pair]
+    lacking = [cell for cell in cells if not (cell.group and cell.group.finished)]
+    alone = len(pairs) == 1 and lacking[0] is cells[0]  # the row that the line is about
+    if alone or len(lacking) == len(cells):
         return "not run"
-    bases = [pair[1] for pair, (_, theirs) in zip(pairs, lacking, strict=True) if theirs]
-    return f"{'; '.join(f'{cell.row}, {cell.column}' for cell in bases)}: not run"
+    return f"{'; '.join(f'{cell.row}, {cell.column}' for cell in lacking)}: not run"
 
 
 def _pair_of(both: Sequence[tuple[Sequence[Predictions], Sequence[Predictions]]]) -> Pair:

@@ -302,7 +302,8 @@ def test_effects_by_hand(tmp_path):
     }
     scheme = f"{source} minus {scratch}, over QBST, SPST, CBST, all confident"
     found = {one.name: one for one in effects(fill(tmp_path / "half", "factorial", half))}
-    assert found[scheme].why == "not run"  # two rows of four
+    lacking = [f"{row}, {at}" for row in ("CBST", "all confident") for at in (source, scratch)]
+    assert found[scheme].why == f"{'; '.join(lacking)}: not run"  # two rows of four have theirs
     spst = found[f"SPST minus QBST, over {scratch}, {source}"].differences
     assert spst is not None
     assert spst[0].mean == pytest.approx(0)  # (10 - 8 + 12 - 14) / 40
