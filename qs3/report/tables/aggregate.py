@@ -200,7 +200,8 @@ def _group(key: tuple[str, str], runs: Sequence[Run]) -> Group:
     twice = sorted(seed for seed, n in Counter(r.seed for r in finished).items() if n > 1)  # type: ignore[type-var]
     if twice:
         comparable = False
-        problems.append(f"seeds {_list(twice)} occur more than once: not averaged")
+        places = ", ".join(str(run.folder) for run in finished if run.seed in twice)
+        problems.append(f"seeds {_list(twice)} occur more than once ({places}): not averaged")
     diverged = [run.seed for run in finished if run.metrics and run.metrics.diverged]
     if diverged:
         problems.append(

@@ -106,9 +106,12 @@ def test_other_data_are_not_averaged(tmp_path, role):
     assert f"the {role} dataset differs" in found.problems[0]
     assert "seeds 2: cccccccccccc" in found.problems[0]
     assert "not averaged" in summarise([r.folder for r in load_runs(tmp_path)])
-    write_run(tmp_path / "again", seed=0)
+    again = write_run(tmp_path / "again", seed=0)
     (found,) = group(load_runs(tmp_path))
     assert "seeds 0 occur more than once" in found.problems[0]
+    both = [str(run.folder) for run in load_runs(tmp_path) if run.seed == 0]
+    assert str(again) in both
+    assert f"({', '.join(both)})" in found.problems[0]  # or nobody knows what to put away
 
 
 @pytest.mark.parametrize(
