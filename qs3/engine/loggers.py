@@ -2,7 +2,8 @@
 
 Rows are sent before the epoch's checkpoint is written. If a kill comes in between, the epoch is
 repeated and its row replaced, so the history of an interrupted run equals that of an
-uninterrupted one.
+uninterrupted one. Each start of a run writes an offline log of wandb of its own, and a kill may
+leave nothing in it, so each log begins with the rows of earlier starts, or of a shared warm-up.
 """
 
 from __future__ import annotations
@@ -33,6 +34,21 @@ class EpochRows(Callback):
 
     def __init__(self, phases: Phases) -> None:
         self.phases = phases
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Send the rows of the epochs before this start to the offline logs, which lack them."""
+        earlier = [
+            (int(row.pop("epoch")), {key: float(value) for key, value in row.items() if value})
+            for logger in trainer.loggers
+            if isinstance(logger, CsvHistory)
+            for row in logger.rows()
+        ]
+        for logger in trainer.loggers:
+            if not getattr(logger, "_offline", False):
+                continue
+            for epoch, row in earlier:
+                if epoch < trainer.current_epoch:
+                    logger.log_metrics(row | {"phase": int(row["phase"])}, step=epoch)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Send the row of this epoch."""
@@ -79,7 +95,7 @@ class CsvHistory(Logger):
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Add the row of epoch `step`; rows from that epoch on, of a killed run, go."""
         assert step is not None
-        rows: list[dict[str, Any]] = [row for row in self._rows() if int(row["epoch"]) < step]
+        rows: list[dict[str, Any]] = [row for row in self.rows() if int(row["epoch"]) < step]
         rows.append({"epoch": step, **metrics})
         columns = list(dict.fromkeys(key for row in rows for key in row))
         text = io.StringIO()
@@ -88,7 +104,12 @@ class CsvHistory(Logger):
         writer.writerows(rows)
         write_text(self.path, text.getvalue())
 
-    def _rows(self) -> list[dict[str, str]]:
+    def rows(self) -> list[dict[str, str]]:
+        """Those there are, as written.
+
+        Raises:
+            DataError: the file is damaged.
+        """
         if not self.path.is_file():
             return []
         try:

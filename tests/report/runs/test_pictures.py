@@ -423,5 +423,16 @@ def test_offline_wandb_holds_config_curves_pictures_and_table(toy):
     assert content["columns"] == ["true class", *CLASSES]
     expected = metrics.final.confusion
     assert content["data"] == [[c, *row] for c, row in zip(CLASSES, expected, strict=True)]
+
+    # The warm-up comes from that run: its epochs are in this one's log, too.
+    other = toy("logger=wandb", "selftraining.theta=0.3")
+    train(other)
+    folder = hashing.run_folder(other)
+    _, rows, _, _ = read(folder)
+    history, keys = table(folder / "history.csv"), ("phase", "lr", "train/loss", "source_val/acc")
+    assert len(history) == len(losses)
+    assert [int(row["trainer/global_step"]) for row in rows] == [*range(len(history))]
+    for row, written in zip(rows, history, strict=True):
+        assert [row[key] for key in keys] == [float(written[key]) for key in keys]
     assert summary["final/accuracy"] == metrics.final.accuracy
     assert "WANDB_MODE" not in os.environ  # nor in the next job of a multirun
