@@ -32,7 +32,10 @@ from qs3.utils.memory import JSON_PEAK, read_whole
 
 log = logging.getLogger(__name__)
 
-_NO_END = "did not end: killed, interrupted or still running; the same command goes on with it"
+_NO_END = (
+    "did not end: killed, interrupted or still running; the same command goes on with it, and with "
+    "jobs that had not begun, which are not counted here"
+)
 
 
 class SummaryOfSeeds(Callback):

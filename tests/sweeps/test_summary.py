@@ -15,6 +15,11 @@ from qs3.report.runs.pictures import of_sweep
 from qs3.sweeps.summary import SummaryOfSeeds, differences, failures, in_words
 from tests.report.made_runs import write_run
 
+NO_END = (
+    "did not end: killed, interrupted or still running; the same command goes on with it, and with "
+    "jobs that had not begun, which are not counted here"
+)
+
 
 def config(folder: Path, *overrides: str, pictures: object = False, num: int = 0):
     hydra = {
@@ -148,7 +153,7 @@ def test_a_job_that_never_ended(summary, tmp_path, capsys):
     out = capsys.readouterr().out.splitlines()
     assert out[-3:-1] == [
         "1 of 2 jobs failed:",
-        "  did not end: killed, interrupted or still running; the same command goes on with it",
+        f"  {NO_END}",
     ]
     assert out[-1].startswith("    seed=1  (")
 
@@ -199,7 +204,7 @@ def test_failures_are_grouped_by_error():
         "4 of 5 jobs failed:",
         "  x", "    a=0  (/logs/0)", "    a=3  (/logs/3)",
         "  y", "    a=1  (/logs/1)",
-        "  did not end: killed, interrupted or still running; the same command goes on with it",
+        f"  {NO_END}",
         "    a=4  (/logs/4)",
     ]  # fmt: skip
     assert failures([job(2, error="")]) == ""
