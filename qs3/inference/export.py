@@ -306,9 +306,12 @@ def metadata(predictor: Predictor) -> dict[str, str]:
         "up": "z" if upright else "none (frame of the camera)",
         "target": result.target,
         "unit": unit,
+        "stored_points": str(result.stored_points),
+        "before": f"farthest point sampling to {result.stored_points} points, from the first one "
+        "on; of a smaller cloud all points, repeated from the first one on",
         "normalisation": f"subtract the mean of the points{scaling}",
         "sampling": f"then farthest point sampling to {predictor.points} points, from the first "
-        f"one on; in training clouds had {result.stored_points} points before",
+        "one on",
         "input": f"{INPUT}: float32 [clouds, points, 3]",
         "output": f"{OUTPUT}: float32 [clouds, {len(predictor.classes)}], before the softmax",
     }

@@ -172,20 +172,22 @@ def test_the_example_of_the_document_needs_numpy_and_onnxruntime_alone(
     """The lines of docs/how-to/predict.md, run as they stand; the same probabilities as ours."""
     run = request.getfixturevalue(which)
     predictor = qs3.load(run)
-    cloud = np.random.default_rng(3).normal(size=(predictor.result.stored_points, 3))
-    np.savetxt(tmp_path / "scan.xyz", cloud)
+    stored = predictor.result.stored_points
     out = tmp_path / "model.onnx"
     assert main(["export", f"ckpt={run}", f"out={out}", "threads=1"]) == 0
     assert "logits on 32 clouds differ" in capsys.readouterr().out
     text = DOCS.read_text(encoding="utf-8")
     code = text.split("```python\n")[1].split("```")[0]
     assert "qs3" not in code
-    found = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
-    ).stdout.split()
-    ours = predictor([np.loadtxt(tmp_path / "scan.xyz")])[0]
-    assert found[0] == predictor.classes[ours.argmax()]
-    assert float(found[1]) == pytest.approx(ours.max(), abs=1e-4)
+    for count in (stored, stored - 30, 2 * stored):  # filled up and thinned, as training's were
+        cloud = np.random.default_rng(3).normal(size=(count, 3)) ** 2
+        np.savetxt(tmp_path / "scan.xyz", cloud)
+        found = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True
+        ).stdout.split()
+        ours = predictor([np.loadtxt(tmp_path / "scan.xyz")])[0]
+        assert found[0] == predictor.classes[ours.argmax()]
+        assert float(found[1]) == pytest.approx(ours.max(), abs=1e-4)
 
 
 def test_the_file_of_a_net_of_metres_says_so(run, metric_run):
