@@ -330,9 +330,11 @@ def _check_frozen(run: Run) -> None:
     augment = run.cfg.protocol.augment
     changes = [key for key, value in STILL.items() if augment.get(key, value) != value]
     if run.cfg.model.get("_target_") == _FEATURES and changes:
+        still = " ".join(f"protocol.augment.{key}={str(STILL[key]).lower()}" for key in changes)
         raise ConfigError(
             "model=features keeps the features of clouds as they are stored, and protocol.augment "
-            f"({', '.join(changes)}) changes clouds in each step; set protocol=frozen"
+            f"({', '.join(changes)}) changes clouds in each step; set protocol=frozen, and where "
+            f"the experiment sets them over it {still}"
         )
 
 

@@ -107,6 +107,8 @@ def test_the_file_is_found_from_another_folder(frozen, tmp_path, monkeypatch):
 def test_what_is_refused(frozen, tmp_path):
     with pytest.raises(ConfigError, match=r"protocol\.augment \(rotate_z, jitter_sigma\) changes"):
         train(frozen("protocol=paper"))
+    with pytest.raises(ConfigError, match=r"sets them over it protocol\.augment\.crop=1\.0$"):
+        train(frozen("protocol.augment.crop=0.3"))  # as experiment=own_scans does
     with pytest.raises(ConfigError, match=r"model\.file=no\.onnx cannot be read; model=features"):
         train(frozen(file="no.onnx"))
     assert not (tmp_path / "logs").exists()
