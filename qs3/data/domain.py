@@ -351,7 +351,12 @@ class Domain:
         else:  # of other settings there is more to say than a digest
             keys = sorted(changed - {"files"})
             was, wanted = ({key: of.get(key) for key in keys} for of in (imported, now))
-            problem = f"{self.folder} was imported with {was}, the config says {wanted}; delete it"
+            problem = f"{self.folder} was imported with {was}, the config says {wanted}; "
+            words = [f"published.{key}={_said(value)}" for key, value in was.items()]
+            plain = all(isinstance(value, bool | int | float | str) for value in was.values())
+            if plain and not changed & {"files", "folder", "format"}:
+                problem += f"say {' '.join(words)} to take it as it is, "
+            problem += "delete it"
         raise DataError(f"{problem} to import it again, or give another `path`")
 
     def _refuse_another(self, importer: Importer, was: Path) -> None:
@@ -360,6 +365,11 @@ class Domain:
         if why and was.name and importer.root.name != was.name:
             told = f"{self.folder} holds what was in {was}: give that, or a folder that is there"
             raise DataError(f"domain {self.name}: {why}{told} (and another `path`)")
+
+
+def _said(value: object) -> str:
+    """A value as a word of the command line has it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def check_all(*domains: Domain) -> None:
