@@ -51,6 +51,7 @@ _CHECKED = 32  # clouds to compare on
 _MOST_CLOUDS, _MOST_POINTS = 1 << 16, 1 << 20
 _MOST_CARD = 1 << 20  # bytes
 _PACKAGES = ("onnx", "onnxscript", "onnxruntime")
+_FEATURES = "qs3.models.features.features"  # a head on a file that has no place in a folder
 
 
 @dataclass(frozen=True)
@@ -156,10 +157,17 @@ def export_folder(
         packages: where a net of one's own is defined, beside those of qs3; the code there is run.
 
     Raises:
-        ConfigError: the folder holds a README.md or config.json of something else, or the result.
+        ConfigError: the folder holds a README.md or config.json of something else, or the result;
+            or the net needs a file that would not be in it.
         MissingDataError, DataError: no result there, or damaged, or `judged` is not of this run.
     """
     file, result = find_result(ckpt), read_result(ckpt)
+    if result.model["_target_"] == _FEATURES:
+        raise ConfigError(
+            "model=features cannot be exported: a folder would lack its backbone, which is the "
+            f"ONNX file {result.model['file']} of yours; others need result.pt, "
+            "and that file in the same place"
+        )
     judgement = read_judgement(Path(judged).expanduser(), file) if judged else None
     if judgement:
         result = replace(result, worth=judgement.sentence)
@@ -377,6 +385,8 @@ def _write_onnx(
 
 def _cannot(predictor: Predictor, error: Exception) -> Qs3Error:
     cause = error.__cause__ or error
+    if isinstance(cause, Qs3Error):  # a net that says itself why not
+        return cause
     first = next((line for line in f"{cause}\n{error}".splitlines() if line.strip()), "")
     return Qs3Error(
         f"torch {torch.__version__} cannot export {predictor.result.model['_target_']}: its layers "
