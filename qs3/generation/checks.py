@@ -88,9 +88,10 @@ def check(cfg: DictConfig) -> None:
                 f"authors made them; leave it out for domain={cfg.domain.name}"
             )
 
-    for key in _OF_DEPTH:
+    looks = cfg.sensor and "sensor" in cfg.recipe
+    for key in ("sensor", *_OF_DEPTH):
         # Before the recipe is built: one that looks at nothing does not take them.
-        if cfg.get(key) and not cfg.sensor:
+        if cfg.get(key) and not looks:
             raise ConfigError(
                 f"domain {cfg.domain.name} looks at nothing, so {key}= says nothing to it: leave "
                 "it out"

@@ -240,7 +240,11 @@ def test_a_frame_without_photograph_or_depth_can_be_kept(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "key", ["provenance=true", "keep_views=true", "scene=room", "crop=mask", "views=7"]
+    "key",
+    [
+        *("provenance=true", "keep_views=true", "scene=room", "crop=mask", "views=7"),
+        "sensor=kinect_v1",  # by which surface samples were called those of a Kinect
+    ],
 )
 def test_a_domain_that_looks_at_nothing_cannot_keep_or_place_anything(meshes, tmp_path, key):
     with pytest.raises(ConfigError, match=f"looks at nothing, so {key.split('=')[0]}= says"):
