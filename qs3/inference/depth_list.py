@@ -207,7 +207,8 @@ def _by_column(row: Mapping[str, Any]) -> dict[str, Any]:
     named: dict[str, Any] = {}
     for key, value in row.items():
         plain = str(key).strip().lower()
-        named[plain if plain in _COLUMNS and plain not in row else key] = value
+        taken = plain in row or plain in named
+        named[key if taken or plain not in _COLUMNS else plain] = value
     return named
 
 

@@ -1,7 +1,7 @@
-"""What the code of a warm-up was: somebody who works on a method or a net runs it again and again.
+"""What the code of a run was: somebody who works on a method or a net runs it again and again.
 
 The version of qs3 stays while they do, and a checkpoint by code that has been edited since is none
-of the present one's.
+of the present one's, nor is the result of a finished run.
 """
 
 from __future__ import annotations

@@ -46,9 +46,10 @@ def test_columns_have_any_case_and_blanks(tmp_path):
     (tmp_path / "a.csv").write_text("Depth ,MASK,Label\na.png,m.png,chair\n")
     ((one,), _) = find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
     assert (one.wrong, one.mask, one.label) == ("", tmp_path / "m.png", "chair")
-    (tmp_path / "a.csv").write_text("Depth,depth,mask\na.png,b.png,m.png\n")
-    with pytest.raises(DataError, match="unknown columns Depth; known"):  # which of the two?
-        find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
+    for first, second, other in (("Depth", "depth", "Depth"), ("Depth", "DEPTH", "DEPTH")):
+        (tmp_path / "a.csv").write_text(f"{first},{second},mask\na.png,b.png,m.png\n")
+        with pytest.raises(DataError, match=f"unknown columns {other}; known"):  # which of both?
+            find_shown(str(tmp_path / "a.csv"), "", Shown("", intrinsics=CAMERA))
 
 
 def test_masks_without_a_depth_image_are_told(tmp_path, caplog):

@@ -1,4 +1,4 @@
-"""A warm-up by code that was edited since is nobody's."""
+"""A warm-up by code that was edited since is nobody's, and a result is that of the old code."""
 
 from __future__ import annotations
 
