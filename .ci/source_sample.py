@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.data.manifest import OK, read_manifest
-from qs3.data.store import open_pointset
 from qs3.datamodules.fps_samples import sample
+from qs3.store.manifest import OK, read_manifest
+from qs3.store.store import open_pointset
 
 POINTS = 512
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import torch
     from omegaconf import DictConfig
 
-    from qs3.data.store import PointSet
     from qs3.generation.scan import Scan, Solid
     from qs3.inference.predictor import Predictor
+    from qs3.store.store import PointSet
 
 
 def train(*overrides: str) -> Path:

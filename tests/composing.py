@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from qs3.config.compose import composing
 from qs3.config.hydra import build
 from qs3.config.location import CONF
-from qs3.data.domain import Domain
+from qs3.datasets.domain import Domain
 
 _VALUE = re.compile(r"(?!hydra\b)([a-zA-Z_]\w*)(\.\w+)*=")
 
@@ -47,7 +47,7 @@ def compose(command: str | None, words: Sequence[str]) -> DictConfig:
 
 
 def compose_domain(name: str, keys: Mapping[str, str]) -> Domain:
-    """What `qs3.data.domain.compose_domain` makes of conf/domain/`name`.yaml."""
+    """What `qs3.datasets.domain.compose_domain` makes of conf/domain/`name`.yaml."""
     words = [f"{k if k.startswith('paths.') else f'domain.{k}'}={v}" for k, v in keys.items()]
     return build(compose(None, [f"+domain={name}", "+paths=default", *words]).domain)
 

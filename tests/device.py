@@ -24,9 +24,10 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from qs3 import kernels as fast
 from qs3.geometry import ball_query, neighbours
-from qs3.models import dgcnn, fast
-from qs3.models.fast import edgeconv
+from qs3.kernels import edgeconv
+from qs3.models import dgcnn
 
 
 class Autocast(torch.autocast):

@@ -4,7 +4,7 @@ import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from qs3.data import domain
+from qs3.datasets import domain
 from tests.composing import by_hydra, compose, compose_domain
 from tests.generation.generating import QUICK
 from tests.training.toy import overrides

@@ -14,8 +14,8 @@ import pytest
 import torch
 import yaml
 
-from tests.commands import main
 from tests.composing import compose
+from tests.running import main
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("*.md")])

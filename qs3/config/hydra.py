@@ -21,11 +21,13 @@ from hydra.errors import CompactHydraException, InstantiationException
 from hydra.types import RunMode
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from pydantic import ValidationError
 
 from qs3.config import hashing
 from qs3.config.checks import check_bool
 from qs3.config.location import CONF, typed
 from qs3.errors import ConfigError, Qs3Error
+from qs3.utils.settings import problems
 
 
 def _run_name(*, _root_: DictConfig) -> str:
@@ -153,7 +155,10 @@ def build(node: Any, **more: Any) -> Any:
         if isinstance(error.__cause__, TypeError | ValueError):
             place = re.search(r"^full_key: (.+)$", str(error), re.MULTILINE)
             where = place[1] if place else str(error).splitlines()[0]
-            raise ConfigError(f"{where}: {error.__cause__}") from error
+            cause = error.__cause__
+            if isinstance(cause, ValidationError):
+                raise ConfigError(problems(cause, where)) from None
+            raise ConfigError(f"{where}: {cause}") from error
         raise
 
 

@@ -14,8 +14,6 @@ import numpy as np
 from lightning.pytorch import LightningDataModule
 from torch import Generator, Tensor
 
-from qs3.data.domain import Domain
-from qs3.data.ensure_source import check_or_make
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Piece, Table, generator_of
 from qs3.datamodules.clouds import Clouds
@@ -23,6 +21,8 @@ from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled, Unlabelled
 from qs3.datamodules.twins import Wants, augmented
+from qs3.datasets.domain import Domain
+from qs3.datasets.ensure_source import check_or_make
 from qs3.errors import ConfigError
 from qs3.utils.seeding import derive
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 
 from qs3.config.location import typed
-from qs3.data.domain import Domain
-from qs3.data.meta import sha256_of
-from qs3.data.store import PointSet
+from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError
+from qs3.store.meta import sha256_of
+from qs3.store.store import PointSet
 
 SOURCE_TWINS = {"whole": "points_whole", "clean": "points_clean", "scan": None}
 """What a teacher can see of a source cloud, and the store's array; None: the cloud itself."""

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from qs3.data.sharded import ShardedArray, picked
+from qs3.store.sharded import ShardedArray, picked
 
 
 @dataclass(frozen=True, eq=False)

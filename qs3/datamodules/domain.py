@@ -24,8 +24,6 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from qs3.config.checks import check_bool, check_choice, check_int
-from qs3.data.domain import Domain, compose_domain
-from qs3.data.store import PointSet
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.batches import Batches, Table, generator_of
 from qs3.datamodules.beside import SOURCE_TWINS, beside_sha256, views_of
@@ -41,7 +39,9 @@ from qs3.datamodules.splits import (
 )
 from qs3.datamodules.twins import augmented
 from qs3.datamodules.validation_split import RULES
+from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError, DataError
+from qs3.store.store import PointSet
 
 SAMPLERS = ("shuffled", "balanced")
 

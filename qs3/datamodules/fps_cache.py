@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from qs3.data.sharded import ShardedArray
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample_all
 from qs3.errors import ConfigError, Qs3Error
+from qs3.store.sharded import ShardedArray
 from qs3.utils.files import atomic_path
 from qs3.utils.locks import locked
 from qs3.utils.plural import counted

@@ -14,8 +14,8 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
-from qs3.data.sharded import ShardedArray
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
+from qs3.store.sharded import ShardedArray
 from qs3.utils.pool import Processes
 from qs3.utils.progress import shown
 from qs3.utils.seeding import derive

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from qs3.data.sharded import ShardedArray
 from qs3.geometry.sampling import farthest_point_sampling_np
+from qs3.store.sharded import ShardedArray
 
 POOL = 2
 """So many points of the fused views are there for each one of which farthest points are taken."""

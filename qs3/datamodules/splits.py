@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from qs3.data.store import PointSet, evenly
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
 from qs3.errors import ConfigError
+from qs3.store.store import PointSet, evenly
 
 
 @dataclass(frozen=True, eq=False)

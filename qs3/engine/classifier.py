@@ -15,9 +15,9 @@ from qs3.datamodules.phases import Phases
 from qs3.engine.cuda_graphs import Graphs
 from qs3.engine.schedules import Plateau, cosine
 from qs3.errors import ConfigError
+from qs3.kernels.norms import use_trained
 from qs3.methods.base import Method, total_loss
 from qs3.models.base import Backbone, PointClassifier
-from qs3.models.norms import use_trained
 from qs3.utils.seeding import derive
 
 # `qs3.engine.loggers.EpochRows` hands the figures on, before the checkpoint is written.

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_unflatten
 
-from qs3.models import fast
+from qs3 import kernels as fast
 from qs3.models.base import Features, PointClassifier, check_points
 
 log = logging.getLogger(__name__)

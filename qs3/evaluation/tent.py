@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.evaluation.metrics import adapt_norms, even_batches
-from qs3.models.norms import check_has_norms, running_norms, use_trained
+from qs3.kernels.norms import check_has_norms, running_norms, use_trained
 
 RATE = 1e-3
 """Adam's learning rate, as in the paper; without weight decay."""

@@ -27,7 +27,7 @@ KEYS = (
 
 _WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0, "shard_mb": 1}
 COLLIDERS = ("skip", "keep")
-UPS = ("auto", "z", "y")
+UPS = ("z", "y")
 _SWITCHES = ("provenance", "keep_views", "force", "strict", "fill_up")
 # Groups that say nothing to a domain that looks at nothing, by the empty choice that it has.
 _OF_LOOKING = ("scene", "tracking", "crop")

@@ -14,12 +14,20 @@ from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[1]
 MAKES_CLOUDS = (
-    *("clouds", "generation", "meshes", "classes.py", "data/frames", "utils/seeding.py"),
+    *(
+        "datasets/clouds",
+        "generation",
+        "meshes",
+        "catalogue",
+        "classes.py",
+        "datasets/frames",
+        "utils/seeding.py",
+    ),
     *("geometry/cameras.py", "geometry/orthographic.py", "geometry/sampling.py"),
     *("sensors/base.py", "sensors/pixel_status.py", "sensors/devices", "sensors/matching"),
     *("sensors/optics", "sensors/renderers"),
 )
-HARMLESS = ("cluster", "config", "data", "errors", "utils")
+HARMLESS = ("cluster", "config", "store", "datasets", "errors", "utils")
 
 
 @functools.cache

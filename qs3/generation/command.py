@@ -18,17 +18,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
-from qs3.data.dataset_folder import CLOUDS, CONFIG, COSTS, INFRARED, check_ours, delete_dataset
-from qs3.data.domain import Domain
-from qs3.data.manifest import MANIFEST
-from qs3.data.store import (
-    ManifestRow,
-    PointSet,
-    counts_text,
-    is_finished,
-    open_pointset,
-    write_pointset,
-)
+from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.checks import check, check_recipe
 from qs3.generation.code_fingerprint import code_fingerprint
@@ -43,9 +33,18 @@ from qs3.generation.plan import benchmark, describe, keep, stated_hash, stored_c
 from qs3.generation.provenance import PROVENANCE
 from qs3.generation.recipe_fingerprint import recipe_fingerprint
 from qs3.generation.travel import software
-from qs3.generation.up_axis import with_up_axis
 from qs3.generation.workers import COLLIDERS, Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
+from qs3.store.dataset_folder import CLOUDS, CONFIG, COSTS, INFRARED, check_ours, delete_dataset
+from qs3.store.manifest import MANIFEST
+from qs3.store.store import (
+    ManifestRow,
+    PointSet,
+    counts_text,
+    is_finished,
+    open_pointset,
+    write_pointset,
+)
 from qs3.utils.files import write_text
 from qs3.utils.locks import owned
 from qs3.utils.plural import counted
@@ -75,7 +74,6 @@ def generate(cfg: DictConfig) -> PointSet:
             folder holds, or the domain has, a published dataset.
     """
     check(cfg)
-    cfg = with_up_axis(cfg)
     domain: Domain = build(cfg.domain)
     folder = domain.folder
     _check_place(domain, cfg.force)

@@ -13,10 +13,10 @@ from typing import Any, overload
 
 import numpy as np
 
-from qs3.data.parts import PartFiles
 from qs3.errors import ConfigError
 from qs3.generation.recipes import Cloud
 from qs3.generation.workers import Outcome
+from qs3.store.parts import PartFiles
 from qs3.utils.files import write_text
 from qs3.utils.memory import read_whole
 

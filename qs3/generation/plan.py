@@ -15,7 +15,6 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build
-from qs3.data.dataset_folder import VIEWS as VIEWS_FOLDER
 from qs3.errors import MeshError
 from qs3.generation.objects import catalogue_seed, mesh_items, own_materials
 from qs3.generation.provenance import Keep
@@ -24,6 +23,7 @@ from qs3.generation.twins import TWINS
 from qs3.meshes.formats.gltf import buffer_files
 from qs3.meshes.formats.mtl import libraries
 from qs3.meshes.source import MeshItem
+from qs3.store.dataset_folder import VIEWS as VIEWS_FOLDER
 from qs3.utils.files import sha256_file
 from qs3.utils.version import VERSION
 

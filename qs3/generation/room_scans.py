@@ -2,7 +2,7 @@
 
 `RoomScan` imitates how real single-view datasets come about (NYU Depth V2, SUN RGB-D): somebody
 stands in a room, the object is somewhere in the picture, other things cover a part of it, an
-annotator draws its mask, and `qs3.data.frames.cutting` cuts by the same rules as it does there.
+annotator draws its mask, and `qs3.datasets.frames.cutting` cuts by the same rules as it does there.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from qs3.config.checks import check_float, check_order, check_ranges
-from qs3.data.frames.cutting import cut, inliers, own_pixels
-from qs3.data.frames.images import DepthImage, Pinhole
-from qs3.data.frames.pieces import pieces
-from qs3.data.frames.rules import Rules
+from qs3.datasets.frames.cutting import cut, inliers, own_pixels
+from qs3.datasets.frames.images import DepthImage, Pinhole
+from qs3.datasets.frames.pieces import pieces
+from qs3.datasets.frames.rules import Rules
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.camera_poses import direction
@@ -294,7 +294,7 @@ def one_piece(
 
 
 def depth_image(frame: DepthFrame, world_from_camera: np.ndarray) -> DepthImage:
-    """A frame as `qs3.data.frames` sees one: its window as the picture, the pose's rotation."""
+    """A frame as `qs3.datasets.frames` sees one: its window as the picture, the pose's rotation."""
     lens, step = frame.camera.intrinsics, frame.step_px
     focal = lens.focal_px / step
     camera = Pinhole(

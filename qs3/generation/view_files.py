@@ -22,7 +22,7 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from qs3.clouds.arrays import read_npz
+from qs3.datasets.clouds.arrays import read_npz
 from qs3.errors import DataError, Qs3Error
 from qs3.generation.provenance import photograph
 from qs3.geometry.cameras import Camera, Intrinsics

@@ -13,10 +13,8 @@ from typing import Any
 
 import torch
 
-from qs3.data.frames.given import read_intrinsics
-from qs3.data.importers.object_archive import read_archive
-from qs3.data.meta import is_finished
-from qs3.data.place import is_archive
+from qs3.datasets.frames.given import read_intrinsics
+from qs3.datasets.importers.object_archive import is_archive, read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.prior import read_prior
 from qs3.inference import pretrained
@@ -42,6 +40,7 @@ from qs3.inference.told import agreement, chosen, told
 from qs3.inference.trusted import trust_of, without_labels
 from qs3.inference.units import predict_units
 from qs3.runs.metrics import Trust, read_metrics
+from qs3.store.meta import is_finished
 from qs3.utils.files import make_folder, write_text
 from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar

@@ -9,9 +9,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from qs3.data.frames.given import Intrinsics, camera_of, check_intrinsics, check_metres, off_centre
-from qs3.data.frames.images import Pinhole
-from qs3.data.frames.pointed import Pointed, point_out
+from qs3.datasets.frames.given import (
+    Intrinsics,
+    camera_of,
+    check_intrinsics,
+    check_metres,
+    off_centre,
+)
+from qs3.datasets.frames.images import Pinhole
+from qs3.datasets.frames.pointed import Pointed, point_out
 from qs3.errors import DataError
 
 

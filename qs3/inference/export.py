@@ -35,8 +35,8 @@ from qs3.inference.model_file import (
 )
 from qs3.inference.model_folder import CARD, CONFIG, WEIGHTS, write_folder
 from qs3.inference.predictor import Predictor, load
+from qs3.kernels.norms import use_trained
 from qs3.models.base import PointClassifier
-from qs3.models.norms import use_trained
 from qs3.runs.metrics import read_metrics
 from qs3.utils.files import atomic_path, make_folder
 from qs3.utils.memory import YAML_PEAK, read_whole

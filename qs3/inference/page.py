@@ -296,7 +296,7 @@ def _size(cloud: np.ndarray, floor_m: float | None) -> str:
 
 def _z_up(sample: Sample) -> np.ndarray:
     """[n, 3] float64, for pictures and sizes, whatever frame the net sees the cloud in."""
-    from qs3.data.importers.base import turned
+    from qs3.datasets.importers.base import turned
 
     cloud = np.asarray(sample.cloud, dtype=np.float64)[:, :3]
     if sample.world_from_camera is not None:

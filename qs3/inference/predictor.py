@@ -29,12 +29,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.config.checks import check_choice, check_int
-from qs3.data.frames.images import Pinhole
-from qs3.data.frames.pointed import Pointed
-from qs3.data.importers.base import UP_AXES, check_cloud
-from qs3.data.importers.folders import CloudFolder
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample
+from qs3.datasets.frames.images import Pinhole
+from qs3.datasets.frames.pointed import Pointed
+from qs3.datasets.importers.base import UP_AXES, check_cloud
+from qs3.datasets.importers.folders import CloudFolder
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.ood import measure_one, ood_reasons, other_units, relax_min_points

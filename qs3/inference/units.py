@@ -19,7 +19,7 @@ from qs3.inference.inputs import (
 from qs3.inference.predictor import DIVERGED, Predictor, Prepared
 from qs3.inference.settings import Settings
 from qs3.inference.table import Row
-from qs3.models.norms import use_trained
+from qs3.kernels.norms import use_trained
 
 
 def predict_units(

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, class_loss, weight
-from qs3.models.norms import use_domain
 
 
 class Cpcm(Method):

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.config.checks import check_choice
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, check_taught, class_loss, feature_dims, weight
 from qs3.methods.reversal import dann_alpha, reverse_gradient
 from qs3.models.base import ClassHead
-from qs3.models.norms import use_domain
 
 
 class Dann(Method):

@@ -14,12 +14,12 @@ from torch import Tensor, nn
 
 from qs3.config.checks import check_float, check_int
 from qs3.errors import ConfigError
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.chamfer import masked_chamfer
 from qs3.methods.deform import cloud_size, deform
 from qs3.methods.mixup import source_loss
 from qs3.models.base import Features
-from qs3.models.norms import use_domain
 
 
 class DefRec(Method):

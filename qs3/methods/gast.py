@@ -16,10 +16,10 @@ from torch.nn import functional as F
 from qs3.config.checks import check_int
 from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, check_taught, feature_dims, weight
 from qs3.methods.deform import VOXELS, cloud_size, deform
 from qs3.methods.mixup import join, source_loss
-from qs3.models.norms import use_domain
 
 _QUARTERS = 4
 

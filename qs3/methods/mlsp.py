@@ -16,12 +16,12 @@ from qs3.config.checks import check_float, check_int
 from qs3.errors import ConfigError
 from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import gather, knn
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, feature_dims, weight
 from qs3.methods.chamfer import masked_mean, nearest
 from qs3.methods.deform import cloud_size, deform
 from qs3.methods.defrec import ReconstructionHead
 from qs3.methods.mixup import source_loss
-from qs3.models.norms import use_domain
 
 CARDINALITIES = 16
 RADIUS = 0.12  # of the ball in which points are counted, in radii of the cloud

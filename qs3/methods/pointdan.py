@@ -14,11 +14,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import ConfigError
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, class_loss, weight
 from qs3.methods.mmd import mmd2
 from qs3.methods.reversal import reverse_gradient, sine_alpha
 from qs3.models.base import check_points
-from qs3.models.norms import use_domain
 
 SIGMAS = (0.01, 0.1, 1.0, 10.0, 100.0)
 

@@ -17,9 +17,9 @@ from torch.nn import functional as F
 
 from qs3.config.checks import check_choice, check_float
 from qs3.geometry.neighbours import gather
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher
-from qs3.models.norms import use_domain
 
 KEPT, LEAST, MOST = 0.7, 0.7, 1.5  # share of a cut cloud, and its size, of the released code
 

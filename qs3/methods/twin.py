@@ -23,9 +23,9 @@ from qs3.config.checks import check_choice, check_float, check_of_use
 from qs3.datamodules.beside import SOURCE_TWINS
 from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import check_taught, class_loss, weight
 from qs3.methods.mean_teacher import MeanTeacher
-from qs3.models.norms import use_domain
 
 TEACHERS = ("mean", "shared", "own")
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from qs3.errors import DataError
 from qs3.geometry.neighbours import exporting
-from qs3.models.norms import head_norm, make_norm
+from qs3.kernels.norms import head_norm, make_norm
 from qs3.utils.plural import counted
 
 
@@ -56,7 +56,7 @@ class ClassHead(nn.Sequential):
         negative_slope: of LeakyReLU; 0 is ReLU.
         first_bias: False where the first layer is published without one.
         hidden_bias: False where no hidden layer has one.
-        norm: of the backbone; see `qs3.models.norms.head_norm` for what it is here.
+        norm: of the backbone; see `qs3.kernels.norms.head_norm` for what it is here.
     """
 
     def __init__(

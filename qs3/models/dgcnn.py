@@ -16,16 +16,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from qs3 import kernels as fast
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError
 from qs3.geometry.device import exact_products, takes_triton
 from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import gather, knn
-from qs3.models import fast
+from qs3.kernels.edgeconv import edge_conv
+from qs3.kernels.norms import head_norm, make_norm, normed, uses_batch
+from qs3.kernels.pointwise_max import max_over_members, max_over_rows, pooled_linear
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.fast.edgeconv import edge_conv
-from qs3.models.fast.pointwise_max import max_over_members, max_over_rows, pooled_linear
-from qs3.models.norms import head_norm, make_norm, normed, uses_batch
 
 VARIANTS = ("uda", "simpleview", "defrec")
 
@@ -37,7 +37,7 @@ class EdgeConv(nn.Module):
 
     Args:
         in_channels, out_channels: Cin, Cout.
-        norm: see `qs3.models.norms`; "batch" is over all edges of the batch, "instance" over the
+        norm: see `qs3.kernels.norms`; "batch" is over all edges of the batch, "instance" over the
             edges of each cloud, in eval too.
         negative_slope: of LeakyReLU.
     """
@@ -114,7 +114,8 @@ class DGCNN(Backbone):
     Args:
         k: neighbours of a point, itself included; clouds smaller than k use all points.
         variant: "uda", "simpleview" or "defrec", see the module.
-        norm: of the EdgeConvs and of conv5, see `qs3.models.norms`; "defrec"'s T-Net has batch norm
+        norm: of the EdgeConvs and of conv5, see `qs3.kernels.norms`; "defrec"'s T-Net has batch
+        norm
             where this is "instance".
         widths: channels of the EdgeConvs.
         embedding: channels of conv5; `feature_dim` is twice that where maximum and mean are taken.

@@ -16,8 +16,8 @@ from qs3.config.checks import check_float, check_int
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.kernels.norms import head_norm, make_norm
 from qs3.models.base import Backbone, Features, PointClassifier
-from qs3.models.norms import head_norm, make_norm
 from qs3.models.pointnet import PointMLP, TNet
 
 
@@ -48,7 +48,7 @@ class NodeModule(nn.Module):
         nodes: M.
         neighbours: K; also the size of a ball.
         radius: of the balls, in the unit of the points.
-        norm: see `qs3.models.norms`.
+        norm: see `qs3.kernels.norms`.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class PointDanBackbone(Backbone):
 
     Args:
         nodes, neighbours, radius: of `NodeModule`.
-        norm: see `qs3.models.norms`; the last one is of one vector a cloud, as in a head.
+        norm: see `qs3.kernels.norms`; the last one is of one vector a cloud, as in a head.
     """
 
     feature_dim = 1024

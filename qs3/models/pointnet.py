@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3 import kernels as fast
 from qs3.errors import ConfigError
 from qs3.geometry.device import exact_products
-from qs3.models import fast
+from qs3.kernels.norms import head_norm, make_norm, normed
+from qs3.kernels.pointwise_max import normed_maximum
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.fast.pointwise_max import normed_maximum
-from qs3.models.norms import head_norm, make_norm, normed
 
 VARIANTS = ("simpleview", "uda", "basic")
 
@@ -34,7 +34,7 @@ class PointMLP(nn.Module):
         widths: C, and channels of each layer.
         last_relu: False leaves out the last ReLU.
         bias: of the linear maps.
-        norm: see `qs3.models.norms`; "batch" is over all points of the batch.
+        norm: see `qs3.kernels.norms`; "batch" is over all points of the batch.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class TNet(nn.Module):
 
     Args:
         channels: C.
-        norm: see `qs3.models.norms`.
+        norm: see `qs3.kernels.norms`.
         activation: after the maximum; PointDAN has LeakyReLU 0.01 there, the others ReLU.
     """
 
@@ -104,7 +104,7 @@ class PointNet(Backbone):
 
     Args:
         variant: "simpleview", "uda" or "basic", see the module.
-        norm: see `qs3.models.norms`.
+        norm: see `qs3.kernels.norms`.
     """
 
     feature_dim = 1024

@@ -16,14 +16,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from qs3 import kernels as fast
 from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_queries
 from qs3.geometry.neighbours import farthest_point_sampling, gather
-from qs3.models import fast
+from qs3.kernels.grouped_mlp_max import grouped_mlp_max
+from qs3.kernels.norms import make_norm, normed
+from qs3.kernels.pointwise_max import max_over_members
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.fast.grouped_mlp_max import grouped_mlp_max
-from qs3.models.fast.pointwise_max import max_over_members
-from qs3.models.norms import make_norm, normed
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class GroupedMLP(nn.Module):
     Args:
         channels: C of the points' features, 0 if they have none.
         widths: of the layers, at least two.
-        norm: see `qs3.models.norms`; statistics are of all members of all groups, of the batch or
+        norm: see `qs3.kernels.norms`; statistics are of all members of all groups, of the batch or
             ("instance") of each cloud.
     """
 
@@ -134,7 +134,7 @@ class PointNet2(Backbone):
 
     Args:
         variant: "msg" or "ssg".
-        norm: see `qs3.models.norms`.
+        norm: see `qs3.kernels.norms`.
     """
 
     feature_dim = 1024

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.models.norms import active, make_norm
+from qs3.kernels.norms import active, make_norm
 
 
 class ConvNorm(nn.Module):
@@ -67,7 +67,7 @@ class ResNet18(nn.Module):
 
     Args:
         channels: at the stem.
-        norm: see `qs3.models.norms`; "instance" is over each image.
+        norm: see `qs3.kernels.norms`; "instance" is over each image.
     """
 
     def __init__(self, channels: int = 16, norm: str = "batch") -> None:

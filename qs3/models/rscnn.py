@@ -19,14 +19,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from qs3 import kernels as fast
 from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
-from qs3.models import fast
+from qs3.kernels.norms import make_norm, normed
+from qs3.kernels.pointwise_max import max_over_members
+from qs3.kernels.rsconv import relations, rs_conv
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.models.fast.pointwise_max import max_over_members
-from qs3.models.fast.rsconv import relations, rs_conv
-from qs3.models.norms import make_norm, normed
 
 # centres, radius (of a cloud in the unit ball), slots of a ball, of each layer
 LEVELS = ((512, 0.23, 48), (128, 0.32, 64))
@@ -43,7 +43,7 @@ class RSConv(nn.Module):
         hidden: channels between the two layers of M.
         out_channels: of the result.
         relation: see the module.
-        norm: see `qs3.models.norms`.
+        norm: see `qs3.kernels.norms`.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class RSCNN(Backbone):
 
     Args:
         relation: "released", "original" or "paper", see the module.
-        norm: see `qs3.models.norms`; statistics are of all slots of all balls.
+        norm: see `qs3.kernels.norms`; statistics are of all slots of all balls.
     """
 
     feature_dim = 1024

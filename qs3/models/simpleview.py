@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from qs3.config.checks import check_int
 from qs3.errors import ConfigError
+from qs3.kernels.norms import head_norm, make_norm
 from qs3.models.base import Backbone, Features, PointClassifier
-from qs3.models.norms import head_norm, make_norm
 from qs3.models.projection import VIEWS, depth_images
 from qs3.models.resnet import ResNet18
 
@@ -28,7 +28,7 @@ class SimpleView(Backbone):
         views, up, pixel: of `depth_images`; `views` are rows of its table, in the order in which
             the head sees them.
         channels: at the stem of the network; a view has 8 times as many features.
-        norm: see `qs3.models.norms`; "instance" is over each image.
+        norm: see `qs3.kernels.norms`; "instance" is over each image.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class FusionHead(nn.Module):
     """Norm and dropout of each view's features, then Linear - BN - ReLU - dropout - Linear.
 
     The first norm is shared by the views and its statistics are over all of them. What `norm` of
-    the backbone means here: `qs3.models.norms.head_norm`.
+    the backbone means here: `qs3.kernels.norms.head_norm`.
     """
 
     def __init__(

@@ -160,7 +160,7 @@ def _pictures(domains: Sequence[str], data_dir: str, split: str, out: str | None
 
     from qs3.config.compose import composing
     from qs3.config.quoting import override
-    from qs3.data.contact_sheets import class_sheet, scan_picture
+    from qs3.report.contact_sheets import class_sheet, scan_picture
     from qs3.report.figures.class_balance import class_picture
     from qs3.report.tables.table import check_domain
 

@@ -34,7 +34,7 @@ from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import global_features, predict
-from qs3.models.norms import begin_target_norms
+from qs3.kernels.norms import begin_target_norms
 from qs3.runs.checkpoints import copy_weights, load, save
 from qs3.runs.metrics import RoundRecord
 from qs3.runs.pseudo_labels import path_of, write_pseudo_labels

@@ -21,9 +21,9 @@ from qs3.config.checks import check_choice, check_float, check_of_use
 from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
+from qs3.kernels.norms import begin_target_norms, use_domain
 from qs3.methods.base import Method, check_taught, class_loss, weight
 from qs3.methods.mean_teacher import move_towards
-from qs3.models.norms import begin_target_norms, use_domain
 from qs3.selftraining.selectors import (
     Selector,
     TeacherPredictions,

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, class_loss
 from qs3.methods.mixup import mix, pcm_loss
-from qs3.models.norms import use_domain
 
 
 class Student(Method):

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.config.quoting import override
-from qs3.data.made_of import MadeOf
-from qs3.data.store import ManifestRow, PointSet, write_pointset
+from qs3.store.made_of import MadeOf
+from qs3.store.store import ManifestRow, PointSet, write_pointset
 
 SHAPES = {
     "ball": (1.0, 1.0, 1.0),

@@ -21,8 +21,8 @@ from qs3.engine.classifier import Classifier
 from qs3.engine.loggers import CsvHistory, EpochRows
 from qs3.engine.trainer import build_each, let_weights_rest, make_trainer
 from qs3.errors import ConfigError
+from qs3.kernels.norms import DomainNorm, check_has_norms
 from qs3.methods.base import Method, feature_dims
-from qs3.models.norms import DomainNorm, check_has_norms
 from qs3.selftraining.callback import SelfTraining, WarmupSelection
 from qs3.selftraining.student_loss import Student
 from qs3.selftraining.student_selection import StudentSelection

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from omegaconf import DictConfig, OmegaConf
 
 from qs3.config.hydra import build, is_given
-from qs3.data.ensure_source import check_or_make
+from qs3.datasets.ensure_source import check_or_make
 from qs3.errors import ConfigError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.selection_rules import chosen_in_words

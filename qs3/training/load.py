@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from qs3.config.hydra import build
-from qs3.data.domain import Domain
-from qs3.data.manifest import read_manifest
-from qs3.data.store import PointSet
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.splits import labels_of, load_clouds, subsample_splits
+from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.metrics import Evaluation
 from qs3.methods.base import Method
 from qs3.runs.metrics import DataMadeOf
+from qs3.store.manifest import read_manifest
+from qs3.store.store import PointSet
 from qs3.training import class_shares
 from qs3.training.given import Given
 from qs3.training.provenance import note_start

@@ -15,11 +15,11 @@ import torch
 from omegaconf import DictConfig
 
 from qs3.config import hashing
-from qs3.data.store import PointSet
 from qs3.datamodules.fps_cache import remove_old_leftovers
 from qs3.errors import ConfigError
 from qs3.runs import folder as runs
 from qs3.runs.checkpoints import LAST
+from qs3.store.store import PointSet
 from qs3.training.code import changed_files, code_sha256, files_sha256
 from qs3.training.given import Given
 from qs3.training.run import Run

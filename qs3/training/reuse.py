@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping
 from omegaconf import DictConfig
 
 from qs3.config import hashing
-from qs3.data.domain import Domain
-from qs3.data.store import is_finished
 from qs3.datamodules.beside import SOURCE_TWINS, beside_sha256
+from qs3.datasets.domain import Domain
 from qs3.errors import MissingDataError, Qs3Error
 from qs3.runs import folder as runs
 from qs3.runs.metrics import DataHashes, RunMetrics, read_metrics
+from qs3.store.store import is_finished
 from qs3.training.run import Run, run_of
 
 

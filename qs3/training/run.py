@@ -10,8 +10,8 @@ from omegaconf import DictConfig
 from qs3.config import hashing
 from qs3.config.checks import check_int
 from qs3.config.hydra import build
-from qs3.data.domain import Domain
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
+from qs3.datasets.domain import Domain
 
 STUDENT = "student.pt"
 """Weights at the end of the last round."""

@@ -11,7 +11,6 @@ from omegaconf import OmegaConf
 
 from qs3.config import hashing
 from qs3.config.hydra import component_names
-from qs3.data.manifest import read_manifest
 from qs3.evaluation.accuracy_estimates import source_ranges
 from qs3.evaluation.ood import limits, ood_reasons_of_all
 from qs3.evaluation.selection_rules import LAST
@@ -32,6 +31,7 @@ from qs3.runs.metrics import (
 from qs3.runs.predictions import FILE as PREDICTIONS
 from qs3.runs.predictions import OF_FILES, write_predictions, write_predictions_of_files
 from qs3.runs.pseudo_labels import path_of
+from qs3.store.manifest import read_manifest
 from qs3.training.build import Built
 from qs3.training.evaluate import Outcome
 from qs3.training.load import Loaded

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.sensors.fit.infrared_noise import through
+from qs3.calibration.fit.infrared_noise import through
 from qs3.sensors.gradients.twin import gaussian
 
 ROUNDS = 20

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from qs3.catalogue import Catalogue
 from qs3.generation.camera_poses import AnchoredViews
 from qs3.generation.recipes import Mesh2Point
 from qs3.geometry.cameras import Camera, Intrinsics
-from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.placement import UnitCube
 from qs3.sensors.base import DepthFrame, window_of
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo

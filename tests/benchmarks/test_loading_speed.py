@@ -16,14 +16,14 @@ import torch
 from lightning.pytorch import Trainer
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.data.array_files import Column, clouds_each, open_array, write_array
-from qs3.data.domain import Domain
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import prepare
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled
+from qs3.datasets.domain import Domain
+from qs3.store.array_files import Column, clouds_each, open_array, write_array
 
 CLOUDS, STORED, POINTS, BATCH = 4183, 2048, 1024, 16  # PointDA-10's ModelNet, QS3's warm-up
 TEXT_FILES = 32

@@ -14,10 +14,10 @@ import sys
 import numpy as np
 import pytest
 
+from qs3.catalogue import Catalogue
 from qs3.generation.camera_poses import AnchoredViews
 from qs3.generation.recipes import Mesh2Point
 from qs3.generation.workers import Job, scan_one
-from qs3.meshes.catalogue import Catalogue
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.renderers.base import Renderer
 from qs3.sensors.renderers.blender import BlenderRenderer

@@ -21,7 +21,7 @@ import hydra
 @hydra.main(version_base="1.1", config_path=None)
 def main(cfg):
     print(os.getcwd(), hydra.core.hydra_config.HydraConfig.get().job.name, flush=True)
-    from qs3.data.domain import compose_domain
+    from qs3.datasets.domain import compose_domain
     compose_domain("own", {})
 
 main()

@@ -9,11 +9,11 @@ import pytest
 import torch
 from lightning.pytorch import Trainer
 
-from qs3.data.domain import Domain
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Unlabelled
+from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError
 from tests.datamodules.test_domain import made
 

@@ -11,13 +11,13 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from torch import nn
 
-from qs3.data.domain import compose_domain
-from qs3.data.store import PointSet, open_pointset
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.domain import DepthScanNetData, DomainData, ModelNetData, SpeckleNetData
 from qs3.datamodules.splits import Labelled, Unlabelled, load_clouds
+from qs3.datasets.domain import compose_domain
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import unit_ball
+from qs3.store.store import PointSet, open_pointset
 from tests.training.search import Truth, search
 from tests.training.test_target_labels import TEST, TRAIN, truth_of, write_shuffled_target
 from tests.training.toy import CLASSES, TinyNet, write_domain

@@ -14,16 +14,16 @@ from omegaconf import open_dict
 from torch import Tensor
 
 from qs3.config.hashing import config_sha256
-from qs3.data.domain import Domain
-from qs3.data.store import ManifestRow, write_pointset
 from qs3.datamodules.adaptation import AdaptationData
 from qs3.datamodules.augment import Augment
 from qs3.datamodules.domain import DomainData
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.random_views import RandomViews, drawn
 from qs3.datamodules.twins import Wants, augmented
+from qs3.datasets.domain import Domain
 from qs3.errors import ConfigError, DataError
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
+from qs3.store.store import ManifestRow, write_pointset
 from tests.composing import compose
 
 N, P, M = 20, 32, 16

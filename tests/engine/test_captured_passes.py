@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from qs3.engine.cuda_graphs import EAGER, Graphs
-from qs3.models.norms import use_domain
+from qs3.kernels.norms import use_domain
 from tests.methods.shapes import tiny_net
 from tests.models.test_all_nets import NETS, build
 

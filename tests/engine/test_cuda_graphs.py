@@ -15,13 +15,13 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from qs3 import kernels as fast
 from qs3.engine import cuda_graphs
 from qs3.engine.cuda_graphs import EAGER, MOST, Graphs, _Passes
 from qs3.errors import DataError
-from qs3.models import fast
+from qs3.kernels.norms import use_domain
 from qs3.models.base import Features, PointClassifier
 from qs3.models.dgcnn import dgcnn
-from qs3.models.norms import use_domain
 from tests.methods.cases import CASES, batch_of, total
 from tests.methods.shapes import CLASSES, tiny_net, tiny_pointdan
 

@@ -6,11 +6,11 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from qs3.catalogue import Catalogue
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement, flat_within, heights_of
 from qs3.generation.scenes import Support
 from qs3.geometry.sampling import surface_sample
-from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh, merge
 
 ALWAYS = Arrangement(tables={"chair": 1.0})

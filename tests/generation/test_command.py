@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.data.store import open_pointset, read_manifest
 from qs3.errors import ConfigError, DataError, MissingDataError, RenderError
 from qs3.generation.command import generate
 from qs3.generation.object_parts import Parts
 from qs3.generation.recipes import Cloud
 from qs3.generation.workers import Outcome
 from qs3.meshes import io
+from qs3.store.store import open_pointset, read_manifest
 from qs3.utils.memory import memory_limit
 from tests.generation.generating import ROOT, command, composed, config, fingerprint
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from qs3.data.store import open_pointset
 from qs3.generation.command import generate
 from qs3.generation.contact_sheets import _range, clouds_picture, infrared_picture
+from qs3.store.store import open_pointset
 from tests.generation.generating import config, fingerprint
 
 

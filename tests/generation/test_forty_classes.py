@@ -3,10 +3,10 @@
 import pytest
 
 from qs3.classes import CLASSES, MODELNET40, class_list, known_as
-from qs3.data.store import open_pointset
 from qs3.errors import ConfigError
 from qs3.generation.command import generate
 from qs3.generation.objects import mesh_items
+from qs3.store.store import open_pointset
 from tests.fixtures.modelnet import write_off_tree
 from tests.generation.generating import config
 

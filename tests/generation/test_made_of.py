@@ -9,10 +9,10 @@ import pytest
 import qs3
 from qs3.classes import CLASSES, MODELNET40
 from qs3.config.hydra import build
-from qs3.data.store import is_finished
 from qs3.errors import ConfigError, DataError
 from qs3.generation.command import generate
 from qs3.generation.made_of import made_of
+from qs3.store.store import is_finished
 from tests.fixtures.modelnet import write_off_tree
 from tests.fixtures.published import write_xyz_tree
 from tests.generation.generating import QUICK, composed, config

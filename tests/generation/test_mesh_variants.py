@@ -9,10 +9,10 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from qs3.data.store import open_pointset
 from qs3.generation.command import generate
 from qs3.generation.objects import mesh_items
 from qs3.generation.plan import describe
+from qs3.store.store import open_pointset
 from qs3.utils.files import sha256_file
 from tests.generation.generating import ROOT, config
 

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import pytest
 
-from qs3.data.store import open_pointset
 from qs3.errors import ConfigError, DataError, MeshError, RenderError
 from qs3.generation import travel
 from qs3.generation.command import generate
@@ -24,6 +23,7 @@ from qs3.generation.object_parts import Parts
 from qs3.generation.workers import Job, Outcome, scan_all
 from qs3.meshes.folder import MeshFolder
 from qs3.meshes.source import MeshItem
+from qs3.store.store import open_pointset
 from qs3.utils.pool import Processes
 from tests.generation.generating import QUICK, ROOT, config, fingerprint
 

@@ -5,11 +5,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import qs3
+from qs3.catalogue import Catalogue
 from qs3.errors import MeshError
 from qs3.generation.command import generate
 from qs3.generation.mesh_sizes import warn_of_sizes
 from qs3.generation.scenes import Alone, Room
-from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.folder import MeshFolder
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import RealSize, UnitCube

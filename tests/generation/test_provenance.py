@@ -10,7 +10,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.data.store import ManifestRow, open_pointset, open_table, read_meta, write_pointset
 from qs3.errors import ConfigError, DataError
 from qs3.generation.command import generate
 from qs3.generation.provenance import (
@@ -24,6 +23,7 @@ from qs3.generation.view_files import load_views, save_view, view_folder
 from qs3.geometry.cameras import Camera, Intrinsics
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.pixel_status import Reason
+from qs3.store.store import ManifestRow, open_pointset, open_table, read_meta, write_pointset
 from tests.generation.generating import config, fingerprint
 
 KEPT = ["provenance=true", "keep_views=true", "tracking=drifting", "scene=room"]

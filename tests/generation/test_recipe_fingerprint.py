@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 import qs3
-from qs3.data.store import open_pointset
 from qs3.generation.code_fingerprint import HARMLESS, MAKES_CLOUDS, code_fingerprint
 from qs3.generation.command import generate
 from qs3.generation.objects import mesh_items
 from qs3.generation.plan import describe
 from qs3.generation.recipe_fingerprint import recipe_fingerprint
+from qs3.store.store import open_pointset
 from tests.generation.generating import config
 
 MADE = ["chair/train/a", "chair/train/b"]
@@ -89,7 +89,7 @@ def test_all_that_makes_clouds_is_in_it():
             for module in re.findall(r"^from (qs3\.[\w.]+) import", path.read_text(), re.MULTILINE):
                 assert module.startswith((*covered, *harmless)), f"{path}: {module}"
     # Of what is harmless, these decide something, and are in it by name.
-    assert {"qs3.utils.seeding", "qs3.data.frames"} <= set(covered)
+    assert {"qs3.utils.seeding", "qs3.datasets.frames"} <= set(covered)
 
 
 def test_all_that_a_config_of_generation_names_is_in_it():

@@ -12,11 +12,10 @@ from omegaconf import OmegaConf
 from scipy.spatial import ConvexHull
 from trimesh.proximity import closest_point_naive
 
+from qs3.catalogue import Catalogue
 from qs3.config.hydra import build
-from qs3.data.frames.images import DepthImage, Pinhole
-from qs3.data.frames.rules import Limits, Rules
-from qs3.data.inspection.surface import surfaces_of
-from qs3.data.manifest import ManifestRow
+from qs3.datasets.frames.images import DepthImage, Pinhole
+from qs3.datasets.frames.rules import Limits, Rules
 from qs3.errors import ConfigError
 from qs3.generation.arrangements import Arrangement
 from qs3.generation.checks import check, check_recipe
@@ -25,10 +24,11 @@ from qs3.generation.recipes import BoxCrop, MaskCrop, TooFewPointsError
 from qs3.generation.room_scans import RoomCamera, one_piece, yaw_between
 from qs3.generation.scenes import Room, Support
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
-from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import OnFurniture
+from qs3.report.inspection.surface import surfaces_of
 from qs3.sensors.renderers.base import Scene
+from qs3.store.manifest import ManifestRow
 from qs3.utils.seeding import object_rng
 from tests.generation.generating import composed
 
@@ -333,7 +333,7 @@ def test_a_scan_of_a_raised_object_is_of_it_alone(cfg, made, lamp):
     assert closest_point_naive(solid, twin[::32].astype(float))[1].max() < 1e-3
     # The placed mesh is found again for `qs3 compare`.
     settings = OmegaConf.to_container(cfg.recipe, resolve=True)
-    catalogue = {"_target_": "qs3.meshes.catalogue.Catalogue", "seed": 1, "train": 20, "test": 0}
+    catalogue = {"_target_": "qs3.catalogue.Catalogue", "seed": 1, "train": 20, "test": 0}
     meta = {"settings": {"recipe": settings, "meshes": catalogue, "seed": lamp.seed}}
     surfaces, reason = surfaces_of(meta, None)
     assert surfaces is not None, reason

@@ -5,20 +5,20 @@ import pytest
 import trimesh
 from trimesh.proximity import closest_point_naive
 
+from qs3.catalogue import Catalogue
 from qs3.config.hydra import build
-from qs3.data.store import open_pointset, open_table, read_meta
 from qs3.errors import ConfigError, DataError
 from qs3.generation.checks import check
 from qs3.generation.command import generate
 from qs3.generation.provenance import NO_RESIDUAL_M, Keep
 from qs3.generation.twins import fused_twins, true_points, whole_surface
 from qs3.geometry.cameras import Camera, Intrinsics, look_at
-from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.renderers.base import Body
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from qs3.store.store import open_pointset, open_table, read_meta
 from qs3.utils.seeding import object_rng
 from tests.generation.generating import composed, config, fingerprint
 

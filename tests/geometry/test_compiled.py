@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qs3.geometry import compiled
-from qs3.models.fast import edgeconv
+from qs3.kernels import edgeconv
 
 
 def edges(points: int, rows: int, k: int, seed: int = 0) -> torch.Tensor:

@@ -17,14 +17,14 @@ import qs3
 import qs3.inference.command
 import qs3.inference.inputs
 from qs3.config.location import typed
-from qs3.data.store import open_pointset
 from qs3.errors import DataError
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.model_file import read_result, write_result
 from qs3.models.dgcnn import DGCNN
 from qs3.runs.predictions import read_predictions
-from tests.commands import main
+from qs3.store.store import open_pointset
 from tests.data.importers.own_clouds import write_odd
+from tests.running import main
 
 ONE = (".xyz", ".txt", ".npy", ".npz", ".ply", ".pcd", ".h5", ".hdf5")
 

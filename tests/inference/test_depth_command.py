@@ -18,14 +18,14 @@ import pytest
 from PIL import Image
 
 import qs3
-from qs3.data.frames.images import Pinhole
-from qs3.data.frames.pointed import point_out
+from qs3.datasets.frames.images import Pinhole
+from qs3.datasets.frames.pointed import point_out
 from qs3.errors import ConfigError, DataError
 from qs3.inference.model_file import read_result, write_result
 from qs3.runs.metrics import read_metrics
-from tests.commands import main
 from tests.fixtures.frame_files import Shot, Thing, kinect, write_archive
 from tests.fixtures.published import CLASSES
+from tests.running import main
 
 SHOT = Shot(
     [

@@ -8,7 +8,7 @@ import pytest
 
 from qs3.errors import DataError
 from qs3.inference.depth_list import Shown, find_shown
-from tests.commands import main
+from tests.running import main
 
 CAMERA = "525,525,319.5,239.5"
 

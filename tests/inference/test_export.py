@@ -28,8 +28,8 @@ from qs3.models.pointnet import pointnet
 from qs3.models.pointnet2 import GroupedMLP, pointnet2
 from qs3.models.rscnn import rscnn
 from qs3.models.simpleview import simpleview
-from tests.commands import main
 from tests.inference.conftest import over_the_floor
+from tests.running import main
 
 # ONNX's script decorator and torch's tree of arguments use what Python and torch call old.
 pytestmark = pytest.mark.filterwarnings(

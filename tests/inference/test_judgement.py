@@ -11,8 +11,8 @@ from qs3.errors import ConfigError, DataError
 from qs3.inference.export import export_command, export_folder
 from qs3.inference.judgement import read_judgement
 from qs3.inference.model_file import read_result, write_result
-from tests.commands import main
 from tests.fixtures.frame_files import write_archive
+from tests.running import main
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from qs3.inference.model_card import card, carried, wilson
 from qs3.inference.model_file import read_result
 from qs3.inference.tensor_file import read_tensors, write_tensors
 from qs3.runs.metrics import read_metrics
-from tests.commands import main
+from tests.running import main
 
 FILES = ["README.md", "config.json", "held_out.safetensors", "model.safetensors"]
 TYPES = (

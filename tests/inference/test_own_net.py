@@ -8,9 +8,9 @@ import torch
 
 import qs3
 from qs3.config.hashing import run_folder
-from qs3.data.store import open_pointset
+from qs3.store.store import open_pointset
 from qs3.training.command import train
-from tests.commands import main
+from tests.running import main
 from tests.training.toy import toy_config, write_toy
 
 MODULE = "tests.training.toy"

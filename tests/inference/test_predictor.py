@@ -18,13 +18,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import qs3
-from qs3.data.store import open_pointset
 from qs3.datamodules import DomainData
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.inference.model_file import read_result, write_result
 from qs3.inference.predictor import load
 from qs3.models.dgcnn import dgcnn
 from qs3.runs.predictions import read_predictions
+from qs3.store.store import open_pointset
 from tests.inference.conftest import over_the_floor
 from tests.limits import memory_of_at_most, time_of_at_most
 
@@ -300,7 +300,7 @@ def test_pickles_are_refused_unopened(run, tmp_path):
         {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "_args_": [1]},
         {"_target_": "qs3.models.dgcnn.nothing", "num_classes": 3},
         {"_target_": "qs3.models.nothing.dgcnn", "num_classes": 3},
-        {"_target_": "qs3.models.norms.head_norm", "kind": "batch"},  # ours, but gives no net
+        {"_target_": "qs3.kernels.norms.head_norm", "kind": "batch"},  # ours, but gives no net
         {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "colour": "red"},
         {"_target_": "qs3.models.dgcnn.dgcnn", "num_classes": 3, "k": -1},
         {"_target_": "tests.training.toy.TinyNet", "num_classes": 3},

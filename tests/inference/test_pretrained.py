@@ -9,13 +9,13 @@ import pytest
 
 import qs3
 from qs3.classes import CLASSES
-from qs3.data.importers.arrays import named_arrays
+from qs3.datasets.importers.arrays import named_arrays
 from qs3.errors import MissingDataError
 from qs3.inference import pretrained
 from qs3.inference.export import export_folder
 from qs3.inference.model_file import find_result, write_result
 from qs3.inference.scores import DISPUTED
-from tests.commands import main
+from tests.running import main
 
 
 @pytest.fixture

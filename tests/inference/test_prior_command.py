@@ -12,8 +12,8 @@ import qs3
 from qs3.errors import ConfigError
 from qs3.evaluation.prior import POWER
 from qs3.inference.cli import PREDICT
-from tests.commands import main
 from tests.composing import compose
+from tests.running import main
 
 
 def test_the_three_ways_to_it_have_one_power() -> None:

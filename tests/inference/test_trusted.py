@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.data.store import open_pointset
 from qs3.errors import DataError
 from qs3.evaluation.estimates_text import DO_NOT_TRUST
 from qs3.evaluation.trust import Seen, judge
@@ -24,10 +23,11 @@ from qs3.inference.held_out import MOST, checked_tensors, known_of, tensors_of
 from qs3.inference.model_file import read_result, write_result
 from qs3.inference.model_folder import HELD_OUT
 from qs3.inference.predictor import load
-from qs3.models.norms import DomainNorm
+from qs3.kernels.norms import DomainNorm
 from qs3.runs.metrics import read_metrics
-from tests.commands import main
+from qs3.store.store import open_pointset
 from tests.inference.conftest import trained
+from tests.running import main
 
 
 def nested(one: torch.Tensor) -> torch.Tensor:

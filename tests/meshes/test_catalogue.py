@@ -8,9 +8,9 @@ from collections import Counter
 
 import pytest
 
+from qs3.catalogue import Catalogue, families, make
 from qs3.classes import CLASSES
 from qs3.errors import ConfigError
-from qs3.meshes.catalogue import Catalogue, families, make
 
 SOME = ("lamp", "monitor", "plant")
 
@@ -107,7 +107,7 @@ def test_two_seeds_share_no_mesh_and_order_families_each_in_its_way():
 
 SCRIPT = """
 import hashlib, sys
-from qs3.meshes.catalogue import Catalogue
+from qs3.catalogue import Catalogue
 items = Catalogue(seed=3, train=2, test=1).items()
 text = " ".join(f"{i.id} {i.origin} {i.load().sha256}" for i in items)
 print(hashlib.sha256(text.encode()).hexdigest())

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from qs3.catalogue import families, make, make_parts
 from qs3.classes import CLASSES
-from qs3.meshes.catalogue import families, make, make_parts
 from qs3.meshes.mesh import merge
 
 SEEDS = range(4)

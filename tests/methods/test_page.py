@@ -13,8 +13,8 @@ import yaml
 from torch import nn
 from torch.nn import functional as F
 
+from qs3.kernels.norms import DomainNorm
 from qs3.methods.base import Method
-from qs3.models.norms import DomainNorm
 from qs3.selftraining.selectors import TeacherPredictions, chosen_by
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.kernels.norms import active
 from qs3.models.base import PointClassifier
-from qs3.models.norms import active
 from qs3.models.rscnn import LEVELS, RSConv, group
 
 

@@ -8,10 +8,10 @@ import torch
 from torch import nn
 
 from qs3.errors import ConfigError, DataError
+from qs3.kernels import plain
+from qs3.kernels.norms import DomainNorm, adapt_batchnorm, use_domain, use_trained
 from qs3.models import pointnet2, rscnn
 from qs3.models.base import PointClassifier
-from qs3.models.fast import plain
-from qs3.models.norms import DomainNorm, adapt_batchnorm, use_domain, use_trained
 from tests.models.test_all_nets import NETS, build, clouds
 
 SMALL = {

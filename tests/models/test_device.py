@@ -12,12 +12,13 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from qs3 import kernels as fast
 from qs3.geometry import neighbours
 from qs3.geometry.farthest_points import farthest_points
-from qs3.models import dgcnn, fast
+from qs3.kernels import edgeconv
+from qs3.kernels.norms import KINDS, use_domain
+from qs3.models import dgcnn
 from qs3.models.base import PointClassifier
-from qs3.models.fast import edgeconv
-from qs3.models.norms import KINDS, use_domain
 from tests.device import Watch, as_on_device, as_on_gpu
 from tests.models.test_all_nets import NETS, build, clouds
 

@@ -7,9 +7,9 @@ from torch.nn import functional as F
 
 from qs3.errors import DataError
 from qs3.geometry.neighbours import knn
+from qs3.kernels.pointwise_max import pooled_linear
 from qs3.models.base import ClassHead, PointClassifier, check_points
 from qs3.models.dgcnn import DGCNN, dgcnn
-from qs3.models.fast.pointwise_max import pooled_linear
 from tests.models.reference import NaiveDGCNN
 
 

@@ -6,8 +6,8 @@ from torch import nn
 
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.kernels import grouped_mlp_max
 from qs3.models import pointnet2 as pointnet2_module
-from qs3.models.fast import grouped_mlp_max
 from qs3.models.pointnet2 import GroupedMLP, pointnet2
 from tests.models.by_formula import clouds, figures, fill
 from tests.models.reference_pointnet2 import StraightMLP, StraightPointNet2

@@ -5,8 +5,8 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from qs3.kernels.rsconv import relations
 from qs3.models.base import PointClassifier
-from qs3.models.fast.rsconv import relations
 from qs3.models.rscnn import group, rscnn
 from tests.models.golden import clouds, gradient_norm, set_weights
 from tests.models.reference_rscnn import NaiveRSCNN

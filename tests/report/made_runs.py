@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import matplotlib.image
 
-from qs3.data.made_of import MadeOf
 from qs3.runs.metrics import (
     AccuracyEstimates,
     DataHashes,
@@ -21,6 +20,7 @@ from qs3.runs.metrics import (
     read_metrics,
     write_metrics,
 )
+from qs3.store.made_of import MadeOf
 
 PUBLISHED = MadeOf(objects="published files", published=True)
 CATALOGUE = MadeOf(objects="embedded catalogue", sensor="kinect_like", views=4, meshes="c" * 12)

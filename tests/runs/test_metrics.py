@@ -35,9 +35,9 @@ from qs3.runs.metrics import (
     write_metrics,
 )
 from qs3.training.command import train
-from tests.commands import main
 from tests.report.made_runs import metrics, scores
 from tests.report.tables.test_tables import run_cell
+from tests.running import main
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 
 

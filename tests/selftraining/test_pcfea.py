@@ -15,9 +15,9 @@ from torch.nn import functional as F
 
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import predict
+from qs3.kernels.norms import DomainNorm
 from qs3.methods.base import Method
 from qs3.models.base import PointClassifier
-from qs3.models.norms import DomainNorm
 from qs3.models.pointnet import pointnet
 from qs3.selftraining.baselines import Random
 from qs3.selftraining.cbst import Cbst

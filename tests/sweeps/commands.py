@@ -6,7 +6,7 @@ import json
 import subprocess
 from pathlib import Path
 
-from tests.commands import command
+from tests.running import command
 
 
 def light(folder: Path, *arguments: str) -> subprocess.CompletedProcess:

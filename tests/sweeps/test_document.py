@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from qs3.config.hydra import build
-from tests.commands import ROOT
+from tests.running import ROOT
 from tests.training.toy import CONF
 
 ANY = "+hydra.launcher.additional_parameters.mail-type=END"

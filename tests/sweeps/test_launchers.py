@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from qs3.config import hashing
 from qs3.config.hydra import _gpu_in_turn
 from qs3.errors import ConfigError
-from tests.commands import command
+from tests.running import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
 from tests.training.toy import CONF, overrides

@@ -25,7 +25,7 @@ from qs3.sweeps.search_report import Tried, report
 from qs3.sweeps.search_space import check_varied, distribution, split, words
 from qs3.training.command import judged, objective_of, train
 from qs3.utils.locks import alone
-from tests.commands import command
+from tests.running import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import toy, toy_data  # noqa: F401 (fixtures)
 from tests.training.toy import CONF, overrides, write_domain

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from qs3.tools import doctor
-from tests.commands import main
+from tests.running import main
 
 ABSENT = doctor.Check("Thing", "raise SystemExit('no library')", ("libthing1",), "no things")
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from qs3.kernels.norms import DomainNorm
 from qs3.models.base import ClassHead, PointClassifier
-from qs3.models.norms import DomainNorm
 from qs3.models.pointdan import TwoHeads
 from tests.methods.shapes import TinyBackbone, TinyNodes
 from tests.training.toy import TinyNet

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from qs3.config import hashing
-from qs3.data.store import open_pointset
 from qs3.datamodules.splits import load_clouds
 from qs3.errors import DataError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.metrics import adapt_norms
 from qs3.methods.source_only import SourceOnly
 from qs3.runs.checkpoints import load
+from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.training.evaluate import ADAPTERS
 from qs3.training.settings import NORMS

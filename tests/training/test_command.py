@@ -14,7 +14,7 @@ from qs3.config.hydra import build
 from qs3.training.settings import KEYS
 from qs3.training.settings import _check_keys as check_keys_of
 from qs3.utils.locks import owned
-from tests.commands import command
+from tests.running import command
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
 from tests.training.toy import CONF, overrides
 

@@ -16,16 +16,16 @@ import torch
 
 from qs3.config import hashing
 from qs3.config.hydra import build
-from qs3.data.store import open_pointset
 from qs3.datamodules.splits import load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.evaluation.tent import minimise_entropy
 from qs3.runs.checkpoints import load
 from qs3.runs.pseudo_labels import write_pseudo_labels
 from qs3.selftraining.selectors import Qbst, TeacherPredictions
+from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.utils.seeding import derive
-from tests.commands import command
+from tests.running import command
 from tests.training.conftest import result_of
 from tests.training.toy import CLASSES, TWIN, TinyNet, overrides, toy_config, write_domain
 from tests.training.watching import interrupt, seen_by

@@ -12,11 +12,11 @@ import torch
 
 from qs3.config import hashing
 from qs3.config.compose import choices
-from qs3.data.store import open_pointset
 from qs3.datamodules.splits import subsample_splits
 from qs3.engine.classifier import Classifier
 from qs3.errors import ConfigError, DataError, MissingDataError, Qs3Error
 from qs3.runs.metrics import TrainingAccuracy
+from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.training.settings import STILL
 from qs3.utils.locks import owned

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from qs3.config import hashing
-from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.runs.metrics import RunMetrics
 from qs3.runs.predictions import read_predictions
 from qs3.runs.pseudo_labels import path_of, read_pseudo_labels
+from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from qs3.training.command import train
 from tests.training.toy import CLASSES, CONF, toy_config, write_toy
 

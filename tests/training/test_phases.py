@@ -12,13 +12,13 @@ from omegaconf import open_dict
 
 from qs3.config import hashing
 from qs3.config.hydra import build
-from qs3.data.store import open_pointset
 from qs3.datamodules.splits import Unlabelled, load_clouds
 from qs3.evaluation.metrics import predict
 from qs3.runs.checkpoints import load
 from qs3.runs.metrics import RunMetrics
 from qs3.runs.pseudo_labels import path_of, read_pseudo_labels
 from qs3.selftraining.callback import SelfTraining
+from qs3.store.store import open_pointset
 from qs3.training.command import train
 from qs3.utils.seeding import derive
 from tests.training.conftest import result_of

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.splits import Unlabelled
 from qs3.errors import DataError
+from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from qs3.training.command import train
 from qs3.training.real_sizes import check_real_sizes
 

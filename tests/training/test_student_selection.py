@@ -15,7 +15,6 @@ import torch
 import qs3.selftraining.student_selection
 from qs3.config import hashing
 from qs3.config.hydra import build
-from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.datamodules.phases import Phases
 from qs3.datamodules.splits import load_clouds
 from qs3.engine.classifier import Classifier
@@ -28,9 +27,10 @@ from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.runs.predictions import OF_FILES
 from qs3.runs.pseudo_labels import read_pseudo_labels
 from qs3.selftraining.student_selection import StudentSelection
+from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from qs3.training.command import headline, train
 from qs3.utils.seeding import derive
-from tests.commands import command
+from tests.running import command
 from tests.training.conftest import result_of
 from tests.training.toy import CLASSES, overrides, toy_config
 from tests.training.watching import Stop, interrupt

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.datamodules.validation_split import RULES
 from qs3.engine.classifier import Classifier
 from qs3.evaluation.metrics import Evaluation
 from qs3.evaluation.selection_rules import STUDENT_RULES
+from qs3.store.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.training.command import train
 from tests.training.search import Truth, search
 from tests.training.toy import _SHAPES, CLASSES, TWIN, write_domain

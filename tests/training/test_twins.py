@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from qs3.config import hashing
-from qs3.data.store import open_pointset, read_manifest, write_pointset
 from qs3.errors import DataError
 from qs3.runs.folder import read_started
+from qs3.store.store import open_pointset, read_manifest, write_pointset
 from qs3.training.command import train
 from qs3.training.shared_warmup import warmup_sha256
 from tests.training.toy import MADE_OF, TWIN, toy_config, write_toy

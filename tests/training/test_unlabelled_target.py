@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from qs3.config import hashing
-from qs3.data.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.errors import ConfigError, DataError
 from qs3.report.tables.aggregate import summarise
 from qs3.report.tables.formats import markdown
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import Selection, read_metrics
+from qs3.store.store import ManifestRow, PointSet, open_pointset, write_pointset
 from qs3.training.command import headline, train
-from tests.commands import main
 from tests.report.tables.test_tables import run_cell
+from tests.running import main
 from tests.training.toy import CLASSES
 
 
@@ -28,13 +28,13 @@ def without_labels(dataset: PointSet) -> PointSet:
 @pytest.fixture
 def unlabelled(monkeypatch):
     """The toy target is opened without its labels."""
-    import qs3.data.domain
+    import qs3.datasets.domain
 
     def opened(folder, *args, **kwargs):
         dataset = open_pointset(folder, *args, **kwargs)
         return without_labels(dataset) if Path(folder).name == "kinectsim10" else dataset
 
-    monkeypatch.setattr(qs3.data.domain, "open_pointset", opened)
+    monkeypatch.setattr(qs3.datasets.domain, "open_pointset", opened)
 
 
 def only(toy_data: Path, folder: Path, keep) -> Path:

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from qs3.data.made_of import MadeOf
-from qs3.data.store import ManifestRow, write_pointset
+from qs3.store.made_of import MadeOf
+from qs3.store.store import ManifestRow, write_pointset
 from tests.composing import compose
 
 CLASSES = ("ball", "rod", "slab")

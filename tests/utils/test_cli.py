@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from qs3.__main__ import QS3
-from qs3.data.scannet.settings import Extraction
+from qs3.datasets.scannet.settings import Extraction
 from qs3.errors import ConfigError
 from qs3.utils.cli import (
     FLAG,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from qs3.utils.environment import needs_packages
-from tests.commands import ROOT
+from tests.running import ROOT
 
 
 @pytest.mark.parametrize("script", ["train.py", "generate.py"])

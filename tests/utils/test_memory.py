@@ -6,16 +6,16 @@ import os
 
 import pytest
 
-from qs3.data.frames.matlab import load_v5
-from qs3.data.manifest import MANIFEST, read_manifest
-from qs3.data.meta import META, read_meta
-from qs3.data.scannet.labels import read_scene_list
+from qs3.calibration.fit.frames import read_camera
+from qs3.datasets.frames.matlab import load_v5
+from qs3.datasets.scannet.labels import read_scene_list
 from qs3.errors import DataError
 from qs3.runs.folder import STARTED, read_started
 from qs3.runs.metrics import METRICS, read_metrics
 from qs3.runs.predictions import read_predictions
 from qs3.runs.pseudo_labels import read_pseudo_labels
-from qs3.sensors.fit.frames import read_camera
+from qs3.store.manifest import MANIFEST, read_manifest
+from qs3.store.meta import META, read_meta
 from qs3.utils.memory import read_whole
 from tests.limits import memory_of_at_most
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from qs3.calibration.fit.frames import _png
 from qs3.errors import DataError
-from qs3.sensors.fit.frames import _png
 from qs3.utils.pictures import read_png
 from tests.limits import memory_of_at_most
 

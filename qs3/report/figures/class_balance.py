@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.data.store import PointSet
 from qs3.errors import DataError
 from qs3.report.figures.canvas import grouped_bars, new_figure, say
+from qs3.store.store import PointSet
 from qs3.utils.plotting import BLUE, INK, PALE_BLUE, save_png
 from qs3.utils.plural import counted
 

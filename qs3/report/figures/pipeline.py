@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from qs3.data.dataset_folder import VIEWS
-from qs3.data.inspection.surface import distance_to_mesh, surfaces_of
-from qs3.data.manifest import read_manifest
-from qs3.data.store import has_variant, open_pointset, read_meta
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.generation.provenance import Keep
 from qs3.generation.view_files import KeptView, load_views
 from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
+from qs3.report.inspection.surface import distance_to_mesh, surfaces_of
+from qs3.store.dataset_folder import VIEWS
+from qs3.store.manifest import read_manifest
+from qs3.store.store import has_variant, open_pointset, read_meta
 from qs3.utils.plural import counted
 from qs3.utils.seeding import object_rng
 
@@ -211,9 +211,8 @@ def kept_object(
 
 def _item(cfg: Any, object_id: str | None) -> MeshItem:
     from qs3.generation.objects import mesh_items
-    from qs3.generation.up_axis import with_up_axis
 
-    items = {item.id: item for item in mesh_items(with_up_axis(cfg))}
+    items = {item.id: item for item in mesh_items(cfg)}
     if object_id is None:
         return items.get(_OFTEN_THERE) or next(iter(items.values()))
     if object_id not in items:

@@ -19,7 +19,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from qs3.classes import known_as
-from qs3.data.importers.object_archive import Archive
+from qs3.datasets.importers.object_archive import Archive
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.evaluation.prior import POWER
 from qs3.inference.model_file import FILE, find_result

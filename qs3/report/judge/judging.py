@@ -1,6 +1,7 @@
 """Runs, objects, predictions, figures: what `qs3 report judge` finds out.
 
-The archive is read by `qs3.data.importers.object_archive`; its clouds go to each run as those of
+The archive is read by `qs3.datasets.importers.object_archive`; its clouds go to each run as those
+of
 `qs3 predict` do, thinned to the points that the run was trained with (`qs3.report.judge.answers`).
 Nothing is trained, chosen or tuned by what comes out.
 """
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Int
 
 from qs3.classes import known_as
 from qs3.config.checks import check_float
-from qs3.data.importers.object_archive import JUDGE, TIERS, Archive, read_archive
+from qs3.datasets.importers.object_archive import JUDGE, TIERS, Archive, read_archive
 from qs3.errors import ConfigError, DataError
 from qs3.evaluation.prior import POWER, check_told
 from qs3.inference.pretrained import name_of

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.data.contact_sheets import class_sheet, contact_sheet, padded, scan_picture
-from qs3.data.store import PointSet
+from qs3.report.contact_sheets import class_sheet, contact_sheet, padded, scan_picture
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.figures.class_balance import class_picture
 from qs3.report.runs.data import RunFiles
 from qs3.report.runs.domains import domain_of, open_domain, positions_in
 from qs3.runs.predictions import Predictions
+from qs3.store.store import PointSet
 from qs3.utils.plural import counted
 
 ROLES = ("source", "target")

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from qs3.data.domain import Domain
-from qs3.data.store import PointSet, is_finished
+from qs3.datasets.domain import Domain
 from qs3.errors import DataError, Qs3Error
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs.data import RunFiles
 from qs3.runs.predictions import FILE
+from qs3.store.store import PointSet, is_finished
 
 _KEYS = tuple(field.name for field in dataclasses.fields(Domain))
 

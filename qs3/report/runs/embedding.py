@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from qs3.data.store import PointSet
 from qs3.datamodules.splits import load_clouds
 from qs3.errors import Qs3Error
 from qs3.evaluation.metrics import global_features
@@ -20,6 +19,7 @@ from qs3.report.runs.data import RunFiles
 from qs3.report.runs.domains import open_domain
 from qs3.report.runs.tsne import tsne
 from qs3.runs.checkpoints import load
+from qs3.store.store import PointSet
 from qs3.utils.seeding import derive
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from qs3.config.hydra import in_multirun
-from qs3.data.viewer.page import page as turnable_page
 from qs3.errors import Qs3Error
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import figures as run_figures
@@ -24,6 +23,7 @@ from qs3.report.runs.clouds import cloud_pictures
 from qs3.report.runs.data import RunFiles, read_run
 from qs3.report.runs.page import page
 from qs3.report.runs.viewed import part_of_run, worst_first
+from qs3.report.viewer.page import page as turnable_page
 from qs3.runs.metrics import RunMetrics, read_metrics
 from qs3.utils.files import write_text
 from qs3.utils.plotting import save_png

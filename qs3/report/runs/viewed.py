@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.data.inspection.open_dataset import opened_domain
-from qs3.data.inspection.viewed import part_of
-from qs3.data.viewer.page import Part
 from qs3.errors import MissingDataError
 from qs3.report.figures.canvas import NothingToDrawError
+from qs3.report.inspection.open_dataset import opened_domain
+from qs3.report.inspection.viewed import part_of
 from qs3.report.runs.data import RunFiles
 from qs3.report.runs.domains import domain_of, open_domain, positions_in
+from qs3.report.viewer.page import Part
 from qs3.runs.predictions import Predictions
 from qs3.utils.plural import counted
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from qs3.data.importers.object_archive import TIERS
+from qs3.datasets.importers.object_archive import TIERS
 from qs3.errors import DataError
 from qs3.report.clustered import LEVEL
 from qs3.report.tables.aggregate import data_differences, data_lines, same_data

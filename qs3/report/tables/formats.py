@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from qs3.data.importers.object_archive import TIERS
+from qs3.datasets.importers.object_archive import TIERS
 from qs3.report.tables.aggregate import FEW_SEEDS, Group, data_lines, task
 from qs3.report.tables.cells import INCOMPLETE, METRICS, Cell, Metric, Table
 from qs3.report.tables.made_of import OTHER_DATA, data_marks, is_other, results_of

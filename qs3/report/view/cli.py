@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from qs3.data.viewer import COLOURS, MOST_CLOUDS, MOST_POINTS
 from qs3.errors import ConfigError
+from qs3.report.viewer import COLOURS, MOST_CLOUDS, MOST_POINTS
 from qs3.utils.cli import FLAG, Command, Option, one_of, text, whole
 
 

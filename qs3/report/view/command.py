@@ -8,29 +8,28 @@ from pathlib import Path
 
 import numpy as np
 
-from qs3.clouds.files import SUFFIXES, CloudFile, parse_clouds
-from qs3.clouds.finite import checked
 from qs3.config.checks import check_choice
 from qs3.config.compose import choices
-from qs3.data.contact_sheets import drawn
-from qs3.data.importers.base import turned
-from qs3.data.importers.folders import UP_AXES
-from qs3.data.importers.object_archive import JUDGE, read_archive
-from qs3.data.inspection.open_dataset import open_named
-from qs3.data.inspection.viewed import chosen, part_of
-from qs3.data.place import is_archive
-from qs3.data.store import is_finished
-from qs3.data.viewer import MOST_POINTS
-from qs3.data.viewer.page import Part, Shown, captions, page, points_each, thinned
-from qs3.data.with_depth import with_depth
+from qs3.datasets.clouds.files import SUFFIXES, CloudFile, parse_clouds
+from qs3.datasets.clouds.finite import checked
+from qs3.datasets.importers.base import turned
+from qs3.datasets.importers.folders import UP_AXES
+from qs3.datasets.importers.object_archive import JUDGE, is_archive, read_archive
+from qs3.datasets.with_depth import with_depth
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.geometry.sampling import surface_sample
 from qs3.inference.inputs import find_files, passed_over, reason_of
 from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
 from qs3.meshes.io import SUFFIXES as MESHES
+from qs3.report.contact_sheets import drawn
+from qs3.report.inspection.open_dataset import open_named
+from qs3.report.inspection.viewed import chosen, part_of
 from qs3.report.runs.data import is_run, read_run
 from qs3.report.runs.viewed import part_of_run, worst_first
+from qs3.report.viewer import MOST_POINTS
+from qs3.report.viewer.page import Part, Shown, captions, page, points_each, thinned
 from qs3.runs.unbegun import is_unbegun
+from qs3.store.store import is_finished
 from qs3.utils.files import write_text
 from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from qs3.data.store import ManifestRow, write_pointset
 from qs3.errors import DataError
 from qs3.report.figures.class_balance import _summary, class_picture
+from qs3.store.store import ManifestRow, write_pointset
 
 
 def store(folder, counts, classes=("bed", "chair", "sofa")):

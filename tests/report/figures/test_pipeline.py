@@ -11,8 +11,8 @@ from qs3.generation.view_files import load_views
 from qs3.meshes.mesh import Mesh
 from qs3.report.figures.pipeline import kept_object, scan_object, signed_distance_m
 from qs3.report.figures.pipeline_figure import pipeline_figure
-from tests.commands import main
 from tests.generation.generating import config
+from tests.running import main
 
 SMALL = ["renderer=mitsuba", "renderer.samples=2", "views=2"]
 CHAIR = "chair/train/chair_0000"

@@ -10,7 +10,7 @@ import torch
 
 from qs3.__main__ import QS3
 from qs3.classes import CLASSES
-from qs3.data.importers.object_archive import read_archive
+from qs3.datasets.importers.object_archive import read_archive
 from qs3.errors import ConfigError, MissingDataError
 from qs3.inference.model_file import Result, write_result
 from qs3.inference.predictor import load

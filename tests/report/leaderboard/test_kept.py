@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from qs3.runs.metrics import METRICS, read_metrics
-from tests.commands import ROOT, main
+from tests.running import ROOT, main
 
 KEPT = ROOT / "docs" / "results" / "leaderboard"
 SECOND = ROOT / "docs" / "results" / "leaderboard_second"

@@ -29,11 +29,11 @@ from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import Times
 from qs3.training.command import train
-from tests.commands import ROOT, main
 from tests.composing import compose
 from tests.engine.test_rows import _flat, _place, _within, differing
 from tests.methods.test_own import METHOD, example
 from tests.report.tables.test_tables import run_cell
+from tests.running import ROOT, main
 from tests.training.toy import write_toy
 
 SPEC = yaml.safe_load((CONF / "table" / "leaderboard.yaml").read_text("utf-8"))

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.data import contact_sheets as pictures
-from qs3.data.store import ManifestRow, open_pointset, write_pointset
 from qs3.errors import Qs3Error
+from qs3.report import contact_sheets as pictures
 from qs3.report.figures.canvas import NothingToDrawError
 from qs3.report.runs import clouds as run_clouds
 from qs3.report.runs.clouds import cloud_pictures
@@ -17,6 +16,7 @@ from qs3.report.runs.data import read_run
 from qs3.report.runs.pictures import draw as draw_run
 from qs3.runs.metrics import DataHashes
 from qs3.runs.predictions import Predictions, read_predictions
+from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from tests.report.made_runs import change, not_blank, table
 from tests.training.toy import CLASSES, write_domain
 

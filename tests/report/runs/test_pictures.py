@@ -27,9 +27,9 @@ from qs3.runs.checkpoints import save
 from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
 from qs3.runs.predictions import read_predictions, write_predictions
 from qs3.training.command import train
-from tests.commands import main
 from tests.report.made_runs import change, not_blank, table
 from tests.report.wandb_files import read
+from tests.running import main
 from tests.training.toy import CLASSES
 from tests.utils.test_yamls import laughs
 

@@ -14,8 +14,8 @@ from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import METRICS
 from qs3.runs.predictions import FILE, read_predictions, write_predictions
-from tests.commands import main
 from tests.report.tables.test_running import fill
+from tests.running import main
 
 PLACE = "target test"
 ROWS = """

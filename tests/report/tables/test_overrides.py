@@ -8,7 +8,7 @@ from qs3.errors import ConfigError
 from qs3.report.tables.overrides import by_column, chosen, file_name, row_of, unknown
 from qs3.report.tables.running import missing
 from qs3.report.tables.table import build_table
-from tests.commands import main
+from tests.running import main
 
 COLUMNS = ("R → A", "R → A0", "S → K")
 TABLE = """

@@ -22,9 +22,9 @@ from qs3.report.tables.running import Job, launch, missing
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes, DataMadeOf, Evaluated
 from qs3.runs.predictions import FILE, Predictions, read_predictions, write_predictions
-from tests.commands import main
 from tests.report.made_runs import CATALOGUE, change, scores
 from tests.report.tables.test_tables import run_cell
+from tests.running import main
 from tests.training.toy import overrides, write_toy
 
 ROOT = Path(__file__).parents[3]

@@ -17,9 +17,9 @@ from qs3.report.tables.cells import Published
 from qs3.report.tables.formats import TO_RUN, csv_text, latex, markdown
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import DataHashes, EpochScores, Evaluated, Warmup
-from tests.commands import main
 from tests.composing import compose
 from tests.report.made_runs import scores, write_run
+from tests.running import main
 
 EXPECTED = ("ablation", "noise", "quickstart", "self_training", "uda")
 
@@ -314,7 +314,7 @@ def test_command_line(tmp_path, capsys):
 
 def test_the_report_needs_no_torch(tmp_path):
     code = (
-        "import sys; from tests.commands import main\n"
+        "import sys; from tests.running import main\n"
         "main(['report', 'table=quickstart', *sys.argv[1:]]); sys.exit('torch' in sys.modules)"
     )
     result = subprocess.run(

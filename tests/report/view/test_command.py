@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from qs3.data.store import open_pointset
 from qs3.runs.metrics import read_metrics
-from tests.commands import main
+from qs3.store.store import open_pointset
 from tests.data.viewer.reading import data_of, places
 from tests.fixtures.frame_files import write_archive
 from tests.report.made_runs import table
+from tests.running import main
 from tests.training.toy import CLASSES, write_domain
 
 RNG = np.random.default_rng(0)

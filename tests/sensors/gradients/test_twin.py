@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.special import gammainc, gammaincc, gammainccinv, gammaincinv
 
+from qs3.calibration.bench.cached_renderer import StillRenderer
 from qs3.errors import ConfigError
-from qs3.sensors.bench.cached_renderer import StillRenderer
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
 from qs3.sensors.gradients.twin import (
     Twin,

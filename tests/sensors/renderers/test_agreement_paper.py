@@ -9,12 +9,12 @@ import pytest
 import trimesh
 from omegaconf import OmegaConf
 
+from qs3.catalogue import Catalogue
 from qs3.config.compose import composed
 from qs3.config.hydra import build
 from qs3.config.location import CONF
 from qs3.generation.camera_poses import AnchoredViews
 from qs3.geometry.cameras import Camera, Intrinsics, Window
-from qs3.meshes.catalogue import Catalogue
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import UnitCube
 from qs3.sensors.base import window_of

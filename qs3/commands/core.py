@@ -1,0 +1,277 @@
+"""The command line: `qs3 COMMAND key=value`; a typed function is the only declaration of a command.
+
+    def sample(
+        input: Annotated[Path, "clouds: a file or a folder"],
+        *,
+        points: Annotated[int, Ge(1), "points of each cloud"] = 1024,
+        **overrides: Annotated[str, "settings of the domain's config"],
+    ) -> None:
+        \"\"\"Draw clouds at random.
+
+        Paragraphs of the docstring stand below the options.
+
+Example:
+            qs3 sample scans points=512
+        \"\"\"
+
+Parameters before the `*` also take words without "="; `*words` takes any number of them, and
+`**overrides` any other key. Types and bounds (`annotated_types`) are checked by pydantic, which is
+imported only when a command runs or shows its help.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import os
+import signal
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from types import FrameType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from qs3.errors import ConfigError, Qs3Error
+from qs3.utils.threads import let_waiting_threads_sleep
+from qs3.utils.version import VERSION
+
+INTERRUPTED, BROKEN_PIPE = 128 + signal.SIGINT, 128 + signal.SIGPIPE
+TERMINATED = 128 + signal.SIGTERM
+_HELP = ("-h", "--help", "help")
+_WIDTH = 100
+_WORDS = {int: "N", float: "NUMBER", bool: "true|false", Path: "PATH", str: "TEXT"}
+
+Commands = Mapping[str, "str | Commands"]
+"""Commands by their words: "module:function", or a mapping of further words. Under "" stands the
+command that is meant when a key=value follows."""
+
+
+def run(commands: Commands, argv: Sequence[str], name: str = "qs3", about: str = "") -> int:
+    """Run a command as a process does; returns the exit status.
+
+    A `Qs3Error` is one line on stderr and status 1; a reader that has seen enough (`| head`) ends
+    the command quietly.
+    """
+    let_waiting_threads_sleep()
+    try:
+        status = _dispatch(commands, list(argv), name, about)
+        sys.stdout.flush()
+    except Qs3Error as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\ninterrupted; run the same command again and it continues", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return BROKEN_PIPE
+    return status
+
+
+def _dispatch(commands: Commands, argv: list[str], name: str, about: str) -> int:
+    first, *rest = argv or ["--help"]
+    if first == "help" and rest:
+        first, *rest = *rest, "--help"
+    if first in ("--version", "version"):
+        print(f"qs3 {VERSION}")
+        return 0
+    if first in _HELP:
+        rows = [(word, _summary(found)) for word, found in commands.items() if word]
+        print(_page(f"{name} COMMAND", about or _summary(commands), rows))
+        return 0
+    if first in commands:
+        found, name = commands[first], f"{name} {first}"
+    elif "" in commands and "=" in first:
+        found, rest = commands[""], argv
+    else:
+        known = [word for word in commands if word]
+        raise ConfigError(f"unknown command {first!r}; {meant(first, known)}")
+    if not isinstance(found, str):
+        return _dispatch(found, rest, name, "")
+    function = _function(found)
+    if not inspect.isfunction(function):  # a command of `qs3.utils.cli`, until the last is gone
+        return function(rest)
+    if {*_HELP[:2]} & {*rest} or rest == ["help"]:
+        print(_help(function, name))
+        return 0
+    words, given = parse(function, rest)
+    return function(*words, **given) or 0
+
+
+def parse(function: Callable[..., Any], argv: Sequence[str]) -> tuple[list[Any], dict[str, Any]]:
+    """The positional arguments and the others that words of a command line stand for.
+
+    Raises:
+        ConfigError: a key that is unknown, missing or given twice; a value of the wrong type.
+    """
+    from pydantic import ConfigDict, ValidationError, create_model
+
+    from qs3.utils.settings import problems
+
+    hints = get_type_hints(function, include_extras=True)
+    known = dict(inspect.signature(function).parameters)
+    bare = [name for name, p in known.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    several = [name for name, p in known.items() if p.kind is p.VAR_POSITIONAL]
+    any_key = [name for name, p in known.items() if p.kind is p.VAR_KEYWORD]
+    fields = {name: p for name, p in known.items() if name not in several + any_key}
+    given: dict[str, Any] = {}
+    words: list[str] = []
+    others: dict[str, str] = {}
+    for word in argv:
+        key, equals, value = word.partition("=")
+        key = key.removeprefix("paths.") if key.removeprefix("paths.") in fields else key
+        free = next((name for name in bare if name not in given), None)
+        if not equals and free and not word.startswith("-"):
+            key, equals, value = free, "=", word
+        if equals and key in given:
+            raise ConfigError(f"{key}= is given twice")
+        if equals and key in fields:
+            given[key] = _split(value, hints[key])
+        elif equals and any_key:
+            others[key] = value
+        elif not equals and several:
+            words.append(word)
+        else:
+            raise ConfigError(f"unknown key {key!r}; {meant(key, fields, '=')}")
+    model = create_model(
+        "Arguments",
+        __config__=ConfigDict(allow_inf_nan=False),
+        **{
+            name: (hints[name], ... if p.default is p.empty else p.default)
+            for name, p in fields.items()
+        },
+    )  # type: ignore[call-overload]
+    try:
+        read = model.model_validate(given)
+    except ValidationError as error:
+        raise ConfigError(problems(error)) from None
+    values = {name: getattr(read, name) for name in fields}
+    for name, value in values.items():
+        if isinstance(value, Path):
+            values[name] = value.expanduser()
+    if several:
+        return [*(values.pop(name) for name in bare), *words], values | others
+    return [], values | others
+
+
+def meant(word: str, known: Iterable[str], end: str = "") -> str:
+    """The nearest of the known words as a question, else all of them."""
+    known = list(known)
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean {near[0]}{end}?" if near else f"there are {', '.join(known)}"
+
+
+def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
+    """`main` of Hydra with the same manners: Ctrl-C and SIGTERM end with their exit status."""
+
+    def command() -> None:
+        signal.signal(signal.SIGTERM, _terminate)
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # the terminal is gone; not nohup's
+            signal.signal(signal.SIGHUP, _terminate)
+        let_waiting_threads_sleep()
+        try:
+            main()
+        except (KeyboardInterrupt, SystemExit) as error:
+            if isinstance(error, SystemExit) and error.code == TERMINATED:
+                what, status = "terminated", TERMINATED
+            elif isinstance(error, KeyboardInterrupt) or isinstance(
+                error.__context__,
+                KeyboardInterrupt,  # Lightning's way to end
+            ):
+                what, status = "interrupted", INTERRUPTED
+            else:
+                raise
+            print(f"\n{what}; run the same command again and it continues", file=sys.stderr)
+            sys.exit(status)
+
+    return command
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    """End as after Ctrl-C, with all that is to be put away; a second SIGTERM ends at once."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    raise SystemExit(TERMINATED)
+
+
+def _function(where: str) -> Callable[..., Any]:
+    module, _, name = where.partition(":")
+    function: Callable[..., Any] = getattr(import_module(module), name)
+    return function
+
+
+def _summary(found: str | Commands) -> str:
+    if not isinstance(found, str):
+        return f"one of {', '.join(word for word in found if word)}"
+    function = _function(found)
+    if not inspect.isfunction(function):
+        return str(function.summary)  # type: ignore[attr-defined]
+    return (inspect.getdoc(function) or "").partition("\n")[0].rstrip(".")
+
+
+def _split(value: str, hint: Any) -> Any:
+    """A list of the words between commas where the type is a sequence."""
+    if value == "null":
+        return None
+    kinds = [get_origin(kind) or kind for kind in _kinds(hint)]
+    if not {tuple, list} & {*kinds}:
+        return value
+    inner = value.removeprefix("[").removesuffix("]")
+    return [word.strip() for word in inner.split(",") if word.strip()]
+
+
+def _kinds(hint: Any) -> list[Any]:
+    """The types that a hint allows, without Annotated and None."""
+    if get_origin(hint) is Annotated:
+        return _kinds(get_args(hint)[0])
+    if get_origin(hint) in (Union, UnionType):
+        return [kind for one in get_args(hint) for kind in _kinds(one)]
+    return [] if hint is type(None) else [hint]
+
+
+def _word(hint: Any) -> str:
+    """What stands for a value of this type in the help."""
+    words = []
+    for kind in _kinds(hint):
+        if get_origin(kind) is Literal:
+            words.append("|".join(map(str, get_args(kind))))
+        elif get_origin(kind) in (tuple, list):
+            words.append(f"{_word(get_args(kind)[0])},...")
+        else:
+            words.append(_WORDS.get(kind, "TEXT"))
+    return "|".join(dict.fromkeys(words))
+
+
+def _help(function: Callable[..., Any], name: str) -> str:
+    hints = get_type_hints(function, include_extras=True)
+    rows, bare = [], []
+    for key, p in inspect.signature(function).parameters.items():
+        hint = hints[key]
+        says = " ".join(m for m in getattr(hint, "__metadata__", ()) if isinstance(m, str))
+        if p.kind is p.VAR_POSITIONAL:
+            bare.append(f"[{key.upper()} ...]")
+            continue
+        if p.kind is p.VAR_KEYWORD:
+            rows.append(("KEY=VALUE", says))
+            continue
+        if p.kind is p.POSITIONAL_OR_KEYWORD:
+            bare.append(key.upper() if p.default is p.empty else f"[{key.upper()}]")
+        if p.default is p.empty:
+            says += " (required)"
+        elif p.default not in (None, "", False, ()):
+            shown = p.default if not isinstance(p.default, tuple) else ",".join(p.default)
+            says += f" (default {str(shown).lower() if shown is True else shown})"
+        rows.append((f"{key}={_word(hint)}", says))
+    summary, _, about = (inspect.getdoc(function) or "").partition("\n")
+    return _page(" ".join([name, *bare]), summary.rstrip("."), rows, about.strip("\n"))
+
+
+def _page(name: str, summary: str, rows: Sequence[tuple[str, str]], about: str = "") -> str:
+    column = min(max((len(left) for left, _ in rows), default=0), 24) + 4
+    lines = [f"{name}: {summary}", ""]
+    for left, right in rows:
+        begin = f"  {left}".ljust(column)
+        begin = begin if len(left) + 4 <= column else f"  {left}\n{' ' * column}"
+        lines.append(begin + f"\n{' ' * column}".join(textwrap.wrap(right, _WIDTH - column)))
+    return "\n".join([*lines, *(["", about] if about else [])])

@@ -1,1 +1,0 @@
-"""Datasets: the store on disk, the domains, the importers of published files."""

@@ -1,0 +1,261 @@
+r"""Datasets of ours as datasets of PyTorch Geometric, and theirs as ours.
+
+    from qs3.datasets.pyg import from_pyg, knn_graph, to_pyg
+
+    train = to_pyg("specklenet10", "train", transform=FixedPoints(1024))  # a domain of conf/domain
+    loader = DataLoader(train, batch_size=32, shuffle=True)               # PyG's own
+    from_pyg({"train": mine, "test": my_test}, "data/mine", classes=["box", "cup"])
+
+    python train.py num_classes=2 domain@data.source=own data.source.path=data/mine \
+        data.source.classes=[box,cup] domain@data.target=own data.target.path=data/theirs \
+        data.target.classes=[box,cup]
+
+PyG is imported here and by nobody else in qs3.data: import this module when you want it. Its own
+neighbour searches need torch-cluster or pyg-lib; `knn_graph` makes their edges from ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch_geometric.data import Data, Dataset, InMemoryDataset
+
+from qs3.classes import class_list
+from qs3.config.checks import check_int
+from qs3.datasets.domain import Domain, compose_domain
+from qs3.errors import ConfigError, DataError
+from qs3.geometry.neighbours import knn
+from qs3.geometry.sampling import farthest_point_sampling_np
+from qs3.store.made_of import MadeOf
+from qs3.store.manifest import ManifestRow
+from qs3.store.store import PointSet, is_begun, is_finished, write_pointset
+from qs3.utils.plural import counted
+
+
+class Clouds(InMemoryDataset):
+    """Clouds as PyG has them: `Data(pos=[P, 3] float32, y=[1] int64, id=str)`, in our order.
+
+    Without labels there is no `y`. Pickles, slices, and takes a `transform` like any of PyG's.
+
+    Attributes:
+        classes: names; `y` is a position in this tuple.
+        name: of the dataset.
+    """
+
+    def __init__(self, clouds: PointSet, transform: Callable[[Data], Data] | None = None) -> None:
+        super().__init__(None, transform)
+        self.classes, self.name = clouds.classes, clouds.name
+        points = torch.from_numpy(np.array(clouds.points, dtype=np.float32))
+        items = []
+        for cloud, label, name in zip(points, clouds.labels.tolist(), clouds.ids, strict=True):
+            label_of = {"y": torch.tensor([label])} if clouds.labelled else {}
+            items.append(Data(pos=cloud, id=name, **label_of))
+        self.data, self.slices = self.collate(items)
+
+    @property
+    def num_classes(self) -> int:
+        """Also of classes that do not occur."""
+        return len(self.classes)
+
+
+def to_pyg(
+    source: PointSet | Domain | str,
+    split: str | None = None,
+    transform: Callable[[Data], Data] | None = None,
+) -> Clouds:
+    """A dataset of ours, in memory, for PyG's loaders, transforms and nets.
+
+    Args:
+        source: an open dataset, a domain, or the name of a domain in conf/domain.
+        split: None: all clouds.
+        transform: applied whenever a cloud is taken.
+
+    Raises:
+        MissingDataError, DataError, ConfigError: as `Domain.open`; or there is no such split.
+    """
+    if isinstance(source, str):
+        source = compose_domain(source, {})
+    clouds = source.open() if isinstance(source, Domain) else source
+    return Clouds(clouds.split(split) if split else clouds, transform)
+
+
+def from_pyg(
+    datasets: Mapping[str, Dataset | Sequence[Data]],
+    folder: str | Path,
+    *,
+    classes: str | Sequence[str] | None = None,
+    points: int | None = None,
+    name: str | None = None,
+) -> PointSet:
+    """Write datasets of PyG as one of ours, which a domain can name by its `path`.
+
+    Their transforms are applied once. z should be up (`Domain.gravity`). Points are kept bit by bit
+    where they are float32 and not thinned.
+
+    Args:
+        datasets: by split ("train", "validation", "test"). Each cloud has `pos` [n, 3], and all or
+            none of them a `y` of one whole number. Its `id` names it, if it has one; a whole number
+            counts within class and split, like the position of a cloud without.
+        folder: of the new dataset.
+        classes: names in the order of `y`, or "modelnet40"; None: `classes` of the first dataset,
+            if it has any; without labels the benchmark's ten.
+        points: of a cloud; larger ones are thinned to their farthest points, from the first on.
+            None: all clouds must have the same number.
+        name: of the new dataset; None: that of the folder.
+
+    Raises:
+        ConfigError: there is something in the folder, the classes are not known or not told apart,
+            or `points` is no number of points.
+        DataError: a cloud does not fit; names split and position.
+    """
+    if points is not None:
+        points = check_int("points", points, 1)
+    folder = Path(folder)
+    if is_finished(folder) or is_begun(folder):
+        raise ConfigError(f"{folder} holds something already; delete it or choose another folder")
+    taken = {
+        (split, number): _read(dataset[number], f"cloud {number} of {split!r}")
+        for split, dataset in datasets.items()
+        for number in range(len(dataset))  # PyG's way of iterating needs an IndexError to end
+    }
+    if not taken:
+        raise DataError("there are no clouds in these datasets")
+    names = _classes(classes, next(iter(datasets.values())), [y for _, y, _ in taken.values()])
+    sizes = [len(pos) for pos, _, _ in taken.values()]
+    if points is None and len(set(sizes)) > 1:
+        raise DataError(
+            f"the clouds have {min(sizes)} to {max(sizes)} points: give points=, to which larger "
+            "ones are thinned"
+        )
+    points = sizes[0] if points is None else points
+    clouds, rows = [], []
+    for (split, number), (pos, y, key) in taken.items():
+        if len(pos) < points:
+            raise DataError(
+                f"cloud {number} of {split!r} has {counted(len(pos), 'point')}, fewer than "
+                f"points={points}; leave it out or give a smaller number"
+            )
+        thinned = farthest_point_sampling_np(pos, points) if len(pos) > points else slice(None)
+        clouds.append(pos[thinned])
+        cls = "" if y is None else names[y]
+        if not isinstance(key, str):
+            key = f"{cls or 'cloud'}/{split}/{number if key is None else key:06d}"
+        rows.append(ManifestRow(id=key, cls=cls, split=split, valid_points=len(pos)))
+    return write_pointset(
+        folder,
+        name=name or folder.name,
+        classes=names,
+        arrays={"points": clouds},
+        rows=rows,
+        meta=MadeOf(objects="a dataset of torch_geometric").meta,
+    )
+
+
+def _read(item: Any, where: str) -> tuple[np.ndarray, int | None, str | int | None]:
+    """Points [n, 3] float32, label and id of one cloud, checked."""
+    pos, y, key = (getattr(item, key, None) for key in ("pos", "y", "id"))
+    if getattr(item, "face", None) is not None:
+        raise DataError(f"{where} is a mesh: give the dataset transform=SamplePoints(n)")
+    if not isinstance(pos, Tensor) or pos.ndim != 2 or pos.shape[1] != 3 or len(pos) == 0:
+        raise DataError(f"{where} has no points: pos is {_shape(pos)}, expected [n, 3]")
+    label = None
+    if y is not None:
+        y = torch.as_tensor(y)
+        if y.numel() != 1 or y.is_floating_point() or y.is_complex():
+            raise DataError(f"{where}: y is {_shape(y)}, expected one whole number, the class")
+        label = int(y)
+    with np.errstate(over="ignore"):  # becomes infinite, and is reported as such
+        points = pos.detach().cpu().numpy().astype(np.float32)
+    if not np.isfinite(points).all():
+        raise DataError(f"{where} has points that are NaN or infinite")
+    return points, label, _id(key, where)
+
+
+def _id(key: Any, where: str) -> str | int | None:
+    """A name, or a number, which a collated dataset has as a tensor; None if there is neither."""
+    said = key.tolist() if isinstance(key, Tensor | np.ndarray | np.generic) else key
+    if isinstance(said, list) and len(said) == 1:
+        (said,) = said
+    if said is None or said == "":
+        return None
+    if isinstance(said, bool) or not isinstance(said, str | int):
+        raise DataError(f"{where}: id is {_shape(key)}, expected a name or a whole number")
+    return said
+
+
+def _shape(value: Any) -> str:
+    return f"{value.dtype} {list(value.shape)}" if isinstance(value, Tensor) else repr(value)[:40]
+
+
+def _classes(
+    given: str | Sequence[str] | None, dataset: Any, labels: list[int | None]
+) -> list[str]:
+    known = [label for label in labels if label is not None]
+    if known and len(known) < len(labels):
+        raise DataError(f"{len(labels) - len(known)} of {len(labels)} clouds have no label y")
+    names = given if given is not None else getattr(dataset, "classes", None)
+    if names is None and known:
+        raise ConfigError(f"give classes=: {max(known) + 1} names or more, in the order of y")
+    names = list(class_list(names))
+    if not names or not all(names) or len(set(names)) < len(names):
+        raise ConfigError(f"classes are {names}: none, without a name, or twice")
+    if known and not 0 <= min(known) <= max(known) < len(names):
+        raise DataError(
+            f"labels are {min(known)} to {max(known)}, but there "
+            f"{'is 1 class' if len(names) == 1 else f'are {len(names)} classes'}"
+        )
+    return names
+
+
+def knn_graph(x: Tensor, batch: Tensor | None, k: int, *, loop: bool = False) -> Tensor:
+    """Edges from the k nearest neighbours of each point to it, as PyG's `knn_graph` has them.
+
+    Clouds of one size take one search a batch; others one a cloud.
+
+    Args:
+        x: [n, c] positions or features of all clouds of a batch, on any device.
+        batch: [n] int64, sorted: which cloud each point belongs to; None: one cloud.
+        k: neighbours of a point; a cloud of fewer has edges to all that there are.
+        loop: whether a point is a neighbour of itself.
+
+    Returns:
+        [2, edges] int64: neighbours (sources) in the first row, points (targets) in the second,
+        points in order, and the neighbours of each from the nearest on.
+
+    Raises:
+        DataError: `batch` is not sorted, or does not fit.
+    """
+    if x.ndim != 2 or k < 1 or (batch is not None and batch.shape != x.shape[:1]):
+        raise DataError(f"knn_graph wants x [n, c], batch [n] and k >= 1, got x {list(x.shape)}")
+    if batch is None:
+        batch = x.new_zeros(len(x), dtype=torch.int64)
+    elif (batch.diff() < 0).any():
+        raise DataError("knn_graph wants the points of each cloud together: batch is not sorted")
+    sizes = batch.unique_consecutive(return_counts=True)[1].tolist()
+    if len(set(sizes)) == 1:
+        return _edges(x.view(len(sizes), sizes[0], -1), k, loop)
+    starts = np.cumsum([0, *sizes]).tolist()
+    parts = [
+        _edges(cloud[None], k, loop) + start
+        for start, cloud in zip(starts, x.split(sizes), strict=False)
+    ]
+    return torch.cat([x.new_empty((2, 0), dtype=torch.int64), *parts], dim=1)
+
+
+def _edges(x: Tensor, k: int, loop: bool) -> Tensor:
+    """[2, edges] of clouds of one size, [b, n, c]."""
+    b, n, _ = x.shape
+    own = torch.arange(n, device=x.device)[None, :, None]
+    index = knn(x, min(k + (not loop), n))
+    if not loop:  # of copies of a point, another one may be found first, and itself not at all
+        other = index != own
+        other[..., -1] &= ~other.all(-1)
+        index = index[other].view(b, n, -1)
+    index = index + (torch.arange(b, device=x.device) * n)[:, None, None]
+    target = torch.arange(b * n, device=x.device).view(b, n, 1).expand_as(index)
+    return torch.stack([index.flatten(), target.flatten()])

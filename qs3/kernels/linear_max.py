@@ -1,0 +1,110 @@
+"""Maximum and mean over points of a linear layer as few operations of an accelerator.
+
+`qs3.kernels.pointwise_max` has the CPU's way. Of z = W x one point of each cloud has a
+channel's maximum, so D, the gradient of z at the maxima, has one entry a cloud and channel:
+
+    dx_r = sum over the channels whose maximum r has, of D W_channel,
+    dW_channel = sum over the clouds, of D x_(the point that has it),
+
+where products with the gradient of all z would be of the layer's size, twice. Each operation is a
+kernel in Triton (`triton_linear_max`), which adds up in an order that never changes; elsewhere it
+takes torch's operations, and so says what the kernel computes.
+"""
+
+# No `from __future__ import annotations`: torch reads the operations' annotations, and where shapes
+# are checked (`make test-all`) it would look their words up in another module.
+import sys
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from qs3.geometry.device import lists_of, takes_triton
+
+_op = torch.library.custom_op
+
+
+def _kernels(x: Tensor) -> Any:
+    """The module of the kernels where they run; they are made for float32."""
+    if not (x.is_cuda and takes_triton(x) and x.dtype == torch.float32):
+        return None
+    from qs3.kernels import triton_linear_max
+
+    return triton_linear_max
+
+
+@_op("qs3::linear_max_gradient", mutates_args=())
+def points_gradient(
+    grad: Tensor, weight: Tensor, beside: Tensor, first: Tensor, order: Tensor
+) -> Tensor:
+    """The gradient of x [b, n, c].
+
+    Args:
+        grad: D at its beginning, [b, at least d].
+        weight: [d, c].
+        beside: [b, c], of which each of a cloud's n points has its share.
+        first: [b, n + 1], where in `order` the channels begin whose maximum a point has.
+        order: int64 [b, d], channels in the order of the points that have their maxima.
+    """
+    if kernels := _kernels(weight):
+        return kernels.points_gradient(grad, weight, beside, first, order)
+    (b, d), n = order.shape, first.shape[1] - 1
+    rows = torch.arange(b * n, device=grad.device)
+    rows = rows.repeat_interleave(first.diff().flatten(), output_size=b * d)
+    entries = grad.gather(1, order)[:, :, None] * weight[order]  # [b, d, c]
+    dx = (beside / n).repeat_interleave(n, dim=0)
+    return dx.index_add_(0, rows, entries.flatten(0, 1)).view(b, n, -1)
+
+
+@points_gradient.register_fake
+def _(grad: Tensor, weight: Tensor, beside: Tensor, first: Tensor, order: Tensor) -> Tensor:
+    return weight.new_empty(len(first), first.shape[1] - 1, weight.shape[1])
+
+
+@_op("qs3::linear_max_weight_gradient", mutates_args=())
+def weight_gradient(grad: Tensor, x: Tensor, where: Tensor, base: Tensor) -> Tensor:
+    """The gradient of W [d, c].
+
+    Args:
+        grad: D at its beginning, [b, at least d].
+        x: [b, n, c].
+        where: int64 [b, d], which point of the cloud has the maximum.
+        base: [d, c], what is added to it.
+    """
+    if kernels := _kernels(x):
+        return kernels.weight_gradient(grad, x, where, base)
+    rows = x.gather(1, where[:, :, None].expand(-1, -1, x.shape[2]))  # [b, d, c]
+    return base + (grad[:, : len(base), None] * rows).sum(0)
+
+
+@weight_gradient.register_fake
+def _(grad: Tensor, x: Tensor, where: Tensor, base: Tensor) -> Tensor:
+    return torch.empty_like(base)
+
+
+class _Pooled(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor) -> Tensor:
+        most, where = (x @ weight.T).max(1)
+        centre = x.mean(1)  # [b, c]
+        ctx.save_for_backward(x, weight, where, centre)
+        return torch.cat([most, centre @ weight.T], dim=1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
+        x, weight, where, centre = ctx.saved_tensors
+        grad = grad.to(x.dtype).contiguous()
+        mean = grad[:, len(weight) :]
+        first, order = lists_of(where, x.shape[1])
+        # The kernels themselves save an operation's own way; a compiler's graph has operations.
+        at = (not torch.compiler.is_compiling() and _kernels(x)) or sys.modules[__name__]
+        dx = at.points_gradient(grad, weight, mean @ weight, first, order)
+        return dx, at.weight_gradient(grad, x, where, mean.T @ centre)
+
+
+def pooled(x: Float[Tensor, "b n c"], weight: Float[Tensor, "d c"]) -> Float[Tensor, "b 2*d"]:
+    """Maximum and mean over the points of a linear map without bias."""
+    return _Pooled.apply(x.contiguous(), weight.contiguous())

@@ -1,1 +1,0 @@
-"""Numbers of the source's sensor, tuned until its clouds are like an unlabelled target's."""

@@ -1,0 +1,39 @@
+"""One declaration of a setting: a frozen dataclass whose types and ranges pydantic checks.
+
+    @settings
+    class Camera:
+        focal_px: Annotated[float, Gt(0)]
+        mode: Literal["near", "far"] = "near"
+
+Ranges are those of `annotated_types` (Ge, Gt, Le, Lt, Interval). `qs3.config.hydra.build` turns a
+pydantic error into a ConfigError that names the place in the config; elsewhere it is a ValueError.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TypeVar, dataclass_transform
+
+from pydantic import ConfigDict, ValidationError
+from pydantic.dataclasses import dataclass as _dataclass
+
+T = TypeVar("T")
+_CONFIG = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def settings(cls: type[T]) -> type[T]:
+    """A frozen dataclass that checks its fields when it is made; unknown arguments are errors."""
+    made: type[T] = _dataclass(frozen=True, config=_CONFIG)(cls)  # type: ignore[assignment]
+    return made
+
+
+def problems(error: ValidationError, place: str = "") -> str:
+    """A pydantic ValidationError in a line: each key with what is wrong."""
+    return "; ".join(
+        f"{'.'.join([place] * bool(place) + [str(p) for p in one['loc'] if isinstance(p, str)])}: "
+        f"{one['msg']}, got {one['input']!r}"
+        if one["type"] != "missing"
+        else f"{'.'.join(map(str, one['loc']))}= is missing"
+        for one in error.errors(include_url=False)
+    )

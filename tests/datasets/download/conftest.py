@@ -1,0 +1,16 @@
+import pytest
+from tests.data.download.server import Site
+
+from qs3.datasets.download.fetching import Resuming
+
+
+@pytest.fixture
+def site(monkeypatch):
+    """A server without files; proxies of the surroundings are passed by, and nobody waits."""
+    monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.setattr(Resuming, "tries", 4)
+    monkeypatch.setattr(Resuming, "wait_s", 0.01)
+    monkeypatch.setattr(Resuming, "timeout_s", 5.0)
+    running = Site()
+    yield running
+    running.close()

@@ -1,0 +1,263 @@
+"""Datasets of ours in PyTorch Geometric's hands, and theirs in ours."""
+
+import pickle
+import re
+import shlex
+
+import numpy as np
+import pytest
+import torch
+from torch_geometric import transforms
+from torch_geometric.data import Data, InMemoryDataset
+from torch_geometric.loader import DataLoader
+from torch_geometric.transforms import NormalizeScale, SamplePoints
+
+from qs3.classes import MODELNET40
+from qs3.datasets import pyg
+from qs3.datasets.domain import Domain
+from qs3.datasets.pyg import from_pyg, knn_graph, to_pyg
+from qs3.errors import ConfigError, DataError
+from qs3.store.store import ManifestRow, write_pointset
+from tests.composing import compose
+
+CLASSES = ("box", "cup", "pen")
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture
+def ours(tmp_path):
+    """Twelve clouds of 64 points, nine of them for training."""
+    rows = [
+        ManifestRow(f"{CLASSES[i % 3]}/{split}/{i:04d}", CLASSES[i % 3], split)
+        for i, split in enumerate(["train"] * 9 + ["test"] * 3)
+    ]
+    points = RNG.normal(size=(12, 64, 3)).astype(np.float32)
+    points[0, 0] = [-0.0, 1e-42, 3.4e38]  # bits that a calculation would not keep
+    return write_pointset(
+        tmp_path / "ours",
+        name="ours",
+        classes=CLASSES,
+        arrays={"points": points},
+        rows=rows,
+        meta={},
+    )
+
+
+def domain(folder, classes=CLASSES):
+    return Domain("mine", "X", "mine", folder, classes=classes)
+
+
+def test_the_examples_of_the_module_are_for_clouds_and_for_classes_of_ones_own(ours):
+    (name, count) = re.search(r"transform=(\w+)\((\d+)\)", pyg.__doc__).groups()
+    thinned = to_pyg(ours, "train", transform=getattr(transforms, name)(int(count)))
+    assert thinned[0].pos.shape == (int(count), 3)
+    line = re.search(r"python train.py(.*?)\n\n", pyg.__doc__, re.DOTALL)[1]
+    cfg = compose("train", shlex.split(line.replace("\\\n", " ")))
+    assert cfg.num_classes == len(cfg.data.source.classes)
+    assert cfg.data.source.classes == cfg.data.target.classes
+
+
+def test_a_split_as_pyg_has_it(ours):
+    data = to_pyg(ours, "train")
+    assert isinstance(data, InMemoryDataset)
+    assert len(data) == 9
+    assert (data.num_classes, data.classes, data.name) == (3, CLASSES, "ours")
+    for i, item in enumerate(data):
+        assert item.pos.dtype == torch.float32
+        assert item.y.dtype == torch.int64
+        assert item.y.tolist() == [ours.labels[i]]
+        assert item.id == ours.ids[i]
+        assert item.pos.numpy().tobytes() == np.asarray(ours.points[i]).tobytes()
+    assert len(data[:4]) == 4
+    batch = next(iter(DataLoader(to_pyg(ours, transform=NormalizeScale()), batch_size=12)))
+    assert batch.pos.shape == (12 * 64, 3)
+    assert batch.pos[64:].abs().max() <= 1  # the first cloud's numbers are too odd
+    assert tuple(batch.id) == ours.ids
+    assert pickle.loads(pickle.dumps(data))[5].id == data[5].id
+    with pytest.raises(DataError, match="has no split 'validation'"):
+        to_pyg(ours, "validation")
+
+
+def test_ours_to_pyg_and_back_bit_for_bit(ours, tmp_path):
+    folder = tmp_path / "back"
+    both = {split: to_pyg(domain(tmp_path / "ours"), split) for split in ("train", "test")}
+    back = from_pyg(both, folder)
+    assert np.asarray(back.points).tobytes() == np.asarray(ours.points).tobytes()
+    np.testing.assert_array_equal(back.labels, ours.labels)
+    np.testing.assert_array_equal(back.splits, ours.splits)
+    assert (back.ids, back.classes) == (ours.ids, CLASSES)
+    assert back.sha256 == ours.sha256
+    again = domain(folder).open()  # as a run does
+    assert again.sha256 == ours.sha256
+    with pytest.raises(ConfigError, match="holds something already"):
+        from_pyg(both, folder)
+
+
+def test_a_domain_by_its_name(ours, monkeypatch, tmp_path):
+    monkeypatch.setattr(
+        "qs3.datasets.pyg.compose_domain",
+        lambda name, overrides: {"mine": domain(tmp_path / "ours")}[name],
+    )
+    assert len(to_pyg("mine")) == 12
+
+
+class Pyramids(InMemoryDataset):
+    """A user's own: meshes, in memory."""
+
+    def __init__(self, count=6, transform=None):
+        super().__init__(None, transform)
+        corners = torch.tensor([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+        face = torch.tensor([[0, 0, 0, 1], [1, 2, 3, 2], [2, 3, 1, 3]])
+        items = [
+            Data(pos=corners * (i + 1), face=face, y=torch.tensor([i % 2])) for i in range(count)
+        ]
+        self.data, self.slices = self.collate(items)
+
+
+def test_a_users_dataset_becomes_a_domain(tmp_path):
+    torch.manual_seed(0)
+    with pytest.raises(DataError, match=r"cloud 0 of 'train' is a mesh: .*SamplePoints"):
+        from_pyg({"train": Pyramids()}, tmp_path / "mine", classes=["even", "odd"])
+    sampled = Pyramids(transform=SamplePoints(128))
+    data = from_pyg({"train": sampled}, tmp_path / "mine", classes=["even", "odd"])
+    assert data.points.shape == (6, 128, 3)
+    assert data.labels.tolist() == [0, 1] * 3
+    assert data.ids[1] == "odd/train/000001"
+    assert np.abs(np.asarray(data.points[5])).max() > 4  # the sixth is six times as large
+    assert domain(tmp_path / "mine", ["even", "odd"]).open().sha256 == data.sha256
+
+
+def clouds(*sizes, **more):
+    return [Data(pos=torch.randn(n, 3, dtype=torch.float64), **more) for n in sizes]
+
+
+def test_clouds_of_several_sizes_are_thinned_to_their_farthest_points(tmp_path):
+    items = clouds(50, 80, 30)
+    with pytest.raises(DataError, match=r"have 30 to 80 points: give points="):
+        from_pyg({"test": items}, tmp_path / "a")
+    with pytest.raises(DataError, match=r"cloud 2 of 'test' has 30 points, fewer than points=31"):
+        from_pyg({"test": items}, tmp_path / "a", points=31)
+    data = from_pyg({"test": items}, tmp_path / "a", points=30)
+    assert not data.labelled
+    assert len(data.classes) == 10
+    assert data.name == "a"
+    for item, cloud in zip(items, np.asarray(data.points), strict=True):
+        points = item.pos.numpy().astype(np.float32)
+        chosen = [0]
+        while len(chosen) < 30 < len(points):  # farthest points, the slow way
+            gaps = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)
+            chosen.append(int(gaps.argmax()))
+        np.testing.assert_array_equal(cloud, points[chosen] if len(points) > 30 else points)
+
+
+@pytest.mark.parametrize(
+    ("items", "why"),
+    [
+        ([], "no clouds"),
+        ([Data(x=torch.zeros(4, 3))], "cloud 0 of 'train' has no points: pos is None"),
+        ([Data(pos=torch.zeros(4, 2))], r"pos is torch.float32 \[4, 2\], expected \[n, 3\]"),
+        ([Data(pos=torch.zeros(0, 3))], "has no points"),
+        ([Data(pos=torch.full((4, 3), torch.nan))], "NaN or infinite"),
+        (clouds(4, y=torch.tensor([0.5])), r"y is torch.float32 \[1\], expected one whole number"),
+        (clouds(4, y=torch.tensor([0, 1])), r"y is torch.int64 \[2\]"),
+        (clouds(4, y=torch.tensor([3])), "labels are 3 to 3, but there are 3 classes"),
+        (clouds(4, y=torch.tensor([-1])), "labels are -1 to -1"),
+        (clouds(4, y=torch.tensor([0])) + clouds(4), "1 of 2 clouds have no label"),
+        (clouds(4, 4, y=torch.tensor([0]), id="a"), "the same id"),
+        (clouds(4, 4, y=torch.tensor([0]), id=7), "the same id"),
+        (
+            clouds(4, id=torch.zeros(4)),
+            r"cloud 0 of 'train': id is torch.float32 \[4\], expected a",
+        ),
+        (clouds(4, id=0.5), "id is 0.5, expected a name or a whole number"),
+        (clouds(4, id=True), "id is True"),
+        ([Data(pos=torch.full((4, 3), 1e300, dtype=torch.float64))], "NaN or infinite"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_place(tmp_path, items, why):
+    with pytest.raises(DataError, match=why):
+        from_pyg({"train": items}, tmp_path / "a", classes=CLASSES)
+    assert not (tmp_path / "a" / "meta.yaml").exists()
+
+
+def test_names_of_classes_must_come_from_somewhere(tmp_path):
+    with pytest.raises(ConfigError, match=r"give classes=: 3 names or more"):
+        from_pyg({"train": clouds(4, y=torch.tensor([2]))}, tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"points": 0}, "points must be a whole number >= 1, got 0"),
+        ({"points": -3}, "points must be a whole number >= 1, got -3"),
+        ({"points": "4"}, "points must be a whole number"),
+        ({"classes": ["a", "a"]}, r"classes are \['a', 'a'\]: .* twice"),
+        ({"classes": ["a", ""]}, "without a name"),
+        ({"classes": []}, r"classes are \[\]"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(tmp_path, settings, why):
+    with pytest.raises(ConfigError, match=why):
+        from_pyg({"train": clouds(5, 7)}, tmp_path / "a", **{"points": 5, **settings})
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_list_of_classes_by_its_name(tmp_path):
+    items = clouds(5, y=torch.tensor([39]))
+    data = from_pyg({"train": items}, tmp_path / "a", classes="modelnet40")
+    assert (data.classes, data.ids) == (MODELNET40, ("xbox/train/000000",))
+    assert domain(tmp_path / "a", "modelnet40").open().sha256 == data.sha256
+
+
+class Numbered(InMemoryDataset):
+    """Clouds with numbers for ids, which collating makes tensors."""
+
+    def __init__(self, *numbers):
+        super().__init__(None)
+        items = [Data(pos=torch.randn(5, 3), id=number) for number in numbers]
+        self.data, self.slices = self.collate(items)
+
+
+def test_numbers_name_clouds_within_their_split(tmp_path):
+    lists = {"train": [*clouds(5, id=7), *clouds(5, id=np.int64(3))], "test": Numbered(7, 8)}
+    data = from_pyg(lists, tmp_path / "a", points=np.int64(5))
+    names = ("cloud/train/000007", "cloud/train/000003", "cloud/test/000007", "cloud/test/000008")
+    assert data.ids == names
+
+
+def slow_edges(x, batch, k, loop):
+    """Each point's neighbours by sorting all distances to points of its cloud."""
+    edges = []
+    for i in range(len(x)):
+        same = [j for j in range(len(x)) if batch[j] == batch[i] and (loop or j != i)]
+        near = sorted(same, key=lambda j: float((x[j] - x[i]).square().sum()))
+        edges += [(j, i) for j in near[:k]]
+    return edges
+
+
+@pytest.mark.parametrize("loop", [False, True])
+@pytest.mark.parametrize("sizes", [(20,), (20, 20, 20), (20, 7, 1, 30), (5, 1)])
+@pytest.mark.parametrize("columns", [3, 5])
+def test_edges_equal_brute_force(sizes, loop, columns):
+    torch.manual_seed(1)
+    x = torch.randn(sum(sizes), columns)
+    batch = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
+    found = knn_graph(x, None if len(sizes) == 1 else batch, 6, loop=loop)
+    assert [tuple(edge) for edge in found.T.tolist()] == slow_edges(x, batch, 6, loop)
+
+
+def test_copies_of_a_point_are_not_its_own_neighbours():
+    x = torch.zeros(12, 3)
+    x[6:] = torch.arange(6.0)[:, None]
+    source, target = knn_graph(x, None, 4)
+    assert (source != target).all()
+    assert torch.bincount(target).tolist() == [4] * 12
+    assert (x[source[target < 6]] == 0).all()  # of seven copies, all four are at distance 0
+
+
+def test_edges_refuse_what_pyg_would_mix_up():
+    with pytest.raises(DataError, match="batch is not sorted"):
+        knn_graph(torch.zeros(3, 3), torch.tensor([0, 1, 0]), 1)
+    with pytest.raises(DataError, match="knn_graph wants"):
+        knn_graph(torch.zeros(3, 3), torch.tensor([0, 1]), 1)
+    assert knn_graph(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 2).shape == (2, 0)

@@ -1,0 +1,85 @@
+import torch
+from torch import nn
+
+from qs3.geometry.neighbours import knn
+from qs3.kernels.edgeconv import _Moments, neighbour_max
+from qs3.kernels.pointwise_max import max_over_rows
+from qs3.models.dgcnn import EdgeConv
+from tests.models.reference import NaiveEdgeConv
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+
+
+def _pair(norm: str, c: int = 6, d: int = 9, seed: int = 0) -> tuple[EdgeConv, NaiveEdgeConv]:
+    torch.manual_seed(seed)
+    ours = EdgeConv(c, d, norm=norm).double()
+    with torch.no_grad():
+        nn.init.normal_(ours.norm.weight)
+        nn.init.normal_(ours.norm.bias)
+        ours.norm.weight[0] = -1.3
+        if norm == "batch":
+            ours.norm.running_mean.normal_()
+            ours.norm.running_var.uniform_(0.5, 2)
+    assert (ours.norm.weight < 0).any()
+    assert (ours.norm.weight > 0).any()
+    return ours, NaiveEdgeConv(ours)
+
+
+def test_float32_statistics_do_not_cancel() -> None:
+    ours, _ = _pair("batch", c=3)
+    x = torch.randn(2, 200, 3) + 30  # std 1 at distance 30
+    index = knn(x, 10)
+    single = EdgeConv(3, 9)
+    single.load_state_dict(ours.state_dict())
+    torch.testing.assert_close(
+        single(x, index).double(), ours(x.double(), index), rtol=0, atol=2e-4
+    )
+
+
+def test_gamma_zero_gives_beta_and_finite_gradients() -> None:
+    ours, _ = _pair("batch")
+    with torch.no_grad():
+        ours.norm.weight.zero_()
+    x = torch.randn(2, 20, 6, dtype=torch.float64, requires_grad=True)
+    out = ours(x, knn(x, 5))
+    expected = nn.functional.leaky_relu(ours.norm.bias, 0.2).expand_as(out)
+    torch.testing.assert_close(out, expected)
+    out.sum().backward()
+    assert torch.isfinite(x.grad).all()
+    assert torch.isfinite(ours.norm.weight.grad).all()
+
+
+def test_one_repeated_point_has_no_variance() -> None:
+    layer = EdgeConv(3, 8)
+    x = torch.full((2, 16, 3), 0.7, requires_grad=True)
+    out = layer(x, knn(x, 4))
+    out.sum().backward()
+    torch.testing.assert_close(out, torch.zeros_like(out), rtol=0, atol=1e-4)
+    assert torch.isfinite(x.grad).all()
+
+
+def test_neighbour_ops_have_right_gradients() -> None:
+    torch.manual_seed(0)
+    x = torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
+    index = torch.randint(7, (5, 4))
+    assert torch.autograd.gradcheck(lambda x: neighbour_max(x, index), x)
+    clouds = torch.randn(2, 5, 3, dtype=torch.float64, requires_grad=True)
+    index = torch.randint(10, (10, 4))
+    assert torch.autograd.gradcheck(lambda x: _Moments.apply(x, index), clouds)
+
+
+def test_max_over_rows_known_answer() -> None:
+    x = torch.tensor([[[1.0, 5.0], [3.0, -2.0], [3.0, 5.0]]])
+    best, where = max_over_rows(x)
+    assert best.tolist() == [[3.0, 5.0]]
+    assert where.tolist() == [[1, 0]]  # the first of equals
+
+
+def test_autocast_keeps_statistics_in_float32() -> None:
+    torch.manual_seed(0)
+    layer = EdgeConv(3, 8)
+    x = torch.randn(2, 32, 3)
+    index = knn(x, 5)
+    plain = layer(x, index)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(layer(x, index), plain)

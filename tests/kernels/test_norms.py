@@ -1,0 +1,200 @@
+import copy
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from qs3.errors import ConfigError, DataError
+from qs3.evaluation.metrics import adapt_norms, predict
+from qs3.kernels.norms import (
+    DomainNorm,
+    active,
+    adapt_batchnorm,
+    begin_target_norms,
+    track,
+    use_domain,
+    use_trained,
+)
+from qs3.models.dgcnn import dgcnn
+from qs3.models.pointnet import pointnet
+
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+BUILDERS = {"dgcnn": dgcnn, "pointnet": pointnet}
+
+
+def _clouds(b: int, seed: int = 0, n: int = 40) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(b, n, 3, generator=generator, dtype=torch.float64)
+
+
+def _running(net: nn.Module) -> list[torch.Tensor]:
+    return [b.clone() for n, b in net.named_buffers() if "running" in n]
+
+
+def _used(net: nn.Module, domain: str) -> set[str]:
+    """Whose norms clouds of `domain` are served with."""
+    with use_trained(net, domain):
+        return {m.domain for m in net.modules() if isinstance(m, DomainNorm)}
+
+
+def test_domain_comes_back_after_an_error_and_nested() -> None:
+    net = nn.Sequential(DomainNorm(3), DomainNorm(3))
+    with use_domain(net, "target"), use_domain(net, "source"):
+        assert [m.domain for m in net] == ["source", "source"]
+    with pytest.raises(RuntimeError, match="x"), use_domain(net, "target"):
+        raise RuntimeError("x")
+    assert [m.domain for m in net] == ["source", "source"]
+    with pytest.raises(ConfigError, match="'source' or 'target'"), use_domain(net, "s"):
+        pass
+
+
+def test_target_norms_begin_with_the_source_s_once() -> None:
+    """So the net says of the target with the target's norms what it said with the source's."""
+    torch.manual_seed(0)
+    net = pointnet(4, norm="domain").double()
+    for seed in range(3):
+        net(_clouds(6, seed))
+    before = torch.from_numpy(predict(net, _clouds(5, 9), 5))  # target norms: never trained
+    begin_target_norms(net)
+    assert torch.equal(torch.from_numpy(predict(net, _clouds(5, 9), 5)), before)
+    with torch.no_grad(), use_domain(net.eval(), "target"):
+        said = net(_clouds(5, 9)).softmax(1)
+    torch.testing.assert_close(said, before)
+    net.train()(_clouds(6, 8))  # a pass on the source alone: the target's are behind
+    assert _used(net, "target") == {"source"}
+    begin_target_norms(net)
+    with use_domain(net, "target"):
+        net(_clouds(6, 7))
+    trained = copy.deepcopy(net.state_dict())
+    begin_target_norms(net)
+    assert all(torch.equal(value, trained[key]) for key, value in net.state_dict().items())
+
+
+@pytest.mark.parametrize("momentum", [0.1, None])
+def test_track_is_what_torch_does(momentum: float | None) -> None:
+    torch.manual_seed(0)
+    ours, theirs = nn.BatchNorm1d(3, momentum=momentum), nn.BatchNorm1d(3, momentum=momentum)
+    for rows in (5, 9, 2):
+        x = torch.randn(rows, 3)
+        theirs(x)
+        track(ours, x.mean(0), x.var(0, correction=0), rows)
+    for a, b in zip(ours.buffers(), theirs.buffers(), strict=True):
+        torch.testing.assert_close(a, b)
+    before = ours.running_mean.clone()
+    track(ours.eval(), torch.ones(3), torch.ones(3), 4)
+    assert torch.equal(ours.running_mean, before)
+
+
+def _whole_batch(net: nn.Module, points: torch.Tensor) -> list[torch.Tensor]:
+    """Running statistics after one training pass over everything, dropout off."""
+    twin = copy.deepcopy(net).train()
+    for module in twin.modules():
+        if isinstance(module, nn.Dropout):
+            module.p = 0.0
+        if isinstance(module, nn.BatchNorm1d):
+            module.momentum = 1.0
+    twin(points)
+    return _running(twin)
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_one_pass_is_exact_in_the_first_norm_and_for_one_batch(name: str) -> None:
+    torch.manual_seed(0)
+    net = BUILDERS[name](4).double()
+    points = _clouds(9)
+    expected = _whole_batch(net, points)
+    adapt_batchnorm(net, [points])
+    for a, b in zip(_running(net), expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-8)
+    adapt_batchnorm(net, [points[:5], points[5:]])
+    for a, b in zip(_running(net)[:2], expected[:2], strict=True):
+        torch.testing.assert_close(a, b, **TIGHT)
+
+
+@pytest.mark.parametrize("name", BUILDERS)
+def test_what_is_kept_of_the_former_statistics(name: str) -> None:
+    """Of every norm that share, and of the new ones, found in the same passes, the rest."""
+    torch.manual_seed(0)
+    net = BUILDERS[name](4).double()
+    net.train()
+    net(_clouds(6))
+    twin = copy.deepcopy(net)
+    before, batches = _running(net), [_clouds(9)[:5], _clouds(9)[5:]]
+    adapt_batchnorm(twin, batches)
+    adapt_batchnorm(net, batches, kept=0.3)
+    for now, old, new in zip(_running(net), before, _running(twin), strict=True):
+        torch.testing.assert_close(now, 0.3 * old + 0.7 * new)
+
+
+def test_only_the_current_domain_is_adapted() -> None:
+    net = dgcnn(4, norm="domain").double()
+    with use_domain(net, "target"):
+        adapted = adapt_batchnorm(net, [_clouds(4)])
+    first = net.backbone.edge_convs[0].norm
+    assert first.target in adapted
+    assert first.source not in adapted
+    assert torch.equal(first.source.running_mean, torch.zeros(64, dtype=torch.float64))
+    assert active(first) is first.source
+
+
+def test_nothing_to_adapt_on() -> None:
+    with pytest.raises(DataError, match="no batches"):
+        adapt_batchnorm(dgcnn(4), [])
+    with pytest.raises(ConfigError, match=r"norms=adabn adapts batch norms, and this net has none"):
+        adapt_batchnorm(nn.Linear(3, 4), [_clouds(4)])
+
+
+def test_instance_norm_has_nothing_to_adapt_but_in_the_head() -> None:
+    net = dgcnn(4, norm="instance").double()
+    assert len(adapt_batchnorm(net, [_clouds(4)])) == 2
+
+
+def test_predictions_of_the_target_use_its_norms_once_it_was_trained_on() -> None:
+    net = pointnet(3, norm="domain")
+    points = torch.randn(4, 20, 3)
+    net(points)  # a pass on the source alone
+    assert _used(net, "target") == {"source"}
+    as_source = predict(net, points, 4)
+    with use_domain(net, "target"):
+        net(points * 3 + 1)
+    assert _used(net, "target") == {"target"}
+    as_target = predict(net, points, 4)
+    assert np.abs(as_source - as_target).max() > 1e-3
+    with torch.no_grad(), use_domain(net.eval(), "target"):
+        np.testing.assert_allclose(as_target, net(points).double().softmax(1).numpy(), atol=1e-6)
+    assert _used(pointnet(3), "target") == set()  # nothing to choose
+    with pytest.raises(ConfigError, match="'source' or 'target'"), use_trained(net, "s"):
+        pass
+
+
+def test_a_student_of_the_target_alone_says_of_the_source_what_its_norms_say() -> None:
+    net = pointnet(3, norm="domain")
+    assert _used(net, "target") == _used(net, "source") == {"source"}  # neither is trained
+    points = torch.randn(4, 20, 3)
+    with use_domain(net, "target"):
+        net(points * 3 + 1)
+    assert _used(net, "source") == {"target"}
+    of_target = predict(net, points, 4)
+    np.testing.assert_array_equal(predict(net, points, 4, domain="source"), of_target)
+
+
+def test_each_layer_is_served_by_the_norm_that_was_trained() -> None:
+    """As methods train them that show their target to the backbone alone; AdaBN is of the same."""
+    torch.manual_seed(0)
+    net = pointnet(3, norm="domain").double()
+    points = _clouds(6)
+    net(points)
+    with use_domain(net, "target"):
+        net.features(3 * points + 1)
+    parts = (net.backbone, net.head)
+    assert [_used(part, "target") for part in parts] == [{"target"}, {"source"}]
+    assert _used(net, "source") == {"source"}
+    with torch.no_grad(), use_domain(net.eval().backbone, "target"):
+        expected = net(points).softmax(1).numpy()
+    np.testing.assert_array_equal(predict(net, points, 6), expected)
+    before = copy.deepcopy(net.state_dict())
+    adapt_norms(net, points, 6, seed=0)
+    changed = {k for k, value in net.state_dict().items() if not torch.equal(value, before[k])}
+    trained = {k for k in before if ("target" if k.startswith("backbone") else "source") in k}
+    assert changed == {k for k in trained if "running" in k or "num_batches" in k}
