@@ -1,5 +1,4 @@
-"""Your own clouds: a folder of files in any format of `qs3.datasets.clouds.files`, with labels or
-without.
+"""Your own clouds: a folder of files in any format of `datasets.clouds`, with labels or without.
 
     class/split/name.ext     split is train, test, or val (validation)
     split/class/name.ext
