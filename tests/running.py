@@ -8,14 +8,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from qs3.__main__ import QS3
-from qs3.utils.cli import run
+from qs3.__main__ import COMMANDS
+from qs3.commands.core import run
 
 ROOT = Path(__file__).parents[1]
 
 
 def main(argv: Sequence[str]) -> int:
-    return run(QS3, argv)
+    return run(COMMANDS, argv)
 
 
 def command(
