@@ -5,7 +5,7 @@ from pathlib import Path
 from qs3.utils.environment import needs_packages
 
 with needs_packages(Path(__file__).parent):
-    from qs3.training.__main__ import main
+    from qs3.commands.train import main
 
 if __name__ == "__main__":
     main()

@@ -195,7 +195,7 @@ PATTERNS = (
     r"sensors/gradients/test_twin\.py::test_its_images.*\[square",
     r"sensors/gradients/test_twin\.py::test_the_gradient_by_speckle.*\[0\.[16]",
     r"sensors/gradients/test_twin\.py::test_gradients_are.*\[(gain|infrared\.(r|p)|projector)",
-    r"training/test_debugging\.py::test_nothing_about_clouds.*\[(?!qs3_s2d\]|own_scans\]|twin_s2d\]|leaderboard\])",
+    r"training/test_debugging\.py::test_nothing_about_clouds.*\[(?!qs3_s2d\]|own_scans\]|leaderboard\])",
     r"training/test_target_labels\.py::test_no_target_label.*\[settings1",
     r"training/test_command\.py::test_what_is_missing.*\[words([5-8]|1[0-35-9])-",
     r"report/tables/test_tables\.py::test_factors_are",

@@ -75,7 +75,7 @@ def help_of(words: list[str], capsys: pytest.CaptureFixture) -> str:
     if words[0] == "qs3":
         assert main([*words[1:], "--help"]) == 0, words
         return capsys.readouterr().out
-    module = {"qs3-train": "qs3.training", "qs3-generate": "qs3.generation"}
+    module = {"qs3-train": "qs3.commands.train", "qs3-generate": "qs3.generation"}
     start = [words[1]] if words[0] == "python" else ["-m", module[words[0]]]
     done = subprocess.run(
         [sys.executable, *start, "--help"], cwd=ROOT, capture_output=True, text=True, check=False

@@ -12,7 +12,7 @@ from qs3.config.hydra import build
 from qs3.runs.metrics import read_metrics
 from qs3.training.command import train
 from tests.composing import compose
-from tests.fixtures.published import write_domain, write_store
+from tests.fixtures.published import write_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
@@ -34,10 +34,8 @@ def test_experiment_runs(experiment, published, tmp_path):
         f"experiment={experiment}", "debug=fast", "data.points=64", "logger=csv", "seed=0",
         "trainer.threads=1", f"paths.data_dir={published.folder}", f"paths.log_dir={tmp_path}",
     ]  # fmt: skip
-    if experiment.startswith("twin_"):
-        twins = ("whole", "exact", "view0", "view0_exact", "view1", "view1_exact")
-        write_store(tmp_path / "source", twins=twins)
-        overrides += [f"data.source.path={tmp_path / 'source'}", "data.source.published=null"]
+    if experiment == "own_meshes":
+        overrides += ["data.target.floor_m=0"]
     cfg = compose("train", overrides)
     for domain in (cfg.data.source, cfg.data.target):
         if domain.name == "source_sample":  # it comes with qs3

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,6 @@ from qs3.training.provenance import warn_of_changes
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
-from qs3.utils.cli import TERMINATED
 from qs3.utils.plural import counted
 from qs3.utils.processor_time import Moment, processor_seconds
 from qs3.utils.threads import cores, number_of
@@ -107,7 +107,7 @@ def _fit(run: Run, loaded: Loaded, built: Built) -> None:
     except MisconfigurationException as error:  # e.g. too small a part of an epoch's batches
         raise ConfigError(f"trainer: {error}") from error
     except SIGTERMException as error:  # of a worker of a sweep; by itself it would be status 0
-        raise SystemExit(TERMINATED) from error
+        raise SystemExit(128 + signal.SIGTERM) from error
     if (done := built.trainer.current_epoch) < run.phases.total:  # `trainer.should_stop`
         raise ConfigError(
             f"training ended after {done} of {epochs}, as a callback asked for: a run is its "

@@ -61,7 +61,7 @@ def test_weights_of_float16_are_refused():
     ("word", "known"),
     [
         ("logger=null", "csv, wandb"),
-        ("+experiment=Null", "adabn_s2d, "),
+        ("+experiment=Null", "cad10, "),
         ("domain@data.source=null", "blensor10, "),
         ("model=3", "dgcnn, "),
         ("callbacks=false", "default, none"),
@@ -107,7 +107,7 @@ def test_a_threshold_beside_a_share_is_refused(key):
     """It changed the run's name alone: a search over thresholds compared copies of one run."""
     said = rf"selftraining\.{key} would have no effect: selftraining\.share=0\.5 sets"
     with pytest.raises(ConfigError, match=said):
-        train_by_words("experiment=qs3_nyu", f"selftraining.{key}=0.01")
+        train_by_words("experiment=source_only_nyu", "selftraining=qbst", f"selftraining.{key}=0.01")
 
 
 def test_epochs_beside_a_budget_in_steps_are_warned_of(monkeypatch, tmp_path, caplog):

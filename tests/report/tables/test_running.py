@@ -176,7 +176,7 @@ def test_compare_by_hand(tmp_path):
 
 def test_runs_are_not_compared_with_themselves(tmp_path):
     """Overrides may make two rows one."""
-    run = "target test: {run: experiment=dann_s2d}"
+    run = "target test: {run: experiment=source_only_s2d method=dann}"
     lines = ("title: t", "metrics: [accuracy]", "columns: [target test]", "rows:")
     rows = (f"  - name: {name}\n    {run}" for name in "ab")
     (tmp_path / "own.yaml").write_text("\n".join([*lines, *rows]))

@@ -6,11 +6,11 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from qs3.commands.core import hydra_command
 from qs3.config.compose import choices_checked
 from qs3.config.hydra import cli_errors, in_multirun
 from qs3.config.location import CONF
 from qs3.runs.unbegun import removed_if_unbegun
-from qs3.utils.cli import hydra_command
 
 
 @hydra_command
