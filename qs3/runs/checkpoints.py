@@ -36,8 +36,8 @@ def save(value: Any, path: str | os.PathLike[str]) -> None:
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         try:
             torch.save(value, file)
-        except RuntimeError as error:  # torch complains of the half file, not of the full disk
-            if isinstance(error.__context__, OSError):
+        except RuntimeError as error:  # torch's complaint of the half file hides what broke it off
+            if isinstance(error.__context__, OSError | KeyboardInterrupt | SystemExit):
                 raise error.__context__ from error
             raise
         file.flush()

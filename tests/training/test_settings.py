@@ -107,7 +107,9 @@ def test_a_threshold_beside_a_share_is_refused(key):
     """It changed the run's name alone: a search over thresholds compared copies of one run."""
     said = rf"selftraining\.{key} would have no effect: selftraining\.share=0\.5 sets"
     with pytest.raises(ConfigError, match=said):
-        train_by_words("experiment=source_only_nyu", "selftraining=qbst", f"selftraining.{key}=0.01")
+        train_by_words(
+            "experiment=source_only_nyu", "selftraining=qbst", f"selftraining.{key}=0.01"
+        )
 
 
 def test_epochs_beside_a_budget_in_steps_are_warned_of(monkeypatch, tmp_path, caplog):
