@@ -176,7 +176,7 @@ def generation(folder: Path) -> None:
 
 def generated(folder: Path) -> Any:
     """The names of all files that are there, and the bytes of all that do not say where or when."""
-    from qs3.store.dataset_folder import CONFIG, COSTS
+    from qs3.store.parts import CONFIG, COSTS
     from qs3.utils.files import sha256_file
 
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.suffix != ".log")

@@ -14,15 +14,13 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from qs3.store.sharded import ShardedArray, picked
-
 
 @dataclass(frozen=True, eq=False)
 class Clouds:
     """n clouds of m points about their centroid, each in `starts` different samples.
 
     Attributes:
-        stored: [N, P, 3] float32, as published; e.g. a memmap, or several.
+        stored: [N, P, 3] float32, as published; e.g. a memmap.
         order: [N, starts, m] indices into a stored cloud, each in the order of farthest point
             sampling; None if m = P, where there is nothing to choose.
         centre: [N, 3] float32, a cloud's centroid about its first point.
@@ -33,7 +31,7 @@ class Clouds:
         floor: z of the floor in `stored`; for "above_floor".
     """
 
-    stored: Float[np.ndarray, "N P 3"] | Float[ShardedArray, "N P 3"]
+    stored: Float[np.ndarray, "N P 3"]
     order: Int[np.ndarray, "N s m"] | None
     centre: Float[np.ndarray, "N 3"]
     radius: Float[np.ndarray, " N"]
@@ -43,7 +41,7 @@ class Clouds:
 
     @staticmethod
     def of(
-        stored: Float[np.ndarray, "n p 3"] | Float[ShardedArray, "n p 3"],
+        stored: Float[np.ndarray, "n p 3"],
         order: np.ndarray | None = None,
         scale: str = "unit_ball",
         floor: float = 0.0,
@@ -51,8 +49,7 @@ class Clouds:
         """All of `stored`; its clouds are read once, for their balls (see `geometry.unit_ball`)."""
         centre = np.empty((len(stored), 3), dtype=np.float32)
         radius = np.empty(len(stored), dtype=np.float32)
-        clouds = stored if isinstance(stored, ShardedArray) else np.asarray(stored)
-        for i, cloud in enumerate(clouds):
+        for i, cloud in enumerate(np.asarray(stored)):
             moved = cloud - cloud[:1]
             centre[i] = moved.mean(axis=0)
             radius[i] = np.linalg.norm(moved - centre[i], axis=1).max() or 1.0
@@ -91,10 +88,11 @@ class Clouds:
             points = self.stored[rows]  # [B, P, 3], a copy
         else:
             chosen = self.order[rows, 0 if start is None else start.numpy()]  # [B, m]
-            if isinstance(self.stored, ShardedArray):
-                points = self.stored.pick(rows, chosen)  # [B, m, 3]
-            else:
-                points = picked(self.stored, rows, chosen)
+            # One table with a row a point: twice as fast as indexing by both.
+            flat = self.stored.reshape(-1, 3)  # a view
+            points = np.asarray(
+                flat.take(chosen + rows[:, None] * self.stored.shape[1], axis=0)
+            )  # [B, m, 3]
         # In this order, which is `geometry.unit_ball`'s: the same bits as of the whole cloud.
         points -= first[:, None]
         points -= centre[:, None]

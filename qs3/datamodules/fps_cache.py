@@ -21,7 +21,6 @@ from jaxtyping import Float
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_samples import sample_all
 from qs3.errors import ConfigError, Qs3Error
-from qs3.store.sharded import ShardedArray
 from qs3.utils.files import atomic_path
 from qs3.utils.locks import locked
 from qs3.utils.plural import counted
@@ -34,7 +33,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def prepare(
-    points: Float[np.ndarray, "n p 3"] | Float[ShardedArray, "n p 3"],
+    points: Float[np.ndarray, "n p 3"],
     count: int,
     *,
     starts: int = 1,

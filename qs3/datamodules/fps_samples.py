@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.geometry.sampling import farthest_point_sampling_np, unit_ball
-from qs3.store.sharded import ShardedArray
 from qs3.utils.pool import Processes
 from qs3.utils.progress import shown
 from qs3.utils.seeding import derive
@@ -57,7 +56,7 @@ def sample(
 
 
 def sample_all(
-    points: Float[np.ndarray, "n p 3"] | Float[ShardedArray, "n p 3"],
+    points: Float[np.ndarray, "n p 3"],
     count: int,
     starts: int,
     processes: int | None = None,
@@ -82,9 +81,7 @@ def sample_all(
     return result
 
 
-def _fill(
-    result: np.ndarray, points: np.ndarray | ShardedArray, begins: Sequence[int], processes: int
-) -> None:
+def _fill(result: np.ndarray, points: np.ndarray, begins: Sequence[int], processes: int) -> None:
     chunks = ((str(i), np.asarray(points[i : i + _CHUNK])) for i in begins)
     _, starts, count = result.shape
     outcomes = Processes(processes).run(partial(_sampler, count, starts), chunks)

@@ -18,12 +18,11 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from qs3.geometry.sampling import farthest_point_sampling_np
-from qs3.store.sharded import ShardedArray
 
 POOL = 2
 """So many points of the fused views are there for each one of which farthest points are taken."""
 
-Stored = Float[np.ndarray, "N P 3"] | Float[ShardedArray, "N P 3"]
+Stored = Float[np.ndarray, "N P 3"]
 
 
 @dataclass(frozen=True, eq=False)

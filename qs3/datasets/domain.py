@@ -19,8 +19,8 @@ from qs3.config.compose import choices, composed
 from qs3.config.location import typed
 from qs3.datasets.importers import Importer, import_into, lie_deeper
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import read_manifest
+from qs3.store.meta import MadeOf
 from qs3.store.store import (
     PointSet,
     has_variant,

@@ -19,13 +19,13 @@ from qs3.meshes.folder import SPLITS
 KEYS = (
     *("seed", "meshes", "fill_up", "poses", "half", "test_fraction", "up", "colliders", "classes"),
     *("splits", "limit", "fraction", "scans", "provenance", "keep_views", "twins", "workers"),
-    *("shard_mb", "force", "strict", "paths", "domain", "catalogue", "renderer", "scene"),
+    *("force", "strict", "paths", "domain", "catalogue", "renderer", "scene"),
     *("tracking", "crop", "views", "recipe", "sensor", "counts", "released", "engine"),
     *("materials", "light", "depth_errors", "benchmark", "cutting"),
 )
 """The keys at the top of conf/generate.yaml and of all that it composes."""
 
-_WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0, "shard_mb": 1}
+_WHOLE = {"seed": 0, "workers": 0, "limit": 1, "scans": 1, "views": 0}
 COLLIDERS = ("skip", "keep")
 UPS = ("z", "y")
 _SWITCHES = ("provenance", "keep_views", "force", "strict", "fill_up")

@@ -35,8 +35,8 @@ from qs3.generation.recipe_fingerprint import recipe_fingerprint
 from qs3.generation.travel import software
 from qs3.generation.workers import COLLIDERS, Job, Outcome, renderer_provenance, scan_all
 from qs3.meshes.source import MeshItem
-from qs3.store.dataset_folder import CLOUDS, CONFIG, COSTS, INFRARED, check_ours, delete_dataset
 from qs3.store.manifest import MANIFEST
+from qs3.store.parts import CLOUDS, CONFIG, COSTS, INFRARED, check_ours, delete_dataset
 from qs3.store.store import (
     ManifestRow,
     PointSet,
@@ -144,7 +144,7 @@ def _warn_of_meshes(cfg: DictConfig, job: Job, items: list[MeshItem]) -> None:
 def _check_place(domain: Domain, force: bool) -> None:
     """Raise where the dataset would replace, or pass for, one that was not made here."""
     try:
-        check_ours(domain.folder, "generate.py", ELSEWHERE)
+        check_ours(domain.folder, "generate.py")
         domain.check_unpublished()
     except OSError as error:  # a name that no folder can have
         raise ConfigError(
@@ -304,7 +304,6 @@ def _write(
             "config": stored_config(cfg),
         },
         tables={"provenance": PROVENANCE} if cfg.provenance else None,
-        shard_mb=cfg.shard_mb,
     )
     if domain.variant == "points":
         return made_here

@@ -31,7 +31,7 @@ class Parts(PartFiles):
     """The parts of one dataset's folder; an object's file is named by the hash of its id."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder, elsewhere=ELSEWHERE)
+        super().__init__(folder)
 
     def begin_by(self, code: str, recipe: Mapping[str, Any]) -> None:
         """Start, or continue what the same code made with the same recipe.

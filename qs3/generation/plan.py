@@ -23,14 +23,14 @@ from qs3.generation.twins import TWINS
 from qs3.meshes.formats.gltf import buffer_files
 from qs3.meshes.formats.mtl import libraries
 from qs3.meshes.source import MeshItem
-from qs3.store.dataset_folder import VIEWS as VIEWS_FOLDER
+from qs3.store.parts import VIEWS as VIEWS_FOLDER
 from qs3.utils.files import sha256_file
 from qs3.utils.version import VERSION
 
 _NOT_DECISIVE = ("threads",)  # of a renderer: never changes a byte
 _PREVIEWS = 2  # objects a class whose first view is kept for the contact sheet
 # Keys of a config that say where things lie, or that never change a byte.
-_UNSTORED = ("paths", "workers", "engine", "shard_mb", "force", "strict")
+_UNSTORED = ("paths", "workers", "engine", "force", "strict")
 
 
 def keep(cfg: DictConfig, items: Sequence[MeshItem], folder: Path) -> Keep:

@@ -14,7 +14,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from qs3.errors import DataError
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.utils.files import write_text
 from qs3.utils.memory import JSON_PEAK, read_whole
 

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from qs3.errors import DataError
-from qs3.utils.memory import TABLE_PEAK, read_whole
-from qs3.utils.plural import counted
+from qs3.store.meta import AGAIN
 from qs3.utils.text_table import csv_text
 
 MANIFEST = "manifest.csv"
@@ -21,8 +20,6 @@ OK = "ok"
 
 SPLITS: tuple[str, ...] = ("train", "validation", "test")
 """The splits a manifest may name; ShapeNet10 alone has all three."""
-
-AGAIN = "delete the folder and generate or import the dataset again"
 
 
 @dataclass(frozen=True)
@@ -79,11 +76,10 @@ def read_manifest(
     """
     path = Path(folder) / MANIFEST
     try:
-        data = read_whole(path, TABLE_PEAK)
-        text = data.decode()
-    except (OSError, UnicodeDecodeError) as error:
+        data = path.read_bytes()
+        rows = _from_csv(data.decode())
+    except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} cannot be read ({error}); {AGAIN}") from error
-    rows = _from_csv(text, path)
     check_rows(rows, tuple(classes), where=str(path))
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
         raise DataError(
@@ -108,23 +104,22 @@ def check_rows(rows: Sequence[ManifestRow], classes: tuple[str, ...], where: str
     index = 0
     labelled = any(row.cls for row in rows)
     for line, row in enumerate(rows, start=2):  # line 1 of the file is the header
-        at = f"{where}, line {line} (id {row.id!r})"
-        if not row.id:
-            raise DataError(f"{at}: the id is empty")
-        if row.id in seen:
-            raise DataError(f"{at}: the same id is already in line {seen[row.id]}")
+        ok, problem = row.status == OK, ""
+        unread = not ok and not row.cls  # its file did not even give the class
+        if not row.id or row.id in seen:
+            problem = f"the same id is already in line {seen[row.id]}" if row.id else "no id"
+        elif labelled and row.cls not in classes and not unread:
+            problem = f"unknown class {row.cls!r}; known are {', '.join(classes)}"
+        elif row.split not in SPLITS:
+            problem = f"unknown split {row.split!r}; known are {', '.join(SPLITS)}"
+        elif row.index != (index if ok else None):
+            problem = f"index is {row.index}, expected {index if ok else None}"
+        elif not ok and not row.reason:
+            problem = "an object that is not ok has a reason"
+        if problem:
+            raise DataError(f"{where}, line {line} (id {row.id!r}): {problem}")
         seen[row.id] = line
-        unread = row.status != OK and not row.cls  # its file could not even tell the class
-        if labelled and row.cls not in classes and not unread:
-            raise DataError(f"{at}: unknown class {row.cls!r}; known are {', '.join(classes)}")
-        if row.split not in SPLITS:
-            raise DataError(f"{at}: unknown split {row.split!r}; known are {', '.join(SPLITS)}")
-        if row.status == OK:
-            if row.index != index:
-                raise DataError(f"{at}: index is {row.index}, expected {index}")
-            index += 1
-        elif row.index is not None or not row.reason:
-            raise DataError(f"{at}: an object that is not ok has no index and has a reason")
+        index += ok
 
 
 def to_csv(rows: Sequence[ManifestRow]) -> str:
@@ -138,26 +133,19 @@ def to_csv(rows: Sequence[ManifestRow]) -> str:
     return csv_text(lines)
 
 
-def _from_csv(text: str, path: Path) -> list[ManifestRow]:
-    try:
-        header, *lines = csv.reader(io.StringIO(text, newline=""), strict=True)
-    except (csv.Error, ValueError) as error:
-        raise DataError(f"{path} is empty or damaged ({error}); {AGAIN}") from error
+def _from_csv(text: str) -> list[ManifestRow]:
+    """The rows; ValueError or csv.Error if damaged, with the line."""
+    header, *lines = csv.reader(io.StringIO(text, newline=""), strict=True)
     more = header[len(_COLUMNS) :]
     if tuple(header[: len(_COLUMNS)]) != _COLUMNS or len({*header}) < len(header):
-        raise DataError(f"{path}, line 1: the columns are not {', '.join(_COLUMNS)}")
+        raise ValueError(f"line 1: the columns are not {', '.join(_COLUMNS)}")
     rows = []
-    for number, values in enumerate(lines, start=2):
-        if len(values) != len(header):
-            has = counted(len(values), "column")
-            raise DataError(f"{path}, line {number}: {has}, not {len(header)}")
-        fields: dict[str, Any] = {}
-        for name, value in zip(_FIELDS, values, strict=False):
-            try:
-                fields[name] = (int(value) if value else None) if name in _INTEGERS else value
-            except ValueError as error:
-                where = f"{path}, line {number}"
-                raise DataError(f"{where}: {name} is {value!r}, not a number") from error
-        further = zip(more, values[len(_COLUMNS) :], strict=True)
-        rows.append(ManifestRow(**fields, more={key: value for key, value in further if value}))
+    for line, values in enumerate(lines, start=2):
+        try:
+            fields: dict[str, Any] = dict(zip([*_FIELDS, *more], values, strict=True))
+            fields |= {name: int(fields[name]) if fields[name] else None for name in _INTEGERS}
+        except ValueError as error:
+            raise ValueError(f"line {line}: {error}") from error
+        further = {key: value for key in more if (value := fields.pop(key))}
+        rows.append(ManifestRow(**fields, more=further))
     return rows

@@ -1,7 +1,13 @@
-"""The unfinished dataset: one file an object or scene, so that an interruption loses at most one.
+"""Finished parts of work that is not finished, so that an interruption loses one part at most.
 
-recipe.json    what the parts were made with; another recipe is refused
-parts/         <name>.npz: the arrays, and a line of JSON with the rest
+    recipe.json   what the parts are made with; another recipe is refused
+    parts/        <name>.npz: arrays, and a note of plain values
+
+The work is mostly a dataset, whose folder holds as well
+
+    views/        images and depths of every view, if they were asked for
+    clouds.png, infrared.png, config.yaml
+    costs.csv     seconds of each object, and the most memory that its process had taken by then
 """
 
 from __future__ import annotations
@@ -18,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import ConfigError, DataError
-from qs3.store.dataset_folder import PARTS, RECIPE
+from qs3.store.meta import MadeOf, is_finished, read_meta
 from qs3.utils.files import (
     make_folder,
     remove_leftovers,
@@ -26,22 +32,18 @@ from qs3.utils.files import (
     write_bytes,
     write_json,
 )
-from qs3.utils.memory import JSON_PEAK, read_whole
+
+RECIPE, PARTS, VIEWS = "recipe.json", "parts", "views"
+CLOUDS, INFRARED, CONFIG, COSTS = "clouds.png", "infrared.png", "config.yaml", "costs.csv"
 
 _MOST_LINES = 12
 
 
 class PartFiles:
-    """The parts in one dataset's folder.
+    """The parts in one folder; every file is written atomically."""
 
-    Args:
-        folder: of the dataset.
-        elsewhere: the setting that names another folder, for messages: "out".
-    """
-
-    def __init__(self, folder: Path, elsewhere: str) -> None:
+    def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._elsewhere = elsewhere
         self._parts = folder / PARTS
 
     @property
@@ -51,36 +53,26 @@ class PartFiles:
 
     @property
     def have_recipe(self) -> bool:
-        """Whether it is known what the parts, or the dataset, were made with."""
+        """Whether it is known what the parts, or the finished work, were made with."""
         return (self.folder / RECIPE).is_file()
 
     def check(self, recipe: Mapping[str, Any]) -> None:
-        """Raise ConfigError (what differs, what to do) if the folder was begun otherwise.
+        """Compare with the recipe that is there.
 
         Raises:
-            DataError: there is no recipe that can be read.
+            ConfigError: it is another one; lists what differs.
+            DataError: there is none that can be read.
         """
         path = self.folder / RECIPE
         try:
-            there = json.loads(read_whole(path, JSON_PEAK))
-        except (OSError, ValueError, RecursionError) as error:
-            raise DataError(
-                f"{path} cannot be read ({error}): use force=true to start over"
-            ) from error
-        found = _differences(there, json.loads(json.dumps(recipe)))
-        if [key for key, _, _ in found] == ["objects"]:
+            there = json.loads(path.read_bytes())
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path} cannot be read ({error}); force=true starts over") from error
+        if found := _differences(there, json.loads(json.dumps(recipe))):
             raise ConfigError(
-                f"{self.folder} was made from other objects: {found[0][1]} there, {found[0][2]} "
-                "now. A dataset is of one set of objects, and another limit= or splits=, or a mesh "
-                "that was repaired, added or removed, makes another: give another "
-                f"{self._elsewhere}, or force=true to make all of it again."
-            )
-        if found:
-            lines = [f"  {key}: {old} there, {new} now" for key, old, new in found]
-            raise ConfigError(
-                f"{self.folder} was made with other settings or versions, and mixing them is "
-                "refused:\n" + "\n".join(lines[:_MOST_LINES]) + "\nUse the same settings, another "
-                f"{self._elsewhere}, or force=true to start over."
+                f"{self.folder} was made with other settings, objects or versions:\n"
+                + "\n".join(found[:_MOST_LINES])
+                + "\nUse the same ones, another folder, or force=true to start over."
             )
 
     def begin(self, recipe: Mapping[str, Any]) -> None:
@@ -88,7 +80,7 @@ class PartFiles:
         if self.have_recipe:
             self.check(recipe)
         else:
-            self.clear()  # parts without a recipe: nobody knows what they were made with
+            self.clear()  # parts without a recipe: it is not known what they were made with
             write_json(self.folder / RECIPE, recipe)
         make_folder(self._parts)
         self.tidy()
@@ -98,26 +90,23 @@ class PartFiles:
         return sha256_file(self.folder / RECIPE)
 
     def check_there(self, recipe_sha256: str) -> None:
-        """On another machine: that it sees this folder, and with the recipe that it works by.
+        """Check on another machine that it sees this folder, with the recipe that it works by.
 
         Raises:
-            DataError: it does not, and what it saved would be lost, or mixed with other objects.
+            DataError: it does not, and what it saved would be lost, or mixed with other parts.
         """
         try:
-            found = self.recipe_sha256()
-        except OSError as error:
+            same = self.recipe_sha256() == recipe_sha256
+        except OSError:
+            same = False
+        if not same:
             raise DataError(
-                f"{platform.node()} does not see {self.folder} ({error.strerror}): give a "
-                f"{self._elsewhere} that all nodes see, or engine.shared_disk=false (engine=ray)"
-            ) from error
-        if found != recipe_sha256:
-            raise DataError(
-                f"{self.folder} was begun anew with other settings while {platform.node()} worked "
-                "by the old ones"
+                f"{platform.node()} does not see {self.folder}, or it was begun anew: give a "
+                "folder that all nodes see, or engine.shared_disk=false (engine=ray)"
             )
 
     def tidy(self) -> None:
-        """Remove what killed processes left half written; nobody may be writing."""
+        """Remove what killed processes left half written; nothing else may be writing."""
         remove_leftovers(self.folder)
         remove_leftovers(self._parts)
 
@@ -181,6 +170,32 @@ class ArraysOnDisk(Mapping[str, np.ndarray]):
         return len(self._names)
 
 
+def check_ours(folder: Path, command: str) -> None:
+    """Refuse to make a dataset where a finished one lies that has no recipe: it was imported.
+
+    Raises:
+        DataError: names what is there and the command that would replace it.
+    """
+    if is_finished(folder) and not (folder / RECIPE).is_file():
+        raise DataError(
+            f"{folder} holds a dataset that {command} did not make "
+            f"({MadeOf.of(read_meta(folder))}) and never replaces; give another folder"
+        )
+
+
+def delete_dataset(folder: Path) -> None:
+    """Delete a dataset, finished or not, and its recipe; other files are left alone."""
+    # meta.yaml first: without it the folder counts as unfinished whatever else is left. The
+    # recipe last: as long as a part is left, it says what the part was made with.
+    (folder / "meta.yaml").unlink(missing_ok=True)
+    for name in (PARTS, VIEWS):
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
+    names = ("manifest.csv", CLOUDS, INFRARED, CONFIG, COSTS)
+    for path in [*(folder / name for name in names), *folder.glob("*.npy"), folder / RECIPE]:
+        path.unlink(missing_ok=True)
+
+
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     try:
@@ -190,28 +205,20 @@ def _opened(path: Path) -> Iterator[Any]:
         raise DataError(f"{path} is damaged ({error}): delete it and run again") from error
 
 
-def _differences(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+def _differences(old: Any, new: Any, key: str = "") -> list[str]:
+    """A line for each place where two recipes differ."""
     if old == new:
         return []
     if isinstance(old, dict) and isinstance(new, dict):
         return [
-            difference
+            line
             for name in dict.fromkeys([*old, *new])
-            for difference in _differences(
-                old.get(name, "nothing"),
-                new.get(name, "nothing"),
-                f"{key}.{name}" if key else name,
-            )
+            for line in _differences(old.get(name), new.get(name), f"{key}.{name}" if key else name)
         ]
-    if key == "objects" and isinstance(old, list) and isinstance(new, list):
-        return [(key, _sample(old, new), _sample(new, old))]
-    return [(key, _short(old), _short(new))]
-
-
-def _sample(some: list, others: list) -> str:
-    """How many there are, and the first that the others lack."""
-    missing = sorted(set(some) - set(others))
-    return f"{len(some)}{f', among them {missing[0]!r}' if missing else ''}"
+    if isinstance(old, list) and isinstance(new, list) and len(str(old)) > 80:
+        other = sorted(map(str, {*map(str, old)} ^ {*map(str, new)}))
+        return [f"  {key}: {len(old)} there, {len(new)} now, such as {' '.join(other[:1])}"]
+    return [f"  {key}: {_short(old)} there, {_short(new)} now"]
 
 
 def _short(value: Any) -> str:

@@ -3,21 +3,21 @@ r"""Point clouds on disk: one folder a dataset, written atomically, checked when
     points.npy         float32 [N, P, 3], C order, metres or the published unit; read as a memmap
     points_clean.npy   optional further arrays of the same shape (here the clean twin)
     provenance.npy     optional tables, float32 [N, P, columns]: what is known of each point
-    points-00000.npy, ...  instead, where a file would exceed `array_files.SHARD_MB`
     manifest.csv       one row an object; those with status "ok" are the N clouds, in order
     meta.yaml          name, classes, hashes, and how it was made; written last
 
 `meta.yaml` is the marker of a finished dataset: a folder without it is refused (see
 `qs3.store.meta`). It holds the SHA-256 of every other file. No file holds a date, so the same
-clouds
-give the same bytes.
+clouds give the same bytes.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,16 +25,6 @@ from typing import Any
 import numpy as np
 
 from qs3.errors import DataError
-from qs3.store.array_files import (
-    SHARD_MB,
-    Column,
-    check_finite,
-    clouds_each,
-    open_array,
-    shard_name,
-    write_array,
-)
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import (
     MANIFEST,
     OK,
@@ -46,17 +36,17 @@ from qs3.store.manifest import (
     to_csv,
 )
 from qs3.store.meta import (
+    AGAIN,
     META,
+    MadeOf,
+    is_begun,
     is_finished,
-    meta_of_finished,
     read_meta,
     sha256_of,
     write_meta,
 )
-from qs3.store.sharded import ShardedArray
 from qs3.utils import text_table
-from qs3.utils.files import make_folder, remove_leftovers, sha256_file, write_text
-from qs3.utils.plural import counted
+from qs3.utils.files import atomic_path, make_folder, remove_leftovers, sha256_file, write_text
 from qs3.utils.version import VERSION
 
 __all__ = [
@@ -75,6 +65,11 @@ __all__ = [
     "write_pointset",
 ]
 
+_CHUNK_CLOUDS = 512  # that are in memory at a time
+
+Clouds = np.ndarray | Sequence[np.ndarray]
+"""[N, P, C], or N arrays [P, C], each of which is asked for when it is needed."""
+
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
@@ -82,20 +77,19 @@ class PointSet:
 
     Attributes:
         classes: names; a label is a position in this tuple.
-        points: [N, P, 3] float32, read only (a memmap, or a copy after `split`; of a dataset in
-            shards what answers like an array, also after `split`).
+        points: [N, P, 3] float32, read only: a memmap, or a copy after `split`.
         labels: [N] int64; all -1 if the dataset has no labels.
         splits: [N] str.
         ids: N unique strings.
         sha256: hash of these clouds with their ids, labels and splits (of the whole dataset,
             also after `split`); goes into every result.
         meta: what meta.yaml holds.
-        floor_m: z of the floor under every cloud, if a `Domain` that opened it knows.
+        floor_m: z of the floor under every cloud, if the `Domain` that opened it gives it.
     """
 
     name: str
     classes: tuple[str, ...]
-    points: np.ndarray | ShardedArray
+    points: np.ndarray
     labels: np.ndarray
     splits: np.ndarray
     ids: tuple[str, ...]
@@ -142,10 +136,9 @@ class PointSet:
 
     def at(self, rows: slice | np.ndarray) -> PointSet:
         """Some clouds, by their positions; the hash is still that of the whole dataset."""
-        points = self.points
         return dataclasses.replace(
             self,
-            points=points.at(rows) if isinstance(points, ShardedArray) else points[rows],
+            points=self.points[rows],
             labels=self.labels[rows],
             splits=self.splits[rows],
             ids=tuple(self.ids[i] for i in np.arange(len(self))[rows]),
@@ -183,31 +176,20 @@ def counts_text(data: PointSet, without: str, missing: Mapping[str, int]) -> lis
     return text_table.aligned([*rows, ["all", *total]], numbers=True, rule=False)
 
 
-def is_begun(folder: str | Path) -> bool:
-    """Whether something was begun in `folder` and not finished (an empty lock is nothing)."""
-    folder = Path(folder)
-    return (
-        folder.is_dir()
-        and not is_finished(folder)
-        and any(path.name != ".lock" for path in folder.iterdir())
-    )
-
-
 def write_pointset(
     folder: str | Path,
     *,
     name: str,
     classes: Sequence[str],
-    arrays: Mapping[str, np.ndarray | Sequence[np.ndarray]],
+    arrays: Mapping[str, Clouds],
     rows: Sequence[ManifestRow],
     meta: Mapping[str, Any],
     tables: Mapping[str, Sequence[str]] | None = None,
-    shard_mb: float = SHARD_MB,
 ) -> PointSet:
     """Write a dataset and open it again, checked.
 
     An older dataset in the same folder stops being finished first, so an interruption never
-    leaves the new clouds under the old description. Nobody else may be writing there.
+    leaves the new clouds under the old description. Nothing else may be writing there.
 
     Args:
         folder: created if need be; other files in it are left alone.
@@ -220,8 +202,6 @@ def write_pointset(
         meta: plain values (numbers, strings, lists, dicts): sensor, renderer, versions, config.
         tables: which of the arrays are not clouds but say something of each point, with the names
             of their columns: they are [N, P, columns], and no variant to train on.
-        shard_mb: no file of clouds exceeds so many MB (10^6 bytes), unless by one cloud; larger
-            arrays are cut. The dataset's hash does not depend on it.
 
     Raises:
         DataError: arrays and rows do not fit together, or a value is not finite.
@@ -230,15 +210,22 @@ def write_pointset(
     folder = Path(folder)
     rows, classes, tables = number(rows), tuple(classes), dict(tables or {})
     check_rows(rows, classes, where=f"rows of dataset {name!r}")
-    columns = {key: Column(name, key, value) for key, value in arrays.items()}
-    clouds, points = _check_arrays(name, columns, sum(row.status == OK for row in rows), tables)
-    # All arrays are cut at the same clouds, where the widest has to be.
-    each = min(clouds_each(shard_mb, column.shape) for column in columns.values())
+    clouds = sum(row.status == OK for row in rows)
+    points = _shape(arrays["points"])[1] if clouds else 0
+    for key, array in arrays.items():
+        columns = len(tables[key]) if key in tables else 3
+        where, shape = f"array {key!r} of dataset {name!r}", (clouds, points, columns)
+        if _shape(array) != shape or not points:
+            raise DataError(f"{where} has shape {_shape(array)}, expected {shape}")
+        for start, chunk in enumerate(_chunks(array, where)):
+            if (bad := _first_bad(chunk)) is not None:
+                at = start * _CHUNK_CLOUDS + bad
+                raise DataError(f"{where}: cloud {at} is not finite")
 
     make_folder(folder)
     (folder / META).unlink(missing_ok=True)
     remove_leftovers(folder)
-    written = {key: write_array(folder, key, column, each) for key, column in columns.items()}
+    hashes = {key: _write_array(folder / f"{key}.npy", array) for key, array in arrays.items()}
     write_text(folder / MANIFEST, to_csv(rows))
     document = {
         "created_by": f"qs3 {VERSION}",
@@ -247,14 +234,8 @@ def write_pointset(
         "clouds": clouds,
         "points": points,
         "failed": len(rows) - clouds,
-        "sha256": {
-            **{key: one.sha256 for key, one in written.items()},
-            "manifest": sha256_file(folder / MANIFEST),
-        },
+        "sha256": {**hashes, "manifest": sha256_file(folder / MANIFEST)},
     }
-    if clouds > each:
-        hashes = {key: list(one.shards) for key, one in written.items()}
-        document["shards"] = {"clouds": each, "sha256": hashes}
     if not any(row.cls for row in rows if row.status == OK):
         document["labelled"] = False
     if tables:
@@ -277,23 +258,18 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
         DataError: a file is damaged or does not fit the others; names file and row.
     """
     folder = Path(folder)
-    meta = meta_of_finished(folder)
+    meta = read_meta(folder)
     classes, hashes = tuple(meta["classes"]), meta["sha256"]
     have = sorted(set(hashes) - {"manifest", *(meta.get("tables") or {})})
     if variant not in have:
-        raise DataError(
-            f"{folder} holds the arrays {have}, not {variant!r}; generate the dataset again with "
-            "it, or choose another variant"
-        )
+        raise DataError(f"{folder} holds the arrays {have}, not {variant!r}: generate it again")
     rows = read_manifest(folder, classes, hashes["manifest"])
     kept = [row for row in rows if row.status == OK]
-    if len(kept) != meta["clouds"]:
-        raise DataError(
-            f"{folder / MANIFEST} has {counted(len(kept), 'row')} with status ok, but {META} "
-            f"promises {counted(meta['clouds'], 'cloud')}; generate or import the dataset again"
-        )
-    points = open_array(folder, variant, meta, 3, verify)
-    check_finite(folder / f"{variant}.npy", points, [row.id for row in kept])
+    points = _open_array(folder, variant, meta, 3, verify)
+    for start in range(0, len(points), _CHUNK_CLOUDS):
+        if (bad := _first_bad(points[start : start + _CHUNK_CLOUDS])) is not None:
+            where = f"{folder / variant}.npy, cloud {start + bad} (id {kept[start + bad].id!r})"
+            raise DataError(f"{where} is not finite; {AGAIN}")
     position = {name: label for label, name in enumerate(classes)}
     return PointSet(
         name=meta["name"],
@@ -308,15 +284,11 @@ def open_pointset(folder: str | Path, variant: str = "points", verify: bool = Tr
 
 
 def has_variant(folder: str | Path, variant: str) -> bool:
-    """Whether a finished dataset lies there that has this array of clouds, by its files' names."""
-    return is_finished(folder) and any(
-        (Path(folder) / name).is_file() for name in (f"{variant}.npy", shard_name(variant, 0))
-    )
+    """Whether a finished dataset lies there that has this array of clouds, by its file's name."""
+    return is_finished(folder) and (Path(folder) / f"{variant}.npy").is_file()
 
 
-def open_table(
-    folder: str | Path, name: str = "provenance"
-) -> tuple[np.ndarray | ShardedArray, tuple[str, ...]]:
+def open_table(folder: str | Path, name: str = "provenance") -> tuple[np.ndarray, tuple[str, ...]]:
     """Open what a dataset knows of each point of its variant "points".
 
     Returns:
@@ -328,15 +300,12 @@ def open_table(
         DataError: the dataset has no such table, or its file is damaged.
     """
     folder = Path(folder)
-    meta = meta_of_finished(folder)
+    meta = read_meta(folder)
     tables = meta.get("tables") or {}
     if name not in tables:
-        raise DataError(
-            f"{folder} holds the tables {sorted(tables)}, not {name!r}; generate the dataset again "
-            "with it (for provenance: provenance=true)"
-        )
+        raise DataError(f"{folder} holds the tables {sorted(tables)}, not {name!r}")
     columns = tuple(tables[name])
-    return open_array(folder, name, meta, len(columns), verify=True), columns
+    return _open_array(folder, name, meta, len(columns), verify=True), columns
 
 
 def _content_hash(array: str, classes: Sequence[str], rows: Sequence[ManifestRow]) -> str:
@@ -345,34 +314,67 @@ def _content_hash(array: str, classes: Sequence[str], rows: Sequence[ManifestRow
     return sha256_of(json.dumps(seen, ensure_ascii=True))
 
 
-def _check_arrays(
-    name: str,
-    arrays: Mapping[str, Column],
-    clouds: int,
-    tables: Mapping[str, Sequence[str]],
-) -> tuple[int, int]:
-    """How many clouds of how many points, after checking that all arrays fit the manifest."""
-    if "points" not in arrays:
-        raise DataError(f"dataset {name!r} needs an array 'points', got {sorted(arrays)}")
-    if wrong := sorted(set(tables) - set(arrays) | set(tables) & {"points"}):
+def _shape(clouds: Clouds) -> tuple[int, ...]:
+    if isinstance(clouds, np.ndarray):
+        return clouds.shape
+    return (len(clouds), *(np.shape(clouds[0]) if len(clouds) else (0, 0)))
+
+
+def _chunks(clouds: Clouds, where: str) -> Iterator[np.ndarray]:
+    """Little-endian float32 [n, P, C] in C order, in order; DataError if shapes differ."""
+    for start in range(0, len(clouds), _CHUNK_CLOUDS):
+        try:
+            yield np.ascontiguousarray(clouds[start : start + _CHUNK_CLOUDS], dtype="<f4")
+        except ValueError as error:
+            raise DataError(f"{where} has clouds of several shapes ({error})") from error
+
+
+def _write_array(path: Path, clouds: Clouds) -> str:
+    """Write an array, atomically; returns its file's SHA-256."""
+    head = _header(_shape(clouds))
+    whole = hashlib.sha256(head)
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        file.write(head)
+        for chunk in _chunks(clouds, str(path)):
+            file.write(chunk.data.cast("B"))
+            whole.update(chunk.data)
+    return whole.hexdigest()
+
+
+def _open_array(
+    folder: Path, key: str, meta: Mapping[str, Any], columns: int, verify: bool
+) -> np.ndarray:
+    """[N, P, columns] float32 memmap whose header, size and hash are what they were.
+
+    Raises:
+        DataError: names the file that is damaged.
+    """
+    path, shape = folder / f"{key}.npy", (meta["clouds"], meta["points"], columns)
+    head = _header(shape)
+    size = len(head) + 4 * shape[0] * shape[1] * shape[2]
+    try:
+        with open(path, "rb") as file:
+            fits = file.read(len(head)) == head and path.stat().st_size == size
+        same = fits and (not verify or sha256_file(path) == meta["sha256"][key])
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); {AGAIN}") from error
+    if not same:
         raise DataError(
-            f"dataset {name!r}: tables {wrong} are not arrays beyond 'points'; arrays are "
-            f"{sorted(arrays)}"
+            f"{path} is damaged: it is not the float32 array {list(shape)} with the SHA-256 in "
+            f"meta.yaml; {AGAIN}"
         )
-    for key, array in arrays.items():
-        if not key.isidentifier() or key in ("manifest", "meta"):
-            raise DataError(f"an array of dataset {name!r} cannot be called {key!r}")
-        width = len(tables[key]) if key in tables else 3
-        if len(array.shape) != 3 or array.shape[2] != width or 0 in array.shape:
-            raise DataError(
-                f"array {key!r} of dataset {name!r} has shape {array.shape}, expected "
-                f"[N, P, {width}] with at least one cloud of one point"
-            )
-        if array.shape[:2] != arrays["points"].shape[:2] or len(array) != clouds:
-            raise DataError(
-                f"array {key!r} of dataset {name!r} has shape {array.shape}, 'points' has "
-                f"{arrays['points'].shape}, and {counted(clouds, 'row has', 'rows have')} status ok"
-            )
-        array.check_finite()
-    n, p, _ = arrays["points"].shape
-    return n, p
+    return np.memmap(path, dtype="<f4", mode="r", offset=len(head), shape=shape)
+
+
+def _header(shape: tuple[int, ...]) -> bytes:
+    """The .npy header of a float32 C-order array: the only one this format has."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        file, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
+    return file.getvalue()
+
+
+def _first_bad(clouds: np.ndarray) -> int | None:
+    finite = np.isfinite(clouds).all(axis=(1, 2))
+    return None if finite.all() else int(np.flatnonzero(~finite)[0])

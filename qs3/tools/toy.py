@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.config.quoting import override
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.store.store import ManifestRow, PointSet, write_pointset
 
 SHAPES = {

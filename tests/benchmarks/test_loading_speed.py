@@ -23,11 +23,9 @@ from qs3.datamodules.fps_cache import prepare
 from qs3.datamodules.phases import Phases, SelfTrainingConfig
 from qs3.datamodules.splits import Labelled
 from qs3.datasets.domain import Domain
-from qs3.store.array_files import Column, clouds_each, open_array, write_array
 
 CLOUDS, STORED, POINTS, BATCH = 4183, 2048, 1024, 16  # PointDA-10's ModelNet, QS3's warm-up
 TEXT_FILES = 32
-MANY, SHARD_MB = 100_000, 512  # 2.5 GB in five files
 
 
 def released_item(path: Path, rng: np.random.Generator) -> np.ndarray:
@@ -123,60 +121,3 @@ def test_an_epoch(
             f"Once: {sampling:.1f} s to sample from 4 starts, then {opening:.2f} s to open"
         )
     assert min(theirs) / ours > 100
-
-
-class _Seeded:
-    """Clouds that are made when they are written."""
-
-    def __init__(self, n: int) -> None:
-        self.n = n
-
-    def __len__(self) -> int:
-        return self.n
-
-    def __getitem__(self, key: slice | int) -> list[np.ndarray] | np.ndarray:
-        if isinstance(key, slice):
-            return [self[i] for i in range(self.n)[key]]
-        return np.random.default_rng(key).random((STORED, 3), dtype=np.float32)
-
-
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")
-def test_an_epoch_of_a_dataset_in_shards(
-    benchmark: BenchmarkFixture, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    """100,000 clouds against the same ones in one file, on one thread; both in the page cache."""
-    n = MANY if benchmark.enabled else 100
-    column = Column("made", "points", _Seeded(n))
-    each = clouds_each(SHARD_MB, column.shape) if benchmark.enabled else 40
-    rng = np.random.default_rng(0)
-    order = rng.integers(STORED, size=(n, 1, POINTS), dtype=np.int16)
-    prepared = {}
-    for name, most in (("cut", each), ("whole", n)):
-        made = write_array(tmp_path, name, column, most)
-        about = {"clouds": n, "points": STORED, "sha256": {name: made.sha256}}
-        if made.shards:
-            about["shards"] = {"clouds": most, "sha256": {name: list(made.shards)}}
-        stored = open_array(tmp_path, name, about, 3, verify=False)
-        prepared[name] = our_data(Clouds.of(stored, order))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        began = time.perf_counter()
-        assert epoch(prepared["whole"]) == n
-        single = time.perf_counter() - began
-        rounds = 2 if benchmark.enabled else 1
-        assert benchmark.pedantic(epoch, args=(prepared["cut"],), rounds=rounds) == n
-        if not benchmark.enabled:
-            return
-        began = time.perf_counter()
-        epoch(prepared["whole"])
-        single = min(single, time.perf_counter() - began)
-    finally:
-        torch.set_num_threads(threads)
-    ours = benchmark.stats.stats.min
-    benchmark.extra_info["times_one_file"] = ours / single
-    with capsys.disabled():
-        print(  # noqa: T201
-            f"\n{n} clouds in {-(-n // each)} files, one thread, augmented: {ours:.1f} s an epoch; "
-            f"in one file {single:.1f} s: {ours / single:.2f} times as long"
-        )

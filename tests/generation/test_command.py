@@ -280,22 +280,6 @@ def test_a_missing_folder_is_named(tmp_path):
         generate(config(tmp_path, tmp_path / "nowhere", "workers=0"))
 
 
-def test_files_of_a_size_that_one_names_hold_the_same_dataset(tmp_path):
-    """1.2 MB of clouds; a second call, with another size, finds them there."""
-    lamps = ("classes=[lamp,table]", "limit=12", "splits=[train]", "recipe.points=4096")
-    whole = generate(config(tmp_path / "a", None, *lamps, domain="modelnet10"))
-    assert len(whole) == 24
-    cut = generate(config(tmp_path / "b", None, *lamps, "shard_mb=1", domain="modelnet10"))
-    folder = tmp_path / "b" / "modelnet10"
-    assert sorted(path.name for path in folder.glob("*.npy")) == [
-        "points-00000.npy",
-        "points-00001.npy",
-    ]
-    again = generate(config(tmp_path / "b", None, *lamps, domain="modelnet10"))
-    assert whole.sha256 == cut.sha256 == again.sha256
-    np.testing.assert_array_equal(np.asarray(again.points), whole.points)
-
-
 def test_surface_samples_lie_on_the_surface_and_dropout_takes_regions(meshes, tmp_path):
     whole = generate(config(tmp_path, meshes, "workers=0", domain="modelnet10"))
     holed = generate(config(tmp_path, meshes, "workers=0", domain="modelnet10_dropout"))

@@ -299,7 +299,7 @@ def test_meta_holds_the_whole_config_but_places_and_what_changes_no_byte():
     assert stored == stored_config(config(*overrides, "meshes=/yours", "renderer.threads=2"))
     assert stored == stored_config(config(*overrides, "meshes=/mine", "engine=slurm"))
     whole = OmegaConf.to_container(config(*overrides))
-    unkept = {"paths", "workers", "engine", "shard_mb", "force", "strict", "renderer", "meshes"}
+    unkept = {"paths", "workers", "engine", "force", "strict", "renderer", "meshes"}
     kept = set(whole) - unkept
     for key in kept:
         assert stored[key] == whole[key], key

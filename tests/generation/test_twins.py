@@ -109,16 +109,6 @@ def test_asking_for_twins_moves_no_byte_and_workers_and_a_resume_move_none_of_th
         generate(two_classes(folder.parent, meshes, "workers=0"))
 
 
-@pytest.mark.slow
-def test_twins_are_cut_into_files_as_clouds_are(kept, meshes, tmp_path):
-    sharded = generate(two_classes(tmp_path / "cut", meshes, *ASKED, "shard_mb=1", "scans=12"))
-    cut = tmp_path / "cut/specklenet10"
-    assert len(sharded) == 48
-    assert (cut / "points_whole-00001.npy").is_file()
-    first = open_pointset(cut, "points_whole")
-    np.testing.assert_array_equal(first.points[0], array(kept[0], "whole")[0])
-
-
 def test_damage_is_noticed_and_the_file_named(kept, tmp_path):
     folder = tmp_path / "copy"
     folder.mkdir()

@@ -20,7 +20,7 @@ from qs3.runs.metrics import (
     read_metrics,
     write_metrics,
 )
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 
 PUBLISHED = MadeOf(objects="published files", published=True)
 CATALOGUE = MadeOf(objects="embedded catalogue", sensor="kinect_like", views=4, meshes="c" * 12)

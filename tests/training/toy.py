@@ -10,7 +10,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.store.store import ManifestRow, write_pointset
 from tests.composing import compose
 

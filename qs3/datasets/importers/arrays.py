@@ -12,8 +12,8 @@ import numpy as np
 from qs3.datasets.clouds.arrays import read_npz
 from qs3.datasets.importers.base import Importer, Item, by_class, class_of, cloud_id, split_of
 from qs3.errors import DataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import ManifestRow
+from qs3.store.meta import MadeOf
 from qs3.utils.text_table import printable
 
 _KEYS = ("points", "cls", "split", "name")

@@ -18,8 +18,8 @@ import numpy as np
 from qs3.classes import ALIASES, known_as
 from qs3.config.checks import check_choice, check_int
 from qs3.errors import ConfigError, DataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import SPLITS, ManifestRow
+from qs3.store.meta import MadeOf
 from qs3.store.store import is_begun, is_finished, write_pointset
 from qs3.utils.locks import locked
 from qs3.utils.plural import counted

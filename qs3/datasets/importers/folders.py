@@ -46,8 +46,8 @@ from qs3.datasets.importers.base import (
 )
 from qs3.datasets.with_depth import NOTHING, with_depth
 from qs3.errors import ConfigError, DataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import ManifestRow
+from qs3.store.meta import MadeOf
 from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
 

@@ -196,7 +196,7 @@ class FrameImporter(Importer):
             "settings": self.settings(),
             "versions": {"qs3": VERSION, "numpy": np.__version__, "scipy": version("scipy")},
         }
-        parts = PartFiles(work, elsewhere="path")
+        parts = PartFiles(work)
         if parts.have_recipe:
             try:
                 parts.check(recipe)

@@ -20,8 +20,8 @@ import numpy as np
 
 from qs3.datasets.importers.base import Importer, Item, by_class
 from qs3.errors import ConfigError, DataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import OK, read_manifest
+from qs3.store.meta import MadeOf
 from qs3.store.store import PointSet, is_finished, open_pointset
 
 _FURTHER_SCAN = re.compile(r"~\d+$")

@@ -34,7 +34,7 @@ from qs3.datasets.importers.base import (
 )
 from qs3.datasets.importers.trees import list_tree
 from qs3.errors import DataError, MeshError
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.utils.seeding import derive
 
 _WHERE = ("", "raw", "ModelNet40", "ModelNet10")  # below the folder, the tree may lie here

@@ -26,7 +26,7 @@ from qs3.datasets.frames.rules import Rules
 from qs3.datasets.frames.vertical import Mounting, angle_deg, floor_up, mounting, planes_up
 from qs3.datasets.importers.frame_importer import Cut, Cutter, FrameImporter, FrameTask
 from qs3.errors import ConfigError, DataError
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.utils.plural import counted
 from qs3.utils.progress import progress_bar
 

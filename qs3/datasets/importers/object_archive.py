@@ -35,8 +35,8 @@ from qs3.config.checks import check_bool, check_int, check_words
 from qs3.datasets.importers.arrays import plain_arrays
 from qs3.datasets.importers.base import Importer, Item, class_of
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import SPLITS, ManifestRow
+from qs3.store.meta import MadeOf
 from qs3.utils.plural import counted
 from qs3.utils.text_table import printable
 

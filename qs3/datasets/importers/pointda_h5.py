@@ -19,8 +19,8 @@ import numpy as np
 from qs3.datasets.clouds.hdf5 import HDF5_DAMAGE, open_hdf5, own_dataset
 from qs3.datasets.importers.base import Importer, Item, cloud_id, inside, turned
 from qs3.errors import DataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import ManifestRow
+from qs3.store.meta import MadeOf
 from qs3.utils.memory import check_memory
 
 _NAME = re.compile(r"(train|test)_(\d+)\.h5")

@@ -32,7 +32,7 @@ from qs3.datasets.frames.sunrgbd import (
 )
 from qs3.datasets.importers.frame_importer import Cut, Cutter, FrameImporter, FrameTask
 from qs3.errors import ConfigError
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.utils.plural import counted
 
 log = logging.getLogger(__name__)

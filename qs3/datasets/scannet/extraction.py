@@ -29,9 +29,9 @@ from qs3.datasets.scannet.scene import SceneResult, extract_scene
 from qs3.datasets.scannet.scene_parts import SceneParts
 from qs3.datasets.scannet.settings import Extraction
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.store.dataset_folder import RECIPE, check_ours, delete_dataset
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import ManifestRow
+from qs3.store.meta import MadeOf
+from qs3.store.parts import RECIPE, check_ours, delete_dataset
 from qs3.store.store import (
     PointSet,
     counts_text,
@@ -106,7 +106,7 @@ def extract(
     }
     make_folder(out)
     with locked(out / ".lock"):
-        check_ours(out, "qs3 scannet", "out")
+        check_ours(out, "qs3 scannet")
         if force and (is_finished(out) or (out / RECIPE).is_file()):
             (out / SCENES).unlink(missing_ok=True)
             delete_dataset(out)

@@ -16,8 +16,7 @@ from qs3.datasets.scannet.labels import Labelled
 from qs3.datasets.scannet.objects import ObjectCloud
 from qs3.datasets.scannet.scene import SceneResult
 from qs3.errors import DataError
-from qs3.store.dataset_folder import RECIPE
-from qs3.store.parts import PartFiles
+from qs3.store.parts import RECIPE, PartFiles
 
 _PLAIN = ("frames", "frames_used", "frames_lost", "frames_unmasked", "notes")
 
@@ -26,7 +25,7 @@ class SceneParts(PartFiles):
     """The parts in one dataset's folder."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder, elsewhere="out")
+        super().__init__(folder)
 
     def check(self, recipe: Mapping[str, Any]) -> None:
         """Check that what is in the folder, if anything, was made with the same recipe.

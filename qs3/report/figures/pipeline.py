@@ -23,8 +23,8 @@ from qs3.meshes.io import load_mesh
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.source import MeshItem
 from qs3.report.inspection.surface import distance_to_mesh, surfaces_of
-from qs3.store.dataset_folder import VIEWS
 from qs3.store.manifest import read_manifest
+from qs3.store.parts import VIEWS
 from qs3.store.store import has_variant, open_pointset, read_meta
 from qs3.utils.plural import counted
 from qs3.utils.seeding import object_rng

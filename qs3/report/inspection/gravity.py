@@ -27,7 +27,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from qs3.geometry.sampling import unit_ball
-from qs3.store.sharded import ShardedArray
 
 UPS: tuple[str, ...] = ("+z", "-z", "+x", "-x", "+y", "-y")
 """The directions that may point up, in the order of all arrays here."""
@@ -161,7 +160,7 @@ class UpModel:
 
 
 def judge_set(
-    points: Float[np.ndarray, "n p 3"] | Float[ShardedArray, "n p 3"],
+    points: Float[np.ndarray, "n p 3"],
     labels: Int[np.ndarray, " n"],
     classes: Sequence[str],
     model: UpModel | None = None,

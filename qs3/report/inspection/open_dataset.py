@@ -9,8 +9,8 @@ from pathlib import Path
 from qs3.config.compose import choices
 from qs3.datasets.domain import Domain, compose_domain
 from qs3.errors import ConfigError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import ManifestRow, read_manifest
+from qs3.store.meta import MadeOf
 from qs3.store.store import PointSet, is_finished, open_pointset
 
 

@@ -17,7 +17,6 @@ from qs3.report.contact_sheets import drawn
 from qs3.report.inspection.open_dataset import Opened
 from qs3.report.inspection.surface import distance_to_mesh, surfaces_of
 from qs3.report.viewer.page import Part, Shown
-from qs3.store.sharded import ShardedArray
 from qs3.store.store import PointSet, open_table
 
 # As `qs3.generation.provenance` writes them, which stands above this package.
@@ -79,7 +78,7 @@ class _Table:
     """What the store's table "provenance" says, if it has one."""
 
     def __init__(self, opened: Opened) -> None:
-        self._table: np.ndarray | ShardedArray | None = None
+        self._table: np.ndarray | None = None
         columns: tuple[str, ...] = ()
         if opened.variant == "points" and "provenance" in opened.data.meta.get("tables", {}):
             self._table, columns = open_table(opened.folder)

@@ -19,7 +19,7 @@ from qs3.datasets.importers.object_archive import TIERS
 from qs3.errors import DataError
 from qs3.runs.folder import read_code
 from qs3.runs.metrics import FINISHED, METRICS, RunMetrics, Scores, read_metrics
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.utils.text_table import aligned
 
 FEW_SEEDS = 3

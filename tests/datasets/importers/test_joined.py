@@ -11,8 +11,8 @@ from qs3.datamodules.validation_split import lineage
 from qs3.datasets.domain import Domain, compose_domain
 from qs3.datasets.importers.joined import Joined
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.store.made_of import MadeOf
 from qs3.store.manifest import read_manifest
+from qs3.store.meta import MadeOf
 from qs3.store.store import ManifestRow, open_pointset, write_pointset
 from tests.fixtures.published import cloud
 

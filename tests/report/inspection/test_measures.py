@@ -15,7 +15,7 @@ from qs3.report.inspection import gap, measures
 from qs3.report.inspection.measure import WITHIN, Bounds, compare
 from qs3.report.inspection.open_dataset import open_named
 from qs3.report.inspection.surface import distance_to_mesh, surfaces_of
-from qs3.store.made_of import MadeOf
+from qs3.store.meta import MadeOf
 from qs3.store.store import ManifestRow, write_pointset
 from qs3.utils.seeding import object_rng
 from tests.fixtures import published as fixtures
