@@ -6,12 +6,12 @@ import logging
 
 import numpy as np
 import pytest
-from tests.data.importers.own_clouds import own, write
 
 from qs3.datasets.with_depth import with_depth
 from qs3.errors import DataError
 from qs3.report.view.cli import VIEW
 from qs3.utils.cli import run
+from tests.datasets.importers.own_clouds import own, write
 
 CLOUD = np.array([[0, 2, 1], [0, 0, 2], [1, 2, 0], [0, 2, 0]], np.float64)
 ZERO = np.zeros((3, 3))

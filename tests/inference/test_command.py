@@ -23,7 +23,7 @@ from qs3.inference.model_file import read_result, write_result
 from qs3.models.dgcnn import DGCNN
 from qs3.runs.predictions import read_predictions
 from qs3.store.store import open_pointset
-from tests.data.importers.own_clouds import write_odd
+from tests.datasets.importers.own_clouds import write_odd
 from tests.running import main
 
 ONE = (".xyz", ".txt", ".npy", ".npz", ".ply", ".pcd", ".h5", ".hdf5")

@@ -14,14 +14,10 @@ from qs3.runs.folder import STARTED, read_started
 from qs3.runs.metrics import METRICS, read_metrics
 from qs3.runs.predictions import read_predictions
 from qs3.runs.pseudo_labels import read_pseudo_labels
-from qs3.store.manifest import MANIFEST, read_manifest
-from qs3.store.meta import META, read_meta
 from qs3.utils.memory import read_whole
 from tests.limits import memory_of_at_most
 
 READERS = {
-    MANIFEST: lambda path: read_manifest(path.parent, ("a",)),
-    META: lambda path: read_meta(path.parent),
     STARTED: lambda path: read_started(path.parent),
     METRICS: lambda path: read_metrics(path.parent),
     "predictions.csv": read_predictions,

@@ -1,7 +1,7 @@
 import pytest
-from tests.data.download.server import Site
 
 from qs3.datasets.download.fetching import Resuming
+from tests.datasets.download.server import Site
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 import requests
-from tests.data.download.server import File
 
 from qs3.datasets.download.fetching import DownloadError, Resuming, fetch
 from qs3.errors import Qs3Error
+from tests.datasets.download.server import File
 
 DATA = np.random.default_rng(0).bytes(3_000_000)
 OTHER = np.random.default_rng(1).bytes(3_000_000)

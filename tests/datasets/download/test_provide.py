@@ -8,7 +8,6 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from tests.data.download.server import File
 
 from qs3.datasets.download import catalogue
 from qs3.datasets.download.catalogue import SOURCES, find
@@ -16,6 +15,7 @@ from qs3.datasets.download.cli import listing
 from qs3.datasets.download.provide import MARK, AgreementError, provide
 from qs3.datasets.importers import NpyTree, PointDAH5, XyzTree
 from qs3.errors import ConfigError, DataError
+from tests.datasets.download.server import File
 from tests.fixtures import published as fixtures
 from tests.running import main
 

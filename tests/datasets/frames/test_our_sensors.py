@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from tests.data.scannet.rooms import room
 from trimesh.proximity import closest_point_naive
 
 from qs3.geometry.cameras import look_at
@@ -10,6 +9,7 @@ from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
 from qs3.store.store import read_manifest
 from tests.composing import compose_domain
+from tests.datasets.scannet.rooms import room
 from tests.fixtures.frame_files import Shot, Thing, write_nyuv2, write_sunrgbd
 
 PLACED = {2: ("chair", 30.0), 4: ("sofa", 180.0), 5: ("table", 20.0)}

@@ -10,13 +10,21 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write, write_odd
 
 from qs3.config.compose import composed
 from qs3.config.hashing import config_hash
 from qs3.datasets.importers import CloudFolder, import_into
 from qs3.errors import DataError
 from qs3.store.store import open_pointset, read_manifest
+from tests.datasets.importers.own_clouds import (
+    CLOUD,
+    FORMATS,
+    TWO,
+    own,
+    read_cloud,
+    write,
+    write_odd,
+)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

@@ -8,13 +8,13 @@ import time
 import h5py
 import numpy as np
 import pytest
-from tests.data.importers.test_damaged_clouds import Trap
 
 from qs3.datasets.clouds.files import parse_cloud
 from qs3.datasets.importers import NamedArrays, NpyTree, PointDAH5, XyzTree, import_into
 from qs3.datasets.importers.base import check_cloud
 from qs3.errors import ConfigError, DataError
 from qs3.store.store import open_pointset
+from tests.datasets.importers.test_damaged_clouds import Trap
 
 TWO = ("bed", "chair")
 

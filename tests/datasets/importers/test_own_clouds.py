@@ -10,12 +10,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tests.data.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write
 
 from qs3.datasets.clouds.files import parse_clouds
 from qs3.datasets.importers import CloudFolder, Importer, XyzTree, import_into
 from qs3.errors import ConfigError, DataError
 from qs3.store.store import open_pointset, read_manifest, write_pointset
+from tests.datasets.importers.own_clouds import CLOUD, FORMATS, TWO, own, read_cloud, write
 
 
 @pytest.mark.parametrize("suffix", [*FORMATS, ".XYZ", ".Ply"])

@@ -10,17 +10,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tests.data.test_domain import domain
 
 from qs3.errors import DataError
 from qs3.store.store import is_finished, open_pointset, read_manifest
+from tests.datasets.test_domain import domain
 from tests.fixtures import published as fixtures
 
 SPLITS = {"train": 2, "test": 1}
 
 _OPEN = """
 import resource, sys
-from tests.data.test_domain import domain
+from tests.datasets.test_domain import domain
 from qs3.errors import Qs3Error
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 try:

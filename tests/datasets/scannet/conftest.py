@@ -1,9 +1,9 @@
 """Rooms rendered and written once."""
 
 import pytest
-from tests.data.scannet.rooms import poses, record, room, write_lists, write_scene
 
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
+from tests.datasets.scannet.rooms import poses, record, room, write_lists, write_scene
 
 LOST = (3, 8)
 

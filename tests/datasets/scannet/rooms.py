@@ -3,7 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from tests.data.scannet.writing import (
+
+from qs3.catalogue import Catalogue
+from qs3.geometry.cameras import Camera, Intrinsics, look_at, rotation_xyz
+from qs3.meshes.mesh import Mesh
+from qs3.sensors.renderers.base import Body, Scene
+from tests.datasets.scannet.writing import (
     ID_OF,
     LOST,
     Recording,
@@ -12,11 +17,6 @@ from tests.data.scannet.writing import (
     write_label_map,
     write_zip,
 )
-
-from qs3.catalogue import Catalogue
-from qs3.geometry.cameras import Camera, Intrinsics, look_at, rotation_xyz
-from qs3.meshes.mesh import Mesh
-from qs3.sensors.renderers.base import Body, Scene
 
 DEPTH = Intrinsics(240, 180, 215.0, 120.3, 88.2)
 COLOUR = Intrinsics(486, 364, 440.0, 240.0, 185.1)  # another resolution, focal length, centre

@@ -6,9 +6,6 @@ import shutil
 
 import numpy as np
 import pytest
-from tests.data.scannet.conftest import LOST
-from tests.data.scannet.rooms import write_lists, write_scene
-from tests.data.scannet.writing import ID_OF, write_zip
 
 from qs3.cluster.ray_tasks import RayTasks
 from qs3.datasets.domain import Domain
@@ -17,6 +14,9 @@ from qs3.datasets.scannet.settings import Extraction
 from qs3.errors import ConfigError, DataError, MissingDataError
 from qs3.report.inspection.surface import distance_to_mesh
 from qs3.store.store import read_manifest
+from tests.datasets.scannet.conftest import LOST
+from tests.datasets.scannet.rooms import write_lists, write_scene
+from tests.datasets.scannet.writing import ID_OF, write_zip
 from tests.fixtures.published import write_store
 from tests.running import main
 

@@ -3,7 +3,6 @@
 import json
 
 import pytest
-from tests.data.scannet.writing import LABELS, write_aggregation, write_label_map
 
 from qs3.classes import CLASSES
 from qs3.datasets.scannet.labels import (
@@ -14,6 +13,7 @@ from qs3.datasets.scannet.labels import (
     read_scene_list,
 )
 from qs3.errors import DataError, MissingDataError
+from tests.datasets.scannet.writing import LABELS, write_aggregation, write_label_map
 
 
 @pytest.fixture

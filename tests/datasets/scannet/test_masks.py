@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.data.scannet.writing import png, write_zip
 
 from qs3.datasets.scannet.masks import INSTANCES, LABELS, MaskArchive
 from qs3.errors import DataError
+from tests.datasets.scannet.writing import png, write_zip
 
 
 def images(dtype=np.uint8, count=3):

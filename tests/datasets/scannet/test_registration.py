@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.data.scannet.rooms import BASE_FROM_COLOUR, BASE_FROM_DEPTH, rigid
 
 from qs3.datasets.scannet.registration import Registration, agreed
 from qs3.datasets.scannet.sens import SensHeader
 from qs3.errors import DataError
+from tests.datasets.scannet.rooms import BASE_FROM_COLOUR, BASE_FROM_DEPTH, rigid
 
 DEPTH_SHAPE, COLOUR_SHAPE = (30, 40), (72, 96)
 

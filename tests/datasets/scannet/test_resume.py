@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.data.scannet.rooms import write_lists, write_scene
-from tests.data.scannet.test_extraction import SMALL, contents, run
+
+from tests.datasets.scannet.rooms import write_lists, write_scene
+from tests.datasets.scannet.test_extraction import SMALL, contents, run
 
 ROOT = Path(__file__).resolve().parents[3]
 

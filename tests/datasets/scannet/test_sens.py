@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.data.scannet.writing import IMU, LOST, Recording, intrinsics
 
 from qs3.datasets.scannet.sens import SensFile, is_rigid
 from qs3.errors import DataError
+from tests.datasets.scannet.writing import IMU, LOST, Recording, intrinsics
 
 SHAPE = (6, 8)
 HEADER_BYTES = 4 + 8 + len(b"StructureSensor") + 292

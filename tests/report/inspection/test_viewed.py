@@ -14,7 +14,7 @@ from qs3.report.inspection.open_dataset import open_named
 from qs3.report.inspection.viewed import chosen, part_of
 from qs3.store.store import ManifestRow, write_pointset
 from qs3.utils.seeding import object_rng
-from tests.data.inspection.test_measures import distances
+from tests.report.inspection.test_measures import distances
 
 
 def write(folder, labels=("a", "b", "a"), tables=None, **arrays):

@@ -8,9 +8,9 @@ import trimesh
 
 from qs3.runs.metrics import read_metrics
 from qs3.store.store import open_pointset
-from tests.data.viewer.reading import data_of, places
 from tests.fixtures.frame_files import write_archive
 from tests.report.made_runs import table
+from tests.report.viewer.reading import data_of, places
 from tests.running import main
 from tests.training.toy import CLASSES, write_domain
 

@@ -6,8 +6,8 @@ from matplotlib import colormaps
 
 from qs3.geometry.orthographic import AZIMUTH_DEG, ELEVATION_DEG, axes_of
 from qs3.report.viewer.page import Part, Shown, page
-from tests.data.viewer.browser import chromium, needs_chromium
-from tests.data.viewer.test_page import HOSTILE
+from tests.report.viewer.browser import chromium, needs_chromium
+from tests.report.viewer.test_page import HOSTILE
 
 pytestmark = [needs_chromium, pytest.mark.slow]
 PAPER = np.array([247, 248, 250])

@@ -21,7 +21,7 @@ from qs3.report.viewer.page import (
     points_each,
     thinned,
 )
-from tests.data.viewer.reading import data_of, levels, places
+from tests.report.viewer.reading import data_of, levels, places
 
 RNG = np.random.default_rng(0)
 
