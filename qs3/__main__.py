@@ -22,8 +22,8 @@ COMMANDS: Commands = {
     "export": "qs3.inference.cli:EXPORT",
     "report": "qs3.report.cli:REPORT",
     "leaderboard": "qs3.report.leaderboard.cli:LEADERBOARD",
-    "bench": "qs3.calibration.bench.cli:BENCH",
-    "fit": "qs3.calibration.fit.cli:FIT",
+    "bench": "qs3.commands.bench:bench",
+    "fit": "qs3.commands.fit:fit",
 }
 
 

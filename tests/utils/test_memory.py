@@ -6,7 +6,6 @@ import os
 
 import pytest
 
-from qs3.calibration.fit.frames import read_camera
 from qs3.datasets.frames.matlab import load_v5
 from qs3.datasets.scannet.labels import read_scene_list
 from qs3.errors import DataError
@@ -23,7 +22,6 @@ READERS = {
     "predictions.csv": read_predictions,
     "pseudo_labels.csv": read_pseudo_labels,
     "scenes.txt": read_scene_list,
-    "camera.json": lambda path: read_camera(str(path), 4, 3),
 }
 
 

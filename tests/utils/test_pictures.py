@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from qs3.calibration.fit.frames import _png
 from qs3.errors import DataError
 from qs3.utils.pictures import read_png
 from tests.limits import memory_of_at_most
@@ -39,7 +38,7 @@ def test_a_small_file_of_a_large_picture_is_refused(side, tmp_path):
     path.write_bytes(tiny_png(side, side))
     refused = pytest.raises(DataError, match=r"a\.png: a PNG of .* px; refused")
     with memory_of_at_most(1 << 27), refused:
-        _png(path)
+        read_png(path.read_bytes(), str(path))
 
 
 def test_a_part_that_promises_more_than_there_is_takes_no_memory(tmp_path):
@@ -47,7 +46,7 @@ def test_a_part_that_promises_more_than_there_is_takes_no_memory(tmp_path):
     data[33:37] = (0xFEFFFF00).to_bytes(4, "big")  # of the compressed rows
     path.write_bytes(data)
     with memory_of_at_most(1 << 27), pytest.raises(DataError, match=r"a\.png: .* broken off"):
-        _png(path)
+        read_png(path.read_bytes(), str(path))
 
 
 def test_a_picture_of_another_kind_is_named_in_words():

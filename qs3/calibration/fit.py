@@ -1,0 +1,124 @@
+"""A sensor preset from depth images of a flat wall: `qs3 fit --help`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.calibration.walls import Noise, Steps, Wall, find_bias, find_noise, find_steps, find_wall
+from qs3.datasets.frames.given import check_intrinsics, read_depth, read_intrinsics
+from qs3.errors import ConfigError
+from qs3.geometry.cameras import Intrinsics
+from qs3.utils.plotting import blank, save_png
+
+_NEAREST_M, _FARTHEST_M = 0.3, 8.0  # limits where no wall was seen outside of them
+_MOST_BIAS = 0.3  # of a distance: a larger one is of another unit or another frame
+_METRES = {"m": 1.0, "mm": 1e-3}
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPreset:
+    """All that was found; see the modules and classes that find it.
+
+    Attributes:
+        camera: of the frames.
+        noise, steps, bias_m, baseline_m, fill: see `FittedDepth`; no bias where no distances were
+            given.
+        walls: the data.
+    """
+
+    camera: Intrinsics
+    noise: Noise
+    steps: Steps
+    bias_m: tuple[float, ...]
+    baseline_m: float | None
+    walls: Sequence[Wall]
+
+    def text(self) -> str:
+        """The preset, a file of conf/sensor."""
+        k, noise = self.camera, self.noise
+        z = np.concatenate([wall.depth_m[np.isfinite(wall.depth_m)] for wall in self.walls])
+        nearest, farthest = float(z.min()), float(z.max())
+        fill = float(np.mean([wall.fill for wall in self.walls]))
+        baseline = "null" if self.baseline_m is None else f"{self.baseline_m:.6g}"
+        return f"""\
+# Fitted to depth images of a flat wall from {nearest:.2f} to {farthest:.2f} m; beyond, noise, steps
+# and bias are extrapolated. Noise is added to the true depth.
+_target_: qs3.sensors.devices.fitted.FittedDepth
+width_px: {k.width_px}
+height_px: {k.height_px}
+focal_px: {k.focal_px:.8g}
+cx_px: {k.cx_px:.8g}
+cy_px: {k.cy_px:.8g}
+min_depth_m: {min(_NEAREST_M, nearest / 1.5):.2g}
+max_depth_m: {max(_FARTHEST_M, farthest * 1.5):.2g}
+noise_floor_m: {noise.floor_m:.6g}
+noise_factor: {noise.factor:.6g}
+noise_power: {noise.power:g}
+correlation_px: {noise.correlation_px:.3g}
+inverse_step_per_m: {self.steps.inverse_per_m:.8g}
+depth_step_m: {self.steps.depth_m:.6g}
+bias_m: [{", ".join(f"{value:.6g}" for value in self.bias_m)}]
+fill_rates: [{fill:.4g}]
+baseline_m: {baseline}
+"""
+
+    def plot(self, path: Path) -> None:
+        """Noise against distance: data and law."""
+        figure = blank(6.4, 4.2, 110, constrained=True)
+        axes = figure.subplots()
+        z = np.linspace(0.9 * self.noise.depth_m.min(), 1.1 * self.noise.depth_m.max(), 200)
+        axes.plot(self.noise.depth_m, 1e3 * self.noise.sigma_m, "o", ms=4, label="data")
+        axes.plot(z, 1e3 * self.noise.law_m(z), label="fitted law, without the steps")
+        nguyen = 0.0012 + 0.0019 * (z - 0.4) ** 2
+        axes.plot(z, 1e3 * nguyen, ":", color="grey", label="Kinect v1 (Nguyen 2012)")
+        axes.set(xlabel="distance (m)", ylabel="noise (mm)", ylim=(0, None))
+        axes.legend(fontsize=8)
+        save_png(figure, path)
+
+
+def fit_walls(
+    files: Sequence[Path],
+    intrinsics: str | None,
+    focal: float | None,
+    unit: str | None = None,
+    distances: Sequence[float] = (),
+    baseline: float | None = None,
+    power: float | None = None,
+) -> FittedPreset:
+    """All steps, from files to the preset; see `qs3 fit --help` for the arguments.
+
+    Raises:
+        ConfigError: no frames or no camera, frames of several sizes, or distances that cannot be
+            those of the frames.
+        MissingDataError, DataError: a file is missing, damaged or not of a flat wall.
+    """
+    scale_m = None if unit is None else _METRES.get(unit) or 1 / float(unit)
+    frames = [read_depth(path, scale_m) for path in files]
+    if len({frame.shape for frame in frames}) != 1:
+        raise ConfigError("expected depth images of one size: qs3 fit frames/*.png ...")
+    height, width = frames[0].shape
+    if intrinsics is not None:
+        pinhole = check_intrinsics(read_intrinsics(intrinsics), frames[0], f"{intrinsics=}")
+        middle_px = (pinhole.fx_px + pinhole.fy_px) / 2
+        camera = Intrinsics(width, height, middle_px, pinhole.cx_px, pinhole.cy_px)
+    elif focal is not None:
+        camera = Intrinsics.centred(width, height, focal)
+    else:
+        raise ConfigError("the camera is missing: intrinsics=fx,fy,cx,cy or focal=PIXELS")
+    walls = [
+        find_wall(str(path), np.where(frame > 0, frame, np.nan), camera)
+        for path, frame in zip(files, frames, strict=True)
+    ]
+    bias_m: tuple[float, ...] = (0.0,)
+    if distances:
+        off = [abs(d - w.centre_m) / w.centre_m for d, w in zip(distances, walls, strict=True)]
+        if max(off) > _MOST_BIAS:
+            seen = ", ".join(f"{wall.centre_m:.2f}" for wall in walls)
+            raise ConfigError(f"distances= of the frames, in metres: the walls are at {seen}")
+        bias_m = find_bias(walls, distances)
+    steps = find_steps(walls)
+    return FittedPreset(camera, find_noise(walls, steps, power), steps, bias_m, baseline, walls)

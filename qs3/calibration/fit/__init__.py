@@ -1,1 +1,0 @@
-"""A sensor preset from a few depth frames of a flat wall: `qs3 fit --help`."""

@@ -1,0 +1,162 @@
+"""Ambient light, blur and read noise of a stereo preset, from infrared pictures, by gradient.
+
+The dots of a real projector are not ours, so pictures are compared by what does not depend on
+where dots lie (`statistics`). The differentiable twin of the preset makes pictures of the same
+wall, with fixed random numbers for the noise, and least squares follows its gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+
+from qs3.config.compose import composed
+from qs3.config.hydra import build
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.geometry.cameras import Window
+from qs3.sensors.devices.speckle_stereo import SpeckleStereo
+from qs3.sensors.gradients import Pair, Twin, View, blurred, exposed, settings_of
+from qs3.sensors.optics.infrared import InfraredCamera
+
+KEYS = ("ambient", "infrared.psf_px", "infrared.read_noise_e")
+_SIDE_PX = 320  # of the plane that the twin shows
+_SMOOTH_PX = 12.0  # standard deviation of the Gaussian that is taken for shading
+_LAGS = 4
+_ERROR = 0.02  # by which statistics of pictures of other dots differ, relative
+
+
+def statistics(grey: torch.Tensor) -> torch.Tensor:
+    """[1 + _LAGS] covariances of pixels 0, 1, 2, ... apart, over rows and columns.
+
+    Of [h, w] grey values relative to the local mean. Neighbours share texture alone, because noise
+    is each pixel's own; the first is texture and noise.
+    """
+    mean = blurred(grey, torch.tensor(_SMOOTH_PX, dtype=grey.dtype))
+    frame = int(4 * _SMOOTH_PX)  # the shading is not known there
+    texture = (grey / mean.clamp_min(1e-9) - 1)[frame:-frame, frame:-frame]
+    wide, high = texture.shape[1], texture.shape[0]
+    covariances = [
+        (texture[:, lag:] * texture[:, : wide - lag]).mean()
+        + (texture[lag:] * texture[: high - lag]).mean()
+        for lag in range(1 + _LAGS)
+    ]
+    return torch.stack(covariances)
+
+
+def fit_light(
+    base: SpeckleStereo, lit: Sequence[np.ndarray], dark: Sequence[np.ndarray], distance_m: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Fit the numbers of `KEYS`.
+
+    Args:
+        base: the preset to begin with; pattern, projector, geometry and electrons stay.
+        lit, dark: [h, w] grey values 0..255 of a wall that faces the cameras, with the projector on
+            and off at the same exposure, a picture a camera.
+        distance_m: of the wall.
+
+    Returns:
+        Values, and relative standard errors by the curvature of the fit.
+    """
+    wanted = _mean(lit, dark)
+    twin = Twin(_facing(base, distance_m), fine=3)
+    start = settings_of(twin.pair, 1.0)
+    camera, zero = base.infrared, torch.zeros((), dtype=torch.float64)
+    assert isinstance(camera, InfraredCamera), "the base has no linear camera"
+    with torch.no_grad():
+        projected, _ = twin.radiance(start | {"ambient": zero})
+    off_grey = float(np.mean([image.mean() for image in dark]))
+    first = [max(float(start[key]), least) for key, least in zip(KEYS, (0.01, 0.3, 1), strict=True)]
+
+    def residuals(logs: torch.Tensor) -> torch.Tensor:
+        numbers = dict(zip(KEYS, torch.tensor(first) * torch.exp(logs), strict=True))
+        settings = start | numbers | {"gain": off_grey / numbers["ambient"]}
+        even = numbers["ambient"].expand(projected.shape)
+        apart = None if camera.ambient_speckles else even
+        noise = torch.Generator().manual_seed(0)
+        on = exposed(even + projected, settings, noise, False, apart, camera.max_exposure)
+        off = exposed(even, settings, noise, False, apart, camera.max_exposure)
+        return (_compared(on, off) / wanted - 1) / _ERROR
+
+    def slopes(logs: np.ndarray) -> np.ndarray:
+        found = torch.autograd.functional.jacobian(residuals, torch.from_numpy(logs))
+        return np.asarray(found)
+
+    solved = least_squares(
+        lambda logs: residuals(torch.from_numpy(logs)).detach().numpy(),
+        np.zeros(len(KEYS)),
+        jac=slopes,
+        bounds=(-4, 4),
+        x_scale=0.5,
+    )
+    values = np.array(first) * np.exp(solved.x)
+    errors = np.sqrt(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)))
+    return dict(zip(KEYS, values.tolist(), strict=True)), dict(
+        zip(KEYS, errors.tolist(), strict=True)
+    )
+
+
+def _compared(on: torch.Tensor, off: torch.Tensor) -> torch.Tensor:
+    """[3 + _LAGS] what is compared: mean light, covariances, and the variance in the dark."""
+    light = (on.mean() / off.mean() - 1)[None]
+    return torch.cat([light, statistics(on), statistics(off)[:1]])
+
+
+def _mean(lit: Sequence[np.ndarray], dark: Sequence[np.ndarray]) -> torch.Tensor:
+    each = [
+        _compared(*(torch.from_numpy(image.astype(np.float64)) for image in pair))
+        for pair in zip(lit, dark, strict=True)
+    ]
+    return torch.stack(each).mean(dim=0)
+
+
+def _facing(base: SpeckleStereo, distance_m: float) -> Pair:
+    """A white plane that faces the cameras, a square of pixels in the middle of the view."""
+    k = base.intrinsics
+    high, wide = min(_SIDE_PX, k.height_px), min(_SIDE_PX, k.width_px)
+    window = Window((k.width_px - wide) // 2, (k.height_px - high) // 2, wide, high)
+    one = torch.ones(high, wide, dtype=torch.float64)
+    plane = torch.zeros(high, wide, 3, dtype=torch.float64)
+    plane[..., 2] = 1 / distance_m
+    view = View(window, plane, one, one, one > 0, one * distance_m)
+    return Pair(base, view, view)
+
+
+def fit_pictures(folder: Path, base: str, distance_m: float) -> str:
+    """Fit the preset `base` to the pictures of a folder; returns the new preset as YAML.
+
+    Files are left.png and left_off.png, and right.png and right_off.png where there are any.
+    """
+    sensor = build(composed(None, f"+sensor={base}").sensor)
+    if not isinstance(sensor, SpeckleStereo):
+        raise ConfigError(f"base={base} is not an active stereo camera")
+    sides = [side for side in ("left", "right") if (folder / f"{side}.png").exists()]
+    if not sides:
+        raise MissingDataError(f"images={folder} has no left.png")
+    lit = [_grey(folder / f"{side}.png") for side in sides]
+    dark = [_grey(folder / f"{side}_off.png") for side in sides]
+    values, errors = fit_light(sensor, lit, dark, distance_m)
+    lines = [f"{key.split('.')[-1]}: {values[key]:.6g}  # +- {errors[key]:.1%}" for key in KEYS]
+    return f"""\
+# Fitted to infrared pictures of a wall at {distance_m:g} m.
+defaults:
+  - {base}
+  - _self_
+
+{lines[0]}
+infrared:
+  {lines[1]}
+  {lines[2]}
+"""
+
+
+def _grey(path: Path) -> np.ndarray:
+    """[h, w] float64, 0..255, of a picture of 8 or 16 bits."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if image is None:
+        raise DataError(f"{path} is not a picture")
+    return image.astype(np.float64) / (257 if image.dtype == np.uint16 else 1)

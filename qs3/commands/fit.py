@@ -1,0 +1,66 @@
+"""`qs3 fit`: a preset for one's own depth camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from annotated_types import Gt
+
+
+def fit(
+    *frames: Annotated[str, "depth images of a wall, .png of 16 bits or .npy"],
+    out: Annotated[Path, "the preset, conf/sensor/NAME.yaml"],
+    plot: Annotated[Path | None, "the picture of data and law, .png (default: next to out)"] = None,
+    intrinsics: Annotated[str | None, "fx,fy,cx,cy in px, or a file that has them"] = None,
+    focal: Annotated[
+        float | None, Gt(0), "px, in place of intrinsics=; the principal point is the middle"
+    ] = None,
+    unit: Annotated[str | None, "m, mm or units a metre (default: mm of whole numbers)"] = None,
+    distances: Annotated[
+        tuple[float, ...], "true ones of each frame's middle, m: for the bias"
+    ] = (),
+    baseline: Annotated[
+        float | None, "m from camera to projector, negative to the left: for the shadows"
+    ] = None,
+    power: Annotated[
+        Literal["1", "2"] | None, "noise grows with Z to this power (default: what fits better)"
+    ] = None,
+    images: Annotated[Path | None, "a folder of infrared pictures, in place of frames"] = None,
+    base: Annotated[str, "stereo preset that images= begins with"] = "realsense_d415",
+    distance: Annotated[float | None, Gt(0), "m to the wall of the pictures"] = None,
+) -> None:
+    """Write a preset for your own depth camera, from images of a flat wall.
+
+    FRAMES show a flat, matt wall from three or more distances (say 1, 1.5, 2 and 3 m), turned by a
+    few degrees so that several steps of depth are seen. The plane that covers most is the wall.
+    The law of the noise, the steps of 1/Z or of Z, the share of valid pixels and, with distances=,
+    the bias are fitted; generation adds them to the true depth.
+
+    images=FOLDER holds pictures of a wall that faces an active stereo camera, with the projector
+    on: left.png, right.png, and the same with it off: left_off.png, right_off.png. Ambient light,
+    blur and read noise of base= are fitted to them.
+
+    Example:
+        qs3 fit frames/*.png intrinsics=580,580,319.5,239.5 out=conf/sensor/my_camera.yaml
+        qs3 fit images=pictures distance=1.2 out=conf/sensor/my_stereo.yaml
+        qs3-generate domain=specklenet10 renderer=mitsuba sensor=my_camera
+    """
+    from qs3.errors import ConfigError
+    from qs3.utils.files import write_text
+
+    if images is not None:
+        from qs3.calibration.infrared import fit_pictures
+
+        if distance is None or out.stem == base:
+            raise ConfigError("images= takes distance=METRES, and another name for out= than base=")
+        text = fit_pictures(images, base, distance)
+    else:
+        from qs3.calibration.fit import fit_walls
+
+        files, number = [Path(frame) for frame in frames], None if power is None else float(power)
+        preset = fit_walls(files, intrinsics, focal, unit, distances, baseline, number)
+        text = preset.text()
+        preset.plot(plot or out.with_suffix(".png"))
+    write_text(out, text)
+    print(f"{text}\nwrote {out}")

@@ -1,1 +1,0 @@
-"""The speckle-stereo sensor in torch, with gradients."""
