@@ -10,19 +10,19 @@ rounding to grey values passes gradients through.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+
 import numpy as np
 import torch
+import torch.nn.functional as F
+
 from qs3.geometry.cameras import Camera, Window
 from qs3.sensors.base import window_of
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
-from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene, tangents
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-import torch.nn.functional as F
 from qs3.sensors.optics.infrared import InfraredCamera
-
+from qs3.sensors.renderers.base import Body, Image, Projector, Renderer, Scene, tangents
 
 _BEND = 1e-3  # of 1 / Z, second difference over neighbours: more is an edge
 

@@ -10,7 +10,7 @@ import pytest
 
 from qs3.calibration import bench, edges, planes
 from qs3.calibration.bands import Band, judge, nguyen_axial_m
-from qs3.calibration.subject import POSE, Subject, TiltedPlane, load
+from qs3.calibration.subject import Subject, TiltedPlane, load
 from qs3.sensors.devices.fitted import FittedDepth
 from qs3.sensors.devices.reference_speckle import ReferenceSpeckle
 from qs3.sensors.devices.speckle_stereo import SpeckleStereo
@@ -77,9 +77,7 @@ def test_levels_are_counted_from_their_offset():
 
 @pytest.mark.parametrize("subject", [KINECT, STEREO], ids=lambda s: s.name)
 @pytest.mark.parametrize(("tilt", "along"), [(0.0, True), (60.0, True), (75.0, False)])
-def test_the_region_sees_the_plane_at_the_depth_and_angle_asked_for(
-    renderer, subject, tilt, along
-):
+def test_the_region_sees_the_plane_at_the_depth_and_angle_asked_for(renderer, subject, tilt, along):
     plane = TiltedPlane(2.0, tilt, along, (20.0, -10.0))
     rng = np.random.default_rng(0)
     frame, part = planes.take(subject, plane, 12, renderer, rng)
