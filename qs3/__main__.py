@@ -3,7 +3,7 @@
 import logging
 import sys
 
-from qs3.commands.core import Commands, run
+from qs3.utils.commands import Commands, run
 
 ABOUT = """from CAD meshes to a classifier that works on real depth scans
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from qs3.__main__ import COMMANDS
-from qs3.commands.core import run
+from qs3.utils.commands import run
 
 ROOT = Path(__file__).parents[1]
 

@@ -6,15 +6,13 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from qs3.commands.core import hydra_command
-from qs3.config.compose import choices_checked
 from qs3.config.hydra import cli_errors, in_multirun
 from qs3.config.location import CONF
 from qs3.runs.unbegun import removed_if_unbegun
+from qs3.utils.commands import hydra_command
 
 
 @hydra_command
-@choices_checked
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 def main(cfg: DictConfig) -> float | None:
     """Run, continue or skip the run that the config describes; returns what a search asks for."""

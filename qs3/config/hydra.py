@@ -24,18 +24,9 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import ValidationError
 
 from qs3.config import hashing
-from qs3.config.checks import check_bool
-from qs3.config.location import CONF, typed
+from qs3.config.location import CONF, PACKAGE, typed
 from qs3.errors import ConfigError, Qs3Error
 from qs3.utils.settings import problems
-
-
-def _run_name(*, _root_: DictConfig) -> str:
-    return hashing.run_name(_root_)
-
-
-def _wandb_id(*, _root_: DictConfig) -> str:
-    return hashing.run_name(_root_).replace("/", "-")
 
 
 def _tags(*, _root_: DictConfig) -> ListConfig:
@@ -55,13 +46,13 @@ def _gpu_in_turn(gpus: int | None = None) -> int:
     A variable such as CUDA_VISIBLE_DEVICES would come too late in a process that has run a job
     before. `gpus` is how many there are; None: as many as CUDA finds.
     """
+    if not in_multirun():
+        return 0
     if gpus is None:
         import torch  # counts without occupying a GPU
 
         gpus = max(1, torch.cuda.device_count())
-    if isinstance(gpus, bool) or not isinstance(gpus, int) or gpus < 1:
-        raise ConfigError(f"trainer.gpus must be a whole number of at least 1, got {gpus!r}")
-    return int(HydraConfig.get().job.num) % gpus if in_multirun() else 0
+    return int(HydraConfig.get().job.num) % gpus
 
 
 def component_names(cfg: DictConfig) -> dict[str, str]:
@@ -79,7 +70,7 @@ def component_names(cfg: DictConfig) -> dict[str, str]:
 
 
 def _sha256(file: str | None) -> str:
-    """Hash of a file; "" if there is none, for the command that needs it to say so."""
+    """Hash of a file; "" if there is none: the command that needs it raises."""
     try:
         return hashing.file_sha256(file) if file else ""
     except Qs3Error:
@@ -87,7 +78,7 @@ def _sha256(file: str | None) -> str:
 
 
 def _choices(group: str, indent: int = 0) -> str:
-    """The choices of a config group, as `a | b`; `none` goes without saying.
+    """The choices of a config group, as `a | b`, without `none`.
 
     With `indent`, in lines of 100 characters that all begin in that column.
     """
@@ -120,20 +111,19 @@ def _files(group: str) -> list[Path]:
     return sorted(path for path in (CONF / group).glob("*.yaml") if path.stem != "none")
 
 
-def _packaged() -> str:
-    """The folder of what comes with qs3: classifiers, and scans for training beside."""
-    return str(Path(__file__).resolve().parents[1] / "pretrained")
-
-
-OmegaConf.register_new_resolver("qs3.packaged", _packaged, replace=True)
-OmegaConf.register_new_resolver("qs3.choices", _choices, replace=True)
-OmegaConf.register_new_resolver("qs3.described", _described, replace=True)
-OmegaConf.register_new_resolver("qs3.gpu_in_turn", _gpu_in_turn, replace=True)
-OmegaConf.register_new_resolver("qs3.tags", _tags, replace=True)
-OmegaConf.register_new_resolver("qs3.run_name", _run_name, replace=True)
+_RESOLVERS: dict[str, Callable[..., Any]] = {
+    "packaged": lambda: str(PACKAGE / "pretrained"),  # classifiers that come with qs3
+    "choices": _choices,
+    "described": _described,
+    "gpu_in_turn": _gpu_in_turn,
+    "tags": _tags,
+    "run_name": lambda *, _root_: hashing.run_name(_root_),
+    "typed": typed,
+    "wandb_id": lambda *, _root_: hashing.run_name(_root_).replace("/", "-"),
+}
+for _name, _resolver in _RESOLVERS.items():
+    OmegaConf.register_new_resolver(f"qs3.{_name}", _resolver, replace=True)
 OmegaConf.register_new_resolver("qs3.sha256", _sha256, replace=True, use_cache=True)
-OmegaConf.register_new_resolver("qs3.typed", typed, replace=True)
-OmegaConf.register_new_resolver("qs3.wandb_id", _wandb_id, replace=True)
 
 
 def build(node: Any, **more: Any) -> Any:
@@ -155,15 +145,14 @@ def build(node: Any, **more: Any) -> Any:
         if isinstance(error.__cause__, TypeError | ValueError):
             place = re.search(r"^full_key: (.+)$", str(error), re.MULTILINE)
             where = place[1] if place else str(error).splitlines()[0]
-            cause = error.__cause__
-            if isinstance(cause, ValidationError):
-                raise ConfigError(problems(cause, where)) from None
-            raise ConfigError(f"{where}: {cause}") from error
+            if isinstance(error.__cause__, ValidationError):
+                raise ConfigError(problems(error.__cause__, where)) from None
+            raise ConfigError(f"{where}: {error.__cause__}") from error
         raise
 
 
 def _check_switches(node: Any) -> None:
-    """Raise ConfigError for a text where a target takes a bool: Hydra reads `no` as one, and true.
+    """Raise ConfigError for a text where a target takes a bool: `no` is one to Hydra, and true.
 
     Goes down as far as `instantiate` does.
     """
@@ -176,7 +165,7 @@ def _check_switches(node: Any) -> None:
     for key in node:
         value = None if OmegaConf.is_missing(node, key) else node[key]
         if key in taken and isinstance(value, str):
-            check_bool(node._get_full_key(key), value)
+            raise ConfigError(f"{node._get_full_key(key)} must be true or false, got {value!r}")
         if node.get("_recursive_", True):
             _check_switches(value)
 
@@ -191,7 +180,7 @@ def _bools(target: str) -> frozenset[str]:
 
 
 def cli_errors(task: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
-    """Run `task`; an error meant for the user becomes a message without a traceback.
+    """Run `task`; a `Qs3Error` becomes a message without a traceback.
 
     HYDRA_FULL_ERROR=1 shows the traceback nevertheless.
     """

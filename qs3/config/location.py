@@ -9,9 +9,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-_INSTALLED = (_PACKAGE / "conf").is_dir()
-_ROOT = _PACKAGE if _INSTALLED else _PACKAGE.parent
+PACKAGE = Path(__file__).resolve().parents[1]
+_INSTALLED = (PACKAGE / "conf").is_dir()
+_ROOT = PACKAGE if _INSTALLED else PACKAGE.parent
 
 CONF = _ROOT / "conf"
 

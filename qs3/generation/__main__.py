@@ -5,11 +5,10 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from qs3.config.compose import choices_checked
 from qs3.config.hydra import cli_errors
 from qs3.config.location import CONF
 from qs3.errors import Qs3Error
-from qs3.utils.cli import hydra_command
+from qs3.utils.commands import hydra_command
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="generate")
@@ -20,7 +19,6 @@ def _composed(cfg: DictConfig) -> None:
 
 
 @hydra_command
-@choices_checked
 def main() -> None:
     """Make the dataset that the command line describes, or continue it."""
     if any(word.startswith("materials=") for word in sys.argv[1:]):

@@ -36,12 +36,12 @@ def _built(
 
     `runs`: there are some, one may think; `row`: a word for one that it has to have.
     """
-    from qs3.config.quoting import override, words_of
+    from qs3.config.quoting import override
     from qs3.report.tables.keeping import unused
     from qs3.report.tables.overrides import row_of
     from qs3.report.tables.table import build_table
 
-    extra = words_of("overrides", overrides)
+    extra = shlex.split(overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
     if runs and not kept and log_dir and not Path(log_dir).is_dir():
         raise ConfigError(f"log_dir={log_dir} is not there; it is the paths.log_dir of the runs")

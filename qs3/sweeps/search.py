@@ -2,44 +2,58 @@
 
     ask Optuna for settings -> launch runs -> read the objective that each returns -> tell Optuna
 
-The objective is a validator of `qs3.evaluation.validators`: accuracy is refused, and so is to vary
-what says how runs are judged (`qs3.sweeps.summary` checks both). The study lies in a file next to
-the runs, so that the same command goes on with it: trials that have finished are not repeated,
-those that failed or were interrupted are tried again. One that diverged is a bad trial, not a
-failed one. What Optuna draws for a trial follows from (seed, number of the trial): an interrupted
-search proposes what an uninterrupted one would have.
+The objective is a validator of `qs3.evaluation`: accuracy is refused, and so is to vary what says
+how runs are judged (`check_varied`). The study lies in a file next to the runs, so that the same
+command goes on with it: trials that have finished are not repeated, those that failed or were
+interrupted are tried again. One that diverged is a poor trial, not a failed one. What Optuna draws
+for a trial follows from (seed, number of the trial): an interrupted search proposes what an
+uninterrupted one would have.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
+import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import (
+    ChoiceSweep,
+    IntervalSweep,
+    Override,
+    QuotedString,
+    RangeSweep,
+)
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import DictConfig
 
 from qs3.config import hashing
-from qs3.config.checks import check_int
+from qs3.config.location import typed
+from qs3.config.quoting import quoted
 from qs3.errors import ConfigError
 from qs3.evaluation.validators import LABEL_FREE
 from qs3.sweeps.listed_jobs import ListedJobs, OverLauncher
 from qs3.sweeps.ray_launcher import RayLauncher
-from qs3.sweeps.search_report import FAILED, Tried, report
-from qs3.sweeps.search_space import distribution, overrides, split, words
 from qs3.training.reuse import check_finished
 from qs3.utils.locks import alone
+from qs3.utils.text_table import aligned
 
 if TYPE_CHECKING:
     from optuna import Study
     from optuna.distributions import BaseDistribution
     from optuna.trial import Trial
 
+VARIED = ("method", "model", "protocol", "selftraining")
+"""First words of the keys that may differ between runs of which an objective chooses one."""
+
+FAILED = "failed"
 _AGAIN = "again"  # of a trial: the number of the one that it repeats
 
 
@@ -61,35 +75,24 @@ class LabelFreeSearch(OverLauncher):
         folder: str,
     ) -> None:  # fmt: skip
         self.params = dict(params)
-        self.trials = check_int("hydra.sweeper.trials", trials, 1)
-        self.at_once = check_int("hydra.sweeper.at_once", at_once, 1)
-        self.seed = check_int("hydra.sweeper.seed", seed, 0)
-        self.random = check_int("hydra.sweeper.random", random, 1)
+        self.trials, self.at_once, self.seed, self.random = trials, at_once, seed, random
         self.folder = Path(folder)
 
     def run(self, arguments: list[str]) -> list[JobReturn]:
         """Search until there are as many trials as were asked for; print the report."""
-        try:
-            import optuna
-        except ImportError as error:
-            raise ConfigError(
-                "the search needs Optuna: pip install '.[search]' in the folder of qs3"
-            ) from error
+        import optuna
+
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         loader = self.hydra_context.config_loader
         fixed, searched = split(arguments, self.params, OverridesParser.create(loader))
         cfg = loader.load_sweep_config(self.config, list(fixed))
         if cfg.objective is None:
-            raise ConfigError("a search needs an objective; set objective=infomax, say")
-        if not searched:
-            raise ConfigError(
-                "there is nothing to search; set hydra.sweeper.params, or key='interval(low,high)'"
-            )
+            raise ConfigError("a search needs an objective, such as objective=infomax")
         space = {key: distribution(one) for key, one in searched.items()}
         study = self._study(cfg, space)
         lock = self.file.with_name(f".{self.file.stem}.lock")
-        with alone(lock, f"another process is searching in {self.file}; wait for it or stop it"):
-            # What has no end there was interrupted, then, and is nobody's any more.
+        with alone(lock, f"another process is searching in {self.file}"):
+            # A trial without an end was interrupted: the lock says that nobody runs it now.
             self._refuse_changed(study, fixed)
             _try_again(study)
             done = self._until_enough(study, fixed, space)
@@ -119,8 +122,7 @@ class LabelFreeSearch(OverLauncher):
     def _refuse_changed(self, study: Study, fixed: Sequence[str]) -> None:
         """Raise if the study's runs were trained on other data, or on another classifier.
 
-        Objectives of two datasets say nothing about settings. One run stands for all: who went on
-        with the study came by here.
+        Objectives of two datasets say nothing about settings. One run stands for all.
         """
         from optuna.trial import TrialState
 
@@ -150,11 +152,136 @@ class LabelFreeSearch(OverLauncher):
     def _ask(self, study: Study, space: Mapping[str, BaseDistribution]) -> Trial:
         from optuna.samplers import TPESampler
 
-        # Trials that are still running count as bad ones, so that those of a batch differ.
+        # Trials that are still running count as poor ones, so that those of a batch differ.
         study.sampler = TPESampler(
             seed=self.seed + 1000 * _count(study), n_startup_trials=self.random, constant_liar=True
         )
         return study.ask(dict(space))
+
+
+def split(
+    arguments: Sequence[str], params: Mapping[str, Any], parser: OverridesParser | None = None
+) -> tuple[list[str], dict[str, Override]]:
+    """Overrides that all runs share, and what is varied, by key.
+
+    `params`: by key a value, or what to vary in Hydra's grammar for sweeps; `arguments` of the
+    command line replace those of the same key.
+    """
+    parser = parser or OverridesParser.create()
+    by_key = {one.get_key_element(): one for one in parser.parse_overrides(list(arguments))}
+    for one in parser.parse_overrides([f"{key}={value}" for key, value in params.items()]):
+        by_key.setdefault(one.get_key_element(), one)
+    varied = {key: one for key, one in by_key.items() if one.is_sweep_override()}
+    return [str(one.input_line) for key, one in by_key.items() if key not in varied], varied
+
+
+def check_varied(varied: Iterable[Override]) -> None:
+    """Refuse to vary what says how runs are judged, on which data, or what changes no result.
+
+    Raises:
+        ConfigError: a key is not below `VARIED`, or a group is put at a place that is not.
+    """
+    for one in varied:
+        places = [one.key_or_group, *([one.package] if one.package else [])]
+        if any(place.replace("/", ".").split(".")[0] not in VARIED for place in places):
+            raise ConfigError(
+                f"{one.input_line}: with objective= only {', '.join(VARIED)} may vary, so that "
+                "all runs are judged in the same way"
+            )
+
+
+def distribution(one: Override) -> BaseDistribution:
+    """What Optuna calls a sweep of Hydra's: whole numbers if both ends are.
+
+    Raises:
+        ValueError: Optuna's, for ends or values that cannot be.
+    """
+    from optuna.distributions import (
+        CategoricalDistribution,
+        FloatDistribution,
+        IntDistribution,
+    )
+
+    sweep: Any = one.value()
+    if isinstance(sweep, ChoiceSweep):
+        plain = [each.text if isinstance(each, QuotedString) else each for each in sweep.list]
+        return CategoricalDistribution(plain)  # type: ignore[arg-type]
+    more: dict[str, Any] = {}
+    if isinstance(sweep, IntervalSweep):
+        low, high, more["log"] = sweep.start, sweep.end, "log" in sweep.tags
+    elif isinstance(sweep, RangeSweep):
+        values = list(sweep.range())  # without its end
+        low, high, more["step"] = values[0], round(values[-1], 10), sweep.step
+    else:
+        raise ConfigError(f"cannot search {one.input_line}; write interval, range or choice")
+    if isinstance(low, int) and isinstance(high, int):
+        return IntDistribution(low, high, **more)
+    return FloatDistribution(float(low), float(high), **more)  # type: ignore[arg-type]
+
+
+def words(params: Mapping[str, Any]) -> dict[str, str]:
+    """A trial's values in Hydra's grammar: numbers with six digits, text quoted if need be."""
+    return {
+        key: quoted(one) if isinstance(one, str) else _plain(one) for key, one in params.items()
+    }
+
+
+def _plain(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def overrides(words: Mapping[str, str]) -> list[str]:
+    """The words of a command line."""
+    return [f"{key}={word}" for key, word in words.items()]
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A trial.
+
+    Attributes:
+        number: of the trial.
+        params: by key what was varied, in Hydra's grammar.
+        value: of the objective; None if it failed or diverged.
+        run: the name of its run, "failed" or "diverged: <name>".
+    """
+
+    number: int
+    params: Mapping[str, str]
+    value: float | None
+    run: str
+
+    @staticmethod
+    def of(number: int, params: Mapping[str, str], value: float | None, run: str) -> Tried:
+        """A trial with what its run returned: None if that failed, NaN if it diverged."""
+        if value is None:
+            return Tried(number, params, None, FAILED)
+        if not math.isfinite(value):
+            return Tried(number, params, None, f"diverged: {run}")
+        return Tried(number, params, value, run)
+
+
+def report(headline: str, objective: str, tried: Sequence[Tried], fixed: Sequence[str]) -> str:
+    """A table of all trials, in order, without any accuracy; `fixed`: overrides that all share."""
+    keys = list(dict.fromkeys(key for one in tried for key in one.params))
+    rows = [("trial", objective, *keys, "run")]
+    for one in tried:
+        value = "-" if one.value is None else f"{one.value:.4f}"
+        values = (one.params.get(key, "-") for key in keys)
+        rows.append((str(one.number), value, *values, one.run))
+    lines = [headline, *aligned(rows)]
+    judged = [one for one in tried if one.value is not None]
+    if judged:
+        sign = 1 if LABEL_FREE[objective].higher_is_better else -1
+        best = max(judged, key=lambda one: sign * (one.value or 0.0))  # the first one wins a tie
+        search = ("hparams_search=", "objective=", "seed=")
+        kept = [word for word in fixed if not word.startswith(search)]
+        command = shlex.join([*kept, *overrides(best.params), "seed=0,1,2"])
+        lines.append(f"Best: trial {best.number}. With several seeds:")
+        lines.append(typed(f"  python train.py -m {command}"))
+    return "\n".join(lines)
 
 
 def _tell(study: Study, trial: Trial, result: JobReturn) -> None:
@@ -167,7 +294,7 @@ def _tell(study: Study, trial: Trial, result: JobReturn) -> None:
     trial.set_user_attr("run", one.run)
     if one.value is not None:
         study.tell(trial, one.value)
-    else:  # a pruned trial is a bad one to TPE, and is not tried again: it would diverge again
+    else:  # a pruned trial is a poor one to TPE, and is not tried again: it would diverge again
         study.tell(trial, state=TrialState.FAIL if value is None else TrialState.PRUNED)
 
 

@@ -1,13 +1,12 @@
-"""What a multirun says at its end: mean and SEM over seeds, one run's page, every job that failed.
+"""What a multirun prints at its end: mean and SEM over seeds, every job that failed.
 
-With `objective=`, by which the runs of a grid or a search are compared without labels, it says the
-objective of each instead of accuracies, and refuses beforehand to vary how runs are judged.
+With `objective=`, by which the runs of a grid or a search are compared without labels, it prints
+the objective of each instead of accuracies, and refuses beforehand to vary how runs are judged.
 """
 
 from __future__ import annotations
 
 import atexit
-import contextlib
 import json
 import logging
 import os
@@ -20,22 +19,16 @@ from typing import Any
 from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from qs3.errors import ConfigError, Qs3Error
+from qs3.errors import ConfigError
 from qs3.evaluation.selection_rules import check_objective
 from qs3.runs.metrics import METRICS
-from qs3.sweeps.search import register
-from qs3.sweeps.search_space import check_varied, split
+from qs3.sweeps.search import Tried, check_varied, register, report, split
 from qs3.utils.files import make_folder
-from qs3.utils.memory import JSON_PEAK, read_whole
 
 log = logging.getLogger(__name__)
 
-_NO_END = (
-    "did not end: killed, interrupted or still running; the same command goes on with it, and with "
-    "jobs that had not begun, which are not counted here"
-)
+_NO_END = "did not end: killed, interrupted or still running; the same command goes on with it"
 
 
 class SummaryOfSeeds(Callback):
@@ -56,39 +49,37 @@ class SummaryOfSeeds(Callback):
         self._main = 0
         self.objective: str | None = None
 
-    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Leave if the folder of a single run cannot be written."""
-        with contextlib.suppress(OmegaConfBaseException):  # a key that it is made of: Hydra says so
-            _check_folder(config.hydra.run.dir)
-
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Begin a new list; leave if nothing can be written, or an objective could not compare."""
+        """Begin a new list; leave if an objective could not compare the runs."""
         register()
-        _check_folder(config.hydra.sweep.dir)
         self.objective = config.get("objective")
         if self.objective is not None:
             _check_fair(config)
         self._main = os.getpid()
-        self.journal = _new_file(Path(config.hydra.sweep.dir).resolve())
+        folder = make_folder(Path(config.hydra.sweep.dir).resolve())
+        handle, name = tempfile.mkstemp(prefix=".multirun-", suffix=".txt", dir=folder)
+        os.close(handle)
+        self.journal = Path(name)
         # Hydra leaves a sweep by the first failed job's exception, past `on_multirun_end`; the
         # finished seeds are worth a table nevertheless.
         atexit.register(self._summarise)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note that the job has begun: a job that is killed says nothing later."""
+        """Note that the job has begun: a job that is killed notes nothing later."""
         # As they were given, which is how a job's end names them; `${...}` would be resolved.
         task = OmegaConf.to_container(config.hydra.overrides.task, resolve=False)
         self._note(config, overrides=task)
 
     def on_job_end(self, config: DictConfig, job_return: Any, **kwargs: Any) -> None:
-        """Note how the job has ended (and say what went wrong: Hydra shows the first error only).
-
-        What all jobs lack, such as the data, is logged once.
-        """
+        """Note how the job has ended, and log what went wrong: Hydra shows the first error only."""
         if self.journal is None:
             return
         returned = getattr(job_return, "_return_value", None)
-        text = in_words(returned) if isinstance(returned, Exception) else ""
+        text = ""
+        if isinstance(returned, Exception):
+            first = str(returned).strip().partition("\n")[0]
+            told = isinstance(returned, CompactHydraException)  # its text begins with the kind
+            text = first if told else f"{type(returned).__name__}: {first}"
         if text and text not in (entry.get("error") for entry in self._read()):
             log.error("%s failed: %s", " ".join(job_return.overrides), text)
         value = returned if isinstance(returned, float) else None
@@ -114,11 +105,10 @@ class SummaryOfSeeds(Callback):
     def _summarise(self) -> None:
         if self.journal is None or os.getpid() != self._main:
             return
-        jobs = last_words(self._read())
+        jobs = sorted(last_words(self._read()), key=lambda job: job.get("job", 0))
         self.journal.unlink(missing_ok=True)
         self.journal = None
-        in_order = sorted(jobs, key=lambda job: job.get("job", 0))  # of the sweep, not of hashes
-        folders = list(dict.fromkeys(Path(job["folder"]) for job in in_order))
+        folders = list(dict.fromkeys(Path(job["folder"]) for job in jobs))
         if self.table and self.objective is not None and jobs:
             sys.stdout.write(objectives(jobs, self.objective) + "\n")
         elif self.table and any((folder / METRICS).is_file() for folder in folders):
@@ -130,34 +120,11 @@ class SummaryOfSeeds(Callback):
         sys.stdout.flush()
 
     def _read(self) -> list[dict[str, Any]]:
-        """What was noted, but for damaged lines: two machines may write at one place."""
         assert self.journal is not None
         try:
-            lines = read_whole(self.journal, JSON_PEAK).splitlines()
+            return [json.loads(line) for line in self.journal.read_text("utf-8").splitlines()]
         except FileNotFoundError:  # by a job that ends after the summary
-            lines = []
-        entries = []
-        for line in lines:
-            with contextlib.suppress(ValueError, RecursionError):
-                entry = json.loads(line)
-                if _is_job(entry):
-                    entries.append(entry)
-        return entries
-
-
-def _is_job(entry: Any) -> bool:
-    if not isinstance(entry, dict) or not isinstance(entry.get("overrides"), list):
-        return False
-    words = [entry.get("folder"), entry.get("error", ""), *entry["overrides"]]
-    return all(isinstance(word, str) for word in words)
-
-
-def in_words(error: BaseException) -> str:
-    """The first line of an error, with its kind."""
-    lines = str(error).strip().splitlines()
-    if isinstance(error, CompactHydraException) and lines:  # its text begins with the kind
-        return lines[0]
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+            return []
 
 
 def last_words(entries: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -173,16 +140,16 @@ def failures(jobs: Sequence[Mapping[str, Any]]) -> str:
 
     A job's "error" is "" if it went well, and missing if it never ended.
     """
-    failed = [job for job in jobs if job.get("error") != ""]
-    if not failed:
+    by_error: dict[str, list[str]] = {}
+    for job in jobs:
+        if job.get("error") != "":
+            line = f"    {' '.join(job['overrides'])}  ({job['folder']})"
+            by_error.setdefault(job.get("error", _NO_END), []).append(line)
+    if not by_error:
         return ""
-    by_error: dict[str, list[Mapping[str, Any]]] = {}
-    for job in failed:
-        by_error.setdefault(job.get("error", _NO_END), []).append(job)
-    lines = [f"{len(failed)} of {len(jobs)} jobs failed:"]
+    lines = [f"{sum(map(len, by_error.values()))} of {len(jobs)} jobs failed:"]
     for error, members in by_error.items():
-        lines.append(f"  {error}")
-        lines += sorted(f"    {' '.join(job['overrides'])}  ({job['folder']})" for job in members)
+        lines += [f"  {error}", *sorted(members)]
     return "\n".join(lines) + "\n"
 
 
@@ -210,8 +177,6 @@ def _pictures(jobs: Sequence[Mapping[str, Any]]) -> str:
 
 def objectives(jobs: Sequence[Mapping[str, Any]], name: str) -> str:
     """A table of the runs' objectives (each job's "value") and the best of them; no accuracy."""
-    from qs3.sweeps.search_report import Tried, report
-
     jobs = sorted(jobs, key=lambda job: job["job"])
     words = [dict(word.partition("=")[::2] for word in job["overrides"]) for job in jobs]
     varied = [key for key in words[0] if len({one.get(key) for one in words}) > 1]
@@ -232,18 +197,3 @@ def _check_fair(config: DictConfig) -> None:
         check_varied(split(config.hydra.overrides.task, params)[1].values())
     except ConfigError as error:  # Hydra makes a warning of a callback's exception
         raise SystemExit(f"{type(error).__name__}: {error}") from error
-
-
-def _check_folder(folder: str) -> None:
-    """Leave, with a message, unless Hydra can write there: it would end in a traceback."""
-    try:
-        make_folder(folder)
-    except Qs3Error as error:
-        raise SystemExit(f"{type(error).__name__}: {error} (paths.log_dir)") from error
-
-
-def _new_file(folder: Path) -> Path:
-    """An empty file in `folder`, which machines of a cluster share."""
-    handle, name = tempfile.mkstemp(prefix=".multirun-", suffix=".txt", dir=folder)
-    os.close(handle)
-    return Path(name)

@@ -9,8 +9,6 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from qs3.config import hashing
-from qs3.config.hydra import _gpu_in_turn
-from qs3.errors import ConfigError
 from tests.running import command
 from tests.sweeps.commands import light, light_runs
 from tests.training.conftest import result_of, toy_data  # noqa: F401 (a fixture)
@@ -70,28 +68,6 @@ def test_a_job_of_rays_whose_process_is_killed_begins_again(tmp_path):
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("hydra.launcher.attempts=0", "hydra.launcher.attempts must be"),
-        ("hydra.launcher.gpus=99", r"no node of the cluster has .*hydra.launcher.gpus=99 cards"),
-    ],
-)
-@pytest.mark.slow
-def test_what_ray_cannot_do_is_said(tmp_path, word, message):
-    result = light(tmp_path, "seed=1", "hydra/launcher=ray", word)
-    assert result.returncode == 1
-    assert re.search(message, result.stderr)
-    assert "Traceback" not in result.stderr
-    assert light_runs(tmp_path) == {}
-
-
-def test_gpus_are_counted():
-    assert _gpu_in_turn(3) == 0  # outside of a sweep
-    with pytest.raises(ConfigError, match=r"trainer\.gpus must be .* at least 1, got 0"):
-        _gpu_in_turn(0)
-
-
 def test_listed_jobs_in_parts(tmp_path):
     """Any jobs, numbered through; each part has to end before the next begins."""
     jobs = [["selftraining.theta=0.5"], ["seed=9"], ["method=dann", "seed=4"]]
@@ -103,9 +79,6 @@ def test_listed_jobs_in_parts(tmp_path):
     assert result.returncode == 1
     assert "1 of 3 jobs failed" in result.stdout
     assert sorted(run["devices"] for run in light_runs(tmp_path).values()) == [[0], [2]]
-    result = light(tmp_path, "hydra/sweeper=listed", "hydra.sweeper.file=nowhere.json")
-    assert result.returncode == 1
-    assert "DataError: the list of jobs nowhere.json cannot be read" in result.stderr
 
 
 @pytest.mark.slow

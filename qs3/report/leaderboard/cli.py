@@ -46,7 +46,7 @@ def _leaderboard(
     more: Sequence[str],
 ) -> int:
     """Train what the row lacks, and print it beside the rows that are there."""
-    from qs3.config.quoting import override, words_of
+    from qs3.config.quoting import override
     from qs3.report.tables.formats import csv_text, latex, markdown
     from qs3.report.tables.keeping import unused
     from qs3.report.tables.overrides import file_name
@@ -55,7 +55,7 @@ def _leaderboard(
     from qs3.report.tables.table import build_table
 
     row = own_row(method, name, selftraining, more)
-    extra = words_of("overrides", overrides)
+    extra = shlex.split(overrides)
     extra += [override("paths.data_dir", data_dir)] if data_dir else []
 
     def built(runs: bool = True) -> Table:

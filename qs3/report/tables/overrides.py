@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import hashlib
 import re
+import shlex
 from collections.abc import Iterable, Sequence
 
 from qs3.config.hashing import is_hashed
-from qs3.config.quoting import words_of
 from qs3.errors import ConfigError
 from qs3.utils.hints import nearest
 
@@ -106,7 +106,7 @@ def file_name(*parts: str | None, columns: Sequence[str], overrides: str) -> str
     Raises:
         ConfigError: a quotation mark in `overrides` has no end.
     """
-    matter = [w for w in words_of("overrides", overrides) if is_hashed(_key(_split(w)[1]))]
+    matter = [w for w in shlex.split(overrides) if is_hashed(_key(_split(w)[1]))]
     settings = "-".join(re.sub(r"[^\w.=]+", "-", word).strip("-") for word in matter)
     if len(settings) > _LONGEST:
         settings = hashlib.sha256(settings.encode()).hexdigest()[:8]

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from qs3.config.compose import composing, explained, first_line
+from qs3.config.compose import composing, first_line
 from qs3.config.location import CONF
 from qs3.config.quoting import override
 from qs3.errors import ConfigError, DataError
@@ -332,7 +332,7 @@ def _fill(
 
 
 def _of_cell(cell: Cell, error: Exception) -> str:
-    return f"table cell {cell.row!r}, {cell.column!r}: {explained(error, 'train', cell.overrides)}"
+    return f"table cell {cell.row!r}, {cell.column!r}: {first_line(error)}"
 
 
 def _without(word: str, words: Sequence[str]) -> tuple[str, ...]:

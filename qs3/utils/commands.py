@@ -79,7 +79,7 @@ def _dispatch(commands: Commands, argv: list[str], name: str, about: str) -> int
         return 0
     if first in _HELP:
         rows = [(word, _summary(found)) for word, found in commands.items() if word]
-        print(_page(f"{name} COMMAND", about or _summary(commands), rows))
+        print(_page(f"{name} COMMAND", about, rows))
         return 0
     if first in commands:
         found, name = commands[first], f"{name} {first}"
@@ -269,7 +269,7 @@ def _help(function: Callable[..., Any], name: str) -> str:
 
 def _page(name: str, summary: str, rows: Sequence[tuple[str, str]], about: str = "") -> str:
     column = min(max((len(left) for left, _ in rows), default=0), 24) + 4
-    lines = [f"{name}: {summary}", ""]
+    lines = [f"{name}: {summary}" if summary else name, ""]
     for left, right in rows:
         begin = f"  {left}".ljust(column)
         begin = begin if len(left) + 4 <= column else f"  {left}\n{' ' * column}"
