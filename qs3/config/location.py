@@ -19,11 +19,7 @@ CONF = _ROOT / "conf"
 def python_command(name: str) -> list[str]:
     """Begin of a process's arguments that run `train` or `generate`, in any folder."""
     if _INSTALLED:
-        return [
-            sys.executable,
-            "-m",
-            f"qs3.{'commands.train' if name == 'train' else 'generation'}",
-        ]
+        return [sys.executable, "-m", f"qs3.commands.{name}"]
     return [sys.executable, str(_ROOT / f"{name}.py")]
 
 

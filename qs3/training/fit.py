@@ -31,10 +31,6 @@ from qs3.training.provenance import warn_of_changes
 from qs3.training.resume import take_checkpoint
 from qs3.training.run import STUDENT, Run
 from qs3.training.write import write_outcome
-<<<<<<< HEAD
-=======
-from qs3.utils.commands import TERMINATED
->>>>>>> 63fae9ef (Read commands from typed functions; let Hydra's errors be the message)
 from qs3.utils.plural import counted
 from qs3.utils.processor_time import Moment, processor_seconds
 from qs3.utils.threads import cores, number_of
