@@ -11,8 +11,8 @@ Datasets are made by qs3-generate and classifiers trained by qs3-train (in a che
 python generate.py and python train.py); both have --help."""
 
 COMMANDS: Commands = {
-    "quickstart": "qs3.tools.quickstart:QUICKSTART",
-    "doctor": "qs3.tools.doctor:DOCTOR",
+    "quickstart": "qs3.commands.quickstart:quickstart",
+    "doctor": "qs3.commands.doctor:doctor",
     "download": "qs3.datasets.download.cli:DOWNLOAD",
     "inspect": "qs3.report.inspection.cli:INSPECT",
     "compare": "qs3.report.inspection.cli:COMPARE",

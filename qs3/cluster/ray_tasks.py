@@ -17,12 +17,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
-from qs3.config.checks import check_float, check_int
+from annotated_types import Ge, Gt
+
 from qs3.errors import ClusterError, ConfigError
-from qs3.utils.plural import counted
 from qs3.utils.pool import Outcome, Result, Task
+from qs3.utils.settings import settings
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ class _Work:
     lost: int = 0
 
 
-@dataclass(frozen=True)
+@settings
 class RayTasks:
     """Does named tasks on a Ray cluster; see `qs3.utils.pool.Pool`.
 
@@ -55,37 +56,19 @@ class RayTasks:
             said.
         attempts: a task that has ended its process so often is given up.
         tasks_per_process: after so many a process is replaced.
-        place: of these settings, for messages.
         shared_disk: all nodes see the files of this machine under the same paths, so that workers
             read meshes and write results themselves; else they are sent.
-
-    Raises:
-        ConfigError: a value cannot be.
     """
 
     address: str = "local"
-    workers: int = 2
-    cpus: float = 1
-    gpus: float = 0
-    memory_gb: float | None = None
-    attempts: int = 3
-    tasks_per_process: int = 200
+    workers: Annotated[int, Ge(1)] = 2
+    cpus: Annotated[float, Gt(0)] = 1
+    gpus: Annotated[float, Ge(0)] = 0
+    memory_gb: Annotated[float, Gt(0)] | None = None
+    attempts: Annotated[int, Ge(1)] = 3
+    tasks_per_process: Annotated[int, Ge(1)] = 200
     shared_disk: bool = True
-    place: str = "engine"
     elsewhere: bool = field(default=True, init=False)
-
-    def __post_init__(self) -> None:
-        check_int("workers", self.workers, 1)
-        check_int(f"{self.place}.attempts", self.attempts, 1)
-        check_int(f"{self.place}.tasks_per_process", self.tasks_per_process, 1)
-        check_float(f"{self.place}.cpus", self.cpus, "(0, inf)")
-        check_float(f"{self.place}.gpus", self.gpus, "[0, inf)")
-        if self.memory_gb is not None:
-            check_float(f"{self.place}.memory_gb", self.memory_gb, "(0, inf)")
-        if not isinstance(self.address, str) or not self.address.strip():
-            raise ConfigError(
-                f"{self.place}.address must be local, auto or an address, got {self.address!r}"
-            )
 
     @property
     def memory_bytes(self) -> int:
@@ -109,10 +92,11 @@ class RayTasks:
         """Do the tasks; as `qs3.utils.pool.Processes.run`.
 
         Raises:
-            ConfigError: Ray is not installed, there is no cluster at the address, or none of its
-                nodes has what a task asks for.
+            ConfigError: no node of the cluster has what a task asks for.
+            ConnectionError: Ray's, if there is no cluster at the address.
         """
-        ray = _ray()
+        import ray
+
         with _connected(ray, self):
             yield from _Run(ray, self, make_worker).outcomes(tasks)
 
@@ -194,9 +178,9 @@ class _Run:
     def _report(self) -> None:
         """Who did how much, and what went wrong on the way."""
         shares = ", ".join(f"{n} by {node}" for node, n in self.nodes.most_common())
-        log.info("%s: %s", counted(len(self.nodes), "node"), shares)
+        log.info("%d nodes: %s", len(self.nodes), shares)
         for what, count in self.troubles.items():
-            log.warning("%s %s; what it had was done again", counted(count, "time"), what)
+            log.warning("%s, %d times; its task was done again", what, count)
 
 
 _WORKERS: dict[bytes, Any] = {}
@@ -229,26 +213,18 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
         cores = math.ceil(how.workers * how.cpus) if how.cpus <= (os.cpu_count() or 1) else None
         local = {"num_cpus": cores, "include_dashboard": False}
     try:
-        try:
-            ray.init(address=how.address, **local, **quiet)
-        except ConnectionError as error:
-            raise ConfigError(
-                f"there is no Ray cluster at {how.place}.address={how.address}: start one "
-                f"(`ray start --head`) or take {how.place}.address=local"
-            ) from error
+        ray.init(address=how.address, **local, **quiet)
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        cpus = int(ray.cluster_resources().get("CPU", 0))
-        log.info("Ray: %s, %s", counted(len(nodes), "node"), counted(cpus, "core"))
+        log.info("Ray: %d nodes, %d cores", len(nodes), ray.cluster_resources().get("CPU", 0))
         if not any(
             has.get("CPU", 0) >= how.cpus
             and has.get("GPU", 0) >= how.gpus
             and has.get("memory", 0) >= how.memory_bytes
             for has in nodes
-        ):
+        ):  # Ray would wait for ever
             raise ConfigError(
-                f"no node of the cluster has {how.place}.cpus={counted(how.cpus, 'core')}, "
-                f"{how.place}.gpus={counted(how.gpus, 'card')} and "
-                f"{how.place}.memory_gb={how.memory_gb or 0} of memory"
+                f"no node of the cluster has cpus={how.cpus:g}, gpus={how.gpus:g} and "
+                f"memory_gb={how.memory_gb or 0:g}"
             )
         yield
     finally:
@@ -256,14 +232,3 @@ def _connected(ray: ModuleType, how: RayTasks) -> Iterator[None]:
         for name, value in kept.items():
             if value is None:
                 os.environ.pop(name, None)
-
-
-def _ray() -> ModuleType:
-    try:
-        import ray
-    except ImportError as error:
-        raise ConfigError(
-            "Ray is not installed: pip install '.[cluster]' in the folder of qs3"
-        ) from error
-    module: ModuleType = ray
-    return module

@@ -62,7 +62,6 @@ class RayLauncher(Launcher):
             "memory_gb": memory_gb,
             "attempts": attempts,
             "tasks_per_process": 1,
-            "place": "hydra.launcher",
         }
 
     def setup(

@@ -65,7 +65,7 @@ def run(commands: Commands, argv: Sequence[str], name: str = "qs3", about: str =
         print("\ninterrupted; run the same command again and it continues", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        _forget_output()
         return BROKEN_PIPE
     return status
 
@@ -173,6 +173,9 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
         let_waiting_threads_sleep()
         try:
             main()
+        except BrokenPipeError:
+            _forget_output()
+            sys.exit(BROKEN_PIPE)
         except (KeyboardInterrupt, SystemExit) as error:
             if isinstance(error, SystemExit) and error.code == TERMINATED:
                 what, status = "terminated", TERMINATED
@@ -187,6 +190,11 @@ def hydra_command(main: Callable[[], Any]) -> Callable[[], None]:
             sys.exit(status)
 
     return command
+
+
+def _forget_output() -> None:
+    """Let the flush at exit go nowhere: the reader of the pipe has gone."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

@@ -241,41 +241,7 @@ def test_the_time_limit_is_not_a_failure_of_the_task(tmp_path):
     assert deaths == {"b": 1}
 
 
-@pytest.mark.parametrize(
-    ("engine", "wrong", "said"),
-    [
-        (RayTasks, {"workers": 0}, "workers"),
-        (RayTasks, {"attempts": 0}, r"engine\.attempts"),
-        (RayTasks, {"cpus": 0}, r"engine\.cpus"),
-        (RayTasks, {"memory_gb": -1.0}, r"engine\.memory_gb"),
-        (RayTasks, {"address": " "}, r"engine\.address"),
-        (arrays, {"cpus": 0}, r"engine\.cpus"),
-        (SlurmArrays, {"cluster": "pbs"}, r"engine\.cluster.*slurm"),
-        (SlurmArrays, {"poll_s": 0}, r"engine\.poll_s"),
-        (SlurmArrays, {"setup": "module load gcc"}, r"engine\.setup=\['module load gcc'\]"),
-        (SlurmArrays, {"partition": ""}, r"engine\.partition"),
-    ],
-)
-def test_settings_that_cannot_be(engine, wrong, said, tmp_path):
-    given = {} if engine is RayTasks else {"folder": str(tmp_path)}
-    with pytest.raises(ConfigError, match=said):
-        engine(**given, **wrong)
-
-
-def test_no_slurm_here_is_said(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigError, match=r"engine=slurm: .*engine\.cluster=local"):
-        list(SlurmArrays(folder=str(tmp_path)).run(make_worker(tmp_path), [("1", 1)]))
-
-
-@slow
-def test_what_no_node_has_is_said(tmp_path):
-    for wrong in ({"cpus": 500}, {"memory_gb": 1e6}):
-        with pytest.raises(ConfigError, match=r"no node of the cluster has engine\.cpus="):
-            list(RayTasks(**wrong).run(make_worker(tmp_path), [("1", 1)]))
-
-
-@slow
-def test_no_cluster_at_the_address_is_said(tmp_path):
-    with pytest.raises(ConfigError, match=r"no Ray cluster at .*ray start --head"):
-        list(RayTasks(address="auto").run(make_worker(tmp_path), [("1", 1)]))
+def test_what_no_node_has_is_an_error_at_once():
+    """Ray itself would wait for ever."""
+    with pytest.raises(ConfigError):
+        list(RayTasks(workers=1, cpus=1e6).run(int, [("a", 1)]))

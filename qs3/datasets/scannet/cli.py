@@ -25,7 +25,7 @@ _SETTINGS = tuple(
 
 
 def _extract(workers: int, engine: str, more: list[str], **given: Any) -> None:
-    from qs3.cluster.choice import pool_of
+    from qs3.cluster import pool_of
     from qs3.datasets.scannet.extraction import extract
 
     settings = Extraction(**{option.key: given.pop(option.key) for option in _SETTINGS})
