@@ -11,12 +11,9 @@ PARALLEL ?= -n 2 --dist loadfile
 DEVICE ?= cpu
 THREADS ?=
 POINTS ?=
-# Of `make release`.
-VERSION ?=
-GO ?= false
 
 .DEFAULT_GOAL := help
-.PHONY: help install doctor quickstart lint format test test-all test-triton bench mutants docs release clean
+.PHONY: help install doctor quickstart lint format test test-all test-triton bench mutants docs clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -72,9 +69,6 @@ mutants: install ## how many faults put into the core the tests notice; hours, g
 docs: install ## the docs as a site, in out/site
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict -f .ci/mkdocs.yml
 	@echo "open out/site/index.html"
-
-release: install ## what a release of VERSION=0.1.0 would do; GO=true: does it, and pushes nothing
-	@PIP_ARGS="$(PIP_ARGS)" $(RUN) .ci/release.py version=$(VERSION) go=$(GO)
 
 clean: ## remove what `make quickstart` made
 	rm -rf out

@@ -1,4 +1,4 @@
-"""Time that processors worked for this process: on a busy machine it says what wall time does not."""
+"""Time that processors worked for this process, which a busy machine does not change."""
 
 from __future__ import annotations
 
