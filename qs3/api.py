@@ -30,7 +30,7 @@ def train(*overrides: str) -> Path:
     A finished run is not trained again. One seed at a time: there is no `-m` here.
 
     Returns:
-        The run's folder; `qs3.report.runs.data.read_run` and `qs3.load` read it.
+        The run's folder; `qs3.report.run_files.read_run` and `qs3.load` read it.
 
     Raises:
         ConfigError, MissingDataError, ...: as the command says them.

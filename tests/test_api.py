@@ -9,7 +9,7 @@ import qs3
 from qs3.api import generate, train
 from qs3.config.compose import composed
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.report.runs.data import read_run
+from qs3.report.run_files import read_run
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import read_metrics
 from qs3.tools.toy import SHAPES, ToyNet, toy_overrides, write_toy

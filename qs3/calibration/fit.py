@@ -12,7 +12,7 @@ from qs3.calibration.walls import Noise, Steps, Wall, find_bias, find_noise, fin
 from qs3.datasets.frames.given import check_intrinsics, read_depth, read_intrinsics
 from qs3.errors import ConfigError
 from qs3.geometry.cameras import Intrinsics
-from qs3.utils.plotting import blank, save_png
+from qs3.utils.pictures import blank, save_png
 
 _NEAREST_M, _FARTHEST_M = 0.3, 8.0  # limits where no wall was seen outside of them
 _MOST_BIAS = 0.3  # of a distance: a larger one is of another unit or another frame

@@ -23,7 +23,7 @@ MAKES_CLOUDS = (
         "datasets/frames",
         "utils/seeding.py",
     ),
-    *("geometry/cameras.py", "geometry/orthographic.py", "geometry/sampling.py"),
+    *("geometry/cameras.py", "geometry/sampling.py"),
     *("sensors/base.py", "sensors/pixel_status.py", "sensors/devices", "sensors/matching"),
     *("sensors/optics", "sensors/renderers"),
 )

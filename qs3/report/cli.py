@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from qs3.config.compose import choices
 from qs3.errors import ConfigError
-from qs3.utils.cli import Command, Group, Option, several, text, whole
+from qs3.utils.cli import Command, Option, several, text, whole
 from qs3.utils.plural import counted
 
 if TYPE_CHECKING:
@@ -143,82 +143,6 @@ def _save(at: str, table: Table, found: Sequence[Any], base: str = "") -> None:
     print(said)
 
 
-def _page(run: str, data_dir: str | None, out: str | None, packages: Sequence[str]) -> None:
-    from qs3.report.runs.pictures import draw
-
-    drawn = draw(run, out, data_dir=data_dir, packages=packages)
-    for note in drawn.notes:
-        print(f"note: {note}")
-    for name, reason in drawn.skipped.items():
-        print(f"no {name}: {reason}")
-    for path in filter(None, (*drawn.pictures.values(), drawn.clouds, drawn.page)):
-        print(path)
-
-
-def _pictures(domains: Sequence[str], data_dir: str, split: str, out: str | None) -> None:
-    from hydra.utils import instantiate
-
-    from qs3.config.compose import composing
-    from qs3.config.quoting import override
-    from qs3.report.contact_sheets import class_sheet, scan_picture
-    from qs3.report.figures.class_balance import class_picture
-    from qs3.report.tables.table import check_domain
-
-    for name in domains:
-        check_domain("domains: ", name)
-    folder = Path(out or Path(data_dir) / "pictures")
-    alone = folder.suffix == ".png"
-    sets, simulated, counts = {}, [], {}
-    with composing() as compose:
-        for name in domains:
-            data_is_in = override("paths.data_dir", Path(data_dir).absolute())
-            cfg = compose("train", [f"domain@data.source={name}", data_is_in])
-            domain = instantiate(cfg.data.source)
-            data = domain.open()
-            words = f"{domain.title}{' (simulated)' if domain.simulated else ''}"
-            sets[f"{domain.symbol}: {words}"] = data
-            simulated += [domain.title] if domain.simulated else []
-            counts[domain.label] = data
-            if alone:
-                continue
-            heading = f"{domain.label}, {split}"
-            print(class_sheet(data, folder / f"{name}.png", split=split, heading=heading))
-    if not alone:
-        print(class_picture(counts, folder / "classes.png"))
-    note = f"simulated: {', '.join(simulated)}" if simulated else ""
-    print(scan_picture(sets, folder if alone else folder / "domains.png", split=split, note=note))
-
-
-def _pipeline(
-    domain: str | None,
-    dataset: str | None,
-    object: str | None,
-    mesh: str | None,
-    meshes: str | None,
-    view: int,
-    out: str,
-    more: Sequence[str],
-) -> None:
-    from qs3.config.quoting import override
-    from qs3.report.figures.pipeline import kept_object, scan_object
-    from qs3.report.figures.pipeline_figure import save_pipeline
-
-    if domain is None and dataset is None:
-        raise ConfigError("missing argument: domain=NAME scans an object, dataset=FOLDER reads one")
-    if domain and dataset:
-        raise ConfigError(
-            "domain= scans an object now, dataset= reads one that was scanned: give one of them"
-        )
-    if dataset is not None:
-        if wrong := [*(["mesh="] if mesh else []), *more]:
-            raise ConfigError(f"{wrong[0]} goes with domain=; with dataset= nothing is scanned")
-        one = kept_object(dataset, object, meshes)
-    else:
-        words = [f"domain={domain}", *([override("meshes", meshes)] if meshes else []), *more]
-        one = scan_object(words, object, mesh)
-    print(save_pipeline(one, out, view))
-
-
 _TABLE = (
     Option(
         "table",
@@ -311,75 +235,4 @@ EFFECTS = Command(
     (*_TABLE, _OUT),
     ("qs3 report effects table=factorial", "qs3 report effects table=headline"),
     about=_PAIRED,
-)
-
-PAGE = Command(
-    "qs3 report page",
-    "the pictures of a run, and a page of all of them",
-    _page,
-    (
-        Option("run", text("PATH"), "the folder that training names", required=True),
-        Option("data_dir", text("FOLDER"), "where its data are now, if they have moved"),
-        Option("out", text("FOLDER"), "default RUN/pictures"),
-        Option("packages", several(text("NAME")), "where a net of your own is defined", ()),
-    ),
-    ("qs3 report page run=logs/qs3_s2d/seed0-5f0c2a71 data_dir=data",),
-    about="""
-Curves, confusion, pseudo-labels, classes, calibration; if its data are there, features and clouds
-of both domains, their class balance and the most confident errors, also as clouds.html, where they
-can be turned; and a page of all, index.html.
-""",
-)
-
-PICTURES = Command(
-    "qs3 report pictures",
-    "contact sheets of domains, one that compares them, and their classes",
-    _pictures,
-    (
-        Option("domains", several(text("NAME")), "of conf/domain", required=True),
-        Option("data_dir", text("FOLDER"), "where datasets lie, paths.data_dir of a run", "data"),
-        Option("split", text("NAME"), "train or test", "train"),
-        Option("out", text("PATH"), "default DATA_DIR/pictures; NAME.png: the comparison alone"),
-    ),
-    ("qs3 report pictures domains=modelnet10,specklenet10,kinectsim10",),
-)
-
-PIPELINE = Command(
-    "qs3 report pipeline",
-    "one object on its way from images to residuals",
-    _pipeline,
-    (
-        Option("domain", text("NAME"), "scans an object of this domain now"),
-        Option("dataset", text("FOLDER"), "or reads it from here, made with keep_views=true"),
-        Option("object", text("ID"), "which one (default: a chair, or the first there is)"),
-        Option("mesh", text("FILE"), "a mesh to scan in place of the domain's objects"),
-        Option("meshes", text("FOLDER"), "of the dataset's or the domain's meshes"),
-        Option("view", whole(0), "which one is shown (default 0)", 0),
-        Option("out", text("FILE"), "the picture", "pipeline.png"),
-    ),
-    (
-        "qs3 report pipeline domain=specklenet10 renderer=mitsuba object=chair/train/chair_0000",
-        "qs3 report pipeline domain=specklenet10 sensor=kinect_v1 mesh=chair.glb out=chair.png",
-        "qs3 report pipeline dataset=data/specklenet10 object=chair/train/chair_0000",
-    ),
-    others={"": "any override of qs3-generate, such as renderer=mitsuba sensor=kinect_v1"},
-)
-
-REPORT = Group(
-    "qs3 report",
-    "tables of runs, what they lack, and pictures",
-    {
-        "table": TABLE,
-        "train": TRAIN,
-        "keep": KEEP,
-        "compare": COMPARE,
-        "effects": EFFECTS,
-        "judge": "qs3.report.judge.cli:JUDGE",
-        "page": PAGE,
-        "pictures": PICTURES,
-        "pipeline": PIPELINE,
-    },
-    ("qs3 report table=uda", "qs3 report train table=uda", "qs3 report pipeline --help"),
-    default="table",
-    about="qs3 report table=NAME is short for qs3 report table table=NAME.",
 )

@@ -16,7 +16,7 @@ written last, and atomically: it is the mark of a finished run.
         round_03/pseudo_labels.csv
         history.csv          one row an epoch
         metrics.json         the result
-        pictures/            of the above, drawn last; see `qs3.report.runs.pictures`
+        pictures/            of the above, drawn last; see `qs3.report.run_page`
 """
 
 from __future__ import annotations

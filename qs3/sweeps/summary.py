@@ -169,7 +169,7 @@ def _pictures(jobs: Sequence[Mapping[str, Any]]) -> str:
     left = [job for job in jobs if job.get("pictures") == "auto" and job.get("error") == ""]
     if not left:
         return ""
-    from qs3.report.runs.pictures import of_sweep
+    from qs3.report.run_page import of_sweep
 
     numbers = {Path(job["folder"]): job["job"] for job in left}
     return of_sweep(sorted(numbers, key=lambda folder: numbers[folder]))

@@ -1,13 +1,237 @@
-"""Pictures whose size is judged by the header alone: unpacked, 91 bytes can be gigabytes."""
+"""Pictures: one look for all figures, clouds and values as images, sheets of them, PNG files.
+
+Nothing is global (no pyplot): no screen is needed, and no figure stays open.
+"""
 
 from __future__ import annotations
 
+import io
 import struct
+import textwrap
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Shaped, UInt8
 
 from qs3.errors import DataError
+from qs3.utils.files import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Image = UInt8[np.ndarray, "h w 3"]
+
+INK, SOFT, GRID = "#1d2430", "#6b7482", "#e3e6eb"
+PAPER, PANEL = "#ffffff", "#f7f8fa"
+DARK = "#18141c"
+"""Where nothing was measured."""
+PALE = (0.93, 0.94, 0.96)
+"""What the colours of a cloud fade to with distance."""
+BLUE, ORANGE, GREEN, RED = "#2f6db3", "#d9822b", "#3a8f5c", "#b5403a"
+PALE_BLUE = "#b9d0ea"
+
+AZIMUTH_DEG, ELEVATION_DEG = -55.0, 18.0
+_BESIDE_DEG = 20.0  # of the camera: straight from there a scan looks whole
+_THUMBNAIL_PX, _DOT_PX = 168, (2, 5)
+_DPI = 130
+
+
+def axes_of(azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, "3 3"]:
+    """Rows right, up and towards the viewer, who stands at this azimuth; z is up."""
+    a, e = np.deg2rad([azimuth_deg, elevation_deg])
+    towards = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    return np.stack([right, np.cross(towards, right), towards])
+
+
+def unit(values: np.ndarray) -> np.ndarray:
+    """The values stretched to 0..1; all 0 if they are equal."""
+    return (values - values.min()) / max(float(np.ptp(values)), 1e-12)
+
+
+def turn_deg(cloud: Float[np.ndarray, "p 3"]) -> float:
+    """Degrees to turn the viewer by: what lies beside the origin is first seen from there.
+
+    That is where a scan has its camera; what lies around the origin is seen as in all pictures.
+    """
+    low, size = cloud.min(axis=0), np.ptp(cloud, axis=0)
+    middle = (low + size / 2)[:2]
+    if np.linalg.norm(middle) <= np.linalg.norm(size[:2]) / 2:
+        return 0.0
+    return round(float(np.rad2deg(np.arctan2(*-middle[::-1]))) - _BESIDE_DEG - AZIMUTH_DEG, 1)
+
+
+def cloud_colours(height: np.ndarray, depth: np.ndarray) -> Float[np.ndarray, "p 3"]:
+    """Colours by height [P] in 0..1, paler by depth [P] from 0 (far) to 1 (near)."""
+    from matplotlib import colormaps
+
+    near = (0.35 + 0.65 * depth)[:, None]
+    colours: np.ndarray = colormaps["viridis"](0.02 + 0.86 * height)[:, :3]
+    return near * colours + (1 - near) * np.array(PALE)
+
+
+def cloud_image(
+    cloud: Float[np.ndarray, "p 3"],
+    side_px: int = _THUMBNAIL_PX,
+    azimuth_deg: float = AZIMUTH_DEG,
+    colours: Float[np.ndarray, "p 3"] | None = None,
+) -> Image:
+    """A cloud, z up, seen without perspective from slightly above, scaled to fill the image.
+
+    `colours` lie in 0..1; without them colour is height, and paler is farther.
+    """
+    xyz = np.asarray(cloud, dtype=np.float64)
+    xyz = xyz - (xyz.min(axis=0) + xyz.max(axis=0)) / 2
+    xyz = xyz / max(float(np.linalg.norm(xyz, axis=1).max()), 1e-12)
+    local = xyz @ axes_of(azimuth_deg, ELEVATION_DEG).T
+    order = np.argsort(local[:, 2], kind="stable")  # the nearest come last, and stay
+    if colours is None:
+        colours = cloud_colours(unit(xyz[:, 2]), unit(local[:, 2]))
+    painted = np.rint(255 * colours[order]).astype(np.uint8)
+    times = side_px / _THUMBNAIL_PX
+    dot = round(float(np.clip(60 / np.sqrt(len(xyz)), *_DOT_PX)) * times)
+    half = (side_px - dot) / 2
+    column = np.rint(half * (1 + local[order, 0])).astype(int)
+    row = np.rint(half * (1 - local[order, 1])).astype(int)
+    image = np.full((side_px, side_px, 3), _rgb(PANEL), dtype=np.uint8)
+    for dv, du in np.ndindex(dot, dot):
+        if np.hypot(dv - (dot - 1) / 2, du - (dot - 1) / 2) <= dot / 2:
+            image[row + dv, column + du] = painted
+    return image
+
+
+def value_image(values: Float[np.ndarray, "h w"], low: float, high: float, colours: str) -> Image:
+    """Values from low to high in a colour map of matplotlib; dark where they are not finite."""
+    from matplotlib import colormaps
+
+    share = (np.nan_to_num(values) - low) / max(high - low, 1e-12)
+    image = np.rint(255 * colormaps[colours](share.clip(0, 1))[..., :3]).astype(np.uint8)
+    image[~np.isfinite(values)] = _rgb(DARK)
+    return image
+
+
+def sheet(
+    images: Sequence[Image | None],
+    titles: Sequence[str],
+    *,
+    columns: int,
+    heading: str = "",
+    rows: Sequence[str] = (),
+    heads: Sequence[str] = (),
+    note: str = "",
+    panel_in: float = 1.45,
+) -> Figure:
+    """A figure of images in rows and columns, scaled to squares of one size.
+
+    Args:
+        images: row by row; None leaves a place empty.
+        titles: one below each image.
+        columns: images in a row.
+        heading, note: a line above all, and one below all.
+        rows, heads: what stands before each row and above each column.
+        panel_in: side of a square, inches.
+    """
+    import cv2
+
+    assert len(images) == len(titles) > 0
+    columns, size = min(columns, len(images)), 7 if panel_in < 2 else 9
+    side = round(panel_in * _DPI)
+    left = round((1.05 if rows else 0.05) * _DPI)
+    tops = [round(((0.45 if heading else 0.1) + (0.35 if heads else 0)) * _DPI)]
+    for first in range(0, len(images), columns):
+        lines = 1 + max(title.count("\n") for title in titles[first : first + columns])
+        tops.append(tops[-1] + side + round((0.1 + 0.018 * size * lines) * _DPI))
+    high = tops[-1] + round(0.28 * _DPI * bool(note))
+    wide = left + columns * side + round(0.05 * _DPI)
+    canvas = np.full((high, wide, 3), _rgb(PAPER), dtype=np.uint8)
+    figure = blank(wide / _DPI, high / _DPI, _DPI)
+
+    def write(x: float, y: float, words: str, size: float, colour: str, **style: str) -> None:
+        place = {"ha": "center", "va": "center", **style}
+        figure.text(x / wide, 1 - y / high, words, fontsize=size, color=colour, parse_math=False,
+                    **place)  # type: ignore[arg-type] # fmt: skip
+
+    for i, (image, title) in enumerate(zip(images, titles, strict=True)):
+        x, y = left + i % columns * side, tops[i // columns]
+        if image is not None:
+            scale = 0.96 * side / max(image.shape[:2])
+            h, w = (max(1, round(length * scale)) for length in image.shape[:2])
+            at_y, at_x = y + (side - h) // 2, x + (side - w) // 2
+            small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)
+            canvas[at_y : at_y + h, at_x : at_x + w] = small
+        write(x + side / 2, y + side + 3, title, size, SOFT, va="top")
+        if i % columns == 0 and i // columns < len(rows):
+            write(left - 12, y + side / 2, rows[i // columns], 9, INK, ha="right")
+    for column, head in enumerate(heads[:columns]):
+        words = textwrap.fill(head, round(18 * panel_in))
+        write(left + (column + 0.5) * side, tops[0] - 0.2 * _DPI, words, 8, INK)
+    write(wide / 2, 0.24 * _DPI, heading, 11, INK, weight="bold")
+    write(wide / 2, high - 0.14 * _DPI, note, 8, SOFT)
+    figure.figimage(canvas, zorder=-1)
+    return figure
+
+
+def blank(width: float, height: float, dpi: float, *, constrained: bool = False) -> Figure:
+    """A figure without axes; sizes in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor=PAPER)
+    if constrained:
+        figure.set_layout_engine("constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_png(figure: Figure, path: Path, colours: int = 0) -> None:
+    """Save, atomically and without a date or a program's name; 0: in all colours."""
+    with warnings.catch_warnings():  # letters that no font here has are drawn as boxes
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        figure.canvas.draw()
+    seen = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(png(seen, colours))
+
+
+def png(image: Image, colours: int = 64) -> bytes:
+    """An image as PNG; few colours are a third of the bytes, 0 keeps them all."""
+    from PIL import Image as Pillow
+
+    file = io.BytesIO()
+    picture = Pillow.fromarray(np.ascontiguousarray(image))
+    (picture.quantize(colours) if colours else picture).save(file, format="png", optimize=True)
+    return file.getvalue()
+
+
+def read_png(
+    source: Path | bytes, where: str = "", *, palette: bool = False
+) -> Shaped[np.ndarray, "h w"]:
+    """[h, w] uint8 or uint16 from a grey PNG; with `palette` also the numbers of its colours.
+
+    Raises:
+        DataError: another kind of picture, or damaged; begins with `where`, else the path.
+    """
+    from PIL import Image as Pillow
+
+    where = where or str(source)
+    try:
+        data = io.BytesIO(source) if isinstance(source, bytes) else source
+        with Pillow.open(data, formats=("PNG",)) as picture:
+            image = np.asarray(picture)
+            mode = picture.mode
+    except (OSError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
+        raise DataError(f"{where} cannot be read ({error})") from error
+    if mode not in ("L", "I;16", "I", *["P"] * palette):
+        raise DataError(f"{where}: expected a grey PNG of 8 or 16 bits")
+    return image if image.dtype == np.uint8 else image.astype(np.uint16)
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour[1:]))
+
 
 MAX_PNG_BYTES = 1 << 26
 _MAX_SIDE_PX = 4096  # of a PNG
@@ -36,30 +260,6 @@ def png_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error})") from error
-
-
-def read_png(data: bytes, where: str) -> np.ndarray:
-    """[h, w] uint8 or uint16 from a grey PNG, its size judged before it is unpacked.
-
-    Raises:
-        DataError: another kind of picture, too large, or damaged; begins with `where`.
-    """
-    width, height, bits, colour = png_header(data, where)
-    if colour != _GREY or bits not in (8, 16):
-        kind = _KINDS.get(colour, f"of type {colour}")
-        raise DataError(
-            f"{where}: the PNG is {kind}, with {bits} bits; expected grey with 8 or 16 bits"
-        )
-    import cv2
-
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise DataError(f"{where}: the PNG cannot be read ({error})") from error
-    dtype = np.uint8 if bits == 8 else np.uint16
-    if image is None or image.shape != (height, width) or image.dtype != dtype:
-        raise DataError(f"{where}: the PNG cannot be read")
-    return image
 
 
 def png_header(data: bytes, where: str) -> tuple[int, int, int, int]:

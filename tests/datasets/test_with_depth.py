@@ -9,9 +9,8 @@ import pytest
 
 from qs3.datasets.with_depth import with_depth
 from qs3.errors import DataError
-from qs3.report.view.cli import VIEW
-from qs3.utils.cli import run
 from tests.datasets.importers.own_clouds import own, write
+from tests.running import main
 
 CLOUD = np.array([[0, 2, 1], [0, 0, 2], [1, 2, 0], [0, 2, 0]], np.float64)
 ZERO = np.zeros((3, 3))
@@ -47,5 +46,5 @@ def test_own_clouds_are_stored_and_shown_without_them(tmp_path, caplog, capsys):
         points = own(tmp_path).open().points[0]
     assert "3 points that are NaN, infinite or (0, 0, 0) left out" in caplog.text
     assert {tuple(p) for p in points.tolist()} == {tuple(p) for p in CLOUD[:3].tolist()}
-    assert run(VIEW, [str(tmp_path / "in"), f"out={tmp_path / 'v.html'}"]) == 0
+    assert main(["view", str(tmp_path / "in"), f"out={tmp_path / 'v.html'}"]) == 0
     assert "3 points without depth left out" in (tmp_path / "v.html").read_text()

@@ -15,8 +15,7 @@ from hypothesis.extra.numpy import arrays
 from qs3.config import hashing
 from qs3.evaluation import confidences as quality
 from qs3.evaluation.estimates_text import MEANINGS, in_words, table, trust_in_words
-from qs3.report.runs.data import read_run
-from qs3.report.runs.page import page
+from qs3.report.run_page import draw
 from qs3.runs.metrics import AccuracyEstimates, Estimates, Trust, read_metrics
 from qs3.runs.predictions import OF_FILES, Predictions, write_predictions_of_files
 from qs3.training.command import headline, train
@@ -250,7 +249,7 @@ def test_a_run_on_one_s_own_scans_says_what_it_can(own):
     assert "expected to be right" in headline(metrics)
     folder = hashing.run_folder(cfg)
     assert read_metrics(folder) == metrics
-    html = page(read_run(folder), {}, {})
+    html = draw(folder, embed=False).page.read_text()
     assert "Quality without labels" in html
     assert MEANINGS["thresholded"] in html
 

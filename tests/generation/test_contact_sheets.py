@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from qs3.generation.command import generate
-from qs3.generation.contact_sheets import _range, clouds_picture, infrared_picture
+from qs3.generation.contact_sheets import clouds_picture, infrared_picture, shown_range
 from qs3.store.store import open_pointset
 from tests.generation.generating import config, fingerprint
 
@@ -55,33 +55,15 @@ def test_force_takes_old_pictures_and_views_away(meshes, tmp_path):
     assert len(open_pointset(folder)) == 9
 
 
-def test_one_scale_a_row(tmp_path):
-    """A cloud of half the size covers about a quarter of the area that its row's largest does."""
-    rng = np.random.default_rng(0)
-    ball = rng.normal(size=(4000, 3))
-    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-    clouds = {"chair": [{"points": ball}, {"points": ball / 2}], "lamp": [{"points": ball / 9}]}
-    clouds_picture(tmp_path / "c.png", clouds, "heading", twin=False)
-    ink = (picture(tmp_path / "c.png") < 245).any(axis=2)
-    rows = {"chair": slice(62, 187), "lamp": slice(187, 312)}  # pixels: 100 an inch
-    widths = []
-    for cls, first in (("chair", 100), ("chair", 225), ("lamp", 100)):
-        columns = np.flatnonzero(ink[rows[cls], first : first + 125].any(axis=0))
-        widths.append(np.ptp(columns))
-    assert widths[0] == pytest.approx(117, abs=5)
-    assert widths[1] == pytest.approx(widths[0] / 2, abs=5)
-    assert widths[2] == pytest.approx(widths[0], abs=5)  # another row, another scale
-
-
 def test_an_image_is_told_apart_where_the_object_is():
     """One in ten of its pixels was matched with something else, anywhere in the search range."""
     rng = np.random.default_rng(0)
     values = rng.uniform(16, 18, 9000)
-    low, high = _range(np.concatenate([values, rng.uniform(1, 90, 1000)]))
+    low, high = shown_range(np.concatenate([values, rng.uniform(1, 90, 1000)]))
     assert low == pytest.approx(15.2, abs=0.4)
     assert high == pytest.approx(18.8, abs=0.4)
-    assert _range(values) == pytest.approx(np.percentile(values, [1, 99]))
-    assert _range(np.array([3.0])) == (3, 3)
+    assert shown_range(values) == pytest.approx(np.percentile(values, [1, 99]))
+    assert shown_range(np.array([3.0])) == (3, 3)
 
 
 def test_a_class_without_clouds_and_a_view_without_depth_are_drawn(tmp_path):

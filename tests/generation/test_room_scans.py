@@ -26,7 +26,7 @@ from qs3.generation.scenes import Room, Support
 from qs3.geometry.cameras import Camera, Intrinsics, look_at, project
 from qs3.meshes.mesh import Mesh
 from qs3.meshes.placement import OnFurniture
-from qs3.report.inspection.surface import surfaces_of
+from qs3.report.datasets import surfaces_of
 from qs3.sensors.renderers.base import Scene
 from qs3.store.manifest import ManifestRow
 from qs3.utils.seeding import object_rng

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from qs3.inference.inputs import Sample
-from qs3.inference.page import Gallery, page
-from qs3.inference.thumbnails import around, depth_png
+from qs3.inference.page import Gallery, around, depth_png, page
 
 HIGH, WIDE = 240, 320
 
@@ -49,7 +48,6 @@ def test_no_object_keeps_its_frame() -> None:
         gallery.add(sample.row("", np.array([0.5 + i / 200, 0.5 - i / 200])), sample)
     shown = gallery.shown()
     assert [row.file for row, _ in shown] == [str(i) for i in range(20)]  # least sure first
-    assert len(gallery) == 60
     for row, sample in shown:
         depth, own = sample.picture
         assert depth.base is None
@@ -59,7 +57,7 @@ def test_no_object_keeps_its_frame() -> None:
 
 @pytest.mark.parametrize(
     ("label", "said"),
-    [("", "No labels were given, so"), ("mug", "No label given is a class of the net, so")],
+    [("", "No labels were given:"), ("mug", "No label given is a class of the net:")],
 )
 def test_the_page_says_why_nothing_was_judged(label: str, said: str) -> None:
     gallery = Gallery(("a", "b"))
@@ -68,7 +66,7 @@ def test_the_page_says_why_nothing_was_judged(label: str, said: str) -> None:
     gallery.add(row, sample)
     text = page("x", [row], gallery, ("a", "b"))
     assert said in text
-    assert text.count("so nobody knows which are right") == 1
+    assert text.count("it is not known which are right") == 1
 
 
 @pytest.mark.parametrize("third", ["", "mug"])

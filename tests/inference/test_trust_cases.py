@@ -13,11 +13,10 @@ import torch
 from omegaconf import OmegaConf
 from scipy.stats import spearmanr
 
-from qs3.errors import DataError
+from qs3.errors import DataError, MissingDataError
 from qs3.evaluation.trust import expected
 from qs3.evaluation.trust_file import PATH, write_calibration
 from qs3.inference.predictor import load
-from qs3.report.figures.canvas import NothingToDrawError
 from qs3.runs.metrics import METRICS
 from tests.composing import compose
 from tests.inference.conftest import overrides_of
@@ -88,7 +87,7 @@ def test_runs_with_labels_of_the_target_or_another_source_are_refused(whole, tmp
     with pytest.raises(DataError, match="labels of the target"):
         trust_known.run_net(supervised)
     other = changed(whole, tmp_path / "b", lambda about: about["data"].update(source="0" * 64))
-    with pytest.raises(NothingToDrawError, match="another version"):
+    with pytest.raises(MissingDataError, match="another version"):
         trust_known.run_net(other)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from qs3.config import hashing
 from qs3.errors import DataError
-from qs3.report.runs.data import read_run
+from qs3.report.run_files import read_run
 from qs3.report.tables.aggregate import load_run, summarise
 from qs3.report.tables.formats import markdown
 from qs3.report.tables.table import build_table

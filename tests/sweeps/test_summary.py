@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.report.runs.pictures import of_sweep
+from qs3.report.run_page import of_sweep
 from qs3.sweeps.summary import SummaryOfSeeds, differences, failures
 from tests.report.made_runs import write_run
 

@@ -10,7 +10,7 @@ from qs3.datamodules.domain import DomainData
 from qs3.datasets.domain import compose_domain
 from qs3.datasets.importers.object_archive import read_archive
 from qs3.errors import ConfigError, DataError, Qs3Error
-from qs3.report.inspection.open_dataset import open_named
+from qs3.report.datasets import open_named
 from qs3.store.store import is_finished, read_manifest
 from tests.fixtures.frame_files import write_archive
 

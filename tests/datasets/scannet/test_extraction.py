@@ -12,7 +12,7 @@ from qs3.datasets.domain import Domain
 from qs3.datasets.scannet.extraction import extract
 from qs3.datasets.scannet.settings import Extraction
 from qs3.errors import ConfigError, DataError, MissingDataError
-from qs3.report.inspection.surface import distance_to_mesh
+from qs3.report.datasets import distance_to_mesh
 from qs3.store.store import read_manifest
 from tests.datasets.scannet.conftest import LOST
 from tests.datasets.scannet.rooms import write_lists, write_scene

@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from qs3.report.judge.judging import _families
-from qs3.report.runs.data import read_run
-from qs3.report.runs.page import key_figures
+from qs3.report.run_files import read_run
+from qs3.report.run_page import key_figures
 from qs3.report.tables.aggregate import summarise
 from qs3.report.tables.comparison import effects, text
 from qs3.report.tables.formats import csv_text, grid, latex, markdown

@@ -1,1 +1,0 @@
-"""Pictures of data: contact sheets, class balance, an object through the pipeline."""

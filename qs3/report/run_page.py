@@ -1,0 +1,378 @@
+"""A run's charts as files in `<run>/pictures`, and a page with them and its clouds.
+
+A picture that has nothing to show is left out, and the page gives the reason.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from qs3.config.hydra import in_multirun
+from qs3.errors import MissingDataError, Qs3Error
+from qs3.evaluation.estimates_text import table as quality_table
+from qs3.evaluation.selection_rules import chosen_in_words
+from qs3.report import run_charts
+from qs3.report.datasets import opened_domain, part_of
+from qs3.report.run_files import RunFiles, domain_of, open_domain, read_run
+from qs3.report.sheets import scan_picture
+from qs3.report.viewer import Part, viewer
+from qs3.runs.metrics import RunMetrics, read_metrics
+from qs3.utils.files import make_folder, write_text
+from qs3.utils.page import render
+from qs3.utils.pictures import save_png
+from qs3.utils.seeding import derive
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+FOLDER, PAGE = "pictures", "index.html"
+ROLES = ("source", "target")
+_CLOUDS, _POINTS = 30, 1024  # on the page: a quarter of a megabyte a run
+_FEATURES = 600  # clouds of each domain in the picture of features
+_WARMUP = "warmup_selected.pt"  # of qs3.selftraining.callback, which imports Lightning
+_TITLES = {
+    "curves": "Training",
+    "confusion": "Confusion of classes",
+    "pseudo_labels": "Pseudo-labels",
+    "classes": "Balance of classes",
+    "calibration": "Calibration",
+    "embedding": "Features of both domains",
+    "domains": "One object of each class",
+    "clouds": "Clouds to turn",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What became of a run's pictures: PNG by name, reasons by name, and the page."""
+
+    pictures: Mapping[str, Path]
+    skipped: Mapping[str, str]
+    page: Path
+
+
+def draw(
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    data_dir: str | Path | None = None,
+    embed: bool = True,
+    config: Mapping[str, Any] | None = None,
+    packages: Sequence[str] = (),
+) -> Drawn:
+    """Draw a run's pictures; those of an earlier call are replaced.
+
+    Args:
+        folder: of the run.
+        out: folder for the files; None: `pictures` in the run's.
+        data_dir: where the datasets lie; None: where the run's config says.
+        embed: also show the features of both domains; takes a minute.
+        config: of the run; None: what Hydra wrote into its folder.
+        packages: where a net of one's own is defined, beside those of qs3; the code there is run.
+
+    Raises:
+        MissingDataError, DataError: see `read_run`.
+    """
+    run = read_run(folder)
+    if config is not None:
+        run = dataclasses.replace(run, config=config)
+    out = make_folder(run.folder / FOLDER if out is None else Path(out))
+    charts: dict[str, Callable[[], Figure | str]] = {
+        "curves": lambda: run_charts.curves(run),
+        "confusion": lambda: run_charts.confusion(run),
+        "pseudo_labels": lambda: run_charts.pseudo_labels(run),
+        "classes": lambda: run_charts.classes(run, _train_labels(run, data_dir)),
+        "calibration": lambda: run_charts.calibration(run),
+        **({"embedding": lambda: _embedding(run, data_dir, packages)} if embed else {}),
+        "domains": lambda: _domains(run, data_dir),
+    }
+    pictures, skipped, clouds = {}, {}, {}
+    for name, make in charts.items():
+        path = out / f"{name}.png"
+        path.unlink(missing_ok=True)
+        try:
+            figure = make()
+        except Qs3Error as error:  # damaged data cost their pictures alone
+            figure = str(error)
+        if isinstance(figure, str):
+            skipped[name] = figure
+        else:
+            save_png(figure, path, colours=256 if name == "domains" else 0)
+            pictures[name] = path
+    try:
+        part = part_of_run(run, worst_first(run)[:_CLOUDS], data_dir, residuals=False)
+        clouds = viewer([part], points=_POINTS)
+    except Qs3Error as error:
+        skipped["clouds"] = str(error)
+    write_text(out / PAGE, _page(run, pictures, skipped, clouds))
+    return Drawn(pictures, skipped, out / PAGE)
+
+
+def _page(
+    run: RunFiles,
+    pictures: Mapping[str, Path],
+    skipped: Mapping[str, str],
+    clouds: Mapping[str, Any],
+) -> str:
+    """The page as HTML, with its PNGs and clouds inside."""
+    from omegaconf import OmegaConf
+
+    settings = None if run.config is None else OmegaConf.to_yaml(dict(run.config), sort_keys=True)
+    return render(
+        "run",
+        title=run.title,
+        finished=run.metrics is not None,
+        facts=key_figures(run).items(),
+        quality=[] if run.metrics is None else quality_table(run.metrics.quality),
+        command=run.command,
+        pictures=[(_TITLES[name], path.read_bytes()) for name, path in pictures.items()],
+        skipped=[(_TITLES[name], reason) for name, reason in skipped.items()],
+        settings=settings,
+        **{"about": (), "notes": (), "data": None, **clouds},
+    )
+
+
+def key_figures(run: RunFiles) -> dict[str, str]:
+    """What the page shows first, in order."""
+    if run.metrics is None:
+        return {"epochs done": str(0 if run.history is None else len(run.history))}
+    m, final = run.metrics, run.metrics.final
+    found = {
+        "source": f"{m.source}, made of: {m.made_of.source}",
+        "target": f"{run.target}, made of: {m.made_of.target}",
+        "method": m.method,
+        "self-training": m.selftraining,
+        "model": m.model,
+        "clouds evaluated": str(final.n),
+    }
+    if final.accuracy is None:
+        found["accuracy"] = "not known: the target has no labels"
+    else:
+        found["accuracy"] = f"{final.accuracy:.1%}"
+        found["balanced accuracy"] = f"{final.balanced_accuracy:.1%}"
+        found["majority rate"] = f"{final.majority_rate:.1%}"
+    if final.calibration_error is not None:
+        note = run_charts.EVALUATION_ONLY
+        found["expected calibration error"] = f"{final.calibration_error:.1%} ({note})"
+    before = m.warmup.selected.scores.accuracy
+    if run.rounds and before is not None:
+        found["accuracy before self-training"] = f"{before:.1%}"
+    found["teacher selected by"] = chosen_in_words(m.selection.teacher)
+    if run.rounds:
+        found["student selected by"] = chosen_in_words(m.selection.student)
+    found["time"] = f"{m.times.seconds:.0f} s"
+    found["hash of the settings"] = m.hash
+    found["versions"] = ", ".join(f"{k} {v}" for k, v in m.versions.items())
+    return found
+
+
+def _train_labels(run: RunFiles, data_dir: str | Path | None) -> np.ndarray | None:
+    """[n] labels of the target's training split, if the run's dataset is there and has some."""
+    try:
+        data = open_domain(run, "target", data_dir)
+    except Qs3Error:
+        return None  # the picture is complete without them
+    return np.array(data.labels[data.indices("train")]) if data.labelled else None
+
+
+def _domains(run: RunFiles, data_dir: str | Path | None) -> Figure | str:
+    """One object of each class in both domains."""
+    sets = {role: open_domain(run, role, data_dir) for role in ROLES}
+    if not all(data.labelled for data in sets.values()):
+        return "a domain has no labels to choose objects by"
+    if sets["source"].classes != sets["target"].classes:
+        return "the two domains do not have the same classes"
+    titles = (f"{role}: {domain_of(run, role, data_dir).label}" for role in ROLES)
+    return scan_picture(dict(zip(titles, sets.values(), strict=True)))
+
+
+def _embedding(run: RunFiles, data_dir: str | Path | None, packages: Sequence[str]) -> Figure | str:
+    """PCA of the global features of test clouds of source and target, before and after.
+
+    "Before" are the weights that the warm-up selected, "after" those of the result: without rounds
+    they are the same, and there is one panel. Which clouds follows from the run's seed.
+    """
+    from qs3.datamodules.splits import load_clouds
+    from qs3.evaluation.metrics import global_features
+    from qs3.inference.model_file import PACKAGES, build_net, read_result
+    from qs3.runs.checkpoints import load
+
+    sets = {role: open_domain(run, role, data_dir) for role in ROLES}
+    assert run.metrics is not None
+    result, packages = read_result(run.folder), (*PACKAGES, *packages)
+    nets = {"result": build_net(result, packages)}
+    if run.rounds and (run.folder / _WARMUP).is_file():
+        before = dataclasses.replace(result, weights=load(run.folder / _WARMUP))
+        nets = {"after the warm-up": build_net(before, packages),
+                "after self-training": nets["result"]}  # fmt: skip
+    if not all(callable(getattr(net, "features", None)) for net in nets.values()):
+        return "the net has no features"
+    parts, labels, names = {}, [], []
+    for role, data in sets.items():
+        split = "test" if "test" in data.counts() else "train"
+        points = load_clouds(data, split, result.points, scale=result.scale).points
+        rng = np.random.default_rng(derive(run.metrics.seed, "embedding", role))
+        chosen = np.sort(rng.permutation(len(points))[:_FEATURES])
+        parts[role] = points[chosen]
+        labels.append(np.array(data.labels[data.indices(split)])[chosen])
+        names.append(f"{role}: {data.name}, {split}")
+    features = {
+        title: np.concatenate(
+            [global_features(net, part, 32, domain=role) for role, part in parts.items()]
+        )
+        for title, net in nets.items()
+    }
+    colours = "colours are true classes, evaluation only"
+    if (labels[1] < 0).all():
+        colours = "colours are the source's classes; those of the target are not known"
+    title = f"{run.title}, on {run.target}: features of clouds (PCA)\n{colours}"
+    domain = np.repeat([0, 1], [len(part) for part in labels])
+    return run_charts.embedding(title, features, np.concatenate(labels), domain, run.classes, names)
+
+
+def worst_first(run: RunFiles, match: str = "") -> list[int]:
+    """Positions in the run's predictions of ids that hold `match`; none without predictions.
+
+    First the errors, the most confident before the others; then all else, the least confident
+    first.
+    """
+    p = run.predictions
+    if p is None:
+        return []
+    wrong = (p.labels >= 0) & (p.predicted != p.labels)
+    sure = p.probabilities.max(axis=1)
+    order = np.lexsort((np.where(wrong, -sure, sure), ~wrong))
+    return [int(i) for i in order if match in p.ids[i]]
+
+
+def part_of_run(
+    run: RunFiles,
+    positions: Sequence[int],
+    data_dir: str | Path | None = None,
+    *,
+    residuals: bool = True,
+    advance: Callable[[], None] = lambda: None,
+) -> Part:
+    """Clouds of the run's target with its result's predictions.
+
+    Args:
+        run: finished.
+        positions: in its predictions.
+        data_dir: where the datasets lie; None: where the run's config says.
+        residuals, advance: as `part_of`.
+
+    Raises:
+        MissingDataError: the run's target is not there, or there are no predictions.
+        DataError: it is damaged.
+    """
+    p, m = run.predictions, run.metrics
+    if p is None or m is None:
+        raise MissingDataError(f"{run.folder} has no predictions; repeat its command")
+    data = open_domain(run, "target", data_dir)
+    place = {id_: i for i, id_ in enumerate(data.ids)}
+    rows = [place[p.ids[i]] for i in positions]
+    opened = opened_domain(domain_of(run, "target", data_dir), data)
+    part = part_of(opened, rows, residuals=residuals, advance=advance)
+    sure = p.probabilities.max(axis=1)
+    shown = [
+        dataclasses.replace(
+            one,
+            label="" if p.labels[i] < 0 else p.classes[p.labels[i]],
+            called=p.classes[p.predicted[i]],
+            sure=float(sure[i]) if np.isfinite(sure[i]) else None,  # JSON knows no NaN
+        )
+        for one, i in zip(part.shown, positions, strict=True)
+    ]
+    wrong = int(((p.labels >= 0) & (p.predicted != p.labels)).sum())
+    order = f"{wrong} are wrong, the most confident first" if wrong else "in doubt first"
+    about = (
+        f"{run.title}, target {run.target}: {len(shown)} of {len(p.ids)} clouds; {order}; the "
+        f"target is made of: {m.made_of.target}; trained on {m.source} ({m.made_of.source})"
+    )
+    return dataclasses.replace(part, shown=shown, about=about)
+
+
+@dataclass(frozen=True)
+class AfterTraining:
+    """Draws a finished run's pictures, and logs them to wandb's active run, if there is one.
+
+    A picture that cannot be made is a warning: the result is saved already.
+
+    Attributes:
+        pictures: False draws nothing, "auto" nothing in a sweep: they would take as long as many a
+            run, and the sweep draws its first run's (`of_sweep`).
+    """
+
+    pictures: bool | Literal["auto"] = "auto"
+
+    def __call__(self, folder: Path, config: Mapping[str, Any] | None = None) -> None:
+        """Draw those of the run in `folder`, by its composed config or the one that lies there."""
+        if not self.pictures or (self.pictures == "auto" and in_multirun()):
+            return
+        try:
+            drawn = draw(folder, embed=False, config=config)
+            _log_to_wandb(drawn, read_metrics(folder))
+            log.info("pictures: %s", drawn.page)
+        except Exception as error:
+            log.warning(
+                "the run is finished, but its pictures failed (%s: %s); qs3 report page "
+                "run=%s draws them again",
+                type(error).__name__,
+                error,
+                folder,
+            )
+
+
+def of_sweep(folders: Sequence[Path]) -> str:
+    """Draw the first finished run's pictures, unless it has some.
+
+    Args:
+        folders: of the runs that left their pictures to the sweep, in order.
+
+    Returns:
+        A line with the page for the terminal; "" if no run is finished, or its pictures failed.
+    """
+    first = next((folder for folder in folders if read_metrics(folder) is not None), None)
+    if first is None:
+        return ""
+    path = first / FOLDER / PAGE
+    if not path.is_file():
+        AfterTraining(pictures=True)(first)
+    if not path.is_file():
+        return ""
+    more = "; of another run: qs3 report page run=PATH" if len(folders) > 1 else ""
+    return f"pictures: {path}{more}\n"
+
+
+def _log_to_wandb(drawn: Drawn, metrics: RunMetrics | None) -> None:
+    wandb: Any = sys.modules.get("wandb")  # not imported: there is no such logger
+    if wandb is None or wandb.run is None or metrics is None:
+        return
+    content: dict[str, Any] = {
+        f"pictures/{name}": wandb.Image(str(path)) for name, path in drawn.pictures.items()
+    }
+    final = metrics.final
+    if final.confusion is not None:
+        names = list(final.predicted)
+        content["confusion"] = wandb.Table(
+            columns=["true class", *names],
+            data=[[name, *row] for name, row in zip(names, final.confusion, strict=True)],
+        )
+    wandb.run.log(content)
+    wandb.run.summary.update(
+        {
+            f"final/{key}": value
+            for key, value in vars(final).items()
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        }
+    )

@@ -1,1 +1,0 @@
-"""Pictures and the page of one run."""

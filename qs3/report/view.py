@@ -1,0 +1,157 @@
+"""`qs3 view`: from paths to a page of clouds; what each path is, and which clouds are shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from qs3.config.compose import choices
+from qs3.datasets.clouds.files import SUFFIXES, parse_clouds
+from qs3.datasets.clouds.finite import checked
+from qs3.datasets.importers.base import turned
+from qs3.datasets.importers.object_archive import JUDGE, is_archive, read_archive
+from qs3.datasets.with_depth import with_depth
+from qs3.errors import DataError, MissingDataError
+from qs3.geometry.sampling import surface_sample
+from qs3.inference.inputs import find_files
+from qs3.meshes.io import DECLARE_UP, is_mesh, load_mesh
+from qs3.meshes.io import SUFFIXES as MESHES
+from qs3.report.datasets import chosen, open_named, part_of
+from qs3.report.run_files import is_run, read_run
+from qs3.report.run_page import part_of_run, worst_first
+from qs3.report.sheets import drawn
+from qs3.report.viewer import Part, Shown, page, points_each
+from qs3.store.store import is_finished
+from qs3.utils.progress import progress_bar
+from qs3.utils.text_table import printable
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is shown of each path; see `qs3 view --help`."""
+
+    match: str = ""
+    up: str = "z"
+    variant: str = ""
+    residual: bool = True
+    data_dir: Path | None = None
+    points: int | None = None
+
+
+def view(
+    paths: Sequence[str], clouds: int, colour: str, wanted: Wanted
+) -> tuple[str, list[str], list[str]]:
+    """The page, what is on it, and what could not be read, a line each.
+
+    Raises:
+        MissingDataError, DataError: nothing can be shown at all.
+    """
+    share = max(1, clouds // len(paths))
+    parts = [_part(path, share, wanted) for path in paths]
+    title = ", ".join(Path(path).absolute().name for path in paths)
+    failed = [words for part in parts for words in part.failed]
+    return page(title, parts, colour, wanted.points), [part.about for part in parts], failed
+
+
+def _part(path: str, most: int, wanted: Wanted) -> Part:
+    place = Path(path).expanduser()
+    if is_finished(place) or (not place.exists() and path in choices("domain")):
+        given = {"variant": wanted.variant, "paths.data_dir": str(wanted.data_dir or "")}
+        opened = open_named(path, {key: value for key, value in given.items() if value})
+        positions = chosen(opened.data, most, wanted.match)
+        with progress_bar("clouds", total=len(positions)) as advance:
+            return part_of(opened, positions, residuals=wanted.residual, advance=advance)
+    if is_run(place):
+        run = read_run(place)
+        positions = worst_first(run, wanted.match)[:most]
+        with progress_bar("clouds", total=len(positions)) as advance:
+            return part_of_run(
+                run, positions, wanted.data_dir, residuals=wanted.residual, advance=advance
+            )
+    if not place.exists():
+        raise MissingDataError(f"{path} is neither there nor the name of a domain")
+    return _archive(place, most, wanted) if is_archive(place) else _files(place, most, wanted)
+
+
+def _archive(path: Path, most: int, wanted: Wanted) -> Part:
+    archive = read_archive(path)
+    names = [f"{archive.cls[i]}/{i}" for i in range(len(archive))]
+    open_ = archive.dev != JUDGE  # that one is looked at once for a rule, by `qs3 report judge`
+    there = np.flatnonzero([wanted.match in name for name in names] & open_)
+    some = drawn(there, most)
+    shown = [
+        Shown(
+            names[i],
+            archive.cloud(i, inliers_only=True),
+            label=str(archive.cls[i]),
+            note=", ".join(dict.fromkeys((str(archive.sub[i]), str(archive.tier[i])))),
+        )
+        for i in sorted(some, key=lambda i: str(archive.cls[i]))
+    ]
+    without = "" if open_.all() else f" without the part {JUDGE}"
+    return Part(shown, f"{len(shown)} of {open_.sum()} objects of {path.name}{without}", unit="m")
+
+
+def _files(place: Path, most: int, wanted: Wanted) -> Part:
+    files, root, _ = find_files(place, key="", suffixes=(*SUFFIXES, *MESHES))
+    names = [path.relative_to(root).as_posix() for path in files]
+    few = drawn(np.flatnonzero([wanted.match in name for name in names]), most)
+    shown: list[Shown] = []
+    failed: list[str] = []
+    with progress_bar("files", total=len(few)) as advance:
+        for i in few:
+            name = printable(names[i])
+            read = _of_mesh if is_mesh(files[i]) else _of_file
+            for one in read(files[i], name, wanted, len(few)):
+                if isinstance(one, Shown):
+                    shown.append(one)
+                else:
+                    failed.append(one)
+            advance()
+    about = place.name if place.is_file() else f"{len(few)} of {len(files)} files in {place.name}"
+    kept = [shown[i] for i in drawn(np.arange(len(shown)), most)]
+    return Part(kept, f"{about}, {len(kept)} of {len(shown)} clouds", failed=failed)
+
+
+def _of_mesh(path: Path, name: str, wanted: Wanted, files: int) -> Iterator[Shown | str]:
+    """Samples of a surface, as its vertices alone show little; or why there are none."""
+    count = points_each(files, wanted.points)
+    try:
+        mesh = load_mesh(path)
+        cloud = surface_sample(mesh.vertices, mesh.faces, count, np.random.default_rng(0))
+        cloud = checked(cloud, name)
+    except DataError as error:
+        yield f"{name}: {error}"
+        return
+    if path.suffix.lower() not in DECLARE_UP:
+        cloud = turned(cloud, wanted.up)
+    yield Shown(
+        name, cloud, label=Path(name).parent.name, note=f"samples of {len(mesh.faces)} faces"
+    )
+
+
+def _of_file(path: Path, name: str, wanted: Wanted, files: int) -> Iterator[Shown | str]:
+    """A file's clouds, or why one cannot be shown.
+
+    Their class is that of the file, else the name of the file's folder.
+    """
+    try:
+        found = parse_clouds(path)
+    except DataError as error:
+        yield f"{name}: {error}"
+        return
+    for i, given in enumerate(found.clouds):
+        own = f"{name}[{i}]" if found.many else name
+        label = Path(name).parent.name if found.labels is None else found.labels[i]
+        words = label.decode(errors="replace") if isinstance(label, bytes) else str(label)
+        try:
+            seen, dropped = with_depth(given, own)
+            cloud = turned(checked(seen, own), wanted.up)
+        except DataError as error:
+            yield f"{own}: {error}"
+            continue
+        note = f"{dropped} points without depth left out" if dropped else ""
+        yield Shown(own, cloud, label=printable(words), note=note)

@@ -1,0 +1,309 @@
+"""A run's pictures and page show what its files hold; what is missing or damaged is named."""
+
+import base64
+import csv
+import json
+import logging
+import os
+import re
+import shutil
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.config import hashing
+from qs3.errors import DataError, MissingDataError
+from qs3.inference.model_file import Result, write_result
+from qs3.models.pointnet import pointnet
+from qs3.report import run_charts
+from qs3.report.run_files import read_run
+from qs3.report.run_page import AfterTraining, draw, of_sweep
+from qs3.runs.checkpoints import save
+from qs3.runs.metrics import DataHashes, EpochScores, Scores, StudentChoice, read_metrics
+from qs3.runs.predictions import read_predictions, write_predictions
+from qs3.training.command import train
+from tests.report.made_runs import change, not_blank, table
+from tests.report.pages import data_of
+from tests.report.wandb_files import read
+from tests.running import main
+from tests.training.toy import CLASSES
+
+ALL = ["curves", "confusion", "pseudo_labels", "classes", "calibration", "domains"]
+
+
+def texts(ax):
+    return [text.get_text() for text in ax.texts]
+
+
+def line(ax, label):
+    (found,) = [each for each in ax.lines if each.get_label() == label]
+    return np.array(found.get_xdata()), np.array(found.get_ydata())
+
+
+def heights(ax, label):
+    (bars,) = [each for each in ax.containers if each.get_label() == label]
+    return [bar.get_height() for bar in bars]
+
+
+def test_files_and_page(run, tmp_path):
+    drawn = draw(run, embed=False)
+    assert list(drawn.pictures) == ALL
+    assert drawn.skipped == {}
+    for name, path in drawn.pictures.items():
+        assert path == run / "pictures" / f"{name}.png"
+        assert not_blank(path), name
+    again = draw(run, tmp_path / "elsewhere", embed=False)
+    for name, path in again.pictures.items():
+        assert path.read_bytes() == drawn.pictures[name].read_bytes(), name
+    page = drawn.page.read_text()
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    images = re.findall(r"base64,([A-Za-z0-9+/=]+)\"", page)
+    assert [base64.b64decode(i) for i in images] == [
+        path.read_bytes() for path in drawn.pictures.values()
+    ]
+    metrics = read_metrics(run)
+    for words in (
+        f"<td>{metrics.final.accuracy:.1%}</td>",
+        "kinectsim10 (simulated)",
+        "python train.py experiment=quickstart",
+        "  epochs: 4",
+        f"source_val, epoch {metrics.warmup.selected.epoch + 1}<",
+    ):
+        assert words in page
+    shown = data_of(page)["clouds"]
+    wrong = [cloud["label"] != cloud["called"] for cloud in shown]
+    assert wrong == sorted(wrong, reverse=True)
+    assert len(shown) == 24
+
+
+def test_curves_are_the_history(run):
+    last = EpochScores(epoch=9, scores=read_metrics(run).final)
+    scores = {"7": 0.1, "8": 0.3, "9": 0.2}
+    student = StudentChoice(rule="snd", epoch=8, score=0.3, scores=scores, held_out=0, last=last)
+    change(run, student=student)
+    rows, axes = table(run / "history.csv"), run_charts.curves(read_run(run)).axes
+    loss, accuracy = line(axes[0], "train/loss"), line(axes[1], "source_val/acc")
+    from_1 = [int(row["epoch"]) + 1 for row in rows]
+    np.testing.assert_allclose(loss, [from_1, [float(row["train/loss"]) for row in rows]])
+    np.testing.assert_allclose(accuracy[1], [100 * float(r["source_val/acc"]) for r in rows])
+    np.testing.assert_allclose(line(axes[2], "lr")[1], [float(row["lr"]) for row in rows])
+    assert texts(axes[0]) == ["warm-up", "round 0", "round 1"]
+    assert [p.get_x() for p in axes[0].patches] == [0.5, 7.5]  # warm-up and every other round
+    teacher = read_metrics(run).warmup.selected.epoch
+    assert line(axes[0], f"teacher: epoch {teacher + 1}")[0].tolist() == [teacher + 1] * 2
+    assert line(axes[1], "student: epoch 9")[0].tolist() == [9, 9]
+
+
+def test_confusion_is_that_of_the_predictions(run):
+    figure = run_charts.confusion(read_run(run))
+    rows = table(run / "predictions.csv")
+    counts = Counter((row["label"], row["predicted"]) for row in rows)
+    drawn = np.array(figure.axes[0].images[0].get_array())
+    per_class = Counter(row["label"] for row in rows)
+    for i, true in enumerate(CLASSES):
+        for j, predicted in enumerate(CLASSES):
+            assert drawn[i, j] == pytest.approx(counts[true, predicted] / per_class[true])
+    words = [t.split("\n") for t in texts(figure.axes[0]) if t]
+    assert sorted(int(n) for n, _ in words) == sorted(counts.values())
+    final, title = read_metrics(run).final, figure.get_suptitle()
+    for key in ("accuracy", "balanced_accuracy", "majority_rate"):
+        assert f"{getattr(final, key):.1%}" in title
+
+
+def test_pseudo_labels_are_those_of_the_tables(run):
+    axes = run_charts.pseudo_labels(read_run(run)).axes
+    records = read_metrics(run).rounds
+    for r, record in enumerate(records):
+        rows = table(run / f"round_{r:02d}" / "pseudo_labels.csv")
+        kept = Counter(row["label"] for row in rows if row["selected"] == "1")
+        for k, name in enumerate(CLASSES):
+            assert f"{kept[name]}/{record.confident[name]}" in texts(axes[0])
+            assert np.array(axes[1].images[0].get_array())[k, r] == record.mu[name]
+        assert heights(axes[2], "selected")[r] == sum(kept.values())
+        assert heights(axes[2], "confident")[r] == record.total_confident
+    theta = line(axes[3], "theta, the confidence asked for")[1]
+    assert theta.tolist() == [record.theta for record in records]
+    for key in ("precision", "recall"):
+        judged = line(axes[3], f"{key} (with target labels, evaluation only)")[1]
+        assert judged.tolist() == [getattr(r.with_target_labels, key) for r in records]
+    shutil.rmtree(run / "round_00")  # then counts are those of metrics.json
+    axes = run_charts.pseudo_labels(read_run(run)).axes
+    first = [texts(axes[0])[2 * k] for k in range(3)]
+    assert first == [f"{records[0].selected[c]}/{records[0].confident[c]}" for c in CLASSES]
+
+
+def test_classes_are_counted(run):
+    axes = run_charts.classes(read_run(run), np.repeat([0, 1, 2], [5, 6, 7])).axes
+    rows = table(run / "predictions.csv")
+    predicted = Counter(row["predicted"] for row in rows)
+    true = "true (with target labels, evaluation only)"
+    assert heights(axes[1], "predicted by the result") == [predicted[name] for name in CLASSES]
+    assert heights(axes[1], true) == [8, 8, 8]
+    assert heights(axes[0], true) == [5, 6, 7]
+    named = Counter(row["label"] for row in table(run / "round_01" / "pseudo_labels.csv"))
+    assert heights(axes[0], "named by the teacher of round 1") == [named[name] for name in CLASSES]
+
+
+def test_a_net_that_has_diverged_has_no_calibration_and_a_page_that_browsers_read(run):
+    """JSON.parse takes no NaN: the page would stay without its clouds."""
+    p = read_predictions(run / "predictions.csv")
+    lost = replace(p, probabilities=np.full_like(p.probabilities, np.nan))
+    write_predictions(run / "predictions.csv", lost)
+    drawn = draw(run, embed=False)
+    assert "diverged" in drawn.skipped["calibration"]
+    assert {one["sure"] for one in data_of(drawn.page.read_text())["clouds"]} == {None}
+
+
+def test_unlabelled_target(run):
+    metrics = read_metrics(run)
+    final = Scores(n=metrics.final.n, predicted=metrics.final.predicted)
+    rounds = [replace(record, with_target_labels=None) for record in metrics.rounds]
+    change(run, final=final, rounds=rounds)
+    rows = table(run / "predictions.csv")
+    with open(run / "predictions.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows({**row, "label": ""} for row in rows)
+    drawn = draw(run, embed=False)
+    assert {*drawn.skipped} == {"confusion", "calibration"}
+    assert "in doubt first" in drawn.page.read_text()
+    axes = run_charts.pseudo_labels(read_run(run)).axes
+    assert not any("precision" in str(each.get_label()) for each in axes[3].lines)
+    assert len(run_charts.classes(read_run(run)).axes[1].containers) == 1
+
+
+def test_unfinished_run_and_stale_pictures(run):
+    (run / "metrics.json").unlink()
+    (run / "predictions.csv").unlink()
+    (run / "pictures").mkdir()
+    (run / "pictures" / "confusion.png").touch()
+    drawn = draw(run)
+    assert list(drawn.pictures) == ["curves", "pseudo_labels", "classes"]
+    assert not (run / "pictures" / "confusion.png").exists()
+    assert "not finished" in drawn.page.read_text()
+    (run / "history.csv").write_text("epoch,phase,lr\n")
+    assert "no epoch" in draw(run).skipped["curves"]
+    with pytest.raises(MissingDataError):
+        draw(run.parent)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("history.csv", ""),
+        ("predictions.csv", "id,mesh\n"),
+        ("round_01/pseudo_labels.csv", "id,label,confidence,selected\na,ball,much,1\n"),
+        ("metrics.json", "{"),
+        (".hydra/config.yaml", "a: [1"),
+    ],
+)
+def test_damaged_files_are_named(run, name, text):
+    (run / name).write_text(text)
+    with pytest.raises(DataError, match=re.escape(name.split("/")[0])):
+        draw(run, embed=False)
+
+
+def use_real_net(run, target="qs3.models.pointnet.pointnet"):
+    """A small net of ours in place of the toy's, with features."""
+    torch.manual_seed(0)
+    model = {"_target_": target, "num_classes": 3, "variant": "basic"}
+    first, second = (pointnet(num_classes=3, variant="basic").state_dict() for _ in range(2))
+    save(first, run / "warmup_selected.pt")
+    result = Result(model, CLASSES, 32, 64, "kinectsim10", "z", "unit_ball", {}, second)
+    write_result(run / "result.pt", result)
+
+
+def own_net(num_classes, variant):
+    return pointnet(num_classes=num_classes, variant=variant)
+
+
+@pytest.mark.slow
+def test_command_with_a_net_of_ones_own(run, toy_data, tmp_path, capsys):
+    use_real_net(run, f"{__name__}.own_net")
+    assert f"{__name__}.own_net" in draw(run).skipped["embedding"]
+    out = tmp_path / "out"
+    words = ["report", "page", f"run={run}", f"data_dir={toy_data}", f"out={out}"]
+    assert main([*words, f"packages={__name__}"]) == 0
+    shown = [*(f"{name}.png" for name in (*ALL[:5], "embedding", ALL[5])), "index.html"]
+    assert capsys.readouterr().out.splitlines() == [str(out / name) for name in shown]
+    assert not_blank(out / "embedding.png")
+
+
+def test_missing_or_damaged_data_cost_their_pictures_and_not_the_page(run, toy_data, tmp_path):
+    use_real_net(run)
+    data_dir = tmp_path / "copy"
+    shutil.copytree(toy_data, data_dir)
+    (data_dir / "kinectsim10" / "points.npy").write_bytes(b"no array")
+    drawn = draw(run, data_dir=data_dir)
+    assert {*drawn.skipped} == {"embedding", "domains", "clouds"}
+    assert "Features of both domains: " in drawn.page.read_text()
+    assert "is not at" in draw(run, data_dir=tmp_path).skipped["domains"]
+    change(run, data=DataHashes(source="0" * 64, target="0" * 64))
+    assert "another version of specklenet10" in draw(run, embed=False).skipped["domains"]
+
+
+def test_features_of_both_domains_on_the_plane_of_largest_variance():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(40, 6)) * [5, 1, 0.1, 0.1, 3, 0.1]
+    places = run_charts.pca(x)
+    assert places.var(axis=0) == pytest.approx(np.linalg.eigvalsh(np.cov(x.T, bias=True))[:3:-1])
+    np.testing.assert_allclose(run_charts.pca(x + 9), places, atol=1e-9)
+    labels, domain = np.tile([0, 1, 1, -1], 10), np.repeat([0, 1], 20)
+    nets = {"before": x, "after": x**2}
+    figure = run_charts.embedding("t", nets, labels, domain, ("a", "b"), ("s", "t"))
+    assert [ax.get_title() for ax in figure.axes] == ["before", "after"]
+    for ax in figure.axes:
+        assert sum(len(dots.get_offsets()) for dots in ax.collections) == 40
+
+
+def test_training_draws_and_its_hash_does_not_know(toy, tmp_path):
+    cfg = toy("report.pictures=true", "selftraining=none")
+    assert hashing.config_sha256(cfg) == hashing.config_sha256(toy("selftraining=none"))
+    train(cfg)
+    pictures = hashing.run_folder(cfg) / "pictures"
+    assert {p.name for p in pictures.iterdir()} == {
+        *(f"{name}.png" for name in ALL if name != "pseudo_labels"), "index.html",
+    }  # fmt: skip
+    assert str(pictures / "index.html") in of_sweep([tmp_path, hashing.run_folder(cfg)])
+
+
+def test_a_failed_picture_is_a_warning(run, caplog):
+    (run / "pictures").write_text("in the way")
+    with caplog.at_level(logging.WARNING):
+        AfterTraining()(run)
+    assert "the run is finished, but its pictures failed" in caplog.text
+
+
+@pytest.mark.slow
+def test_offline_wandb_holds_config_curves_pictures_and_table(toy):
+    cfg = toy("logger=wandb", "report.pictures=true")
+    metrics = train(cfg)
+    folder = hashing.run_folder(cfg)
+    config, rows, summary, record = read(folder)
+    assert (record.run_group, record.job_type) == ("quickstart", "train")
+    assert record.run_id == hashing.run_name(cfg).replace("/", "-")
+    assert {"specklenet10 -> kinectsim10", "qbst", "simulated"} <= set(record.tags)
+    assert config["protocol"]["epochs"] == 4
+    history = table(folder / "history.csv")
+    losses = [row["train/loss"] for row in rows if "train/loss" in row]
+    assert losses == pytest.approx([float(row["train/loss"]) for row in history])
+    logged = {key: value for row in rows for key, value in row.items() if key.startswith("pict")}
+    assert sorted(logged) == sorted(f"pictures/{name}" for name in ALL)
+    (files,) = folder.glob("wandb/offline-run-*/files")
+    for name in ALL:
+        drawn = (folder / "pictures" / f"{name}.png").read_bytes()
+        assert (files / logged[f"pictures/{name}"]["path"]).read_bytes() == drawn
+    (confusion,) = [row["confusion"] for row in rows if "confusion" in row]
+    content = json.loads((files / confusion["path"]).read_text())
+    expected = metrics.final.confusion
+    assert content["data"] == [[c, *row] for c, row in zip(CLASSES, expected, strict=True)]
+    # The warm-up comes from that run: its epochs are in this one's log, too.
+    other = toy("logger=wandb", "selftraining.theta=0.3")
+    train(other)
+    _, rows, _, _ = read(hashing.run_folder(other))
+    assert [int(row["trainer/global_step"]) for row in rows] == [*range(len(history))]
+    assert summary["final/accuracy"] == metrics.final.accuracy
+    assert "WANDB_MODE" not in os.environ  # nor in the next job of a multirun

@@ -1,0 +1,82 @@
+"""Sheets of datasets: the right clouds, named, complete and repeatable."""
+
+import numpy as np
+
+from qs3.report import sheets
+from qs3.store.store import ManifestRow, write_pointset
+from qs3.utils.pictures import save_png
+from tests.fixtures.published import write_domain
+from tests.report.made_runs import not_blank
+from tests.running import main
+
+
+def store(folder, ids, **more):
+    rows = [ManifestRow(name, name.split("/")[0], "train", more=more) for name in ids]
+    points = [np.random.default_rng(i).normal(size=(20, 3)) for i in range(len(ids))]
+    return write_pointset(
+        folder, name="x", classes=("bed", "chair", "sofa"), arrays={"points": points}, rows=rows,
+        meta={},
+    ), rows  # fmt: skip
+
+
+def words(figure):
+    return [text.get_text() for text in figure.texts]
+
+
+def test_same_object_in_all_domains_where_possible(tmp_path):
+    a, _ = store(tmp_path / "a", ["bed/1", "bed/2", "chair/1"])
+    b, _ = store(tmp_path / "b", ["bed/2", "bed/3"])
+    c, _ = store(tmp_path / "c", ["bed/9", "sofa/1"])
+    beds = sheets._same_object([a, b, c], "bed")
+    for found, (data, index) in zip(beds, [(a, 1), (b, 0), (c, 0)], strict=True):
+        np.testing.assert_array_equal(found, data.points[index])
+    titles = words(sheets.scan_picture({"A": a, "B": b, "C": c}, note="n"))
+    assert {"A", "B", "C", "n", "bed", "chair", "no chair", "sofa", "no sofa"} <= {*titles}
+
+
+def test_a_sheet_of_each_class_that_is_there(tmp_path):
+    data, rows = store(tmp_path / "d", [f"bed/{i}" for i in range(50)] + ["sofa/1"], tier="hard")
+    place = tmp_path / "s"
+    saved = sheets.sheets_by_class(data, rows, place, "train", 20, True, "x, train")
+    assert [path.name for path in saved] == ["bed.png", "sofa.png"]
+    assert all(map(not_blank, saved))
+    before = saved[0].read_bytes()
+    sheets.sheets_by_class(data, rows, place, "train", 20, True, "x, train")
+    assert saved[0].read_bytes() == before
+    bare, rows = store(tmp_path / "u", ["/1", "/2"])
+    (saved,) = sheets.sheets_by_class(bare, rows, place, "train", 20, False, "u")
+    assert saved.name == "all.png"
+
+
+def test_a_class_sheet_has_a_row_a_class(tmp_path):
+    data, _ = store(tmp_path / "d", [f"bed/{i}" for i in range(9)] + ["sofa/椅子"])
+    figure = sheets.class_sheet(data, "train", "all of them")
+    assert {"bed", "sofa", "all of them", "椅子"} <= {*words(figure)}
+    assert len([title for title in words(figure) if title.isdigit()]) == 6
+    save_png(figure, tmp_path / "a.png", colours=256)
+    assert not_blank(tmp_path / "a.png")
+
+
+def test_what_is_drawn_is_not_at_even_steps():
+    """Families of a catalogue take turns: at even steps all shown would be of one."""
+    found = sheets.drawn(np.arange(100), 10)
+    assert found == sorted({*found})
+    assert len({i % 10 for i in found}) > 4
+    assert sheets.drawn(np.array([5, 7]), 2) == [5, 7]
+
+
+def test_command(tmp_path, capsys):
+    for name in ("specklenet10", "kinectsim10"):
+        write_domain(name, tmp_path, {"train": 1, "test": 1}, published=False)
+    domains = "domains=[specklenet10,kinectsim10]"
+    places = [f"data_dir={tmp_path}", f"out={tmp_path / 'out'}"]
+    assert main(["report", "pictures", domains, *places]) == 0
+    made = ("domains", "classes", "specklenet10", "kinectsim10")
+    paths = [tmp_path / "out" / f"{name}.png" for name in made]
+    assert capsys.readouterr().out.split() == [str(path) for path in paths]
+    assert all(map(not_blank, paths))
+    alone = tmp_path / "alone" / "scans.png"
+    assert main(["report", "pictures", domains, f"data_dir={tmp_path}", f"out={alone}"]) == 0
+    assert list(alone.parent.iterdir()) == [alone]
+    assert main(["report", "pictures", "domains=[scannet10]", f"data_dir={tmp_path}"]) == 1
+    assert "MissingDataError: domain scannet10" in capsys.readouterr().err
