@@ -54,8 +54,8 @@ test: install ## all tests that are not slow, on 2 cores
 
 test-triton: install ## kernels for GPUs in Triton's interpreter, which is fetched for it (286 MB)
 	$(RUN) -m pip install --disable-pip-version-check --quiet $(PIP_ARGS) --no-deps --target out/triton triton==3.9.0
-	PYTHONPATH=out/triton $(RUN) -m pytest $(PARALLEL) tests/geometry/test_triton_farthest_points.py \
-	  tests/geometry/test_smallest.py tests/kernels/test_edge_norm.py tests/kernels/test_linear_max.py
+	PYTHONPATH=out/triton $(RUN) -m pytest $(PARALLEL) tests/kernels/test_points.py \
+	  tests/kernels/test_edge_norm.py tests/kernels/test_linear_max.py
 
 test-all: install ## the slow tests too, shapes in signatures checked, and the benchmarks once each
 	QS3_CHECK_SHAPES=1 $(RUN) -m pytest $(PARALLEL) -m ''

@@ -108,7 +108,7 @@ def _stand_in(net: PointClassifier, whole: _Passes, backbone: _Passes) -> Any:
         def features(self, points: Float[Tensor, "b n 3"]) -> Features:
             if kind.features is not PointClassifier.features:
                 return super().features(points)
-            check_points(points, self.backbone)
+            check_points(points)
             return backbone(points)
 
         def __copy__(self) -> Any:

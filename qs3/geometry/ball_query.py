@@ -15,8 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from qs3.errors import DataError
-from qs3.geometry.neighbours import exporting, takes_numpy
+from qs3.kernels.device import exporting, takes_numpy
 
 _BLOCK = 1 << 26  # distances held at once on a device: 256 MB in float32
 _CPU_BLOCK = 1 << 18  # 1 MB in float32, to stay in the cache
@@ -55,12 +54,7 @@ def ball_queries(
     Returns:
         For each query [B, M, count] int64. A ball without points holds the index of the point
         nearest to its centre.
-
-    Raises:
-        DataError: radii and counts do not fit together, or are out of range.
     """
-    if len(radii) != len(counts) or any(r <= 0 for r in radii) or any(k < 1 for k in counts):
-        raise DataError(f"ball query needs radii > 0 and counts >= 1, got {radii} and {counts}")
     with torch.no_grad(), torch.autocast(points.device.type, enabled=False):
         if points.dtype in (torch.float16, torch.bfloat16):
             points, centres = points.float(), centres.float()

@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from qs3.errors import ConfigError
-
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -30,12 +28,6 @@ class Intrinsics:
     focal_px: float
     cx_px: float
     cy_px: float
-
-    def __post_init__(self) -> None:
-        if self.width_px < 1 or self.height_px < 1:
-            raise ConfigError(f"image size {self.width_px} x {self.height_px} px is empty")
-        if not self.focal_px > 0:
-            raise ConfigError(f"focal_px must be positive, got {self.focal_px}")
 
     @staticmethod
     def centred(width_px: int, height_px: int, focal_px: float) -> Intrinsics:
@@ -92,8 +84,7 @@ def look_at(eye_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
     eye = np.asarray(eye_m, dtype=np.float64)
     forward = np.asarray(target_m, dtype=np.float64) - eye
     norm = np.linalg.norm(forward)
-    if norm == 0:
-        raise ConfigError("a camera cannot look at its own position")
+    assert norm > 0, "a camera cannot look at its own position"
     forward /= norm
     right = np.cross(forward, [0.0, 0.0, 1.0])
     if np.linalg.norm(right) < 1e-9:  # straight up or down: any roll is upright

@@ -11,11 +11,11 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from qs3.geometry import compiled, smallest
-from qs3.geometry.device import exact_products, takes_triton
-from qs3.geometry.farthest_points import farthest_points, farthest_points_by_scan
-from qs3.geometry.matmul import matmul_t
 from qs3.geometry.sampling import farthest_point_sampling_np
+from qs3.kernels import compiled
+from qs3.kernels.device import exact_products, exporting, takes_numpy, takes_triton
+from qs3.kernels.matmul import matmul_t
+from qs3.kernels.points import farthest_points, farthest_points_by_scan, smallest_sums
 
 _BLOCK = 1 << 26  # distances held at once: 256 MB in float32
 _CPU_BLOCK = 1 << 20  # 4 MB, to stay near the caches
@@ -56,8 +56,7 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
         return _smallest(x @ scaled.transpose(1, 2) + squares, k)
     on_cpu = takes_numpy(x)
     block = _CPU_BLOCK if on_cpu else _BLOCK
-    least = _smallest_on_cpu if on_cpu else _smallest
-    added = on_cpu and n >= 3 * compiled.groups_for(k) and compiled.usable(x)
+    added = on_cpu and n >= 3 * compiled.groups_for(k)
     rows = max(1, min(n, block // n))
     clouds = max(1, block // (n * rows))
     out = torch.empty(b, n, k, dtype=torch.int64, device=x.device)
@@ -70,11 +69,11 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
             else:
                 product = x[c, j : j + rows] @ scaled[c].transpose(1, 2)
             if takes_triton(x):
-                found = smallest.smallest_sums(product, squares[c, 0], k)
+                found = smallest_sums(product, squares[c, 0], k)
             elif added:
                 found = compiled.smallest_sums(product.view(-1, n), squares[c, 0], k)
             else:
-                found = least(product.add_(squares[c]).view(-1, n), k)
+                found = _smallest(product.add_(squares[c]).view(-1, n), k)
             part.copy_(found.view(part.shape))
     return out
 
@@ -82,37 +81,6 @@ def _knn_dense(x: Tensor, k: int) -> Tensor:
 def _smallest(values: Tensor, k: int) -> Tensor:
     """Columns of the k smallest values of each row, smallest first: [..., n] -> [..., k]."""
     return values.topk(k, largest=False)[1]
-
-
-def _smallest_on_cpu(values: Tensor, k: int) -> Tensor:
-    """As `_smallest`, several times faster: only the few values that can be in are sorted.
-
-    `qs3.geometry.compiled.smallest_sums` is the same, compiled.
-
-    Columns are dealt to groups; the k-th smallest of the groups' minima is no less than the
-    k-th smallest of the row, so everything above it is out. That leaves hardly more than k.
-    numpy's sort is vectorised, with AVX-512 well; its partition and torch's topk are not. Of equal
-    values the first columns come first, on all processors.
-    """
-    r, n = values.shape
-    groups = compiled.groups_for(k)
-    if n < 3 * groups:
-        return _smallest(values, k)
-    array = values.numpy()
-    dealt = values[:, : n // groups * groups].reshape(r, -1, groups)
-    bound = np.sort(dealt.amin(1).numpy(), axis=1)[:, k - 1 : k]
-    flat = np.flatnonzero(array <= bound)
-    row = flat // n
-    count = np.bincount(row, minlength=r)
-    width = max(int(count.max()), k)
-    first = np.arange(r) * width - (np.cumsum(count) - count)
-    slot = np.arange(len(flat)) + first[row]  # in [r, width], each row filled from the left
-    few = np.full(r * width, np.inf, dtype=array.dtype)
-    column = np.zeros(r * width, dtype=np.int64)
-    few[slot] = array.ravel()[flat]
-    column[slot] = flat - row * n
-    order = np.argsort(few.reshape(r, width), axis=1, kind="stable")[:, :k]
-    return torch.from_numpy(np.take_along_axis(column.reshape(r, width), order, axis=1))
 
 
 def gather(x: Tensor, index: Int[Tensor, "b ..."]) -> Tensor:
@@ -151,15 +119,3 @@ def farthest_point_sampling(
     clouds = zip(x.detach().float().numpy(), starts, strict=True)
     orders = [farthest_point_sampling_np(cloud, n, first) for cloud, first in clouds]
     return torch.from_numpy(np.stack(orders))
-
-
-def takes_numpy(x: Tensor) -> bool:
-    """On the CPU, unless an export writes down what is done to `x`: other devices' way is torch."""
-    return x.device.type == "cpu" and not exporting()
-
-
-def exporting() -> bool:
-    """Whether `torch.export` (of `torch.onnx.export` too) is making a graph of what is done."""
-    if hasattr(torch.compiler, "is_exporting"):  # since torch 2.7
-        return torch.compiler.is_exporting()
-    return torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()

@@ -22,8 +22,7 @@ def farthest_point_sampling_np(
     """
     points = np.asarray(points)
     total = len(points)
-    if total == 0 or not 0 <= start < total or n < 0:
-        raise DataError(f"cannot take {n} of {total} points from point {start}")
+    assert 0 <= start < total, f"point {start} of {total}"
     if n > total:
         return np.resize(farthest_point_sampling_np(points, total, start), n)
     if n == 0:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 from torch import Tensor
 
-from qs3.geometry.neighbours import exporting
+from qs3.kernels.device import exporting
 
 _plain = False
 

@@ -22,7 +22,7 @@ lest squares of deviations from it cancel.
 # No `from __future__ import annotations`: torch reads the operations' annotations, and where shapes
 # are checked (`make test-all`) it would look their words up in another module.
 import sys
-from typing import Any
+from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Float, Int
@@ -30,21 +30,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from qs3.geometry.device import ROWS, lists_of, takes_triton
+from qs3.kernels.device import ROWS, lists_of, triton_kernels
 
 MOST_NEIGHBOURS = 256  # which was taken is kept in a byte
 _SHARE = 16
 
 _op = torch.library.custom_op
-
-
-def _kernels(x: Tensor) -> Any:
-    """The module of the kernels where they run; they are made for float32."""
-    if not (x.is_cuda and takes_triton(x) and x.dtype == torch.float32):
-        return None
-    from qs3.kernels import triton_edge_norm
-
-    return triton_edge_norm
+_TRITON = "triton_edge_norm"
 
 
 @_op("qs3::edge_extremes", mutates_args=())
@@ -66,7 +58,7 @@ def edge_extremes(
         own: Q - pivot, [r, d].
         parts: sums over some edges of z - pivot and of its square, [2, parts, d].
     """
-    if kernels := _kernels(pr):
+    if kernels := triton_kernels(_TRITON, pr):
         return kernels.edge_extremes(pr, index, gamma, pivot)
     p, r = pr.chunk(2, dim=1)
     members, own = p[index], r - p - pivot  # [r, k, d], [r, d]
@@ -77,14 +69,15 @@ def edge_extremes(
     return z.gather(1, taken)[:, 0], taken[:, 0].to(torch.uint8), members.sum(1), own, parts
 
 
-@edge_extremes.register_fake
-def _(
-    pr: Tensor, index: Tensor, gamma: Tensor, pivot: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+@no_type_check
+def _room_for_extremes(pr, index, gamma, pivot):
     rows, d = len(pr), len(gamma)
-    like = [pr.new_empty(rows, d) for _ in range(3)]
+    best, sums, own = (pr.new_empty(rows, d) for _ in range(3))
     taken = pr.new_empty(rows, d, dtype=torch.uint8)
-    return like[0], taken, like[1], like[2], pr.new_empty(2, -(-rows // ROWS), d)
+    return best, taken, sums, own, pr.new_empty(2, -(-rows // ROWS), d)
+
+
+edge_extremes.register_fake(_room_for_extremes)
 
 
 @_op("qs3::edge_output", mutates_args=())
@@ -112,7 +105,7 @@ def edge_output(
         t: [r, d].
         constants: [5, d]: mean, var, 1 / sigma, h, and mean - pivot.
     """
-    if kernels := _kernels(best):
+    if kernels := triton_kernels(_TRITON, best):
         return kernels.edge_output(best, sums, pivot, gamma, beta, edges, eps, negative_slope)
     off, square = sums / edges
     var = (square - off.square()).clamp_min(0)
@@ -122,18 +115,13 @@ def edge_output(
     return y, t, torch.stack([pivot + off, var, rstd, h, off])
 
 
-@edge_output.register_fake
-def _(
-    best: Tensor,
-    sums: Tensor,
-    pivot: Tensor,
-    gamma: Tensor,
-    beta: Tensor,
-    edges: int,
-    eps: float,
-    negative_slope: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.empty_like(best), torch.empty_like(best), best.new_empty(5, len(gamma))
+edge_output.register_fake(
+    lambda best, sums, pivot, gamma, *_: (
+        torch.empty_like(best),
+        torch.empty_like(best),
+        best.new_empty(5, len(gamma)),
+    )
+)
 
 
 @_op("qs3::edge_output_gradient", mutates_args=())
@@ -151,18 +139,15 @@ def edge_output_gradient(
         du: [r, d].
         parts: sums over some points of what dbeta and dgamma are sums of, [2, parts, d].
     """
-    if kernels := _kernels(y):
+    if kernels := triton_kernels(_TRITON, y):
         return kernels.edge_output_gradient(grad, y, t, constants, negative_slope)
     du = torch.where(y > 0, grad, negative_slope * grad)
     return du, torch.stack([du, du * t * constants[2]])
 
 
-@edge_output_gradient.register_fake
-def _(
-    grad: Tensor, y: Tensor, t: Tensor, constants: Tensor, negative_slope: float
-) -> tuple[Tensor, Tensor]:
-    rows, d = y.shape
-    return torch.empty_like(y), y.new_empty(2, -(-rows // ROWS), d)
+edge_output_gradient.register_fake(
+    lambda grad, y, *_: (torch.empty_like(y), y.new_empty(2, -(-len(y) // ROWS), y.shape[1]))
+)
 
 
 @_op("qs3::edge_gradient", mutates_args=())
@@ -187,7 +172,7 @@ def edge_gradient(
         constants: [5, d], of `edge_output`.
         of_norm: [2, d], dbeta and dgamma.
     """
-    if kernels := _kernels(pr):
+    if kernels := triton_kernels(_TRITON, pr):
         return kernels.edge_gradient(pr, own, du, taken, sums, first, order, constants, of_norm)
     rows, d = du.shape
     k = len(order) // rows
@@ -203,19 +188,7 @@ def edge_gradient(
     return torch.cat([dp - dq, dq], dim=1)
 
 
-@edge_gradient.register_fake
-def _(
-    pr: Tensor,
-    own: Tensor,
-    du: Tensor,
-    taken: Tensor,
-    sums: Tensor,
-    first: Tensor,
-    order: Tensor,
-    constants: Tensor,
-    of_norm: Tensor,
-) -> Tensor:
-    return torch.empty_like(pr)
+edge_gradient.register_fake(lambda pr, *_: torch.empty_like(pr))
 
 
 class _EdgeNorm(torch.autograd.Function):
@@ -290,4 +263,4 @@ def edge_maximum(pr: Float[Tensor, "r c"], index: Int[Tensor, "r k"]) -> Float[T
 def _implementation(x: Tensor) -> Any:
     """Where the operations are taken from: the kernels themselves save an operation's own way."""
     compiling = torch.compiler.is_compiling()  # whose graph has operations
-    return (not compiling and _kernels(x)) or sys.modules[__name__]
+    return (not compiling and triton_kernels(_TRITON, x)) or sys.modules[__name__]

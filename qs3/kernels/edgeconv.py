@@ -17,7 +17,7 @@ moments of the *inputs*: with A the adjacency (A_ij = 1 if j is a neighbour of i
     sum_ij z_ij^2 = diag(W1 X' diag(d) X W1' + 2 E X'(A X) W1' + k E X'X E').
 
 That is for the CPU, where what goes along the edges, A and the maximum, is compiled
-(`qs3.geometry.compiled`). To an accelerator these are 164 kernels a layer, forward and backward,
+(`qs3.kernels.compiled`). To an accelerator these are 164 kernels a layer, forward and backward,
 each started by itself; there `edge_norm` takes the statistics on its way over the edges, and where
 it is not at hand z_ij is written out for them, in 30.
 """
@@ -33,11 +33,10 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3 import kernels as fast
-from qs3.geometry import compiled
-from qs3.geometry.device import lists_of, takes_triton
-from qs3.geometry.matmul import linear
-from qs3.geometry.neighbours import exporting
+from qs3.kernels import compiled
+from qs3.kernels.device import exporting, lists_of, takes_triton
 from qs3.kernels.edge_norm import MOST_NEIGHBOURS, edge_maximum, edge_norm
+from qs3.kernels.matmul import linear
 from qs3.kernels.norms import active, normed, track, uses_batch
 from qs3.kernels.pointwise_max import max_over_members, max_over_rows
 

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from qs3.geometry.matmul import matmul_t, t_matmul
+from qs3.kernels.matmul import matmul_t, t_matmul
 from qs3.kernels.norms import active, track, uses_batch
 from qs3.kernels.pointwise_max import max_over_rows
 

@@ -21,18 +21,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from qs3.geometry.device import lists_of, takes_triton
+from qs3.kernels.device import lists_of, triton_kernels
 
 _op = torch.library.custom_op
-
-
-def _kernels(x: Tensor) -> Any:
-    """The module of the kernels where they run; they are made for float32."""
-    if not (x.is_cuda and takes_triton(x) and x.dtype == torch.float32):
-        return None
-    from qs3.kernels import triton_linear_max
-
-    return triton_linear_max
+_TRITON = "triton_linear_max"
 
 
 @_op("qs3::linear_max_gradient", mutates_args=())
@@ -48,7 +40,7 @@ def points_gradient(
         first: [b, n + 1], where in `order` the channels begin whose maximum a point has.
         order: int64 [b, d], channels in the order of the points that have their maxima.
     """
-    if kernels := _kernels(weight):
+    if kernels := triton_kernels(_TRITON, weight):
         return kernels.points_gradient(grad, weight, beside, first, order)
     (b, d), n = order.shape, first.shape[1] - 1
     rows = torch.arange(b * n, device=grad.device)
@@ -58,9 +50,11 @@ def points_gradient(
     return dx.index_add_(0, rows, entries.flatten(0, 1)).view(b, n, -1)
 
 
-@points_gradient.register_fake
-def _(grad: Tensor, weight: Tensor, beside: Tensor, first: Tensor, order: Tensor) -> Tensor:
-    return weight.new_empty(len(first), first.shape[1] - 1, weight.shape[1])
+points_gradient.register_fake(
+    lambda grad, weight, beside, first, order: weight.new_empty(
+        len(first), first.shape[1] - 1, weight.shape[1]
+    )
+)
 
 
 @_op("qs3::linear_max_weight_gradient", mutates_args=())
@@ -73,15 +67,13 @@ def weight_gradient(grad: Tensor, x: Tensor, where: Tensor, base: Tensor) -> Ten
         where: int64 [b, d], which point of the cloud has the maximum.
         base: [d, c], what is added to it.
     """
-    if kernels := _kernels(x):
+    if kernels := triton_kernels(_TRITON, x):
         return kernels.weight_gradient(grad, x, where, base)
     rows = x.gather(1, where[:, :, None].expand(-1, -1, x.shape[2]))  # [b, d, c]
     return base + (grad[:, : len(base), None] * rows).sum(0)
 
 
-@weight_gradient.register_fake
-def _(grad: Tensor, x: Tensor, where: Tensor, base: Tensor) -> Tensor:
-    return torch.empty_like(base)
+weight_gradient.register_fake(lambda grad, x, where, base: torch.empty_like(base))
 
 
 class _Pooled(torch.autograd.Function):
@@ -100,7 +92,9 @@ class _Pooled(torch.autograd.Function):
         mean = grad[:, len(weight) :]
         first, order = lists_of(where, x.shape[1])
         # The kernels themselves save an operation's own way; a compiler's graph has operations.
-        at = (not torch.compiler.is_compiling() and _kernels(x)) or sys.modules[__name__]
+        at = (not torch.compiler.is_compiling() and triton_kernels(_TRITON, x)) or sys.modules[
+            __name__
+        ]
         dx = at.points_gradient(grad, weight, mean @ weight, first, order)
         return dx, at.weight_gradient(grad, x, where, mean.T @ centre)
 

@@ -14,15 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Literal
 from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError
 
-KINDS = ("batch", "instance", "domain")
+Norm = Literal["batch", "instance", "domain"]
 DOMAINS = ("source", "target")
 _Norm = nn.modules.batchnorm._NormBase
 _BatchNorm = nn.modules.batchnorm._BatchNorm
@@ -57,7 +58,7 @@ class DomainNorm(nn.Module):
         return f"domain={self.domain}"
 
 
-def make_norm(kind: str, channels: int, *, images: bool = False) -> nn.Module:
+def make_norm(kind: Norm, channels: int, *, images: bool = False) -> nn.Module:
     """The norm of that name for [R, C] (not "instance") or [B, C, N], or for `images` [B, C, H, W].
 
     Layers that compute the statistics themselves take parameters and running statistics from
@@ -68,13 +69,10 @@ def make_norm(kind: str, channels: int, *, images: bool = False) -> nn.Module:
     if kind == "instance":
         plain = nn.InstanceNorm2d if images else nn.InstanceNorm1d
         return plain(channels, affine=True)
-    if kind == "domain":
-        return DomainNorm(channels, images=images)
-    names = ", ".join(f"'{k}'" for k in KINDS)
-    raise ConfigError(f"norm must be one of {names}, got {kind!r}")
+    return DomainNorm(channels, images=images)
 
 
-def head_norm(kind: str) -> str:
+def head_norm(kind: Norm) -> Norm:
     """The kind to use where each cloud is one vector: instance norm has nothing to do there."""
     return "batch" if kind == "instance" else kind
 
@@ -138,11 +136,8 @@ def use_domain(net: nn.Module, domain: str) -> Iterator[None]:
     """Passes of `net` inside use the norms of `domain`; afterwards those of before.
 
     Nothing happens in a net without domain-specific norms, so callers need not ask.
-
-    Raises:
-        ConfigError: no such domain.
     """
-    _check_domain(domain)
+    assert domain in DOMAINS, domain
     with _using({norm: domain for norm in _domain_norms(net)}):
         yield
 
@@ -155,11 +150,8 @@ def use_trained(net: nn.Module, domain: str) -> Iterator[None]:
     So a net that has only seen the source serves the target with the source's norms, a student
     that has only seen the target the source with the target's, and a net whose backbone alone has
     seen the target serves it with the backbone's norms of the target and the head's of the source.
-
-    Raises:
-        ConfigError: no such domain.
     """
-    _check_domain(domain)
+    assert domain in DOMAINS, domain
     with _using({norm: _trained(norm, domain) for norm in _domain_norms(net)}):
         yield
 
@@ -174,11 +166,6 @@ def _using(domains: dict[DomainNorm, str]) -> Iterator[None]:
     finally:
         for norm, domain in before.items():
             norm.domain = domain
-
-
-def _check_domain(domain: str) -> None:
-    if domain not in DOMAINS:
-        raise ConfigError(f"domain must be 'source' or 'target', got {domain!r}")
 
 
 def _domain_norms(net: nn.Module) -> list[DomainNorm]:
@@ -262,9 +249,7 @@ def adapt_batchnorm(
         The adapted norms.
 
     Raises:
-        ConfigError: there is no norm, or one takes no statistics in a pass, so that there are none
-            to store.
-        DataError: there are no batches.
+        ConfigError: there is no norm.
     """
     check_has_norms(net, "adabn")
     norms = running_norms(net)
@@ -290,10 +275,7 @@ def check_has_norms(net: nn.Module, what: str) -> None:
         ConfigError: `evaluation.norms` is `what`, and the net has no running statistics.
     """
     if not running_norms(net):
-        raise ConfigError(
-            f"evaluation.norms={what} adapts batch norms, and this net has none: set "
-            "evaluation.norms=trained"
-        )
+        raise ConfigError(f"evaluation.norms={what} adapts batch norms, and this net has none")
 
 
 def running_norms(net: nn.Module) -> list[_BatchNorm]:
@@ -324,17 +306,11 @@ def _estimate(
             net(points)
             seen += 1
             for norm, pool in zip(norms, pooled, strict=True):
-                if norm not in _LAST_COUNT:
-                    name = next(n for n, m in net.named_modules() if m is norm)
-                    raise ConfigError(
-                        f"{name} takes no statistics in a pass; a layer that does not call its "
-                        "norm must use qs3.kernels.norms.track"
-                    )
+                assert norm in _LAST_COUNT, "a layer that does not call its norm must use `track`"
                 pool.add(_LAST_COUNT[norm])
     finally:
         for hook in hooks:
             hook.remove()
-    if not seen:
-        raise DataError("no batches to take statistics of")
+    assert seen, "no batches to take statistics of"
     for pool in pooled:
         pool.store(kept)

@@ -21,10 +21,9 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from qs3 import kernels as fast
-from qs3.geometry import compiled
-from qs3.geometry.matmul import matmul_t
-from qs3.geometry.neighbours import exporting
-from qs3.kernels import linear_max
+from qs3.kernels import compiled, linear_max
+from qs3.kernels.device import exporting
+from qs3.kernels.matmul import matmul_t
 from qs3.kernels.norms import active, statistics, uses_batch
 
 _AT_ONCE = 1 << 20  # values of z worked on at once: 4 MB in float32

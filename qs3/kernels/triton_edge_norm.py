@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from qs3.geometry.device import ROWS
+from qs3.kernels.device import ROWS
 
 _CHANNELS = 64  # of a program
 _FEW_CHANNELS = 32  # of one whose points take their neighbours' from the cache

@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from qs3.geometry.device import ROWS
+from qs3.kernels.device import ROWS
 
 _CHANNELS = 32  # of a program
 _OF_A_POINT = 512  # channels of a program that goes over a point's maxima, of which most have few

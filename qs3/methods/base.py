@@ -11,20 +11,23 @@ not said, is whether it is the first of an optimiser's step, which may take seve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import torch
+from annotated_types import Ge, Interval
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_float
 from qs3.datamodules.twins import Wants
 from qs3.errors import ConfigError
 
 if TYPE_CHECKING:
     from qs3.datamodules.adaptation import AdaptationData
     from qs3.models.base import Features
+
+Weight = Annotated[float, Ge(0)]  # of a loss; 0 switches it off
+Share = Annotated[float, Interval(ge=0, le=1)]
 
 
 class Method(nn.Module):
@@ -49,9 +52,6 @@ class Method(nn.Module):
         """Make the heads that this method puts on `net`. Called once, before `loss`.
 
         Their weights come from torch's global generator, which the caller has seeded.
-
-        Raises:
-            ConfigError: the model does not offer what the method needs.
         """
 
     def start_epoch(self, net: nn.Module, data: AdaptationData, epoch: int, epochs: int) -> None:
@@ -78,33 +78,16 @@ class Method(nn.Module):
         raise NotImplementedError
 
 
-def total_loss(method: nn.Module, terms: Any) -> Float[Tensor, ""]:
+def total_loss(method: nn.Module, terms: dict[str, Tensor]) -> Float[Tensor, ""]:
     """The sum of the terms of a method's loss.
 
-    Args:
-        method: whose loss it is, perhaps a user's.
-        terms: what it returned, a dict of scalar tensors by name if it keeps to the rule.
-
     Raises:
-        ConfigError: they are not scalar tensors by name (a loss of each cloud would be summed, not
-            averaged), or no gradient leads back from them.
+        ConfigError: one is no scalar: a loss of each cloud would be summed, not averaged.
     """
-    rule = f"{type(method).__name__}.loss must return a dict of scalar tensors by name"
-    if not isinstance(terms, dict) or not terms:
-        raise ConfigError(f"{rule}, not {_what(terms)}")
     for name, term in terms.items():
-        if not isinstance(term, Tensor) or term.ndim:
-            raise ConfigError(f"{rule}; {name!r} is {_what(term)}")
-    total = torch.stack(list(terms.values())).sum()
-    if not total.requires_grad:
-        raise ConfigError(f"{rule}; no gradient leads back from {', '.join(terms)}")
-    return total
-
-
-def _what(value: Any) -> str:
-    if isinstance(value, Tensor):
-        return f"a tensor {list(value.shape)}"
-    return "an empty dict" if value == {} else f"of type {type(value).__name__}"
+        if term.ndim:
+            raise ConfigError(f"{type(method).__name__}.loss: {name!r} must be a scalar tensor")
+    return torch.stack(list(terms.values())).sum()
 
 
 def class_loss(
@@ -124,54 +107,30 @@ def class_loss(
     return F.cross_entropy(logits, labels, label_smoothing=smoothing * classes / (classes - 1))
 
 
-def weight(key: str, value: float) -> float:
-    """A loss's weight from `method.<key>`: any finite number >= 0; 0 switches the loss off."""
-    return float(check_float(f"method.{key}", value, ">= 0"))
-
-
 @torch.no_grad()
-def feature_dims(net: Any, asks: str = "this method") -> tuple[int, int | None]:
-    """Widths of a net's features: of a cloud, and of a point (None: it has none per point).
-
-    Asked of the net itself, with two clouds in eval mode: nothing in it changes. `asks`: who needs
-    them, for the message.
-
-    Raises:
-        ConfigError: the model is not a backbone with a head.
-    """
-    features = _of_two_clouds(net, asks)
+def feature_dims(net: Any) -> tuple[int, int | None]:
+    """Widths of a net's features: of a cloud, and of a point (None: it has none per point)."""
+    features = _of_two_clouds(net)
     per_point = features.per_point
     return features.global_.shape[1], None if per_point is None else per_point.shape[2]
 
 
-def check_taught(net: Any, key: str, instead: str) -> None:
+def check_taught(net: Any, key: str) -> None:
     """Refuse a loss of features that no gradient changes, such as those of `model=features`.
 
     It would be minimised by nothing, and the run would be one without it under another name.
 
-    Args:
-        net: asked in eval mode, with two clouds: nothing in it changes.
-        key: what asks for the loss, as it is set.
-        instead: what to do about it.
-
     Raises:
-        ConfigError: they do not change, or the model is not a backbone with a head.
+        ConfigError: they do not change; names `key`, which asks for the loss.
     """
     with torch.enable_grad():
         taught = _of_two_clouds(net).global_.requires_grad
     if not taught:
-        raise ConfigError(
-            f"{key} trains a net's features, and this model's are frozen: it would teach nothing; "
-            f"{instead}"
-        )
+        raise ConfigError(f"{key} trains a net's features, and this model's are frozen")
 
 
-def _of_two_clouds(net: Any, asks: str = "this method") -> Features:
-    if not hasattr(net, "features"):
-        raise ConfigError(
-            f"{asks} needs a model's features, but {type(net).__name__} has none; choose e.g. "
-            "model=dgcnn or model=pointnet"
-        )
+def _of_two_clouds(net: Any) -> Features:
+    """Features of two clouds in eval mode; nothing in the net changes."""
     parameter = next(net.parameters())
     points = torch.linspace(-1, 1, 2 * 64 * 3, device=parameter.device, dtype=parameter.dtype)
     points = torch.sin(7919 * points).view(2, 64, 3)  # spread out, without drawing at random

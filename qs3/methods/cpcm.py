@@ -15,7 +15,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, class_loss, weight
+from qs3.methods.base import Method, Weight, class_loss
+from qs3.utils.settings import checked
 
 
 class Cpcm(Method):
@@ -34,9 +35,10 @@ class Cpcm(Method):
 
     uses_target: ClassVar[bool] = True
 
-    def __init__(self, mix_weight: float = 1.0) -> None:
+    @checked
+    def __init__(self, mix_weight: Weight = 1.0) -> None:
         super().__init__()
-        self.mix_weight = weight("mix_weight", mix_weight)
+        self.mix_weight = mix_weight
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator

@@ -1,21 +1,49 @@
 """DANN: features from which a second head cannot tell the domain.
 
-Ganin et al., "Domain-Adversarial Training of Neural Networks", JMLR 2016.
+Ganin et al., "Domain-Adversarial Training of Neural Networks", JMLR 2016. Gradient reversal is the
+identity forward, and minus alpha times the gradient backward (section 3.3, eq. 16-18).
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+import math
+from typing import Any, ClassVar, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_choice
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, check_taught, class_loss, feature_dims, weight
-from qs3.methods.reversal import dann_alpha, reverse_gradient
+from qs3.methods.base import Method, Weight, check_taught, class_loss, feature_dims
 from qs3.models.base import ClassHead
+from qs3.utils.settings import checked
+
+
+class _Reverse(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, alpha: float) -> Tensor:
+        ctx.alpha = alpha
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return -ctx.alpha * grad, None
+
+
+def reverse_gradient(x: Float[Tensor, "*shape"], alpha: float) -> Float[Tensor, "*shape"]:
+    """R(x) = x with dR/dx = -alpha I; alpha >= 0."""
+    return _Reverse.apply(x, alpha)
+
+
+def dann_alpha(progress: float) -> float:
+    """2 / (1 + exp(-10 p)) - 1: from 0 to 1 as p does (section 5.2.2); 0.5 at p = 0.11."""
+    return 2.0 / (1.0 + math.exp(-10.0 * progress)) - 1.0
+
+
+def sine_alpha(progress: float) -> float:
+    """sin(p pi / 2): PointDAN's (its code: with p = (epoch + 1) / epochs), from 0 to 1."""
+    return math.sin(progress * math.pi / 2)
 
 
 class Dann(Method):
@@ -38,24 +66,22 @@ class Dann(Method):
 
     uses_target: ClassVar[bool] = True
 
+    @checked
     def __init__(
         self,
-        class_weight: float = 1.0,
-        domain_weight: float = 1.0,
-        domain_batches: str = "together",
+        class_weight: Weight = 1.0,
+        domain_weight: Weight = 1.0,
+        domain_batches: Literal["together", "apart"] = "together",
     ) -> None:
         super().__init__()
-        self.domain_batches = check_choice(
-            "method.domain_batches", domain_batches, ("together", "apart")
-        )
-        self.class_weight = weight("class_weight", class_weight)
-        self.domain_weight = weight("domain_weight", domain_weight)
+        self.class_weight, self.domain_weight = class_weight, domain_weight
+        self.domain_batches = domain_batches
         self.domain_head: nn.Module | None = None
 
     def prepare(self, net: nn.Module) -> None:
         """The domain head."""
         if self.domain_weight:
-            check_taught(net, "method=dann", "choose method=pcfea, or a model that is trained")
+            check_taught(net, "method=dann")
         self.domain_head = ClassHead(feature_dims(net)[0], 2, dropout=0.0)
 
     def loss(

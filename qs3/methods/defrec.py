@@ -1,32 +1,138 @@
 """DefRec: reconstruct a deformed region of target clouds; with or without PCM.
 
 Achituve, Maron, Chechik, "Self-Supervised Learning for Domain Adaptation on Point Clouds", WACV
-2021.
+2021. A region is a "volume-based voxel" (section 3.1): its points are replaced by a small blob at
+its centre. Points are compared by the Chamfer distance of Fan, Su, Guibas, "A Point Set Generation
+Network for 3D Object Reconstruction from a Single Image", CVPR 2017, eq. 1, with means in place of
+sums.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch
-from jaxtyping import Float
+from annotated_types import Ge
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from qs3.config.checks import check_float, check_int
 from qs3.errors import ConfigError
+from qs3.geometry.neighbours import gather
+from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, feature_dims, weight
-from qs3.methods.chamfer import masked_chamfer
-from qs3.methods.deform import cloud_size, deform
-from qs3.methods.mixup import source_loss
+from qs3.methods.base import Method, Share, Weight, feature_dims
+from qs3.methods.pcm import source_loss
 from qs3.models.base import Features
+from qs3.utils.settings import checked
+
+GRID = 3
+VOXELS = GRID**3
+_STD = 0.001**0.5  # of the blob: the covariance is 0.001 I
+_OF = 1024  # points of the clouds for which `min_points` are stated
+
+
+class Deformed(NamedTuple):
+    """Clouds with one voxel deformed.
+
+    Attributes:
+        points: [B, N, 3].
+        mask: [B, N] the points that were replaced; none where no voxel had enough points.
+        voxel: [B] the voxel, 0 to 26; meaningless where the mask is empty.
+    """
+
+    points: Float[Tensor, "b n 3"]
+    mask: Bool[Tensor, "b n"]
+    voxel: Int[Tensor, " b"]
+
+
+def voxel_of(points: Float[Tensor, "b n 3"]) -> Int[Tensor, "b n"]:
+    """Voxel 9 i + 3 j + k of each point, in a grid of 3 x 3 x 3 on [-1, 1]^3.
+
+    Half-open voxels [low, high); points outside belong to the nearest one. (The released code
+    has open ones: a point on a border falls into voxel 0, wherever it is.)
+    """
+    cell = ((points.float() + 1) * (GRID / 2)).floor().long().clamp(0, GRID - 1)  # [b, n, 3]
+    return (cell[..., 0] * GRID + cell[..., 1]) * GRID + cell[..., 2]
+
+
+def voxel_centre(voxel: Int[Tensor, " b"]) -> Float[Tensor, "b 3"]:
+    """Centre of a voxel: -2/3, 0 or 2/3 in each coordinate."""
+    cell = torch.stack([voxel // GRID**2, voxel // GRID % GRID, voxel % GRID], dim=1)
+    return (cell + 0.5) * (2 / GRID) - 1
+
+
+def cloud_size(points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b 1 1"]:
+    """Largest distance of a point from the origin; 1 where all points lie there."""
+    size = points.norm(dim=2).amax(dim=1)[:, None, None]
+    return torch.where(size > 0, size, 1)
+
+
+def deform(points: Float[Tensor, "b n 3"], generator: torch.Generator, min_points: int) -> Deformed:
+    """Deform one voxel of each cloud.
+
+    The voxel is the first, in a random order that the batch shares, which holds at least
+    `min_points` points in 1,024 of the cloud's: papers and codes say how many for clouds of that
+    size, and a cloud of a quarter of the points has a quarter of them in each voxel. Its points
+    become draws from N(centre, 0.001 I). The input is left alone.
+    """
+    b, n, _ = points.shape
+    device = points.device
+    order = torch.randperm(VOXELS, generator=generator, device=generator.device).to(device)
+    noise = torch.randn(b, n, 3, generator=generator, device=generator.device).to(points)
+    of = voxel_of(points)  # [b, n]
+    counts = torch.zeros(b, VOXELS, dtype=torch.int64, device=device)
+    counts.scatter_add_(1, of, torch.ones_like(of))
+    enough = _OF * counts[:, order] >= n * min_points  # [b, 27], in the random order
+    voxel = order[enough.int().argmax(1)]  # the first True
+    mask = (of == voxel[:, None]) & enough.any(1, keepdim=True)
+    blob = voxel_centre(voxel).to(points.dtype)[:, None] + _STD * noise  # [b, n, 3]
+    return Deformed(torch.where(mask[:, :, None], blob, points), mask, voxel)
+
+
+def masked_chamfer(
+    a: Float[Tensor, "b n 3"],
+    b: Float[Tensor, "b m 3"],
+    mask_a: Bool[Tensor, "b n"],
+    mask_b: Bool[Tensor, "b m"],
+) -> Float[Tensor, " b"]:
+    """mean_i min_j |a_i - b_j|^2 + mean_j min_i |a_i - b_j|^2, over marked i and j only.
+
+    In squared units of the clouds, >= 0; 0 for a cloud in which nothing is marked (in a or b).
+    float32 at least, also under autocast. Nearest points are found without gradient; the
+    gradient is that of the distances to them, as that of the minimum.
+    """
+    with torch.autocast(a.device.type, enabled=False):
+        a, b = (x.float() if x.dtype in (torch.float16, torch.bfloat16) else x for x in (a, b))
+        to_b, to_a = nearest(a.detach(), b.detach(), mask_a, mask_b)
+        forth = (a - gather(b, to_b)).square().sum(2)  # [b, n]
+        back = (b - gather(a, to_a)).square().sum(2)  # [b, m]
+        both = mask_a.any(1, keepdim=True) & mask_b.any(1, keepdim=True)
+        return masked_mean(forth, mask_a & both) + masked_mean(back, mask_b & both)
+
+
+def nearest(a: Tensor, b: Tensor, mask_a: Tensor, mask_b: Tensor) -> tuple[Tensor, Tensor]:
+    """For each a the nearest marked b [b, n], for each b the nearest marked a [b, m].
+
+    By distances in the dtype of a and b, also under autocast.
+    """
+    with torch.autocast(a.device.type, enabled=False), exact_products():
+        squares = -2 * a @ b.transpose(1, 2)  # [b, n, m]
+    squares += a.square().sum(2)[:, :, None]
+    squares += b.square().sum(2)[:, None]
+    squares.masked_fill_(~(mask_a[:, :, None] & mask_b[:, None]), torch.inf)
+    return squares.argmin(2), squares.argmin(1)
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of the marked values of each row, 0 without any: [b, n] -> [b]."""
+    return torch.where(mask, values, 0.0).sum(1) / mask.sum(1).clamp_min(1)
 
 
 class DefRec(Method):
     r"""L = (1 - w) L_s + w 20 Chamfer(h(deformed x_t), x_t), between the deformed points only.
 
     L_s is the cross-entropy of source clouds, or PCM's of mixed ones. One voxel of each cloud is
-    deformed (`qs3.methods.deform`); h, a map of each point with features of point and cloud,
+    deformed (`deform`); h, a map of each point with features of point and cloud,
     tells where its points had been. The mean is over the clouds that have a voxel to deform (the
     released code divides zero by zero for one without).
 
@@ -43,32 +149,24 @@ class DefRec(Method):
 
     uses_target: ClassVar[bool] = True
 
+    @checked
     def __init__(
         self,
-        defrec_weight: float = 0.5,
-        scale: float = 20.0,
-        min_points: int = 40,
+        defrec_weight: Share = 0.5,
+        scale: Weight = 20.0,
+        min_points: Annotated[int, Ge(1)] = 40,
         pcm: bool = False,
         on_source: bool = False,
-        dropout: float = 0.5,
+        dropout: Share = 0.5,
     ) -> None:
         super().__init__()
-        check_float("method.defrec_weight", defrec_weight, "[0, 1]")
-        self.defrec_weight, self.scale = defrec_weight, weight("scale", scale)
-        self.min_points = check_int("method.min_points", min_points, 1)
-        self.pcm, self.on_source = pcm, on_source
-        self.dropout = check_float("method.dropout", dropout, "[0, 1]")
+        self.defrec_weight, self.scale, self.min_points = defrec_weight, scale, min_points
+        self.pcm, self.on_source, self.dropout = pcm, on_source, dropout
         self.head: ReconstructionHead | None = None
 
     def prepare(self, net: nn.Module) -> None:
         """The reconstruction head."""
-        cloud, point = feature_dims(net)
-        if point is None:
-            raise ConfigError(
-                "method=defrec needs features of every point, and this model has none; choose "
-                "e.g. model=dgcnn or model=pointnet"
-            )
-        self.head = ReconstructionHead(cloud, point, self.dropout)
+        self.head = ReconstructionHead(net, self.dropout)
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator
@@ -103,14 +201,19 @@ class ReconstructionHead(nn.Module):
     its points and computed once.
 
     Args:
-        cloud_dim: D, of the cloud's vector.
-        point_dim: C, of a point's.
+        net: has features [B, D] of clouds and [B, N, C] of points.
         dropout: after the first two layers.
-        out: 3, or more where more is told of a point.
+        out: 3, or more where more is predicted of a point.
+
+    Raises:
+        ConfigError: the net has no features of points.
     """
 
-    def __init__(self, cloud_dim: int, point_dim: int, dropout: float, out: int = 3) -> None:
+    def __init__(self, net: nn.Module, dropout: float, out: int = 3) -> None:
         super().__init__()
+        cloud_dim, point_dim = feature_dims(net)
+        if point_dim is None:
+            raise ConfigError("this method needs features of points: choose e.g. model=dgcnn")
         both = nn.Linear(point_dim + cloud_dim, 256, bias=False)  # drawn for both at once
         self.of_point = nn.Parameter(both.weight.detach()[:, :point_dim].clone())
         self.of_cloud = nn.Parameter(both.weight.detach()[:, point_dim:].clone())

@@ -6,20 +6,21 @@ Clouds", ICCV 2021. The self-training that completes it is `selftraining=spst`.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_int
-from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import farthest_point_sampling, gather
+from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, check_taught, feature_dims, weight
-from qs3.methods.deform import VOXELS, cloud_size, deform
-from qs3.methods.mixup import join, source_loss
+from qs3.methods.base import Method, Weight, check_taught, feature_dims
+from qs3.methods.defrec import VOXELS, cloud_size, deform
+from qs3.methods.pcm import join, source_loss
+from qs3.utils.settings import checked
 
 _QUARTERS = 4
 
@@ -27,7 +28,7 @@ _QUARTERS = 4
 class Gast(Method):
     r"""L = w_c L_s + w_d [DefCls(x_s) + DefCls(x_t)] + w_r [RotCls(x_s) + RotCls(x_t)].
 
-    DefCls: one of 27 voxels of a cloud is deformed (`qs3.methods.deform`): which? Cross-entropy
+    DefCls: one of 27 voxels of a cloud is deformed (`deform`): which? Cross-entropy
     of a linear map of the cloud's vector. RotCls: a cloud is mixed with itself, one part turned
     about x, the other about y, each by a multiple of 90 degrees (`turn_parts`): by which?
     λ CE(h_1, a) + (1 - λ) CE(h_2, b), h_1 and h_2 linear.
@@ -48,26 +49,25 @@ class Gast(Method):
 
     uses_target: ClassVar[bool] = True
 
+    @checked
     def __init__(
         self,
-        class_weight: float = 0.5,
-        def_weight: float = 0.5,
-        rot_weight: float = 0.2,
-        min_points: int = 20,
+        class_weight: Weight = 0.5,
+        def_weight: Weight = 0.5,
+        rot_weight: Weight = 0.2,
+        min_points: Annotated[int, Ge(1)] = 20,
         pcm: bool = False,
     ) -> None:
         super().__init__()
-        self.class_weight = weight("class_weight", class_weight)
-        self.def_weight = weight("def_weight", def_weight)
-        self.rot_weight = weight("rot_weight", rot_weight)
-        self.min_points, self.pcm = check_int("method.min_points", min_points, 1), pcm
+        self.class_weight, self.def_weight, self.rot_weight = class_weight, def_weight, rot_weight
+        self.min_points, self.pcm = min_points, pcm
         self.def_head: nn.Module | None = None
         self.rot_heads: nn.ModuleList | None = None
 
     def prepare(self, net: nn.Module) -> None:
         """Linear heads: 27 voxels; four turns, twice. Only those of losses in use."""
         if self.def_weight or self.rot_weight:
-            check_taught(net, "method=gast", "choose method=pcfea, or a model that is trained")
+            check_taught(net, "method=gast")
         width, _ = feature_dims(net)
         if self.def_weight:
             self.def_head = nn.Linear(width, VOXELS)

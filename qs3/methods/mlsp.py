@@ -5,23 +5,21 @@ Liang et al., "Point Cloud Domain Adaptation via Masked Local 3D Structure Predi
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
+from annotated_types import Ge
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_float, check_int
-from qs3.errors import ConfigError
-from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import gather, knn
+from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, feature_dims, weight
-from qs3.methods.chamfer import masked_mean, nearest
-from qs3.methods.deform import cloud_size, deform
-from qs3.methods.defrec import ReconstructionHead
-from qs3.methods.mixup import source_loss
+from qs3.methods.base import Method, Share, Weight
+from qs3.methods.defrec import ReconstructionHead, cloud_size, deform, masked_mean, nearest
+from qs3.methods.pcm import source_loss
+from qs3.utils.settings import checked
 
 CARDINALITIES = 16
 RADIUS = 0.12  # of the ball in which points are counted, in radii of the cloud
@@ -33,7 +31,7 @@ class Mlsp(Method):
     r"""L = (1 - w) L_s + w 20 Chamfer + w_n (1 - |cos|) + w_c CE, the last three of masked points.
 
     L_s is the cross-entropy of source clouds, or PCM's of mixed ones. One voxel of each target
-    cloud is masked as DefRec deforms it (`qs3.methods.deform`). One head predicts for each of its
+    cloud is masked as DefRec deforms it (`deform`). One head predicts for each of its
     points a position, a normal and a cardinality (`cardinalities`). The prediction at a position is
     compared with what is true at the nearest original point, and the truth of each original point
     with the prediction at the nearest position; means over the points each way, and over the
@@ -54,33 +52,25 @@ class Mlsp(Method):
 
     uses_target: ClassVar[bool] = True
 
+    @checked
     def __init__(
         self,
-        position_weight: float = 0.5,
-        normal_weight: float = 0.5,
-        cardinality_weight: float = 0.05,
-        min_points: int = 40,
+        position_weight: Share = 0.5,
+        normal_weight: Weight = 0.5,
+        cardinality_weight: Weight = 0.05,
+        min_points: Annotated[int, Ge(1)] = 40,
         pcm: bool = True,
-        dropout: float = 0.5,
+        dropout: Share = 0.5,
     ) -> None:
         super().__init__()
-        self.position_weight = check_float("method.position_weight", position_weight, "[0, 1]")
-        self.normal_weight = weight("normal_weight", normal_weight)
-        self.cardinality_weight = weight("cardinality_weight", cardinality_weight)
-        self.min_points = check_int("method.min_points", min_points, 1)
-        self.pcm = pcm
-        self.dropout = check_float("method.dropout", dropout, "[0, 1]")
+        self.position_weight, self.normal_weight = position_weight, normal_weight
+        self.cardinality_weight = cardinality_weight
+        self.min_points, self.pcm, self.dropout = min_points, pcm, dropout
         self.head: ReconstructionHead | None = None
 
     def prepare(self, net: nn.Module) -> None:
         """The head."""
-        cloud, point = feature_dims(net)
-        if point is None:
-            raise ConfigError(
-                "method=mlsp needs features of every point, and this model has none; choose "
-                "e.g. model=dgcnn or model=pointnet"
-            )
-        self.head = ReconstructionHead(cloud, point, self.dropout, 3 + 3 + CARDINALITIES)
+        self.head = ReconstructionHead(net, self.dropout, 3 + 3 + CARDINALITIES)
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator

@@ -2,25 +2,29 @@
 
 Importing a file runs it, as it would in `python my_method.py`: the user has named it, and nothing
 here makes a file of somebody else harmless. It is read once, and what is run are the bytes whose
-SHA-256 is in the run's config: so the run's hash knows the method, and a file that was edited since
-is another run, never the same one gone on with.
+SHA-256 is in the run's config: so the run's hash knows the method, and an edited file is another
+run, never the same one gone on with.
 """
 
 from __future__ import annotations
 
 import hashlib
 import sys
-import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import torch
+from torch import nn
+
 from qs3.errors import ConfigError, MissingDataError
-from qs3.methods.base import Method
+from qs3.methods.base import Method, total_loss
+
+_CLOUDS = 4
 
 
 def own(file: str, sha256: str, **settings: Any) -> Method:
-    """The method of a file, which has one class derived from `Method` and its `loss`.
+    """The method of a file, which has one class derived from `Method`.
 
     Args:
         file: Python source; of more than one file only this one is in the hash.
@@ -29,35 +33,30 @@ def own(file: str, sha256: str, **settings: Any) -> Method:
 
     Raises:
         MissingDataError: there is no such file.
-        ConfigError: its content is another one, it cannot be imported, it has no such class or
-            several, the settings are not its own, its `__init__` leaves out `Method`'s, or it
-            asks for labels of the target.
+        ConfigError: its content is another one, it has no such class or several, or it asks for
+            labels of the target.
     """
     path = Path(file).expanduser()
     try:
         source = path.read_bytes()
     except OSError as error:
         raise MissingDataError(f"method.file={file} cannot be read ({error})") from error
-    if (found := hashlib.sha256(source).hexdigest()) != sha256:
+    if hashlib.sha256(source).hexdigest() != sha256:
+        raise ConfigError(f"method.file={file} has changed since this run was asked for")
+    module = _imported(path, source, sha256)
+    found = [
+        value
+        for value in vars(module).values()
+        if isinstance(value, type)
+        and issubclass(value, Method)
+        and value.__module__ == module.__name__
+    ]
+    if len(found) != 1 or found[0].labels != "source":
         raise ConfigError(
-            f"method.file={file} has changed since this run was asked for (SHA-256 {found[:12]}, "
-            f"not {sha256[:12]}); give the command again: the new content is a run of its own"
+            f"method.file={file} must have one class derived from qs3.methods.base.Method, of "
+            f"labels of the source; found {', '.join(cls.__name__ for cls in found) or 'none'}"
         )
-    cls = _class_of(_imported(path, source, sha256), file)
-    try:
-        method = cls(**settings)
-    except TypeError as error:  # of an unknown setting, above all
-        raise ConfigError(f"method.file={file}: {cls.__name__}: {error}") from error
-    if "_modules" not in vars(method):  # torch's own words come later and name neither
-        raise ConfigError(
-            f"method.file={file}: {cls.__name__}.__init__ must begin with super().__init__()"
-        )
-    if method.labels != "source":
-        raise ConfigError(
-            f"method.file={file}: {cls.__name__}.labels is {method.labels!r}: a method of one's "
-            "own gets labels of the source alone"
-        )
-    return method
+    return found[0](**settings)
 
 
 def _imported(path: Path, source: bytes, sha256: str) -> ModuleType:
@@ -70,30 +69,45 @@ def _imported(path: Path, source: bytes, sha256: str) -> ModuleType:
     sys.modules[name] = module
     try:
         exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)
-    except Exception as error:
+    except BaseException:
         del sys.modules[name]
-        frames = traceback.extract_tb(error.__traceback__)
-        lines = [frame.lineno for frame in frames if frame.filename == str(path)]
-        line = error.lineno if isinstance(error, SyntaxError) else lines[-1]
-        raise ConfigError(
-            f"method.file={path}, line {line}: {type(error).__name__}: {error}"
-        ) from error
+        raise
     return module
 
 
-def _class_of(module: ModuleType, file: str) -> type[Method]:
-    """The one class of a module that is a method and was not imported there."""
-    found = [
-        value
-        for value in vars(module).values()
-        if isinstance(value, type)
-        and issubclass(value, Method)
-        and value.__module__ == module.__name__
-    ]
-    if len(found) != 1 or found[0].loss is Method.loss:
-        names = ", ".join(cls.__name__ for cls in found) or "none"
-        raise ConfigError(
-            f"method.file={file}: expected one class derived from qs3.methods.base.Method, with a "
-            f"loss of its own; found {names}"
-        )
-    return found[0]
+def try_step(method: Method, net: nn.Module, classes: int, points: int) -> None:
+    """Prepare a method, and take its loss and the gradient of four random clouds.
+
+    So its errors come before any run begins. A method that prepares each epoch is only prepared:
+    its loss may need what that leaves. Nothing is drawn from torch's global generator.
+
+    Args:
+        method: of `own`.
+        net: [B, N, 3] to logits [B, C], new; it is changed.
+        classes: C.
+        points: N.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        method.prepare(net)
+        if type(method).start_epoch is Method.start_epoch:
+            batch = random_batch(method, classes, points)
+            net.train()
+            terms = method.loss(net, batch, torch.Generator().manual_seed(0))
+            total_loss(method, terms).backward()
+
+
+def random_batch(method: Method, classes: int, points: int) -> dict[str, Any]:
+    """A batch of what the method asks for, of clouds in the unit ball; see `qs3.methods.base`."""
+
+    def clouds() -> torch.Tensor:
+        drawn = torch.randn(_CLOUDS, points, 3)
+        return drawn / drawn.norm(dim=2).amax(dim=1)[:, None, None]
+
+    source = {"points": clouds(), f"y_{method.labels}": torch.arange(_CLOUDS) % classes}
+    if method.wants.again:
+        source["again"] = clouds()
+    batch: dict[str, Any] = {"index": 0, "epoch": 0, "progress": 0.5, "source": source}
+    if method.uses_target:
+        batch["target"] = {"points": clouds()}
+    return batch

@@ -1,7 +1,8 @@
 """PointDAN: align domains by the discrepancy of two classifiers, and by the features of nodes.
 
 Qin et al., "PointDAN: A Multi-Scale 3D Domain Adaption Network for Point Cloud Representation",
-NeurIPS 2019; the discrepancy is that of Saito et al., "Maximum Classifier Discrepancy", CVPR 2018.
+NeurIPS 2019; the discrepancy is that of Saito et al., "Maximum Classifier Discrepancy", CVPR 2018,
+that of nodes of Gretton et al., "A Kernel Two-Sample Test", JMLR 2012, eq. 5 (the biased estimate).
 """
 
 from __future__ import annotations
@@ -13,12 +14,35 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.errors import ConfigError
+from qs3.kernels.device import exact_products
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import Method, class_loss, weight
-from qs3.methods.mmd import mmd2
-from qs3.methods.reversal import reverse_gradient, sine_alpha
+from qs3.methods.base import Method, Weight, class_loss
+from qs3.methods.dann import reverse_gradient, sine_alpha
 from qs3.models.base import check_points
+from qs3.utils.settings import checked
+
+
+def mmd2(
+    x: Float[Tensor, "m d"], y: Float[Tensor, "n d"], sigmas: Sequence[float]
+) -> Float[Tensor, ""]:
+    """Mean k(x, x') + mean k(y, y') - 2 mean k(x, y), all pairs, a sample with itself included.
+
+    k(a, b) = sum over sigmas of exp(-|a - b|^2 / (2 sigma^2)). In [0, 2 len(sigmas)]; 0 for equal
+    samples. float32 at least, also under autocast.
+    """
+    with torch.autocast(x.device.type, enabled=False), exact_products():
+        x, y = (z.float() if z.dtype in (torch.float16, torch.bfloat16) else z for z in (x, y))
+        both = torch.cat([x, y])
+        both = both - both.mean(0).detach()  # nearer to 0: squares lose fewer digits
+        norms = both.square().sum(1)
+        squares = (norms[:, None] + norms[None] - 2 * both @ both.T).clamp_min(0)
+        # Rounding would leave a sample at some distance from itself: far, for a sigma of 0.01.
+        itself = torch.eye(len(both), dtype=torch.bool, device=both.device)
+        squares = squares.masked_fill(itself, 0.0)
+        kernel = torch.stack([torch.exp(squares / (-2 * sigma**2)) for sigma in sigmas]).sum(0)
+        m = len(x)
+        return kernel[:m, :m].mean() + kernel[m:, m:].mean() - 2 * kernel[:m, m:].mean()
+
 
 SIGMAS = (0.01, 0.1, 1.0, 10.0, 100.0)
 
@@ -47,25 +71,22 @@ class PointDan(Method):
 
     uses_target: ClassVar[bool] = True
 
+    @checked
     def __init__(
         self,
-        class_weight: float = 1.0,
-        discrepancy_weight: float = 1.0,
-        node_weight: float = 1.0,
-        classifier_rate: float = 2.0,
+        class_weight: Weight = 1.0,
+        discrepancy_weight: Weight = 1.0,
+        node_weight: Weight = 1.0,
+        classifier_rate: Weight = 2.0,
     ) -> None:
         super().__init__()
-        self.class_weight = weight("class_weight", class_weight)
-        self.discrepancy_weight = weight("discrepancy_weight", discrepancy_weight)
-        self.node_weight = weight("node_weight", node_weight)
-        self.classifier_rate = weight("classifier_rate", classifier_rate)
+        self.class_weight, self.discrepancy_weight = class_weight, discrepancy_weight
+        self.node_weight, self.classifier_rate = node_weight, classifier_rate
         self.attention: nn.ModuleDict | None = None
 
     def prepare(self, net: Any) -> None:
         """An attention of each domain."""
-        module = getattr(getattr(net, "backbone", None), "node_module", None)
-        if module is None:
-            raise ConfigError("method=pointdan needs its own generator of nodes: model=pointdan")
+        module = net.backbone.node_module  # of model=pointdan alone
         width = module.nodes * module.offset.in_features
         self.attention = nn.ModuleDict(
             {domain: NodeAttention(width) for domain in ("source", "target")}
@@ -83,7 +104,7 @@ class PointDan(Method):
         features, attended = {}, {}
         for domain in ("source", "target"):
             points = batch[domain]["points"]
-            check_points(points, net.backbone)
+            check_points(points)
             with use_domain(net, domain):
                 found, nodes = net.backbone.with_nodes(points)
             features[domain] = found.global_  # [B, 1024]

@@ -2,41 +2,65 @@
 
 Cardace, Spezialetti, Zama Ramirez, Salti, Di Stefano, "Self-Distillation for Unsupervised 3D Domain
 Adaptation", WACV 2023, its first step. The second, labels refined on a graph of the target's
-clouds, is `selftraining=sd`.
+clouds, is `selftraining=sd`. The teacher's weights are running means of the student's: Tarvainen,
+Valpola, "Mean teachers are better role models", NeurIPS 2017.
 """
 
 from __future__ import annotations
 
+import copy
 import math
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from annotated_types import Gt
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
-from qs3.config.checks import check_choice, check_float
+from qs3.errors import ConfigError
 from qs3.geometry.neighbours import gather
 from qs3.kernels.norms import use_domain
-from qs3.methods.base import check_taught, class_loss, weight
-from qs3.methods.mean_teacher import MeanTeacher
+from qs3.methods.base import Method, Share, Weight, check_taught, class_loss
+from qs3.utils.settings import checked
+
+
+@torch.no_grad()
+def move_towards(mean: nn.Module, net: nn.Module, part: Tensor) -> None:
+    """A running mean of weights and statistics takes `part` in [0, 1] of the net's.
+
+    Raises:
+        ConfigError: weights are in half precision, in which a mean stands still: it rounds away
+            what a step adds, and a count beyond 256.
+    """
+    theirs = net.state_dict()
+    if any(one.dtype in (torch.float16, torch.bfloat16) for one in theirs.values()):
+        raise ConfigError("trainer.precision: a running mean stands still in half precision")
+    for name, value in mean.state_dict().items():
+        if value.is_floating_point():
+            value.lerp_(theirs[name], part.to(value))
+        else:
+            value.copy_(theirs[name])  # counts of batch norm
+
 
 KEPT, LEAST, MOST = 0.7, 0.7, 1.5  # share of a cut cloud, and its size, of the released code
 
 
-class Sd(MeanTeacher):
+class Sd(Method):
     r"""L = CE(net(x_s'), y_s) + w e^{-5 (1 - p)^2} H(softmax(g(x) / T_t), softmax(f(x') / T_s)).
 
-    f: the backbone's vector of a cloud [B, D]; g: the same of the teacher, a net whose weights and
-    statistics are running means of the student's; x: the batch's clouds of both domains; x': as
-    they are spoilt for the student (`spoilt`); H(q, p) = -sum_d q_d log p_d, mean over the clouds;
-    p: progress of the warm-up. The D features serve as logits; T_t < T_s sharpens what the student
-    is to follow.
+    f: the backbone's vector of a cloud [B, D]; g: the same of the teacher in eval mode, which no
+    gradient reaches; x: the batch's clouds of both domains; x': as they are spoilt for the student
+    (`spoilt`); H(q, p) = -sum_d q_d log p_d, mean over the clouds; p: progress of the warm-up. The
+    D features serve as logits; T_t < T_s sharpens what the student is to follow.
+
+    After step t = 0, 1, ... the teacher takes the part max(1 / (t + 1), 1 - m) of the student's
+    weights and statistics: a plain mean at first.
 
     Args:
         consistency_weight: w; 1 in the released code's logs, 0 trains on the source alone.
-        momentum: m in [0, 1].
-        teacher_temperature, student_temperature: T_t, T_s > 0.
+        momentum: m.
+        teacher_temperature, student_temperature: T_t, T_s.
         cut: whose spoilt clouds are cut, too: "source" as in the released code, which does so to
             those of CAD models, "both" or "none".
 
@@ -45,30 +69,39 @@ class Sd(MeanTeacher):
     """
 
     uses_target: ClassVar[bool] = True
+    steps: Tensor
 
+    @checked
     def __init__(
         self,
-        consistency_weight: float = 1.0,
-        momentum: float = 0.999,
-        teacher_temperature: float = 0.1,
-        student_temperature: float = 0.5,
-        cut: str = "source",
+        consistency_weight: Weight = 1.0,
+        momentum: Share = 0.999,
+        teacher_temperature: Annotated[float, Gt(0)] = 0.1,
+        student_temperature: Annotated[float, Gt(0)] = 0.5,
+        cut: Literal["source", "both", "none"] = "source",
     ) -> None:
-        super().__init__(momentum)
-        self.consistency_weight = weight("consistency_weight", consistency_weight)
-        for key, value in (("teacher", teacher_temperature), ("student", student_temperature)):
-            check_float(f"method.{key}_temperature", value, "> 0")
-        self.teacher_temperature, self.student_temperature = (
-            teacher_temperature,
-            student_temperature,
-        )
-        self.cut = check_choice("method.cut", cut, ("source", "both", "none"))
+        super().__init__()
+        self.consistency_weight, self.momentum, self.cut = consistency_weight, momentum, cut
+        self.teacher_temperature = teacher_temperature
+        self.student_temperature = student_temperature
+        self.teacher: Any = None
+        self.register_buffer("steps", torch.zeros((), dtype=torch.float64))
 
     def prepare(self, net: Any) -> None:
-        """The teacher."""
+        """The teacher, which is the student before its first step."""
         if self.consistency_weight:
-            check_taught(net, "method=sd", "choose method=pcfea, or a model that is trained")
-        super().prepare(net)
+            check_taught(net, "method=sd")
+        self.teacher = copy.deepcopy(net).requires_grad_(False)
+
+    @torch.no_grad()
+    def follow(self, net: nn.Module) -> None:
+        """One step of the running means; the first takes the student as it is.
+
+        Called before a step it does what it would do after the one before.
+        """
+        self.teacher.eval()  # the trainer puts all modules into training mode, now and then
+        self.steps += 1
+        move_towards(self.teacher, net, (1 / self.steps).clamp_min(1 - self.momentum))
 
     def loss(
         self, net: Any, batch: dict[str, Any], generator: torch.Generator

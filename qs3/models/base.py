@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3.errors import DataError
-from qs3.geometry.neighbours import exporting
-from qs3.kernels.norms import head_norm, make_norm
-from qs3.utils.plural import counted
+from qs3.kernels.device import exporting
+from qs3.kernels.norms import Norm, head_norm, make_norm
 
 
 class Features(NamedTuple):
@@ -69,7 +68,7 @@ class ClassHead(nn.Sequential):
         negative_slope: float = 0.2,
         first_bias: bool = True,
         hidden_bias: bool = True,
-        norm: str = "batch",
+        norm: Norm = "batch",
     ) -> None:
         widths = (feature_dim, *hidden)
         layers: list[nn.Module] = []
@@ -96,7 +95,7 @@ class PointClassifier(nn.Module):
 
     def features(self, points: Float[Tensor, "b n 3"]) -> Features:
         """Features of checked clouds: for heads besides the classifier's."""
-        check_points(points, self.backbone)
+        check_points(points)
         return self.backbone(points)
 
     def forward(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b c"]:
@@ -108,11 +107,8 @@ class PointClassifier(nn.Module):
         self.backbone.compile(*args, **settings)
 
 
-def check_points(points: Tensor, net: nn.Module | None = None) -> None:
-    """Raise `DataError`, naming the item, unless `points` is a finite, not empty [B, N, 3].
-
-    Clouds of one point are refused for a `net` with instance norms over points: one value has no
-    statistics, and torch says so for some of the nets only.
+def check_points(points: Tensor) -> None:
+    """Raise `DataError` unless `points` is a finite, not empty [B, N, 3].
 
     A training step on a device would wait for the answer in each of its passes, so there values
     are looked at on the CPU and in evaluation alone: what is trained on was checked by the store.
@@ -120,22 +116,9 @@ def check_points(points: Tensor, net: nn.Module | None = None) -> None:
     """
     if points.ndim != 3 or points.shape[2] != 3 or points.shape[0] == 0 or points.shape[1] == 0:
         raise DataError(f"expected points [B >= 1, N >= 1, 3], got {list(points.shape)}")
-    if (
-        points.shape[1] == 1
-        and net is not None
-        and any(isinstance(module, nn.InstanceNorm1d) for module in net.modules())
-    ):
-        raise DataError(
-            "clouds of one point have no statistics for norm=instance: give clouds of more points "
-            "(data.points), or train with norm=batch"
-        )
     if exporting() or (points.device.type != "cpu" and torch.is_grad_enabled()):
         return
-    if torch.isfinite(points).all():
-        return
-    bad = (~torch.isfinite(points)).flatten(1).sum(1)  # [B]
-    item = int(bad.nonzero()[0, 0])
-    raise DataError(
-        f"batch item {item} has {counted(int(bad[item]), 'coordinate')} NaN or infinite (so have "
-        f"{int((bad > 0).sum())} of {len(bad)} items); check the dataset behind it"
-    )
+    finite = torch.isfinite(points)
+    if not finite.all():
+        item = int((~finite).flatten(1).any(1).nonzero()[0, 0])
+        raise DataError(f"coordinates of batch item {item} are NaN or infinite")

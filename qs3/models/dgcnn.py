@@ -11,23 +11,25 @@ Three variants, chosen by `variant`; parameters are with the class head for 10 c
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import torch
+from annotated_types import Ge
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3 import kernels as fast
-from qs3.config.checks import check_int
-from qs3.errors import ConfigError
-from qs3.geometry.device import exact_products, takes_triton
-from qs3.geometry.matmul import linear
 from qs3.geometry.neighbours import gather, knn
+from qs3.kernels.device import exact_products, takes_triton
 from qs3.kernels.edgeconv import edge_conv
-from qs3.kernels.norms import head_norm, make_norm, normed, uses_batch
+from qs3.kernels.matmul import linear
+from qs3.kernels.norms import Norm, head_norm, make_norm, normed, uses_batch
 from qs3.kernels.pointwise_max import max_over_members, max_over_rows, pooled_linear
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.utils.settings import checked
 
-VARIANTS = ("uda", "simpleview", "defrec")
+Variant = Literal["uda", "simpleview", "defrec"]
 
 
 class EdgeConv(nn.Module):
@@ -47,7 +49,7 @@ class EdgeConv(nn.Module):
         in_channels: int,
         out_channels: int,
         *,
-        norm: str = "batch",
+        norm: Norm = "batch",
         negative_slope: float = 0.2,
     ) -> None:
         super().__init__()
@@ -85,7 +87,7 @@ class EdgeTNet(nn.Module):
     Two layers act on each edge, so unlike EdgeConv's they cannot be computed without edges.
     """
 
-    def __init__(self, norm: str = "batch") -> None:
+    def __init__(self, norm: Norm = "batch") -> None:
         super().__init__()
         kind = head_norm(norm)  # rows of all clouds together
 
@@ -114,9 +116,8 @@ class DGCNN(Backbone):
     Args:
         k: neighbours of a point, itself included; clouds smaller than k use all points.
         variant: "uda", "simpleview" or "defrec", see the module.
-        norm: of the EdgeConvs and of conv5, see `qs3.kernels.norms`; "defrec"'s T-Net has batch
-        norm
-            where this is "instance".
+        norm: of the EdgeConvs and of conv5, see `qs3.kernels.norms`; the T-Net of "defrec" has
+            batch norm where this is "instance".
         widths: channels of the EdgeConvs.
         embedding: channels of conv5; `feature_dim` is twice that where maximum and mean are taken.
     """
@@ -125,16 +126,13 @@ class DGCNN(Backbone):
         self,
         *,
         k: int = 20,
-        variant: str = "uda",
-        norm: str = "batch",
+        variant: Variant = "uda",
+        norm: Norm = "batch",
         widths: tuple[int, ...] = (64, 64, 128, 256),
         embedding: int = 1024,
     ) -> None:
         super().__init__()
-        if variant not in VARIANTS:
-            names = ", ".join(f"'{v}'" for v in VARIANTS)
-            raise ConfigError(f"variant must be one of {names}, got {variant!r}")
-        self.k = self.least_points = check_int("model.k", k, 1)
+        self.k = self.least_points = k
         self.variant = variant
         self.feature_dim = embedding if variant == "defrec" else 2 * embedding
         self.transform = EdgeTNet(norm) if variant == "defrec" else None
@@ -168,11 +166,12 @@ class DGCNN(Backbone):
         return Features(torch.cat([most, y.mean(1)], dim=1), per_point)
 
 
+@checked
 def dgcnn(
     num_classes: int,
-    k: int = 20,
-    variant: str = "uda",
-    norm: str = "batch",
+    k: Annotated[int, Ge(1)] = 20,
+    variant: Variant = "uda",
+    norm: Norm = "batch",
     dropout: float = 0.5,
 ) -> PointClassifier:
     """DGCNN with its class head (512, 256; batch norm, LeakyReLU 0.2)."""

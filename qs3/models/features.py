@@ -14,7 +14,7 @@ import hashlib
 import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,11 +23,10 @@ from torch import Tensor, nn
 
 from qs3.datamodules.clouds import Clouds
 from qs3.datamodules.fps_cache import keep_array, read_array
-from qs3.errors import ConfigError, DataError
-from qs3.geometry.neighbours import exporting
+from qs3.errors import ConfigError, DataError, MissingDataError
+from qs3.kernels.device import exporting
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
-from qs3.utils.memory import check_memory
-from qs3.utils.plural import counted
+from qs3.utils.settings import checked
 
 log = logging.getLogger(__name__)
 
@@ -44,50 +43,25 @@ class Encoder:
     """
 
     def __init__(self, data: bytes, sha256: str, where: str) -> None:
-        try:
-            import onnx
-            import onnxruntime  # type: ignore[import-untyped]
-        except ImportError as error:
-            raise ConfigError(
-                f"model=features needs onnxruntime ({error}): "
-                "pip install '.[onnx]' in the folder of qs3"
-            ) from error
+        import onnx
+        import onnxruntime  # type: ignore[import-untyped]
+
         self.sha256, self.where = sha256, where
         self.known: dict[bytes, Float[np.ndarray, " d"]] = {}
-        try:
-            model = onnx.load_model_from_string(data)
-        except Exception as error:  # protobuf's parser raises errors of its own
-            raise DataError(f"{where} is not an ONNX file, or damaged ({error})") from error
-        if _names_files(model):
-            raise DataError(
-                f"{where} keeps weights in files beside it, which are not read; export it as one "
-                "file (torch.onnx.export(..., external_data=False))"
-            )
-        del model
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 4  # what it has to say is in the error
         options.intra_op_num_threads = torch.get_num_threads()
         there = onnxruntime.get_available_providers()
         try:
+            model = onnx.load_model_from_string(data)
+            assert not _names_files(model), "weights lie in files beside it: export it as one file"
             self.session = onnxruntime.InferenceSession(
                 data, options, providers=[name for name in _PROVIDERS if name in there]
             )
-        except Exception as error:  # of pybind: a RuntimeError, or one of its own classes
-            raise DataError(f"{where} cannot be run by onnxruntime ({error})") from error
-        inputs, outputs = self.session.get_inputs(), self.session.get_outputs()
-        if len(inputs) != 1 or len(outputs) != 1:
-            raise DataError(
-                f"{where} has {counted(len(inputs), 'input')} and "
-                f"{counted(len(outputs), 'output')}; expected one of each: clouds [B, N, 3] to "
-                "features [B, D]"
-            )
-        self.name = inputs[0].name
-        size = outputs[0].shape[-1] if outputs[0].shape else None
-        if not isinstance(size, int):
-            raise DataError(
-                f"{where}: its output is {outputs[0].shape}; expected a known D in [B, D]"
-            )
-        self.dim = size
+            (points,), (features,) = self.session.get_inputs(), self.session.get_outputs()
+            self.name, self.dim = points.name, int(features.shape[-1])
+        except Exception as error:  # of protobuf and pybind, with classes of their own
+            raise DataError(f"{where} is not an ONNX net [B, N, 3] to [B, D]: {error}") from error
 
     def __deepcopy__(self, memo: Any) -> Encoder:
         """Copies of a net share it: nothing in it is trained."""
@@ -97,7 +71,7 @@ class Encoder:
         """Features, of known clouds without computing them.
 
         Raises:
-            DataError: the file's net cannot take these clouds, or does not give finite [B, D].
+            DataError: the file's net does not give finite float32 [B, D].
         """
         found = [self.known.get(digest) for digest in map(_digest, points)]
         new = [i for i, one in enumerate(found) if one is None]
@@ -108,18 +82,10 @@ class Encoder:
 
     def compute(self, points: Float[np.ndarray, "b n 3"]) -> Float[np.ndarray, "b d"]:
         """Features by the net itself; see `__call__`."""
-        try:
-            (found,) = self.session.run(None, {self.name: np.ascontiguousarray(points)})
-        except Exception as error:
-            raise DataError(
-                f"{self.where} does not take clouds {list(points.shape)} ({error})"
-            ) from error
+        (found,) = self.session.run(None, {self.name: np.ascontiguousarray(points)})
         expected = (len(points), self.dim)
         if found.shape != expected or found.dtype != np.float32 or not np.isfinite(found).all():
-            raise DataError(
-                f"{self.where} gave {found.dtype} {list(found.shape)} for clouds "
-                f"{list(points.shape)}; expected finite float32 {list(expected)}"
-            )
+            raise DataError(f"{self.where} gave other than finite float32 {list(expected)}")
         return np.asarray(found)
 
     def remember(self, clouds: Clouds, folder: Path | None) -> None:
@@ -134,7 +100,7 @@ class Encoder:
         name, shape = f"features {self.sha256} {data}", (len(digests), self.dim)
 
         def work() -> Float[np.ndarray, "n d"]:
-            log.info("features of %s by %s", counted(len(digests), "cloud"), self.where)
+            log.info("features of %d clouds by %s", len(digests), self.where)
             return np.concatenate([self.compute(batch) for batch in points])
 
         if folder is None:
@@ -156,21 +122,19 @@ class Frozen(Backbone):
     def forward(self, points: Float[Tensor, "b n 3"]) -> Features:
         """[B, N, 3] to the file's features; no gradient goes back to the points."""
         if exporting():
-            raise ConfigError(
-                "model=features cannot be exported: its backbone is an ONNX file of yours already; "
-                "its head is `net.head` of qs3.load(run)"
-            )
+            raise ConfigError("model=features cannot be exported: its backbone is an ONNX file")
         found = self.encoder(points.detach().cpu().to(torch.float32).numpy())
         return Features(torch.from_numpy(found).to(points), None)
 
 
+@checked
 def features(
     num_classes: int,
     file: str,
     sha256: str,
     hidden: Sequence[int] = (256,),
     dropout: float = 0.5,
-    norm: str = "batch",
+    norm: Literal["batch", "domain"] = "batch",
 ) -> PointClassifier:
     """A head on the features that a file's net gives.
 
@@ -180,18 +144,13 @@ def features(
         sha256: 64 hex digits, of its content.
         hidden: widths of the head; none is a linear probe.
         dropout: in the head.
-        norm: of the head: "batch" or "domain".
+        norm: of the head; of one vector a cloud there is no instance norm.
 
     Raises:
-        ConfigError: the file is not there, or another one than that of this hash; instance norm.
-        DataError: it is damaged, or is not such a net.
+        MissingDataError: the file is not there.
+        DataError: it is another one than that of this hash, damaged, or not such a net.
     """
-    if norm == "instance":  # in heads it is batch norm, and a head is all that is trained here
-        raise ConfigError(
-            "model.norm=instance is of a cloud's points, and model=features trains a head on one "
-            "vector a cloud: the run would be that of batch; set model.norm=batch or domain"
-        )
-    encoder = _encoder(str(file), str(sha256))
+    encoder = _encoder(file, sha256)
     head = ClassHead(encoder.dim, num_classes, hidden=tuple(hidden), dropout=dropout, norm=norm)
     return PointClassifier(Frozen(encoder), head)
 
@@ -207,16 +166,12 @@ def remember(net: nn.Module, of: Iterable[Clouds], folder: Path | None) -> None:
 @functools.lru_cache(maxsize=2)
 def _encoder(file: str, sha256: str) -> Encoder:
     """One for all nets of a process: it is large, and what is known is known to all."""
-    path = Path(file).expanduser()
-    if not path.is_file():
-        raise ConfigError(f"model.file={file} is not there; model=features needs an ONNX file")
-    check_memory(3 * path.stat().st_size, f"model.file={file}")
-    data = path.read_bytes()
-    if (found := hashlib.sha256(data).hexdigest()) != sha256:
-        raise ConfigError(
-            f"model.file={file} is another file than the one that was meant (SHA-256 "
-            f"{found[:12]}, not {sha256[:12]})"
-        )
+    try:
+        data = Path(file).expanduser().read_bytes()
+    except OSError as error:
+        raise MissingDataError(f"model.file={file} cannot be read ({error})") from error
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise DataError(f"model.file={file} is not the file of SHA-256 {sha256[:12]}")
     return Encoder(data, sha256, f"model.file={file}")
 
 

@@ -6,19 +6,20 @@ NeurIPS 2019: PointNet with a module of self-adaptive nodes between its layers.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
+from annotated_types import Ge, Gt
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from qs3.config.checks import check_float, check_int
 from qs3.geometry.ball_query import ball_query
-from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import farthest_point_sampling, gather
-from qs3.kernels.norms import head_norm, make_norm
+from qs3.kernels.device import exact_products
+from qs3.kernels.norms import Norm, head_norm, make_norm
 from qs3.models.base import Backbone, Features, PointClassifier
 from qs3.models.pointnet import PointMLP, TNet
+from qs3.utils.settings import checked
 
 
 class Nodes(NamedTuple):
@@ -57,12 +58,10 @@ class NodeModule(nn.Module):
         nodes: int = 64,
         neighbours: int = 64,
         radius: float = 0.3,
-        norm: str = "batch",
+        norm: Norm = "batch",
     ) -> None:
         super().__init__()
-        self.nodes = check_int("model.nodes", nodes, 1)
-        self.neighbours = check_int("model.neighbours", neighbours, 1)
-        self.radius = check_float("model.radius", radius, "> 0")
+        self.nodes, self.neighbours, self.radius = nodes, neighbours, radius
         self.offset = nn.Linear(channels, 3, bias=False)
         self.residual = PointMLP(channels, channels, norm=norm)
 
@@ -103,7 +102,7 @@ class PointDanBackbone(Backbone):
     feature_dim = 1024
 
     def __init__(
-        self, *, nodes: int = 64, neighbours: int = 64, radius: float = 0.3, norm: str = "batch"
+        self, *, nodes: int = 64, neighbours: int = 64, radius: float = 0.3, norm: Norm = "batch"
     ) -> None:
         super().__init__()
         self.input_transform = TNet(3, norm, nn.LeakyReLU)
@@ -143,12 +142,13 @@ class TwoHeads(nn.Module):
         return (self.first(features) + self.second(features)) / 2
 
 
+@checked
 def pointdan(
     num_classes: int,
-    nodes: int = 64,
-    neighbours: int = 64,
-    radius: float = 0.3,
-    norm: str = "batch",
+    nodes: Annotated[int, Ge(1)] = 64,
+    neighbours: Annotated[int, Ge(1)] = 64,
+    radius: Annotated[float, Gt(0)] = 0.3,
+    norm: Norm = "batch",
 ) -> PointClassifier:
     """PointDAN's net; any method can train it, `method=pointdan` needs it."""
     backbone = PointDanBackbone(nodes=nodes, neighbours=neighbours, radius=radius, norm=norm)

@@ -12,19 +12,20 @@ Three variants, chosen by `variant`; parameters are with the class head for 10 c
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from qs3 import kernels as fast
-from qs3.errors import ConfigError
-from qs3.geometry.device import exact_products
-from qs3.kernels.norms import head_norm, make_norm, normed
+from qs3.kernels.device import exact_products
+from qs3.kernels.norms import Norm, head_norm, make_norm, normed
 from qs3.kernels.pointwise_max import normed_maximum
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.utils.settings import checked
 
-VARIANTS = ("simpleview", "uda", "basic")
+Variant = Literal["simpleview", "uda", "basic"]
 
 
 class PointMLP(nn.Module):
@@ -38,7 +39,7 @@ class PointMLP(nn.Module):
     """
 
     def __init__(
-        self, *widths: int, last_relu: bool = True, bias: bool = True, norm: str = "batch"
+        self, *widths: int, last_relu: bool = True, bias: bool = True, norm: Norm = "batch"
     ) -> None:
         super().__init__()
         layers: list[nn.Module] = []
@@ -80,7 +81,7 @@ class TNet(nn.Module):
     """
 
     def __init__(
-        self, channels: int, norm: str = "batch", activation: type[nn.Module] = nn.ReLU
+        self, channels: int, norm: Norm = "batch", activation: type[nn.Module] = nn.ReLU
     ) -> None:
         super().__init__()
         self.channels = channels
@@ -109,11 +110,8 @@ class PointNet(Backbone):
 
     feature_dim = 1024
 
-    def __init__(self, *, variant: str = "simpleview", norm: str = "batch") -> None:
+    def __init__(self, *, variant: Variant = "simpleview", norm: Norm = "batch") -> None:
         super().__init__()
-        if variant not in VARIANTS:
-            names = ", ".join(f"'{v}'" for v in VARIANTS)
-            raise ConfigError(f"variant must be one of {names}, got {variant!r}")
         turned = variant != "basic"
         relu, bias = variant != "simpleview", variant != "basic"
         first, middle = {
@@ -168,8 +166,9 @@ def transform_regulariser(transform: Float[Tensor, "b c c"]) -> Float[Tensor, ""
     return (identity - transform @ transform.transpose(1, 2)).flatten(1).norm(dim=1).mean()
 
 
+@checked
 def pointnet(
-    num_classes: int, dropout: float = 0.3, variant: str = "simpleview", norm: str = "batch"
+    num_classes: int, dropout: float = 0.3, variant: Variant = "simpleview", norm: Norm = "batch"
 ) -> PointClassifier:
     """PointNet with its class head: hidden layers of 512 and 256, of 512 in "basic"."""
     backbone = PointNet(variant=variant, norm=norm)

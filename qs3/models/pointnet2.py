@@ -10,20 +10,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3 import kernels as fast
-from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_queries
 from qs3.geometry.neighbours import farthest_point_sampling, gather
 from qs3.kernels.grouped_mlp_max import grouped_mlp_max
-from qs3.kernels.norms import make_norm, normed
+from qs3.kernels.norms import Norm, make_norm, normed
 from qs3.kernels.pointwise_max import max_over_members
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.utils.settings import checked
 
 
 @dataclass(frozen=True)
@@ -40,22 +40,8 @@ SSG = (
     (128, (Scale(0.4, 64, (128, 128, 256)),)),
 )
 MSG = (
-    (
-        512,
-        (
-            Scale(0.1, 16, (32, 32, 64)),
-            Scale(0.2, 32, (64, 64, 128)),
-            Scale(0.4, 128, (64, 96, 128)),
-        ),
-    ),
-    (
-        128,
-        (
-            Scale(0.2, 32, (64, 64, 128)),
-            Scale(0.4, 64, (128, 128, 256)),
-            Scale(0.8, 128, (128, 128, 256)),
-        ),
-    ),
+    (512, (Scale(0.1, 16, (32, 32, 64)), *SSG[0][1], Scale(0.4, 128, (64, 96, 128)))),
+    (128, (Scale(0.2, 32, (64, 64, 128)), *SSG[1][1], Scale(0.8, 128, (128, 128, 256)))),
 )
 
 
@@ -69,7 +55,7 @@ class GroupedMLP(nn.Module):
             ("instance") of each cloud.
     """
 
-    def __init__(self, channels: int, widths: Sequence[int], *, norm: str = "batch") -> None:
+    def __init__(self, channels: int, widths: Sequence[int], *, norm: Norm = "batch") -> None:
         super().__init__()
         sizes = (3 + channels, *widths)
         self.linears = nn.ModuleList(nn.Linear(i, o, bias=False) for i, o in pairwise(sizes))
@@ -110,7 +96,7 @@ class SetAbstraction(nn.Module):
         norm: see `GroupedMLP`.
     """
 
-    def __init__(self, channels: int, centres: int, scales: Sequence[Scale], norm: str) -> None:
+    def __init__(self, channels: int, centres: int, scales: Sequence[Scale], norm: Norm) -> None:
         super().__init__()
         self.centres, self.scales = centres, tuple(scales)
         self.mlps = nn.ModuleList(GroupedMLP(channels, s.widths, norm=norm) for s in scales)
@@ -140,10 +126,8 @@ class PointNet2(Backbone):
     feature_dim = 1024
     least_points = 513  # more than there are centres: fewer start over
 
-    def __init__(self, *, variant: str = "msg", norm: str = "batch") -> None:
+    def __init__(self, *, variant: Literal["msg", "ssg"] = "msg", norm: Norm = "batch") -> None:
         super().__init__()
-        if variant not in ("ssg", "msg"):
-            raise ConfigError(f"variant must be 'ssg' or 'msg', got {variant!r}")
         channels, levels = 0, []
         for centres, scales in SSG if variant == "ssg" else MSG:
             levels.append(SetAbstraction(channels, centres, scales, norm))
@@ -165,8 +149,12 @@ class PointNet2(Backbone):
         return Features(self.last(xyz, features, origin, everything).squeeze(1), None)
 
 
+@checked
 def pointnet2(
-    num_classes: int, variant: str = "msg", norm: str = "batch", dropout: float = 0.5
+    num_classes: int,
+    variant: Literal["msg", "ssg"] = "msg",
+    norm: Norm = "batch",
+    dropout: float = 0.5,
 ) -> PointClassifier:
     """PointNet++ with its class head (512, 256; ReLU)."""
     backbone = PointNet2(variant=variant, norm=norm)

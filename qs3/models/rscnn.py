@@ -13,21 +13,22 @@ d = xj - xi; what it is in code is the switch `relation`:
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from qs3 import kernels as fast
-from qs3.errors import ConfigError
 from qs3.geometry.ball_query import ball_query
 from qs3.geometry.neighbours import farthest_point_sampling, gather
-from qs3.kernels.norms import make_norm, normed
+from qs3.kernels.norms import Norm, make_norm, normed
 from qs3.kernels.pointwise_max import max_over_members
 from qs3.kernels.rsconv import relations, rs_conv
 from qs3.models.base import Backbone, ClassHead, Features, PointClassifier
+from qs3.utils.settings import checked
 
+Relation = Literal["released", "original", "paper"]
 # centres, radius (of a cloud in the unit ball), slots of a ball, of each layer
 LEVELS = ((512, 0.23, 48), (128, 0.32, 64))
 
@@ -47,7 +48,13 @@ class RSConv(nn.Module):
     """
 
     def __init__(
-        self, channels: int, hidden: int, out_channels: int, relation: str, *, norm: str = "batch"
+        self,
+        channels: int,
+        hidden: int,
+        out_channels: int,
+        relation: Relation,
+        *,
+        norm: Norm = "batch",
     ) -> None:
         super().__init__()
         inner = channels + 3 if channels else 16
@@ -130,12 +137,8 @@ class RSCNN(Backbone):
     feature_dim = 1024
     least_points = LEVELS[0][0] + 1  # more than there are centres: fewer start over
 
-    def __init__(self, *, relation: str = "released", norm: str = "batch") -> None:
+    def __init__(self, *, relation: Relation = "released", norm: Norm = "batch") -> None:
         super().__init__()
-        if relation not in ("released", "original", "paper"):
-            raise ConfigError(
-                f"relation must be 'released', 'original' or 'paper', got {relation!r}"
-            )
         self.relation, self.norm = relation, norm
         self.layers = nn.ModuleList(
             [RSConv(0, 64, 128, relation, norm=norm), RSConv(128, 128, 512, relation, norm=norm)]
@@ -175,7 +178,7 @@ def group(
     index: Int[Tensor, "b m"],
     radius: float,
     slots: int,
-    relation: str,
+    relation: Relation,
 ) -> Int[Tensor, "b m k"]:
     """Members of each ball, the distinct ones first, then copies of the first.
 
@@ -198,10 +201,11 @@ def group(
     return torch.cat([centre, torch.where(copy, centre, found)], dim=2)
 
 
+@checked
 def rscnn(
     num_classes: int,
-    relation: str = "released",
-    norm: str = "batch",
+    relation: Relation = "released",
+    norm: Norm = "batch",
     dropout: float = 0.5,
 ) -> PointClassifier:
     """RS-CNN with its class head (512, 256; ReLU)."""

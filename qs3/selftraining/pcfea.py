@@ -22,8 +22,8 @@ from qs3.datamodules.phases import plain_epochs
 from qs3.errors import ConfigError
 from qs3.evaluation.metrics import said_of
 from qs3.kernels.norms import begin_target_norms, use_domain
-from qs3.methods.base import Method, check_taught, class_loss, weight
-from qs3.methods.mean_teacher import move_towards
+from qs3.methods.base import Method, check_taught, class_loss
+from qs3.methods.sd import move_towards
 from qs3.selftraining.selectors import (
     Selector,
     TeacherPredictions,
@@ -92,8 +92,8 @@ class Pcfea(Method):
         momentum: float = 0.0,
     ) -> None:
         super().__init__()
-        self.strength = weight("strength", strength)
-        self.align_weight = weight("align_weight", align_weight)
+        self.strength = check_float("method.strength", strength, ">= 0")
+        self.align_weight = check_float("method.align_weight", align_weight, ">= 0")
         self.shift = check_choice("method.shift", shift, ("growing", "full", "none"))
         self.pool = check_choice("method.pool", pool, ("share", "threshold"))
         self.rank = check_choice("method.rank", rank, ("label", "most"))
@@ -124,11 +124,7 @@ class Pcfea(Method):
                 "model=dgcnn or model=pointnet"
             )
         if self.align_weight and len(head) == 1:  # what it is given is the net's vector
-            check_taught(
-                net,
-                "method.align_weight with a head of one layer",
-                "set method.align_weight=0, or give the head a hidden layer (model.hidden)",
-            )
+            check_taught(net, "method.align_weight with a head of one layer")
         classes, width = head[-1].weight.shape
         self.register_buffer("mean", torch.zeros(classes, width))
         self.register_buffer("source_mean", torch.zeros(classes, width))

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from qs3.kernels.norms import use_domain
 from qs3.methods.base import Method, class_loss
-from qs3.methods.mixup import mix, pcm_loss
+from qs3.methods.pcm import mix, pcm_loss
 
 
 class Student(Method):

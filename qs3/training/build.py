@@ -135,7 +135,7 @@ def _classifier(run: Run, method: Method, given: Given | None) -> Classifier:
     if cfg.evaluation.norms != "trained":
         check_has_norms(classifier.net, cfg.evaluation.norms)
     if scheme.rounds and getattr(scheme.selector, "needs_features", False):
-        feature_dims(classifier.net, f"selftraining.selector ({type(scheme.selector).__name__})")
+        feature_dims(classifier.net)
     if cfg.compile:
         classifier.net.compile()  # in place; nets that are only evaluated stay as they are
     return classifier

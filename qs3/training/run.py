@@ -35,7 +35,7 @@ class Run:
         return self.cfg.method.get("_target_") == _SUPERVISED
 
 
-_SUPERVISED = "qs3.methods.supervised.Supervised"  # its name only: its module imports torch
+_SUPERVISED = "qs3.methods.bounds.Supervised"  # its name only: its module imports torch
 
 
 def run_of(cfg: DictConfig) -> Run:

@@ -5,6 +5,7 @@
         focal_px: Annotated[float, Gt(0)]
         mode: Literal["near", "far"] = "near"
 
+A function, or the `__init__` of a class with a state of its own, is `@checked` instead.
 Ranges are those of `annotated_types` (Ge, Gt, Le, Lt, Interval). `qs3.config.hydra.build` turns a
 pydantic error into a ConfigError that names the place in the config; elsewhere it is a ValueError.
 """
@@ -12,12 +13,14 @@ pydantic error into a ConfigError that names the place in the config; elsewhere 
 from __future__ import annotations
 
 import dataclasses
-from typing import TypeVar, dataclass_transform
+from collections.abc import Callable
+from typing import Any, TypeVar, dataclass_transform
 
-from pydantic import ConfigDict, ValidationError
+from pydantic import ConfigDict, ValidationError, validate_call
 from pydantic.dataclasses import dataclass as _dataclass
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 _CONFIG = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
 
 
@@ -26,6 +29,11 @@ def settings(cls: type[T]) -> type[T]:
     """A frozen dataclass that checks its fields when it is made; unknown arguments are errors."""
     made: type[T] = _dataclass(frozen=True, config=_CONFIG)(cls)  # type: ignore[assignment]
     return made
+
+
+def checked(function: F) -> F:
+    """A function that checks the types and ranges of its arguments."""
+    return validate_call(config=_CONFIG)(function)
 
 
 def problems(error: ValidationError, place: str = "") -> str:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.methods.source_only import SourceOnly
+from qs3.methods.bounds import SourceOnly
 from qs3.models.dgcnn import dgcnn
 from qs3.models.pointdan import pointdan
 from tests.benchmarks.device import DEVICE, POINTS, WHERE, finish

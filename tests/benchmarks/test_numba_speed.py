@@ -9,7 +9,7 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from qs3.geometry import compiled
+from qs3.kernels import compiled
 from qs3.models.dgcnn import dgcnn
 from tests.benchmarks.device import WHERE
 from tests.benchmarks.test_dgcnn_speed import _fastest, _step
@@ -23,7 +23,7 @@ def test_what_numba_brings(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture,
 ) -> None:
-    """A training step with the kernels of `qs3.geometry.compiled` against torch's operations."""
+    """A training step with the kernels of `qs3.kernels.compiled` against torch's operations."""
     torch.manual_seed(0)
     points, labels = torch.randn(b, n, 3) / 2, torch.randint(10, (b,))
     step = _step(dgcnn(10), points, labels)

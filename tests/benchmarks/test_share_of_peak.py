@@ -22,8 +22,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-from qs3.geometry import compiled
-from qs3.geometry.matmul import matmul_t
+from qs3.kernels import compiled
+from qs3.kernels.matmul import matmul_t
 from tests.benchmarks.test_simpleview_speed import boxes
 from tests.benchmarks.test_throughput import _inference, _net, _training
 from tests.models.test_all_nets import NETS

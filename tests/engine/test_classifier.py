@@ -10,11 +10,11 @@ import torch
 
 from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
+from qs3.methods.bounds import SourceOnly
 from qs3.methods.dann import Dann
 from qs3.methods.gast import Gast
 from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
-from qs3.methods.source_only import SourceOnly
 from qs3.models.pointdan import pointdan
 from qs3.selftraining.student_loss import Student
 from tests.methods.shapes import tiny_net

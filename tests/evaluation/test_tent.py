@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from qs3.evaluation.metrics import adapt_norms
 from qs3.evaluation.tent import RATE, entropy, minimise_entropy
 from qs3.kernels.norms import use_domain
-from qs3.methods.source_only import SourceOnly
+from qs3.methods.bounds import SourceOnly
 from qs3.models.base import ClassHead, PointClassifier
 from qs3.models.dgcnn import DGCNN
 from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, train

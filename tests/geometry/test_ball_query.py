@@ -3,7 +3,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.errors import DataError
 from qs3.geometry import ball_query as module
 from qs3.geometry.ball_query import ball_queries, ball_query
 
@@ -67,16 +66,3 @@ def test_blocks_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> Non
         assert torch.equal(a, b)
     for radius, count, expected in ((0.5, 4, whole[0]), (1.0, 9, whole[1])):
         assert torch.equal(ball_query(x, x[:, :20], radius, count), expected)
-
-
-def test_half_precision_is_searched_in_float32() -> None:
-    x = torch.randn(1, 40, 3).bfloat16()
-    expected = ball_query(x.float(), x.float(), 0.7, 5)
-    assert torch.equal(ball_query(x, x, 0.7, 5), expected)
-
-
-@pytest.mark.parametrize(("radii", "counts"), [([0.0], [1]), ([1.0], [0]), ([1.0], [1, 2])])
-def test_refuses(radii: list[float], counts: list[int]) -> None:
-    x = torch.zeros(1, 2, 3)
-    with pytest.raises(DataError, match="radii > 0 and counts >= 1"):
-        ball_queries(x, x, radii, counts)

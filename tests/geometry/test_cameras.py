@@ -2,38 +2,16 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import FrozenInstanceError
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from qs3.errors import ConfigError
 from qs3.geometry.cameras import Camera, Intrinsics, Window, look_at, project, rotation_xyz
 
 coordinates = st.tuples(*[st.floats(-5, 5, allow_subnormal=False)] * 3).map(np.array)
 angles = st.tuples(*[st.floats(-4, 4, allow_subnormal=False)] * 3).map(np.array)
-
-
-@pytest.mark.parametrize("size", [(0, 5), (5, 0), (-1, 5), (5, -1)])
-def test_an_empty_image_is_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(ConfigError, match=rf"image size {size[0]} x {size[1]} px is empty"):
-        Intrinsics(*size, 10.0, 0.0, 0.0)
-
-
-@pytest.mark.parametrize("focal", [0.0, -1.0, math.nan])
-def test_a_focal_length_is_positive(focal: float) -> None:
-    with pytest.raises(ConfigError, match="focal_px must be positive"):
-        Intrinsics(4, 4, focal, 0.0, 0.0)
-
-
-def test_the_middle_of_an_image() -> None:
-    k = Intrinsics.centred(5, 4, 2.0)
-    assert k == Intrinsics(5, 4, 2.0, 2.0, 1.5)
-    assert Intrinsics.centred(1, 1, 0.5) == Intrinsics(1, 1, 0.5, 0.0, 0.0)
 
 
 def test_what_is_rendered() -> None:
@@ -43,17 +21,6 @@ def test_what_is_rendered() -> None:
     assert Camera(k, np.eye(4), window).rendered == window
     image = np.arange(24).reshape(4, 6)
     assert image[window.slices].tolist() == [[13, 14, 15], [19, 20, 21]]
-
-
-def test_cameras_cannot_be_changed() -> None:
-    k = Intrinsics.centred(6, 4, 2.0)
-    for value, key in (
-        (k, "focal_px"),
-        (Window(0, 0, 1, 1), "left"),
-        (Camera(k, np.eye(4)), "window"),
-    ):
-        with pytest.raises(FrozenInstanceError):
-            setattr(value, key, 3)
 
 
 @settings(max_examples=40, deadline=None)
@@ -85,11 +52,6 @@ def test_looking_straight_up_or_down(side: float) -> None:
     pose = look_at(np.zeros(3), np.array([0, 0, side]))
     np.testing.assert_array_equal(pose[:3, :3].T, [[1, 0, 0], [0, side, 0], [0, 0, side]])
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
-
-
-def test_looking_at_oneself() -> None:
-    with pytest.raises(ConfigError, match="cannot look at its own position"):
-        look_at(np.ones(3), np.ones(3))
 
 
 @settings(max_examples=40, deadline=None)

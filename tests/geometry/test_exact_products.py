@@ -15,12 +15,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from qs3.config.hashing import config_sha256
-from qs3.geometry.device import exact_products
 from qs3.geometry.neighbours import knn
-from qs3.methods.chamfer import masked_chamfer, nearest
+from qs3.kernels.device import exact_products
+from qs3.methods.defrec import masked_chamfer, nearest
 from qs3.methods.gast import turn_parts
 from qs3.methods.mlsp import cardinalities, normals_of
-from qs3.methods.mmd import mmd2
+from qs3.methods.pointdan import mmd2
 from tests.composing import compose
 from tests.device import as_on_device
 from tests.models.test_all_nets import NETS, build

@@ -5,8 +5,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.geometry import compiled, neighbours
+from qs3.geometry import neighbours
 from qs3.geometry.neighbours import farthest_point_sampling, gather, knn
+from qs3.kernels import compiled
 from tests.device import as_on_device
 from tests.geometry.test_sampling import assert_farthest
 
@@ -37,37 +38,6 @@ def test_knn_equals_brute_force(n: int, c: int, k: int, dtype: torch.dtype) -> N
     assert torch.equal(index[:, :, 0], torch.arange(n).expand(2, n))  # itself
 
 
-def _points(kind: str, shape: tuple[int, int, int], dtype: torch.dtype) -> torch.Tensor:
-    x = torch.randn(shape, generator=torch.Generator().manual_seed(0)).to(dtype)
-    if kind == "grid":  # most distances are equal to others
-        return (2 * x).round()
-    if kind == "copies":
-        return x[:, torch.arange(shape[1]) % 40]
-    if kind == "one place":
-        return torch.zeros_like(x)
-    if kind == "nan":
-        x[0, 5, 0], x[1, 7] = torch.nan, torch.inf
-    return x
-
-
-@pytest.mark.parametrize("kind", ["random", "grid", "copies", "one place", "nan"])
-@pytest.mark.parametrize(("n", "c", "k"), [(192, 3, 20), (333, 5, 20), (500, 3, 33), (260, 8, 1)])
-@pytest.mark.parametrize("threads", [1, 3])
-def test_compiled_and_numpys_nearest_are_the_same(
-    n: int, c: int, k: int, kind: str, threads: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """To the last index, also where distances are equal: trainings must not depend on numba."""
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    for dtype in (torch.float32, torch.float64):
-        x = _points(kind, (2, n, c), dtype)
-        found = knn(x, k)
-        with monkeypatch.context() as without:
-            without.setattr(compiled, "has_numba", lambda: False)
-            assert torch.equal(knn(x, k), found)
-        if kind in ("random", "grid"):
-            _assert_nearest(x.double(), found, atol=1e-4)
-
-
 @pytest.mark.parametrize("equal", [0, 1, 60, 200])
 def test_smallest_sums_of_rows_that_are_mostly_equal(equal: int) -> None:
     """Of `equal` columns that share the least value the first come first."""
@@ -79,12 +49,6 @@ def test_smallest_sums_of_rows_that_are_mostly_equal(equal: int) -> None:
     assert torch.equal(values, sums)
     assert torch.equal(sums.gather(1, found), sums.sort(1)[0][:, :20])
     assert torch.equal(found, sums.sort(dim=1, stable=True)[1][:, :20])
-    assert torch.equal(neighbours._smallest_on_cpu(sums, 20), found)
-
-
-def test_knn_is_exact_in_float64() -> None:
-    x = torch.randn(2, 400, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(knn(x, 20), _distances(x).topk(20, largest=False)[1])
 
 
 def test_knn_tree_and_dense_agree(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,17 +109,6 @@ def test_gather() -> None:
     index = torch.tensor([[[0, 2]], [[1, 1]]])
     assert gather(x, index).tolist() == [[[[0, 1], [4, 5]]], [[[8, 9], [8, 9]]]]
     assert gather(x, index[:, 0]).shape == (2, 2, 2)
-
-
-@pytest.mark.parametrize("shape", [(2, 5, 7), (7, 5, 2), (3, 1, 1)])
-def test_gather_by_loops(shape: tuple[int, int, int]) -> None:
-    b, n, c = shape
-    x = torch.randn(b, n, c)
-    index = torch.randint(n, (b, 4, 3))
-    expected = torch.stack([cloud[rows] for cloud, rows in zip(x, index, strict=True)])
-    assert torch.equal(gather(x, index), expected)
-    with as_on_device():
-        assert torch.equal(gather(x, index), expected)
 
 
 def _on_device(*args: Any) -> torch.Tensor:

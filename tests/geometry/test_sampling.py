@@ -83,11 +83,8 @@ def test_fps_of_one_repeated_point_and_of_too_few() -> None:
     assert farthest_point_sampling_np(square, 0).tolist() == []
 
 
-@pytest.mark.parametrize(("n", "start"), [(2, 3), (2, 4), (2, -1), (-1, 0)])
-def test_fps_bad_arguments(n: int, start: int) -> None:
-    with pytest.raises(DataError, match="cannot take"):
-        farthest_point_sampling_np(np.zeros((3, 3)), n, start)
-    with pytest.raises(DataError, match="NaN"):
+def test_fps_of_what_is_no_number() -> None:
+    with pytest.raises(DataError):
         farthest_point_sampling_np(np.full((3, 3), np.nan), 2)
 
 
@@ -114,13 +111,6 @@ def test_unit_ball(dtype: type) -> None:
     np.testing.assert_allclose(np.linalg.norm(ball, axis=2).max(axis=1), 1, rtol=1e-6)
     np.testing.assert_allclose(unit_ball(points[2]), ball[2], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(unit_ball(points * 9 - 4), ball, atol=1e-5)
-
-
-@pytest.mark.parametrize("value", [0.0, 0.1, 1e6, 1 / 3])
-def test_unit_ball_of_one_repeated_point_is_zero(value: float) -> None:
-    for dtype in (np.float32, np.float64):
-        ball = unit_ball(np.full((2, 7, 3), value, dtype=dtype))
-        assert np.array_equal(ball, np.zeros((2, 7, 3)))
 
 
 def test_surface_sample_follows_area() -> None:

@@ -3,7 +3,6 @@ from torch import nn
 
 from qs3.geometry.neighbours import knn
 from qs3.kernels.edgeconv import _Moments, neighbour_max
-from qs3.kernels.pointwise_max import max_over_rows
 from qs3.models.dgcnn import EdgeConv
 from tests.models.reference import NaiveEdgeConv
 
@@ -49,15 +48,6 @@ def test_gamma_zero_gives_beta_and_finite_gradients() -> None:
     assert torch.isfinite(ours.norm.weight.grad).all()
 
 
-def test_one_repeated_point_has_no_variance() -> None:
-    layer = EdgeConv(3, 8)
-    x = torch.full((2, 16, 3), 0.7, requires_grad=True)
-    out = layer(x, knn(x, 4))
-    out.sum().backward()
-    torch.testing.assert_close(out, torch.zeros_like(out), rtol=0, atol=1e-4)
-    assert torch.isfinite(x.grad).all()
-
-
 def test_neighbour_ops_have_right_gradients() -> None:
     torch.manual_seed(0)
     x = torch.randn(7, 3, dtype=torch.float64, requires_grad=True)
@@ -66,13 +56,6 @@ def test_neighbour_ops_have_right_gradients() -> None:
     clouds = torch.randn(2, 5, 3, dtype=torch.float64, requires_grad=True)
     index = torch.randint(10, (10, 4))
     assert torch.autograd.gradcheck(lambda x: _Moments.apply(x, index), clouds)
-
-
-def test_max_over_rows_known_answer() -> None:
-    x = torch.tensor([[[1.0, 5.0], [3.0, -2.0], [3.0, 5.0]]])
-    best, where = max_over_rows(x)
-    assert best.tolist() == [[3.0, 5.0]]
-    assert where.tolist() == [[1, 0]]  # the first of equals
 
 
 def test_autocast_keeps_statistics_in_float32() -> None:

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from qs3.geometry.device import lists_of
 from qs3.kernels import linear_max
+from qs3.kernels.device import lists_of
 from tests.triton import in_interpreter, needs_triton
 from tests.unchecked import unchecked
 
@@ -80,7 +80,7 @@ def test_torchs_compiler_takes_them() -> None:
 # Channels that fill no block, a point that has many maxima, and gradients of more than the maxima.
 COMPARE = """
 import torch
-from qs3.geometry.device import lists_of
+from qs3.kernels.device import lists_of
 from qs3.kernels import linear_max, triton_linear_max
 for b, n, c, d in ((2, 9, 5, 30), (3, 20, 130, 17), (1, 1, 1, 1)):
     torch.manual_seed(0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import nn
 
-from qs3.errors import ConfigError, DataError
+from qs3.errors import ConfigError
 from qs3.evaluation.metrics import adapt_norms, predict
 from qs3.kernels.norms import (
     DomainNorm,
@@ -45,8 +45,6 @@ def test_domain_comes_back_after_an_error_and_nested() -> None:
     with pytest.raises(RuntimeError, match="x"), use_domain(net, "target"):
         raise RuntimeError("x")
     assert [m.domain for m in net] == ["source", "source"]
-    with pytest.raises(ConfigError, match="'source' or 'target'"), use_domain(net, "s"):
-        pass
 
 
 def test_target_norms_begin_with_the_source_s_once() -> None:
@@ -139,15 +137,8 @@ def test_only_the_current_domain_is_adapted() -> None:
 
 
 def test_nothing_to_adapt_on() -> None:
-    with pytest.raises(DataError, match="no batches"):
-        adapt_batchnorm(dgcnn(4), [])
-    with pytest.raises(ConfigError, match=r"norms=adabn adapts batch norms, and this net has none"):
+    with pytest.raises(ConfigError, match="norms=adabn"):
         adapt_batchnorm(nn.Linear(3, 4), [_clouds(4)])
-
-
-def test_instance_norm_has_nothing_to_adapt_but_in_the_head() -> None:
-    net = dgcnn(4, norm="instance").double()
-    assert len(adapt_batchnorm(net, [_clouds(4)])) == 2
 
 
 def test_predictions_of_the_target_use_its_norms_once_it_was_trained_on() -> None:
@@ -164,19 +155,6 @@ def test_predictions_of_the_target_use_its_norms_once_it_was_trained_on() -> Non
     with torch.no_grad(), use_domain(net.eval(), "target"):
         np.testing.assert_allclose(as_target, net(points).double().softmax(1).numpy(), atol=1e-6)
     assert _used(pointnet(3), "target") == set()  # nothing to choose
-    with pytest.raises(ConfigError, match="'source' or 'target'"), use_trained(net, "s"):
-        pass
-
-
-def test_a_student_of_the_target_alone_says_of_the_source_what_its_norms_say() -> None:
-    net = pointnet(3, norm="domain")
-    assert _used(net, "target") == _used(net, "source") == {"source"}  # neither is trained
-    points = torch.randn(4, 20, 3)
-    with use_domain(net, "target"):
-        net(points * 3 + 1)
-    assert _used(net, "source") == {"target"}
-    of_target = predict(net, points, 4)
-    np.testing.assert_array_equal(predict(net, points, 4, domain="source"), of_target)
 
 
 def test_each_layer_is_served_by_the_norm_that_was_trained() -> None:

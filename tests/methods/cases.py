@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from qs3.methods.base import Method
+from qs3.methods.bounds import SourceOnly, Supervised
 from qs3.methods.cpcm import Cpcm
 from qs3.methods.dann import Dann
 from qs3.methods.defrec import DefRec
@@ -18,8 +19,6 @@ from qs3.methods.mlsp import Mlsp
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
 from qs3.methods.sd import Sd
-from qs3.methods.source_only import SourceOnly
-from qs3.methods.supervised import Supervised
 from qs3.methods.twin import Twin
 from qs3.selftraining.pcfea import Pcfea
 from qs3.selftraining.student_loss import Student
@@ -32,7 +31,7 @@ class Case:
     Attributes:
         make: the method.
         passes: how often a batch passes through the net (PointDAN's through its generator). SD's
-            and Twin's two more are their teacher's, and have no way back; nor has a shared one's.
+            two more are its teacher's, and have no way back.
         source: whether its batches have labelled source clouds.
         pseudo: pseudo-labels of its target clouds: "hard", "soft", or "" for none.
     """
@@ -50,10 +49,6 @@ def _styled(**settings: Any) -> Pcfea:
     return method
 
 
-OF_WHOLES = {"twin_weight": 1.0, "logit_weight": 1.0, "feature_weight": 1.0}
-EVERYTHING = {**OF_WHOLES, "again_weight": 1.0, "view_weight": 1.0, "target_weight": 1.0}
-"""All parts of `Twin`."""
-
 # A voxel of a toy cloud holds few points.
 CASES = {
     "source_only": Case(SourceOnly, 1),
@@ -66,25 +61,17 @@ CASES = {
     "defrec_on_source": Case(lambda: DefRec(min_points=2, on_source=True), 3),
     "defrec_pcm": Case(lambda: DefRec(min_points=2, pcm=True), 2),
     "gast": Case(lambda: Gast(min_points=2), 5),
-    "gast_no_rotation": Case(lambda: Gast(min_points=2, rot_weight=0.0), 3),
     "gast_pcm": Case(lambda: Gast(min_points=2, pcm=True), 5),
     "cpcm": Case(Cpcm, 3),
     "mlsp": Case(lambda: Mlsp(min_points=2), 2),
     "sd": Case(Sd, 2),
-    "sd_cut_both": Case(lambda: Sd(cut="both"), 2),
     "twin": Case(Twin, 2),
-    "twin_everything": Case(lambda: Twin(**EVERYTHING), 4),
-    "twin_shared": Case(lambda: Twin(**EVERYTHING, teacher="shared"), 5),
-    "twin_own": Case(lambda: Twin(**OF_WHOLES, teacher="own"), 2),  # and one of the other net's
-    "twin_of_the_source": Case(lambda: Twin(**OF_WHOLES, again_weight=0.0), 2),
     "pcfea": Case(Pcfea, 1),  # until there is a pool
     "pcfea_styled": Case(_styled, 2),
     "pcfea_averaged": Case(lambda: _styled(momentum=0.99), 2),
     "student": Case(Student, 1, source=False, pseudo="hard"),
-    "student_pcm": Case(lambda: Student(pcm=True), 1, source=False, pseudo="hard"),
     "student_source": Case(lambda: Student(weight_step=0.005), 2, pseudo="hard"),
     "student_source_pcm": Case(lambda: Student(pcm=True), 2, pseudo="hard"),
-    "student_mrkld": Case(lambda: Student(mrkld=0.1), 2, pseudo="hard"),
     "student_lrent": Case(Student, 2, pseudo="soft"),
 }
 
@@ -106,14 +93,8 @@ def batch_of(
         batch["source"] = {"points": points[0], f"y_{method.labels}": labels}
     if method.uses_target or case.pseudo:
         batch["target"] = {"points": points[1]}
-    wants = method.wants
-    for domain, key, wanted in (
-        ("source", "twin", wants.twin),
-        ("source", "again", wants.again),
-        ("target", "twin", wants.target_twin),
-    ):
-        if wanted:
-            batch[domain][key] = clouds(1)[0]
+    if method.wants.again:
+        batch["source"]["again"] = clouds(1)[0]
     if case.pseudo:
         soft = nn.functional.one_hot(labels, classes).float() * 0.7 + 0.3 / classes
         batch["target"]["y_pseudo"] = soft if case.pseudo == "soft" else labels

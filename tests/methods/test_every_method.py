@@ -13,25 +13,32 @@ import yaml
 from hydra.utils import get_class
 from torch import nn
 
+from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from qs3.methods.base import Method, feature_dims
-from qs3.methods.twin import Twin
+from qs3.methods.cpcm import Cpcm
+from qs3.methods.dann import Dann
+from qs3.methods.defrec import DefRec
+from qs3.methods.gast import Gast
+from qs3.methods.mlsp import Mlsp
+from qs3.methods.pointdan import PointDan
+from qs3.methods.sd import Sd
 from qs3.models.base import ClassHead, PointClassifier
 from qs3.models.dgcnn import DGCNN
 from qs3.models.pointdan import pointdan
 from qs3.selftraining.student_loss import Student
 from tests.methods import cases
 from tests.methods.cases import Case, batch_of, total
+from tests.unchecked import unchecked
 
 NAMES = [
     *("source_only", "pcm", "dann", "defrec_on_source", "defrec_pcm", "gast", "gast_pcm"),
-    *("pointdan", "cpcm", "mlsp", "sd", "twin_everything", "twin_shared", "twin_own"),
+    *("pointdan", "cpcm", "mlsp", "sd", "twin"),
     *("pcfea_styled", "student_all"),
 ]
 CASES = {
     **cases.CASES,
     "student_all": Case(lambda: Student(True, 0.01, 0.1, 1), 2, pseudo="soft"),
-    "twin_own": Case(lambda: Twin(**cases.OF_WHOLES, teacher="own"), 1),
 }
 parametrize = pytest.mark.parametrize("name", NAMES)
 
@@ -59,7 +66,7 @@ def test_gradients_reach_every_weight(name: str) -> None:
     _total(net, method, batch).backward()
     for part in (net, method):
         for key, p in part.named_parameters():
-            if not p.requires_grad:  # a teacher's
+            if not p.requires_grad:  # the teacher's
                 assert p.grad is None, key
                 continue
             assert p.grad is not None, key
@@ -76,15 +83,8 @@ def test_a_step_is_a_function_of_the_generator(name: str) -> None:
         for seed in (0, 0, 1)
     ]
     assert torch.equal(values[0], values[1])
-    if name not in (
-        "source_only",
-        "dann",
-        "pointdan",
-        "pcfea_styled",
-        "twin_everything",
-        "twin_shared",
-        "twin_own",
-    ):  # these draw nothing of their own
+    if name not in ("source_only", "dann", "pointdan", "pcfea_styled", "twin"):
+        # these draw nothing of their own
         assert not torch.equal(values[0], values[2])
     torch.set_rng_state(state)
 
@@ -110,14 +110,7 @@ WEIGHTS = {
         "discrepancy_weight": {"discrepancy"},
         "node_weight": {"nodes"},
     },
-    "twin_everything": {
-        "twin_weight": {"twin"},
-        "logit_weight": {"logits"},
-        "feature_weight": {"features"},
-        "again_weight": {"again"},
-        "view_weight": {"views"},
-        "target_weight": {"target"},
-    },
+    "twin": {"again_weight": {"again"}},
     "pcfea_styled": {"align_weight": {"align_source", "align_target"}},
 }
 
@@ -137,9 +130,23 @@ def test_a_weight_multiplies_its_terms_and_no_others(name: str) -> None:
 
 def test_who_sees_the_target() -> None:
     seen = {name for name, case in CASES.items() if case.make().uses_target}
-    without = {"source_only", "supervised", "pcm", "twin", "twin_of_the_source", "twin_own"}
+    without = {"source_only", "supervised", "pcm", "twin"}
     students = {name for name in CASES if name.startswith("student")}  # theirs are pseudo-labelled
     assert seen == set(CASES) - without - students
+
+
+WRONG = [
+    *((Dann, "domain_batches", "both"), (PointDan, "node_weight", -1.0)),
+    *((DefRec, "defrec_weight", 1.5), (DefRec, "scale", float("inf")), (Gast, "min_points", 0)),
+    *((Mlsp, "dropout", "half"), (Sd, "teacher_temperature", 0.0), (Cpcm, "mix_weight", -1.0)),
+]
+
+
+@unchecked
+@pytest.mark.parametrize(("method", "key", "value"), WRONG)
+def test_wrong_settings_name_the_key(method: type[Method], key: str, value: Any) -> None:
+    with pytest.raises(ConfigError, match=key):
+        build({"_target_": f"{method.__module__}.{method.__name__}", key: value})
 
 
 CONFIGS = [
@@ -213,8 +220,3 @@ def test_asking_for_widths_changes_nothing() -> None:
     assert net.training
     assert torch.equal(torch.get_rng_state(), state)
     assert all(torch.equal(value, before[key]) for key, value in net.state_dict().items())
-
-
-def test_a_net_without_features_is_refused() -> None:
-    with pytest.raises(ConfigError, match="Linear has none"):
-        feature_dims(nn.Linear(3, 4))

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from qs3.methods.deform import VOXELS
+from qs3.methods.defrec import VOXELS
 from qs3.methods.gast import Gast, turn_parts
 from tests.methods.shapes import CLASSES, tiny_net
 
@@ -77,15 +77,3 @@ def test_a_net_that_knows_nothing_pays_ln_27_and_ln_4() -> None:
 def test_clouds_without_a_voxel_to_deform_do_not_count() -> None:
     terms = losses(Gast(min_points=1025, rot_weight=0.0))
     assert terms["def_source"].item() == terms["def_target"].item() == 0.0
-
-
-@pytest.mark.parametrize(
-    ("settings", "names"),
-    [
-        ({}, {"ce", "def_source", "def_target", "rot_source", "rot_target"}),
-        ({"rot_weight": 0.0}, {"ce", "def_source", "def_target"}),
-        ({"def_weight": 0.0, "pcm": True}, {"pcm", "rot_source", "rot_target"}),
-    ],
-)
-def test_losses_can_be_left_out(settings: dict, names: set) -> None:
-    assert set(losses(Gast(**{"min_points": 2, **settings}))) == names

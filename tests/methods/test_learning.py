@@ -21,14 +21,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from qs3.methods.base import Method
-from qs3.methods.chamfer import masked_chamfer
+from qs3.methods.bounds import SourceOnly
 from qs3.methods.dann import Dann
-from qs3.methods.deform import deform
-from qs3.methods.defrec import DefRec
+from qs3.methods.defrec import DefRec, deform, masked_chamfer
 from qs3.methods.gast import Gast
 from qs3.methods.pcm import Pcm
 from qs3.methods.pointdan import PointDan
-from qs3.methods.source_only import SourceOnly
 from qs3.models.base import Backbone, Features, PointClassifier
 from tests.methods.shapes import CLASSES, accuracy, boxes, tiny_net, tiny_pointdan, train, unit_ball
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch.nn import functional as F
 
 from qs3.geometry.neighbours import farthest_point_sampling
-from qs3.methods.mixup import mix, pcm_loss
+from qs3.methods.pcm import mix, pcm_loss
 
 
 def _batch(b: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -10,13 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from qs3.errors import ConfigError
-from qs3.methods.chamfer import nearest
-from qs3.methods.deform import deform
+from qs3.methods.defrec import deform, nearest
 from qs3.methods.mlsp import NEIGHBOURS, RADIUS, Mlsp, cardinalities, normals_of, thinnest
-from qs3.models.base import Features
 from tests.methods.shapes import CLASSES, boxes, tiny_net, train, unit_ball
-from tests.unchecked import unchecked
 
 
 @settings(max_examples=30, deadline=None)
@@ -33,13 +29,6 @@ def test_cardinalities_by_loops(b: int, n: int, seed: int) -> None:
             assert found[i, j] == min(math.floor(count * 1024 / n / 2), 15)
 
 
-def test_the_same_surface_with_fewer_points_has_the_same_cardinalities() -> None:
-    points = torch.rand(1, 1024, 3, generator=torch.Generator().manual_seed(0))
-    points = points * torch.tensor([0.7, 0.7, 0.0])
-    dense, few = cardinalities(points), cardinalities(points[:, :512])
-    assert dense.float().mean().item() == pytest.approx(few.float().mean().item(), rel=0.1)
-
-
 def test_normals_are_those_of_eigenvectors() -> None:
     points = torch.randn(2, 40, 3, generator=torch.Generator().manual_seed(0)).double()
     found = normals_of(points)
@@ -50,15 +39,6 @@ def test_normals_are_those_of_eigenvectors() -> None:
             value, vector = torch.linalg.eigh(around.T @ around)
             if value[1] > 2 * value[0]:  # else any direction between will do
                 assert abs(found[i, j].double() @ vector[:, 0]) > 0.999
-
-
-def test_normals_of_a_plane() -> None:
-    points = torch.rand(1, 200, 3, generator=torch.Generator().manual_seed(0))
-    points[..., 2] = 0.5 * points[..., 0]
-    expected = torch.tensor([-0.5, 0.0, 1.0]) / math.sqrt(1.25)
-    torch.testing.assert_close(
-        (normals_of(points) @ expected).abs(), torch.ones(1, 200), rtol=1e-3, atol=1e-3
-    )
 
 
 def test_autocast_keeps_surfaces_and_neighbours() -> None:
@@ -145,22 +125,6 @@ def test_no_voxel_to_mask_is_no_loss_and_no_nan() -> None:
     assert all(terms[name].item() == 0.0 for name in ("position", "normal", "cardinality"))
     torch.stack(list(terms.values())).sum().backward()
     assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
-
-
-def test_a_model_without_features_per_point_is_refused() -> None:
-    net = tiny_net()
-    per_cloud = net.backbone.forward
-    net.backbone.forward = lambda points: Features(per_cloud(points).global_, None)
-    with pytest.raises(ConfigError, match="method=mlsp needs features of every point"):
-        Mlsp().prepare(net)
-    with pytest.raises(ConfigError, match=r"method.position_weight must be in \[0, 1\]"):
-        Mlsp(position_weight=2.0)
-
-
-@unchecked
-def test_a_setting_that_is_no_number_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"method\.dropout must be a number, got 'half'"):
-        Mlsp(dropout="half")
 
 
 def thin(points: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 import yaml
 from torch import nn
@@ -65,9 +64,3 @@ def test_the_selector_keeps_what_leads_by_more_than_theta() -> None:
     chosen = chosen_by(cls(), TeacherPredictions.of(p, "abcd"), 0.3, 0)
     assert chosen.selected.tolist() == [True, False, False, True]
     assert chosen.kept.tolist() == [2, 0, 0]
-
-
-@pytest.mark.parametrize("word", ["ABOVE", "METHODS", "SCHEMES"])
-def test_tables_that_a_new_part_has_a_line_in_are_where_the_page_says(word: str) -> None:
-    (file,) = re.findall(rf"`{word}` (?:in|of)\s+`([\w/.]+)`", PAGE.read_text("utf-8"))
-    assert re.search(rf"^{word} = {{$", (ROOT / file).read_text("utf-8"), re.MULTILINE)

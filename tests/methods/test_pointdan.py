@@ -4,11 +4,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3.errors import ConfigError
-from qs3.methods.mmd import mmd2
-from qs3.methods.pointdan import SIGMAS, PointDan, discrepancy
+from qs3.methods.pointdan import SIGMAS, PointDan, discrepancy, mmd2
 from qs3.models.pointdan import pointdan
-from tests.methods.shapes import tiny_net
 
 
 def test_discrepancy_known_answers() -> None:
@@ -67,15 +64,6 @@ def test_attention_belongs_to_a_domain() -> None:
         assert all(p.grad is not None for p in method.attention[domain].parameters())
     assert net.head.first.weight.grad is None
     assert net.backbone.node_module.residual.layers[0].weight.grad.abs().max() > 0
-
-
-def test_the_kernels_of_the_paper() -> None:
-    assert SIGMAS == (0.01, 0.1, 1.0, 10.0, 100.0)
-
-
-def test_another_model_is_refused() -> None:
-    with pytest.raises(ConfigError, match="model=pointdan"):
-        PointDan().prepare(tiny_net())
 
 
 def test_classifiers_learn_at_their_own_rate() -> None:

@@ -1,18 +1,16 @@
 """Every net of conf/model with every norm: passes, one cloud, domains, AdaBN."""
 
-import copy
 from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
-from qs3.errors import ConfigError, DataError
 from qs3.kernels import plain
 from qs3.kernels.norms import DomainNorm, adapt_batchnorm, use_domain, use_trained
 from qs3.models import pointnet2, rscnn
 from qs3.models.base import PointClassifier
-from tests.models.test_all_nets import NETS, build, clouds
+from tests.models.test_all_nets import NETS, build, clouds, each_net
 
 SMALL = {
     "dgcnn": {"k": 8},
@@ -52,7 +50,7 @@ def _statistics(net: nn.Module) -> dict[str, torch.Tensor]:
     return {key: value.clone() for key, value in net.named_buffers() if "running" in key}
 
 
-@pytest.mark.parametrize("name", NETS)
+@each_net
 def test_instance_norm_is_of_each_cloud(name: str) -> None:
     net, points = _small(name, "instance").train(), clouds(3, 50)
     net(points).square().sum().backward()
@@ -61,20 +59,7 @@ def test_instance_norm_is_of_each_cloud(name: str) -> None:
     torch.testing.assert_close(net(points), alone, rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", NETS)
-def test_instance_norm_of_one_point(name: str) -> None:
-    """It has no statistics; SimpleView's are of its images."""
-    net, points = _small(name, "instance"), clouds(2, 1)
-    for training in (True, False):
-        net.train(training)
-        if name == "simpleview":
-            assert net(points).isfinite().all()
-            continue
-        with pytest.raises(DataError, match="one point have no statistics for norm=instance"):
-            net(points)
-
-
-@pytest.mark.parametrize("name", NETS)
+@each_net
 def test_domains(name: str) -> None:
     """On the source it is batch norm; a pass on the target changes and uses the target's alone."""
     small: dict[str, Any] = SMALL.get(name, {}) | ({} if name == "pointdan" else {"dropout": 0.0})
@@ -142,30 +127,3 @@ def test_adabn_against_brute_force(name: str, kind: str) -> None:
             rows = torch.cat(given[norm], dim=1)  # [C, rows]
             torch.testing.assert_close(rows.mean(1), mean, **TIGHT)
             torch.testing.assert_close(rows.var(1), variance, **TIGHT)
-
-
-def test_adabn_leaves_nothing_to_chance() -> None:
-    """PointDAN's nodes start anywhere in training; here the statistics are the same to the bit."""
-    net, points = _small("pointdan", "batch"), clouds(6, 40)
-    found = []
-    for seed in (0, 1):
-        torch.manual_seed(seed)
-        twin = copy.deepcopy(net).train()
-        adapt_batchnorm(twin, [points[:3], points[3:]])
-        assert all(module.training for module in twin.modules())
-        found.append(_statistics(twin))
-    for key, value in found[0].items():
-        assert torch.equal(value, found[1][key]), key
-
-
-def test_a_norm_that_takes_no_statistics_is_named() -> None:
-    class Dead(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.used, self.unused = nn.BatchNorm1d(3), nn.BatchNorm1d(3)
-
-        def forward(self, points: torch.Tensor) -> torch.Tensor:
-            return self.used(points.mean(1))
-
-    with pytest.raises(ConfigError, match="unused takes no statistics"):
-        adapt_batchnorm(Dead(), [torch.randn(4, 5, 3)])

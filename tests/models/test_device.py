@@ -12,11 +12,9 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3 import kernels as fast
 from qs3.geometry import neighbours
-from qs3.geometry.farthest_points import farthest_points
 from qs3.kernels import edgeconv
-from qs3.kernels.norms import KINDS, use_domain
+from qs3.kernels.norms import use_domain
 from qs3.models import dgcnn
 from qs3.models.base import PointClassifier
 from tests.device import Watch, as_on_device, as_on_gpu
@@ -28,7 +26,6 @@ BARS = {
     "pointdan": 350,
     "pointnet": 180,
     "pointnet2": 450,
-    "pointnet2_ssg": 250,
     "rscnn": 250,
     "simpleview": 230,
 }
@@ -61,22 +58,13 @@ def test_kernels_of_dgcnn_without_triton(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("norm", KINDS)
+@pytest.mark.parametrize("norm", ["instance", "domain"])
 @pytest.mark.parametrize("name", NETS)
 def test_no_norm_asks_for_a_value(name: str, norm: str) -> None:
     net = build(name, norm=norm).float().to("meta")
     for training in (True, False):
         watch = _step(net.train(training), torch.empty(2, 640, 3, device="meta"))
         assert watch.carried == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("variant", ["simpleview", "defrec"])
-def test_kernels_of_dgcnn_s_variants(variant: str) -> None:
-    net = build("dgcnn", variant=variant).float().train().to("meta")
-    watch = _step(net, torch.empty(16, 1024, 3, device="meta"))
-    assert watch.carried == []
-    assert watch.kernels.total() <= 300
 
 
 @pytest.mark.parametrize(
@@ -122,28 +110,3 @@ def test_dgcnn_s_answers_without_a_way_back_are_the_cpu_s(negative: bool) -> Non
             found = net(points)
     torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-9)
     assert watch.counts["qs3.edge_extremes.default"] == 4
-
-
-def test_kernels_are_of_the_cpu() -> None:
-    here, there = torch.empty(1), torch.empty(1, device="meta")
-    assert fast.usable(here)
-    assert not fast.usable(there)
-    assert fast.usable(there, anywhere=True)
-    with fast.plain():
-        assert not fast.usable(there, anywhere=True)
-
-
-def test_farthest_points_are_one_operation() -> None:
-    x, start = (
-        torch.empty(2, 20, 3, device="meta"),
-        torch.empty(2, dtype=torch.int64, device="meta"),
-    )
-    with Watch() as watch:
-        taken = farthest_points(x, 7, start)
-    assert watch.kernels == {"qs3.farthest_points.default": 1}
-    assert taken.shape == (2, 7)
-
-
-@pytest.mark.slow
-def test_farthest_points_as_torch_wants_operations() -> None:
-    torch.library.opcheck(farthest_points, (torch.rand(2, 20, 3), 7, torch.tensor([3, 19])))

@@ -5,10 +5,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from qs3.errors import DataError
 from qs3.geometry.neighbours import knn
-from qs3.kernels.pointwise_max import pooled_linear
-from qs3.models.base import ClassHead, PointClassifier, check_points
+from qs3.models.base import ClassHead, PointClassifier
 from qs3.models.dgcnn import DGCNN, dgcnn
 from tests.models.reference import NaiveDGCNN
 
@@ -41,15 +39,6 @@ def test_equals_naive_network(variant: str, norm: str, training: bool) -> None:
     torch.testing.assert_close(
         model.backbone.conv5.weight.grad, twin.conv5.weight.grad, rtol=1e-8, atol=1e-9
     )
-
-
-def test_pooled_linear_gradient() -> None:
-    torch.manual_seed(0)
-    x = torch.randn(2, 9, 5, dtype=torch.float64, requires_grad=True)
-    weight = torch.randn(7, 5, dtype=torch.float64, requires_grad=True)
-    y = x @ weight.T
-    torch.testing.assert_close(pooled_linear(x, weight), torch.cat([y.amax(1), y.mean(1)], 1))
-    assert torch.autograd.gradcheck(pooled_linear, (x, weight))
 
 
 def _error(value: list[torch.Tensor], truth: list[torch.Tensor]) -> float:
@@ -101,12 +90,6 @@ def test_autocast_keeps_neighbours_in_float32(monkeypatch: pytest.MonkeyPatch) -
     assert all(torch.equal(a, b) for a, b in zip(found[:8], found[8:], strict=True))
     assert half.dtype == torch.bfloat16
     torch.testing.assert_close(half.float(), plain, rtol=0.02, atol=0.02)
-
-
-@pytest.mark.parametrize("shape", [(8, 3), (2, 8, 2), (2, 0, 3), (0, 8, 3)])
-def test_bad_shape(shape: tuple[int, ...]) -> None:
-    with pytest.raises(DataError, match="expected points"):
-        check_points(torch.zeros(shape))
 
 
 @pytest.fixture

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import logging
 
 import numpy as np
 import pytest
 import torch
 
 from qs3.datamodules.clouds import Clouds
-from qs3.errors import ConfigError, DataError, Qs3Error
+from qs3.errors import DataError, MissingDataError, Qs3Error
 from qs3.methods.base import feature_dims
 from qs3.models.features import Encoder, features, remember
 from tests.models.onnx_files import weights, write_encoder
@@ -52,12 +51,6 @@ def test_it_is_the_file_s_net_and_a_head(tmp_path):
     assert len(made(tmp_path / "a.onnx", hidden=(8, 5)).head) == 9
 
 
-def test_instance_norm_is_refused(tmp_path):
-    """It was batch norm under another name."""
-    with pytest.raises(ConfigError, match=r"^model\.norm=instance .* set model\.norm=batch or dom"):
-        made(write_encoder(tmp_path / "a.onnx"), norm="instance")
-
-
 def test_features_are_computed_once_and_kept(tmp_path, clouds, monkeypatch):
     asked = []
     real = Encoder.compute
@@ -92,47 +85,30 @@ def test_features_are_computed_once_and_kept(tmp_path, clouds, monkeypatch):
     assert len(list((tmp_path / "features").iterdir())) == 2
 
 
-def test_without_a_folder_nothing_is_written(tmp_path, clouds):
-    net = made(write_encoder(tmp_path / "a.onnx", seed=5))
-    remember(net, [clouds], None)
-    assert len(net.backbone.encoder.known) == 14
-    assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
-
-
 def _bytes(path):
     path.write_bytes(b"\x80\x04no net at all" * 9)
     return path
 
 
 @pytest.mark.parametrize(
-    ("write", "message"),
+    "write",
     [
-        (_bytes, "not an ONNX file, or damaged|cannot be run by onnxruntime"),
-        (lambda p: write_encoder(p, external=True), "keeps weights in files beside it"),
-        (lambda p: write_encoder(p, inputs=["mask"]), "has 2 inputs and 1 output"),
-        (
-            lambda p: write_encoder(p, some=True, out=["b", "d"]),
-            r"its output is \['b', .*a known D",
-        ),
+        _bytes,
+        lambda p: write_encoder(p, external=True),
+        lambda p: write_encoder(p, inputs=["mask"]),
+        lambda p: write_encoder(p, some=True, out=["b", "d"]),
     ],
 )
-def test_files_that_are_refused(tmp_path, write, message):
+def test_files_that_are_refused(tmp_path, write):
     path = write(tmp_path / "a.onnx")
-    with pytest.raises(DataError, match=message) as caught:
+    with pytest.raises(DataError, match=r"a\.onnx"):
         made(path)
-    assert "a.onnx" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"scale": np.inf}, "expected finite float32"),
-        ({"axes": [0], "out": ["n", 6]}, r"gave float32 \[9, 6\] for clouds \[4, 9, 3\]"),
-    ],
-)
-def test_features_that_are_refused(tmp_path, changes, message):
+@pytest.mark.parametrize("changes", [{"scale": np.inf}, {"axes": [0], "out": ["n", 6]}])
+def test_features_that_are_refused(tmp_path, changes):
     net = made(write_encoder(tmp_path / "a.onnx", **changes))
-    with pytest.raises(DataError, match=message):
+    with pytest.raises(DataError):
         net.features(torch.randn(4, 9, 3))
 
 
@@ -149,20 +125,9 @@ def test_a_truncated_file_raises_nothing_but_our_errors(tmp_path):
     assert refused == len(range(0, len(whole), 7))
 
 
-def test_another_file_than_was_meant(tmp_path, monkeypatch):
+def test_another_file_than_was_meant(tmp_path):
     path = write_encoder(tmp_path / "a.onnx")
-    with pytest.raises(ConfigError, match="is another file than the one that was meant"):
+    with pytest.raises(DataError, match=r"a\.onnx"):
         features(4, str(path), "0" * 64)
-    with pytest.raises(ConfigError, match="is not there; model=features needs an ONNX file"):
+    with pytest.raises(MissingDataError):
         features(4, str(tmp_path / "no.onnx"), "0" * 64)
-    monkeypatch.setenv("QS3_MEMORY_GB", "1e-7")
-    with pytest.raises(DataError, match="more than 1e-07 GB: refused"):
-        features(4, str(path), "1" * 64)
-
-
-def test_it_says_when_it_computes(tmp_path, clouds, caplog):
-    net = made(write_encoder(tmp_path / "a.onnx", seed=6))
-    with caplog.at_level(logging.INFO):
-        for _ in range(2):
-            remember(net, [clouds], tmp_path)
-    assert caplog.text.count("features of 14 clouds by model.file=") == 1

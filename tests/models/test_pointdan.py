@@ -39,42 +39,6 @@ def test_node_module_against_loops() -> None:
             torch.testing.assert_close(found.points[cloud, i], torch.cat([f[cloud, i], back]))
 
 
-def test_sizes() -> None:
-    torch.manual_seed(0)
-    net = pointdan(10)
-    points = torch.rand(2, 100, 3) * 2 - 1
-    assert net(points).shape == (2, 10)
-    features, nodes = net.backbone.with_nodes(points)
-    assert features.global_.shape == (2, 1024)
-    assert features.per_point is not None
-    assert features.per_point.shape == (2, 100, 128)
-    assert nodes.features.shape == (2, 64, 64)
-    counts = {name: sum(p.numel() for p in m.parameters()) for name, m in net.named_children()}
-    # Two T-Nets, four convolutions, nodes; each with its batch norm. Two linear heads.
-    transforms = _t_net(3) + _t_net(64)
-    convolutions = _conv(3, 64) + _conv(64, 64) + _conv(128, 128) + _conv(128, 1024)
-    assert counts["backbone"] == transforms + convolutions + _conv(64, 64) + 3 * 64 + 2048
-    assert counts["head"] == 2 * (1024 * 10 + 10)
-
-
-def _conv(wide: int, narrow: int) -> int:
-    return wide * narrow + 3 * narrow  # weights, bias, scale and shift
-
-
-def _t_net(k: int) -> int:
-    points = _conv(k, 64) + _conv(64, 128) + _conv(128, 1024)
-    return points + _conv(1024, 512) + _conv(512, 256) + 256 * k * k + k * k
-
-
-def test_logits_are_the_mean_of_both_heads() -> None:
-    net = pointdan(3, nodes=4, neighbours=4).eval()
-    points = torch.rand(2, 30, 3)
-    features = net.features(points).global_
-    torch.testing.assert_close(
-        net(points), (net.head.first(features) + net.head.second(features)) / 2
-    )
-
-
 def test_order_of_points_does_not_matter_but_for_the_first() -> None:
     """In eval the first node is the first point; the order of the rest is free."""
     torch.manual_seed(0)

@@ -1,14 +1,10 @@
-import copy
-
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional as F
 
 from qs3.models.base import PointClassifier
-from qs3.models.projection import depth_images
-from qs3.models.resnet import ResNet18
-from qs3.models.simpleview import simpleview
+from qs3.models.simpleview import depth_images, simpleview
 from tests.models.golden import clouds, gradient_norm, set_weights
 from tests.models.reference_simpleview import NaiveSimpleView, images_reference
 
@@ -25,14 +21,6 @@ def _small(**settings: object) -> PointClassifier:
         if p.ndim == 1:
             nn.init.normal_(p, 1.0, 0.3)
     return model.double()
-
-
-def test_initial_weights() -> None:
-    net = ResNet18()
-    block = net.blocks[3]
-    assert (block.second.norm.weight == 0).all()
-    assert (block.first.norm.weight == 1).all()
-    assert block.second.conv.weight.std().item() == pytest.approx((2 / (32 * 9)) ** 0.5, rel=0.05)
 
 
 # (0.3, 0.1, -0.2): which pixel by hand, from the table; size 128, so pixel ceil(63.5 + 64 r / d)
@@ -53,13 +41,6 @@ def test_one_point_in_each_view(view: int, row: float, column: float, depth: flo
     where = [int(-(-(63.5 + 64 * c / depth) // 1)) for c in (row, column)]
     assert image.nonzero().tolist() == [where]
     assert image[tuple(where)].item() == pytest.approx(depth)
-
-
-def test_pixel_by_hand() -> None:
-    # 64 * 0.14 / 1.4 = 6.4: column ceil(69.9), row ceil(63.5)
-    image = depth_images(torch.tensor([[[0.14, 0.0, 0.0]]]))[0, 0]
-    assert image.nonzero().tolist() == [[64, 70]]
-    assert image[64, 70].item() == pytest.approx(1.4)
 
 
 def test_shared_pixel() -> None:
@@ -115,45 +96,6 @@ def test_equals_straight_network(training: bool, norm: str) -> None:
         torch.testing.assert_close(p.grad, theirs[name].grad, rtol=1e-10, atol=1e-10)
     for mine, other in zip(model.backbone.buffers(), twin.images.buffers(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-10, atol=1e-10)
-
-
-@pytest.mark.parametrize("image_size", [16, 64])
-def test_float32_error_is_that_of_the_straight_network(image_size: int) -> None:
-    # 16 channels: oneDNN's float32 gradient of a 1x1 convolution of stride 2 writes out of its
-    # memory with 4 channels (torch 2.13, 48 images of 64 x 64), in the plain network too
-    exact = _small(image_size=image_size, channels=16)
-    model = copy.deepcopy(exact).float()
-    twin = NaiveSimpleView(model)
-    points, labels = _points(8), torch.arange(8) % 4
-    points = points.float().double()  # the same images
-    nets = [(exact, points), (model, points.float()), (twin, points.float())]
-    out = []
-    for net, x in nets:
-        logits = net(x)
-        F.cross_entropy(logits, labels).backward()
-        out.append(logits.detach().double())
-    error = (out[1] - out[0]).norm(), (out[2] - out[0]).norm()
-    assert error[0] <= 2 * error[1]
-    truth = [p.grad for p in exact.backbone.images.parameters()]
-    mine = [p.grad for p in model.backbone.images.parameters()]
-    other = [p.grad for p in twin.images.parameters()]
-    total = [
-        sum((p.double() - q).square().sum() for p, q in zip(grads, truth, strict=True)).sqrt()
-        for grads in (mine, other)
-    ]
-    assert total[0] <= 2 * total[1]
-
-
-@pytest.mark.parametrize(("kind", "error"), [(torch.bfloat16, 0.03), (torch.float16, 0.004)])
-@pytest.mark.parametrize("training", [False, True])
-def test_half_precision_is_near(training: bool, kind: torch.dtype, error: float) -> None:
-    """Within some roundings (2^-8 and 2^-11) of the same weights and points in float64."""
-    half = _small().to(kind).train(training)
-    points = _points(8).to(kind)
-    logits = half(points)
-    exact = copy.deepcopy(half).double().train(training)(points.double())
-    assert logits.dtype == kind
-    assert (logits - exact).norm() <= error * exact.norm()
 
 
 def test_copies_of_one_point() -> None:

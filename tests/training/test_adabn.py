@@ -10,7 +10,7 @@ from qs3.datamodules.splits import load_clouds
 from qs3.errors import DataError
 from qs3.evaluation.estimates_text import in_words
 from qs3.evaluation.metrics import adapt_norms
-from qs3.methods.source_only import SourceOnly
+from qs3.methods.bounds import SourceOnly
 from qs3.runs.checkpoints import load
 from qs3.store.store import open_pointset
 from qs3.training.command import train

@@ -89,7 +89,7 @@ def test_help_imports_nothing_heavy(tmp_path):
         (("method=pmc",), ("did you mean method=pcm?",)),
         (("domain@data.target=objcts",), ("did you mean domain@data.target=objects?",)),
         (("domain@data.source=specklenet",), ("did you mean domain@data.source=specklenet10?",)),
-        (("method.wieght=1", "method=twin"), ("did you mean method.twin_weight=?",)),
+        (("method.again_wieght=1", "method=twin"), ("did you mean method.again_weight=?",)),
         (
             ("experiment=own_scans", "data.target.up=y"),
             ("did you mean data.target.published.up=?",),

@@ -201,7 +201,6 @@ def test_norms_of_a_domain_that_is_not_seen_rest(toy_data: Path, tmp_path: Path)
         (
             (
                 *TWIN,
-                "method.teacher=own",
                 "selftraining=spst",
                 "data.source.views=random",
                 FEATURED,

@@ -38,7 +38,7 @@ def test_overfit_learns_a_few_clouds_by_heart(toy):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["dgcnn", "pointnet", "pointnet2_ssg"])
+@pytest.mark.parametrize("model", ["dgcnn", "pointnet", "pointnet2"])
 def test_overfit_works_for_real_nets(model, toy_data, tmp_path):
     """As typed, but for the size of the data."""
     cfg = compose("train", [

@@ -15,7 +15,7 @@ from qs3.datamodules.phases import Phases
 from qs3.engine.classifier import Classifier
 from qs3.engine.schedules import Plateau
 from qs3.methods.base import class_loss
-from qs3.methods.source_only import SourceOnly
+from qs3.methods.bounds import SourceOnly
 from qs3.models.pointnet import pointnet, transform_regulariser
 from qs3.selftraining.student_loss import Student
 from qs3.training.command import train

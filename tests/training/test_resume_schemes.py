@@ -45,7 +45,7 @@ METHODS = {
     "pointdan": ("method=pointdan", NODES),
     "sd": ("method=sd", FEATURED),
     "cpcm": ("method=cpcm",),
-    "twin": (*TWIN, "method.teacher=own", "data.source.views=random", FEATURED),
+    "twin": (*TWIN, "data.source.views=random", FEATURED),
     "mlsp": ("method=mlsp", FEATURED),
     "pcfea": ("method=pcfea", "method.every=1.0", FEATURED),  # its only pool is of epoch 1
     "pcfea_qbst": ("method=pcfea_qbst", FEATURED),

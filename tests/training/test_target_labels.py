@@ -139,7 +139,7 @@ def test_no_target_label_within_reach(toy, tmp_path, watch, settings, class_in_i
     assert bool(names) == class_in_id
     rounds = "selftraining=none" not in settings
     more = {"y_pseudo"} if rounds else set()
-    more |= {"twin", "again"} if "method=twin" in settings else set()
+    more |= {"again"} if "method=twin" in settings else set()
     assert watch.keys == {"points", "y_source"} | more
 
 

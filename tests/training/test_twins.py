@@ -17,7 +17,7 @@ from tests.training.toy import MADE_OF, TWIN, toy_config, write_toy
 from tests.training.watching import interrupt
 
 WORDS = (
-    *(*TWIN, "method.target_weight=0.0", "selftraining=none", "protocol.epochs=2"),
+    *(*TWIN, "data.source.views=random", "selftraining=none", "protocol.epochs=2"),
     "model._target_=tests.training.nets.featured",
 )
 
@@ -39,9 +39,9 @@ def with_other_twins(folder):
     """Write a dataset anew: the same clouds, so its hash is the same, and other twins."""
     before = open_pointset(folder)
     arrays = {
-        name: np.array(open_pointset(folder, name).points) for name in ("points", "points_whole")
+        name: np.array(open_pointset(folder, name).points) for name in ("points", "points_exact")
     }
-    arrays["points_whole"] += 1
+    arrays["points_exact"] += 1
     rows = read_manifest(folder, before.classes)
     made = write_pointset(
         folder, name=before.name, classes=before.classes, arrays=arrays, rows=rows,

@@ -25,11 +25,7 @@ MADE_OF = {
     ),
 }
 CONF = Path(__file__).parents[2] / "conf"
-TWIN = (
-    "method=twin",
-    *(f"method.{part}_weight=1.0" for part in ("twin", "logit", "feature", "view", "target")),
-)
-"""With all parts."""
+TWIN = ("method=twin",)
 
 
 class TinyNet(nn.Module):

@@ -168,7 +168,7 @@ def _check_class(table: Table, name: str) -> None:
     """
     from qs3.config.compose import composed
     from qs3.config.hydra import build
-    from qs3.methods.trial import try_step
+    from qs3.methods.own import try_step
 
     cells = [cell for cell in table.rows[name] if cell and cell.runnable]
     if not cells:
@@ -177,7 +177,7 @@ def _check_class(table: Table, name: str) -> None:
     cell = cells[0]
     cfg = composed("train", *cell.overrides)
     method, net = build(cfg.method), build(cfg.model)
-    try_step(method, net, cfg.method.file, cfg.num_classes, cfg.data.points)
+    try_step(method, net, cfg.num_classes, cfg.data.points)
 
 
 def _intervals(table: Table, name: str) -> str:

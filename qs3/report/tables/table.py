@@ -32,7 +32,7 @@ from qs3.utils.memory import YAML_PEAK, read_whole
 from qs3.utils.plural import counted
 from qs3.utils.yamls import load_yaml
 
-_SUPERVISED = "qs3.methods.supervised.Supervised"
+_SUPERVISED = "qs3.methods.bounds.Supervised"
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))

@@ -1,4 +1,4 @@
-"""Loops over neighbours that numba compiles for this processor. Imported where numba is.
+"""Loops over neighbours that numba compiles for this processor. Imported at the first call.
 
 Each works on a range, so that threads can share it: of rows, or, where rows add up, of channels.
 Inner loops begin at 0: an index that may be negative keeps LLVM from using vectors.

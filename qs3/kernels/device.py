@@ -1,10 +1,12 @@
-"""What an accelerator has beyond torch's own operations."""
+"""Which way an operation goes: by numpy, by kernels of this processor or GPU, into a graph."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 import torch
 from jaxtyping import Int
@@ -21,6 +23,13 @@ def takes_triton(x: Tensor) -> bool:
     counted and traced.
     """
     return x.is_meta or (x.is_cuda and _HAS_TRITON)
+
+
+def triton_kernels(module: str, x: Tensor) -> Any:
+    """The module of `qs3.kernels` with kernels for `x`, or None: they are made for float32."""
+    if not (x.is_cuda and takes_triton(x) and x.dtype == torch.float32):
+        return None
+    return import_module(f"qs3.kernels.{module}")
 
 
 @contextmanager
@@ -63,3 +72,15 @@ def lists_of(
     points = torch.arange(least, least + rows + 1, dtype=kind, device=index.device)
     points = points.expand(*index.shape[:-1], -1).contiguous()
     return torch.searchsorted(named, points), order
+
+
+def takes_numpy(x: Tensor) -> bool:
+    """On the CPU, unless an export writes down what is done to `x`: other devices' way is torch."""
+    return x.device.type == "cpu" and not exporting()
+
+
+def exporting() -> bool:
+    """Whether `torch.export` (of `torch.onnx.export` too) is making a graph of what is done."""
+    if hasattr(torch.compiler, "is_exporting"):  # since torch 2.7
+        return torch.compiler.is_exporting()
+    return torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()

@@ -9,8 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from qs3.geometry import compiled
-from qs3.kernels import edgeconv
+from qs3.kernels import compiled, edgeconv
 
 
 def edges(points: int, rows: int, k: int, seed: int = 0) -> torch.Tensor:
@@ -107,32 +106,6 @@ def test_threads_move_no_bit(monkeypatch):
         assert all(map(torch.equal, results[0], others))
 
 
-def test_without_numba_torch_gives_the_same(monkeypatch):
-    torch.manual_seed(0)
-    b, n, k = 2, 60, 6
-    index = torch.randint(n, (b, n, k))
-    layer = edgeconv.nn.BatchNorm1d(12).double()
-
-    def outcome() -> list[torch.Tensor]:
-        torch.manual_seed(1)
-        x = torch.randn(b, n, 5, dtype=torch.float64, requires_grad=True)
-        weight = torch.randn(12, 10, dtype=torch.float64, requires_grad=True)
-        out = edgeconv.edge_conv(x, index, weight, layer, 0.2)
-        out.square().sum().backward()
-        return [out.detach(), x.grad, weight.grad]
-
-    asked = []
-    real = compiled.neighbour_max
-    monkeypatch.setattr(compiled, "neighbour_max", lambda *given: asked.append(1) or real(*given))
-    with_it = outcome()
-    assert asked
-    asked.clear()
-    monkeypatch.setattr(compiled, "has_numba", lambda: False)
-    for ours, theirs in zip(with_it, outcome(), strict=True):
-        torch.testing.assert_close(ours, theirs)
-    assert not asked
-
-
 @pytest.mark.parametrize(("rows", "k", "among"), [(1, 1, 1), (50, 4, 50), (40, 20, 3)])
 def test_rows_are_added_to_those_that_they_name(rows, k, among):
     """By a loop; with rows that nobody names, and some that one row names several times."""
@@ -161,7 +134,7 @@ def test_torchs_compiler_knows_them():
 
 FORKED = """
 import os, torch
-from qs3.geometry import compiled
+from qs3.kernels import compiled
 torch.set_num_threads(2)
 x, index = torch.randn(500, 64), torch.randint(500, (4000, 20))
 best, _ = compiled.neighbour_max(x, index)

@@ -1,4 +1,4 @@
-"""The k smallest values of rows in one kernel. Imported where Triton is, and there is a GPU."""
+"""The kernels of `qs3.kernels.points`. Imported where Triton is, and there is a GPU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,45 @@ _FEW = 64  # values of a row that are sorted
 
 @triton.jit
 @no_type_check
-def _kernel(
+def _farthest(points, start, out, n, steps, BLOCK: tl.constexpr):
+    """One cloud a program: its points and their distances stay in registers."""
+    cloud = tl.program_id(0).to(tl.int64)
+    at = tl.arange(0, BLOCK)
+    here = at < n
+    row = points + cloud * n * 3
+    x = tl.load(row + 3 * at, mask=here, other=0.0)
+    y = tl.load(row + 3 * at + 1, mask=here, other=0.0)
+    z = tl.load(row + 3 * at + 2, mask=here, other=0.0)
+    nearest = tl.where(here, float("inf"), -2.0)  # squared distance to the points taken so far
+    last = tl.load(start + cloud).to(tl.int32)
+    for i in range(steps):
+        tl.store(out + cloud * steps + i, last.to(tl.int64))
+        dx = x - tl.load(row + 3 * last)
+        dy = y - tl.load(row + 3 * last + 1)
+        dz = z - tl.load(row + 3 * last + 2)
+        nearest = tl.minimum(nearest, dx * dx + dy * dy + dz * dz)
+        nearest = tl.where(at == last, -1.0, nearest)  # never again
+        last = tl.argmax(nearest, axis=0)
+
+
+def farthest_points(x: Tensor, n: int, start: Tensor) -> Tensor:
+    """As the operation."""
+    b, total, _ = x.shape
+    out = torch.empty(b, n, dtype=torch.int64, device=x.device)
+    block = triton.next_power_of_2(total)
+    settings: dict[str, Any] = {
+        "BLOCK": block,
+        "num_warps": max(1, min(16, block // 256)),
+        "enable_fp_fusion": False,  # the rounding of the steps, so that ties fall alike
+    }
+    with torch.cuda.device_of(x):
+        _farthest[(b,)](x.contiguous(), start.contiguous(), out, total, n, **settings)
+    return out
+
+
+@triton.jit
+@no_type_check
+def _smallest(
     values, more, few, out, r, n, k,
     BLOCK: tl.constexpr, BOUNDED: tl.constexpr, FEW: tl.constexpr,
 ):  # fmt: skip
@@ -62,7 +100,7 @@ def _kernel(
 
 
 def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
-    """As `qs3.geometry.smallest.smallest_sums`, of float32."""
+    """As the operation, of float32."""
     b, r, n = values.shape
     out = torch.empty(b, r, k, dtype=torch.int64, device=values.device)
     block = triton.next_power_of_2(n)
@@ -71,5 +109,5 @@ def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     settings: dict[str, Any] = {"BLOCK": block, "BOUNDED": bounded, "FEW": _FEW}
     settings["num_warps"] = max(1, block // 1024)
     with torch.cuda.device_of(values):
-        _kernel[(b * r,)](values.contiguous(), more.contiguous(), few, out, r, n, k, **settings)
+        _smallest[(b * r,)](values.contiguous(), more.contiguous(), few, out, r, n, k, **settings)
     return out

@@ -1,8 +1,8 @@
 """EdgeConv along its edges, nearest neighbours, and maxima of linear layers backwards, compiled.
 
 By torch's operations the gathered rows are written and read again, k times the size of the result;
-here it is one loop. Without numba, and off the CPU, callers go by torch's operations, with the same
-values, and gradients whose sums are in another order.
+here it is one loop. Off the CPU callers go by torch's operations, with the same values, and
+gradients whose sums are in another order.
 """
 
 from __future__ import annotations
@@ -16,15 +16,13 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from qs3.utils.jit import has_numba
-
 _ALONE = 1 << 16  # values that are too few to be shared by threads
 _BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
 
 
 def usable(x: Tensor) -> bool:
     """Whether the operations of this module may be called for `x`."""
-    return x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and has_numba()
+    return x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
 
 
 @torch.library.custom_op("qs3::neighbour_max", mutates_args=())
@@ -44,10 +42,12 @@ def neighbour_max(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
     return best, where
 
 
-@neighbour_max.register_fake
-def _(x: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-    best = x.new_empty(len(index), x.shape[1])
-    return best, best.new_empty(best.shape, dtype=torch.int32)
+neighbour_max.register_fake(
+    lambda x, index: (
+        x.new_empty(len(index), x.shape[1]),
+        x.new_empty(len(index), x.shape[1], dtype=torch.int32),
+    )
+)
 
 
 @torch.library.custom_op("qs3::neighbour_max_backward", mutates_args=())
@@ -58,9 +58,9 @@ def neighbour_max_backward(grad: Tensor, where: Tensor, points: int) -> Tensor:
     return out
 
 
-@neighbour_max_backward.register_fake
-def _(grad: Tensor, where: Tensor, points: int) -> Tensor:
-    return grad.new_empty(points, grad.shape[1])
+neighbour_max_backward.register_fake(
+    lambda grad, where, points: grad.new_empty(points, grad.shape[1])
+)
 
 
 @torch.library.custom_op("qs3::add_to_neighbours", mutates_args=())
@@ -71,9 +71,7 @@ def add_to_neighbours(x: Tensor, index: Tensor) -> Tensor:
     return out
 
 
-@add_to_neighbours.register_fake
-def _(x: Tensor, index: Tensor) -> Tensor:
-    return x.new_empty(x.shape)
+add_to_neighbours.register_fake(lambda x, index: x.new_empty(x.shape))
 
 
 @torch.library.custom_op("qs3::linear_max_backward", mutates_args=())
@@ -97,16 +95,18 @@ def linear_max_backward(
     return dx, dweight
 
 
-@linear_max_backward.register_fake
-def _(x: Tensor, weight: Tensor, grad: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    return x.new_empty(x.shape), weight.new_empty(weight.shape)
+linear_max_backward.register_fake(
+    lambda x, weight, *_: (x.new_empty(x.shape), weight.new_empty(weight.shape))
+)
 
 
 @torch.library.custom_op("qs3::smallest_sums", mutates_args=("values",))
 def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     """Columns of the k smallest values of each row after `more` was added to them, smallest first.
 
-    As `qs3.geometry.neighbours` finds them by numpy, of equal values the first columns.
+    Columns are dealt to groups; the k-th smallest of the groups' minima is no less than the k-th
+    smallest of the row, so everything above it is out, which leaves hardly more than k to be
+    sorted. Of equal values the first columns come first, on all processors.
 
     Args:
         values: [r, n] contiguous; the sums afterwards.
@@ -132,9 +132,9 @@ def smallest_sums(values: Tensor, more: Tensor, k: int) -> Tensor:
     return out
 
 
-@smallest_sums.register_fake
-def _(values: Tensor, more: Tensor, k: int) -> Tensor:
-    return values.new_empty(len(values), k, dtype=torch.int64)
+smallest_sums.register_fake(
+    lambda values, more, k: values.new_empty(len(values), k, dtype=torch.int64)
+)
 
 
 def _kth_smallest(x: Tensor, k: int) -> Tensor:
@@ -154,7 +154,7 @@ def groups_for(k: int) -> int:
 
 def _shared(kernel: str, size: int, values: int, *tensors: Tensor) -> None:
     """Call a kernel on parts of its range, one for each of torch's threads."""
-    from qs3.geometry import numba_kernels
+    from qs3.kernels import numba_kernels
 
     run: Callable[..., None] = getattr(numba_kernels, kernel)
     arrays = [one.detach().contiguous().numpy() for one in tensors]  # results are contiguous

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from qs3.geometry import matmul as products
-from qs3.geometry.matmul import linear, matmul_t, t_matmul
+from qs3.kernels import matmul as products
+from qs3.kernels.matmul import linear, matmul_t, t_matmul
 
 
 @pytest.mark.parametrize("operator", [True, False])
