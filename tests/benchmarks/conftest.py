@@ -1,33 +1,24 @@
-"""Benchmarks run as trainings do; on another device than the CPU only those that take it run."""
+"""Benchmarks run as trainings do."""
 
-import sys
 from collections.abc import Iterator
 
 import pytest
 
 from qs3.utils.threads import let_waiting_threads_sleep
+from tests.benchmarks.timing import DEVICE, ENABLED, THREADS, deterministic
 
-if "--benchmark-enable" in sys.argv:  # before torch is loaded
+if ENABLED:
     let_waiting_threads_sleep()
 
 import torch
 
 from qs3.engine.trainer import settle_process
-from tests.benchmarks.device import DEVICE, THREADS, deterministic
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        module = getattr(item, "module", None)
-        here = module is not None and module.__name__.startswith("tests.benchmarks.")
-        if DEVICE.type != "cpu" and here and not hasattr(module, "DEVICE"):
-            item.add_marker(pytest.mark.skip(reason="is of the CPU"))
 
 
 @pytest.fixture(autouse=True)
-def as_trainings_do(request: pytest.FixtureRequest) -> Iterator[None]:
+def as_trainings_do() -> Iterator[None]:
     """As `trainer=cpu` has it; on a GPU, where `trainer.deterministic` costs, without it."""
-    if not request.config.getoption("benchmark_enable"):
+    if not ENABLED:
         yield
         return
     filled = torch.utils.deterministic.fill_uninitialized_memory
