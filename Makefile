@@ -64,7 +64,7 @@ bench: install ## speed, as ratios against named baselines; of nets and methods 
 	QS3_BENCH_DEVICE=$(DEVICE) QS3_BENCH_THREADS=$(THREADS) QS3_BENCH_POINTS=$(POINTS) $(RUN) -m pytest tests/benchmarks --benchmark-enable -s
 
 mutants: install ## how many faults put into the core the tests notice; hours, goes on where it stopped
-	$(RUN) .ci/mutants.py .ci/mutants.toml docs/results/mutants.csv
+	$(RUN) .ci/mutants.py .ci/mutants.toml out/mutants.csv
 
 docs: install ## the docs as a site, in out/site
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict -f .ci/mkdocs.yml

@@ -3,6 +3,7 @@
 import logging
 import sys
 
+from qs3.commands.report import REPORT
 from qs3.utils.commands import Commands, run
 
 ABOUT = """from CAD meshes to a classifier that works on real depth scans
@@ -20,19 +21,8 @@ COMMANDS: Commands = {
     "scannet": "qs3.datasets.scannet.cli:SCANNET",
     "predict": "qs3.inference.cli:PREDICT",
     "export": "qs3.inference.cli:EXPORT",
-    "report": {
-        "": "qs3.report.cli:TABLE",
-        "table": "qs3.report.cli:TABLE",
-        "train": "qs3.report.cli:TRAIN",
-        "keep": "qs3.report.cli:KEEP",
-        "compare": "qs3.report.cli:COMPARE",
-        "effects": "qs3.report.cli:EFFECTS",
-        "judge": "qs3.report.judge.cli:JUDGE",
-        "page": "qs3.commands.report_pages:page",
-        "pictures": "qs3.commands.report_pages:pictures",
-        "pipeline": "qs3.commands.report_pages:pipeline",
-    },
-    "leaderboard": "qs3.report.leaderboard.cli:LEADERBOARD",
+    "report": REPORT,
+    "leaderboard": "qs3.commands.report:leaderboard",
     "bench": "qs3.commands.bench:bench",
     "fit": "qs3.commands.fit:fit",
 }

@@ -64,7 +64,9 @@ def test_pages_that_code_and_configs_name_are_there():
     missing = {}
     for folder, suffix in (("qs3", "*.py"), ("conf", "*.yaml"), ("tests", "*.py")):
         for file in sorted((ROOT / folder).rglob(suffix)):
-            named = re.findall(r"\bdocs/[\w/-]+\.(?:md|csv|json|png)", file.read_text("utf-8"))
+            named = re.findall(
+                r"\bdocs/[\w/-]+\.(?:md|csv\.gz|csv|json|png)", file.read_text("utf-8")
+            )
             if gone := [name for name in named if not (ROOT / name).is_file()]:
                 missing[str(file.relative_to(ROOT))] = gone
     assert not missing

@@ -4,7 +4,7 @@ Three estimates of their accuracy, made from confidences alone, what else hints 
 verdict of all. The three learn what a confidence means on labelled validation clouds of the source,
 and carry it over to the target. That carries over only in part: clouds of another domain, or of no
 known class, get high confidences too. `qs3.evaluation.trust` takes down for that:
-docs/results/trust.md.
+docs/results/tried.md.
 """
 
 from __future__ import annotations

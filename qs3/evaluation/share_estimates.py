@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 TEMPERATURE = 2.0
-"""T: chosen on real objects of the part for training, with their labels (docs/results/twin.md)."""
+"""T: chosen on real objects of the part for training, with their labels (docs/results/tried.md)."""
 
 MORE = 5.0
 """m: as many clouds more of each class."""

@@ -1,6 +1,6 @@
 """`trust_weights.json`: the calibration of `qs3.evaluation.trust`, and how far off it was found.
 
-`.ci/trust_fit.py` writes it; docs/results/trust.md has the cases and the figures.
+`.ci/trust_fit.py` writes it; docs/results/tried.md has the cases and the figures.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Rays that meet an edge, or two faces in one place, are decided by rounding, and compilers round
 differently on different processors: of the same meshes, settings and code two machines may make
 clouds that differ in a few points. Their content hashes differ, this does not, so that results may
-be averaged (`qs3.report.tables.aggregate`). Any change of the code that makes clouds changes it,
+be averaged (`qs3.report.tables.results`). Any change of the code that makes clouds changes it,
 words in comments and docstrings do not; so do objects that failed on one machine alone.
 """
 

@@ -25,7 +25,7 @@ _Word = Annotated[str, Field(max_length=64), AfterValidator(_printable)]
 
 @dataclass(frozen=True)
 class Interval:
-    """A share and its interval at 95 %; see `qs3.report.judge.intervals.Share`."""
+    """A share and its interval at 95 %; see `qs3.report.intervals`."""
 
     mean: _Share
     low: _Share | None
@@ -43,7 +43,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Tier:
-    """Figures on the objects of one tier; see `qs3.report.judge.judging.Figures`."""
+    """Figures on the objects of one tier; see `qs3.report.judge.Figures`."""
 
     tier: _Word
     n: int

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 TRAINED = "trained"
 ADAPTERS: dict[str, Callable[..., None]] = {
     "adabn": adapt_norms,
-    "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/twin.md
+    "alpha_bn": partial(adapt_norms, kept=0.5),  # why half: docs/results/tried.md
     "tent": minimise_entropy,
 }
 """Values of `evaluation.norms` (`qs3.training.settings.NORMS`), beside "trained"."""

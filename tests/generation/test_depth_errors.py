@@ -1,16 +1,12 @@
 """Errors that are taken out of depth again, and the table that asks what they are worth."""
 
-import re
-import shlex
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 import qs3
-from qs3.config.hydra import build
 from qs3.errors import ConfigError
 from qs3.generation.checks import check
 from qs3.generation.depth_errors import DepthErrors
@@ -20,8 +16,7 @@ from qs3.meshes.mesh import merge
 from qs3.sensors.base import DepthFrame
 from qs3.sensors.devices.time_of_flight import TimeOfFlight
 from qs3.sensors.renderers.mitsuba import MitsubaRenderer
-from tests.composing import compose
-from tests.generation.generating import QUICK, ROOT, composed
+from tests.generation.generating import QUICK, composed
 from tests.sensors.scenery import POSE, box_of, square
 
 NO_HOLES, NO_MIXED = DepthErrors(holes=False), DepthErrors(mixed_pixels=False)
@@ -147,64 +142,3 @@ def test_domains_without_a_fixed_view_refuse_it(words, message):
 def test_wrong_settings_are_named(settings, message):
     with pytest.raises(ConfigError, match=message):
         DepthErrors(**settings)
-
-
-# --- the table that asks what they are worth
-
-
-def recipes():
-    """Settings of each folder of the page's commands, by its name."""
-    text = (ROOT / "docs" / "results" / "light.md").read_text().replace("\\\n", " ")
-    words = {
-        name: value for name, value in re.findall(r'^    ([GA])="([^"]*)"', text, re.MULTILINE)
-    }
-    found = {}
-    for line in re.findall(r"^    \$G (.*)$", text, re.MULTILINE):
-        given = shlex.split(f"{words['G']} {line}".replace("$A", words["A"]))[2:]
-        (folder,) = [w.split("data/light_")[1] for w in given if w.startswith("domain.path=")]
-        cfg = composed(*given)
-        check(cfg)
-        assert build(cfg.recipe).views.count == 1
-        found[folder] = plan_settings(cfg)
-    return found
-
-
-def test_every_row_of_the_table_has_its_data_and_differs_by_what_it_says():
-    made = recipes()
-    rows = yaml.safe_load((ROOT / "conf" / "table" / "light.yaml").read_text())["rows"]
-    runs = [row["target test"]["run"] for row in rows]
-    folders = [re.search(r"data/light_(\w+)", run)[1] for run in runs]
-    assert sorted(folders) == sorted(made)
-    assert len({re.sub(r" data\.source\.path=\S+", "", run) for run in runs}) == len(runs)
-
-    def differs(one, other):
-        a, b = (dict(made[name]["recipe"]) for name in (one, other))
-        out = {key for key in {*a, *b} if a.get(key) != b.get(key)}
-        rest = [
-            {k: v for k, v in made[n].items() if k not in ("recipe", "domain")}
-            for n in (one, other)
-        ]
-        assert rest[0] == rest[1]  # seed, meshes, renderer
-        return out
-
-    assert differs("base", "materials") == {"materials"}
-    assert differs("base", "ambient") == {"light", "sensor"}
-    assert differs("ambient", "sun") == {"light"}
-    assert differs("ambient", "all") == {"materials"}
-    for arm in ("base", "all"):
-        for without in ("no_holes", "no_mixed"):
-            assert differs(arm, f"{arm}_{without}") == {"depth_errors"}
-
-
-def test_the_experiment_is_a_row_without_rooms_of_the_real_table():
-    light = compose("train", ["experiment=light", "data.source.path=x"])
-    real = compose(
-        "train",
-        [
-            "experiment=source_only_nyu", "domain@data.source=specklenet10_kinect",
-            "domain@data.target=objects", "data.scale=unit_ball", "protocol.augment.lift=0",
-        ],
-    )  # fmt: skip
-    for key in ("model", "method", "protocol", "selftraining", "selection"):
-        assert light[key] == real[key], key
-    assert (light.data.points, light.data.scale) == (512, "unit_ball")

@@ -1,32 +1,12 @@
 """What several tests of the report share."""
 
 import shutil
-from collections.abc import Mapping
-from functools import lru_cache
 
 import pytest
 from omegaconf import OmegaConf
 
-from qs3.report.tables.table import build_table, table_names
 from tests.training.conftest import finished, toy, toy_data  # noqa: F401
 from tests.training.toy import toy_config
-
-
-@pytest.fixture(scope="session")
-def empty(tmp_path_factory):
-    """Each table without any runs, by name, built when it is asked for."""
-    log_dir = tmp_path_factory.mktemp("logs")
-
-    class Tables(Mapping):
-        __getitem__ = staticmethod(lru_cache(None)(lambda name: build_table(name, log_dir)))
-
-        def __iter__(self):
-            return iter(table_names())
-
-        def __len__(self):
-            return len(table_names())
-
-    return Tables()
 
 
 @pytest.fixture

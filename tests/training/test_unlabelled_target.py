@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from qs3.report.tables.aggregate import summarise
 
 from qs3.config import hashing
 from qs3.errors import ConfigError, DataError
-from qs3.report.tables.aggregate import summarise
 from qs3.report.tables.formats import markdown
 from qs3.report.tables.table import build_table
 from qs3.runs.metrics import Selection, read_metrics

@@ -133,7 +133,7 @@ class Importer(abc.ABC):
     def object_of(self, id_: str) -> str:
         """Which object a cloud shows, where its id tells; else "".
 
-        Clouds of one object are not independent samples: `qs3.report.tables.paired` takes them
+        Clouds of one object are not independent samples: `qs3.report.intervals` takes them
         together.
         """
         return ""

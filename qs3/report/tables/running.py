@@ -17,8 +17,8 @@ from pathlib import Path
 from qs3.config.location import python_command, typed
 from qs3.config.quoting import override
 from qs3.errors import ConfigError
-from qs3.report.tables.cells import Table
-from qs3.report.tables.overrides import chosen, unknown
+from qs3.report.tables.spec import chosen
+from qs3.report.tables.table import Table
 
 LAUNCHERS: Mapping[str, str | None] = {
     "basic": None,
@@ -59,29 +59,18 @@ def missing(
 
     Args:
         seeds: that each cell should have; none: those that the table wants.
-        rows, columns: only those of one of these names, or, where none has that name, whose name
-            contains the word; all if empty.
+        rows, columns: only those that these words mean (`spec.chosen`); all if empty.
 
     Raises:
-        ConfigError: one of `rows` fits no row, one of `columns` no column, or both together no
-            cell.
+        ConfigError: a word means nothing, or all together mean no cell that can be run.
     """
-    cells = [c for c in table.cells if c.runnable and not c.missing]
-    for kind, words, every in (("column", columns, table.columns), ("row", rows, table.rows)):
-        names = dict.fromkeys(getattr(c, kind) for c in cells)
-        meant = chosen(every, words)  # also one that cannot be run: no other is meant by its name
-        lost = unknown(every, words)
-        cells = [c for c in cells if getattr(c, kind) in meant]
-        if words and (lost or not cells):
-            named = " or ".join(map(repr, lost or words))
-            why = f"of table {table.name} has {named} in its name"
-            if not lost:  # published figures alone, or what it needs is not there
-                why = f"{named} of table {table.name} can be run"
-            left = f"; {kind}s to run are {', '.join(map(repr, names))}" if names else ""
-            raise ConfigError(f"no {kind} {why}{left}")
+    meant = chosen(table.columns, columns, "columns: "), chosen(table.rows, rows, "rows: ")
+    cells = [c for c in table.cells if c.runnable and c.column in meant[0] and c.row in meant[1]]
+    if not cells:
+        raise ConfigError(f"nothing of {', '.join((*rows, *columns))} can be run")
     jobs: dict[tuple[str, ...], Job] = {}
     for cell in sorted(cells, key=lambda cell: not cell.first):
-        done = set(cell.group.seeds) if cell.group else set()
+        done = set(cell.runs.seeds) if cell.runs else set()
         for seed in seeds or cell.seeds:
             if seed not in done:
                 overrides = (*cell.overrides, f"seed={seed}")
@@ -100,7 +89,7 @@ def launch(
     """Run jobs, in order, as one multirun of `train.py`; returns its exit status.
 
     What becomes of them is written to the terminal by the multirun itself, with the failures last;
-    with submitit, what a job says lies in `<log_dir>/.submitit`.
+    with submitit, what a job prints lies in `<log_dir>/.submitit`.
 
     Args:
         launcher: one of `LAUNCHERS`.

@@ -1,0 +1,314 @@
+"""`qs3 report` and `qs3 leaderboard`: tables of runs, what they lack, comparisons and pictures."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from annotated_types import Ge
+
+from qs3.errors import ConfigError
+
+if TYPE_CHECKING:
+    from qs3.report.tables.comparison import Compared
+    from qs3.report.tables.table import Table
+
+REPORT = {
+    "": "qs3.commands.report:table",
+    "table": "qs3.commands.report:table",
+    "train": "qs3.commands.report:train",
+    "keep": "qs3.commands.report:keep",
+    "compare": "qs3.commands.report:compare",
+    "effects": "qs3.commands.report:effects",
+    "judge": "qs3.commands.report:judge",
+    "page": "qs3.commands.report_pages:page",
+    "pictures": "qs3.commands.report_pages:pictures",
+    "pipeline": "qs3.commands.report_pages:pipeline",
+}
+
+_Name = Annotated[str, "name of a file in conf/table, or a file NAME.yaml"]
+_Logs = Annotated[str, "paths.log_dir of the runs"]
+_Data = Annotated[str | None, "paths.data_dir of the runs"]
+_Target = Annotated[str | None, "another target domain for all of the table"]
+_Overrides = Annotated[str, 'more settings "A=B ..." of all runs; COLUMN:A=B of a column\'s']
+_Kept = Annotated[Path | None, "results that `qs3 report keep` has kept: shown, not trained"]
+_Columns = Annotated[tuple[str, ...], "only columns of this name, or with it in theirs"]
+_Rows = Annotated[tuple[str, ...], "only rows of this name, or with it in theirs"]
+_Out = Annotated[str | None, "where the files go (default LOG_DIR/tables)"]
+_Seeds = Annotated[tuple[Annotated[int, Ge(0)], ...], "of each cell (default: the table's)"]
+_Jobs = Annotated[int | None, Ge(1), "runs at the same time"]
+_Launcher = Literal["basic", "joblib", "ray", "slurm", "submitit_local", "submitit_slurm"]
+
+
+def _built(
+    table: str,
+    log_dir: str,
+    data_dir: str | None,
+    target: str | None,
+    overrides: str,
+    kept: Path | None,
+    columns: tuple[str, ...] = (),
+    **more: Any,
+) -> Table:
+    import shlex
+
+    from qs3.config.quoting import override
+    from qs3.report.tables.table import build_table
+
+    extra = shlex.split(overrides)
+    extra += [override("paths.data_dir", data_dir)] if data_dir else []
+    return build_table(table, log_dir, extra, target, kept, columns=columns, **more)
+
+
+def _place(name: str, out: str | None, log_dir: str, *more: str | None) -> Path:
+    """Where a table's files go, without suffix."""
+    import re
+
+    parts = (re.sub(r"[^\w.]+", "-", part).strip("-.") for part in (name, *more) if part)
+    return Path(out or Path(log_dir) / "tables") / "-".join(parts)
+
+
+def table(
+    *,
+    table: _Name,
+    log_dir: _Logs = "logs",
+    data_dir: _Data = None,
+    target: _Target = None,
+    overrides: _Overrides = "",
+    kept: _Kept = None,
+    columns: _Columns = (),
+    out: _Out = None,
+) -> None:
+    """Print a table of runs, and save it as .md, .csv and .tex.
+
+    `qs3 report table=NAME` is short for `qs3 report table table=NAME`.
+
+    Example:
+        qs3 report table=uda
+        qs3 report table=headline kept=docs/results/headline.csv.gz
+        qs3 report table=leaderboard columns="S -> K"
+        qs3 report table=uda target=kinectsim10 overrides="trainer=gpu data.points=512"
+    """
+    from qs3.report.tables.formats import csv_text, latex, markdown, save
+
+    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
+    texts = {".md": markdown(found), ".csv": csv_text(found), ".tex": latex(found)}
+    said = save(_place(found.name, out, log_dir, target, *columns), texts)
+    print(texts[".md"])
+    print(f"runs lie in {log_dir}; {said}")
+
+
+def train(
+    *,
+    table: _Name,
+    log_dir: _Logs = "logs",
+    data_dir: _Data = None,
+    target: _Target = None,
+    overrides: _Overrides = "",
+    kept: _Kept = None,
+    columns: _Columns = (),
+    seeds: _Seeds = (),
+    rows: _Rows = (),
+    jobs: _Jobs = None,
+    launcher: Annotated[_Launcher | None, "of Hydra (default basic; joblib with jobs)"] = None,
+    **settings: Annotated[str, "settings of the launcher, hydra.launcher.NAME"],
+) -> int:
+    """Train what a table lacks, seed by seed; called again it goes on.
+
+    Example:
+        qs3 report train table=cad10
+        qs3 report train table=self_training rows=qbst columns="S -> D" seeds=0
+        qs3 report train table=uda launcher=joblib jobs=4
+        qs3 report train table=uda launcher=slurm jobs=16 hydra.launcher.partition=gpu
+    """
+    from qs3.report.tables.running import launch, missing
+
+    if wrong := [key for key in settings if not key.lstrip("+").startswith("hydra.launcher.")]:
+        raise ConfigError(f"unknown key {wrong[0]!r}")
+    found = _built(table, log_dir, data_dir, target, overrides, kept)
+    todo = missing(found, seeds, rows, columns)
+    print(f"table {found.name}: {len(todo)} runs to do", flush=True)
+    launcher = launcher or ("joblib" if (jobs or 1) > 1 else "basic")
+    more = [f"{key}={value}" for key, value in settings.items()]
+    return launch(todo, launcher, jobs, log_dir, more)
+
+
+def keep(
+    *,
+    table: _Name,
+    into: Annotated[Path, "the file, NAME.csv.gz"],
+    log_dir: _Logs = "logs",
+    data_dir: _Data = None,
+    target: _Target = None,
+    overrides: _Overrides = "",
+    kept: Annotated[Path | None, "a file whose runs are kept on, too"] = None,
+    columns: _Columns = (),
+) -> None:
+    """Keep the results of a table's finished runs in one small file.
+
+    It holds what tables and paired intervals need, by row, column and seed.
+
+    Example:
+        qs3 report keep table=real into=docs/results/real.csv.gz
+        qs3 report table=real kept=docs/results/real.csv.gz
+    """
+    from qs3.report.tables.results import write_kept
+    from qs3.report.tables.table import kept_lines
+
+    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
+    lines = kept_lines(found)
+    write_kept(into, lines)
+    print(f"kept {len(lines)} runs of table {found.name} in {into}")
+
+
+def compare(
+    *,
+    table: _Name,
+    base: Annotated[str, "the row to compare with: its name, or a part of it"],
+    log_dir: _Logs = "logs",
+    data_dir: _Data = None,
+    target: _Target = None,
+    overrides: _Overrides = "",
+    kept: _Kept = None,
+    columns: _Columns = (),
+    out: _Out = None,
+) -> None:
+    """Print the difference of each row to one row, with its interval.
+
+    Paired over test clouds and the seeds that both have, two at least; accuracy and balanced
+    accuracy, and both of each tier where the target has tiers. Intervals are at 95 %, over seeds
+    and what clouds share: meshes, rooms or blocks of frames.
+
+    Example:
+        qs3 report compare table=cad10 base="source only" kept=docs/results/cad10.csv.gz
+    """
+    from qs3.report.tables.comparison import against, row_of
+
+    row = row_of(_built(table, log_dir, data_dir, target, overrides, None, runs=False), base)
+    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
+    place = _place(found.name, out, log_dir, target, *columns, "compared")
+    _save(place, found, against(found, row), row)
+
+
+def effects(
+    *,
+    table: _Name,
+    log_dir: _Logs = "logs",
+    data_dir: _Data = None,
+    target: _Target = None,
+    overrides: _Overrides = "",
+    kept: _Kept = None,
+    columns: _Columns = (),
+    out: _Out = None,
+) -> None:
+    """Print differences between columns over all rows, of rows over columns, or of factors.
+
+    Paired, with intervals, as of `qs3 report compare`.
+
+    Example:
+        qs3 report effects table=headline kept=docs/results/headline.csv.gz
+    """
+    from qs3.report.tables import comparison
+
+    found = _built(table, log_dir, data_dir, target, overrides, kept, columns)
+    place = _place(found.name, out, log_dir, target, *columns, "effects")
+    _save(place, found, comparison.effects(found))
+
+
+def _save(place: Path, table: Table, found: list[Compared], base: str = "") -> None:
+    from qs3.report.tables.comparison import csv_text, text
+    from qs3.report.tables.formats import save
+
+    page = text(found, base, markdown=True, table=table)
+    said = save(place, {".md": page, ".csv": csv_text(found, base)})
+    print(text(found, base, table=table))
+    print(said)
+
+
+def judge(
+    *,
+    runs: Annotated[tuple[str, ...], "folders of runs, or of seeds, or patterns"],
+    data: Annotated[Path, "the archive, .npz"],
+    classes: Annotated[tuple[str, ...], "only objects of these (default: all)"] = (),
+    part: Annotated[str, "part of the archive (default: judge, if it has one)"] = "",
+    inliers_only: Annotated[bool, "leave out points that the archive marks as stray"] = True,
+    floor: Annotated[float | None, "its z in metres, minus the camera's height"] = None,
+    prior: Annotated[str, "also with classes as common: rooms or C:N,C:N; see qs3 predict"] = "",
+    prior_power: Annotated[float, Ge(0), "how much of that is believed: 0 none, 1 all"] = 0.5,
+    device: Annotated[str, "cpu, cuda or cuda:1"] = "cpu",
+    out: Annotated[Path | None, ".csv or .json, with all digits"] = None,
+) -> None:
+    """Judge saved runs on an archive of real objects that they were not trained on.
+
+    Accuracy, balanced accuracy over the classes that are there, the majority rate and the recall of
+    each class, for all objects and for the clean and the hard ones. Runs of one config that saw the
+    same data are one row, averaged over their seeds; the other rows are compared with the first,
+    paired object by object and seed by seed. Intervals take blocks of 30 frames in a row as
+    clusters.
+
+    Example:
+        qs3 report judge runs=logs/source_only_s2d,logs/qs3_s2d data=held_back.npz out=judged.csv
+        qs3 report judge runs=dgcnn-rooms data=held_back.npz floor=-1.2 prior=rooms
+    """
+    from qs3.report import judge as judging
+    from qs3.utils.files import write_text
+
+    verdict = judging.judge(
+        runs, data, classes=classes, part=part, inliers_only=inliers_only, floor=floor,
+        device=device, prior=prior, prior_power=prior_power,
+    )  # fmt: skip
+    print(judging.text(verdict))
+    if out:
+        as_text = judging.json_text if out.suffix.lower() == ".json" else judging.csv_text
+        write_text(out, as_text(verdict))
+        print(f"saved {out}")
+
+
+def leaderboard(
+    *,
+    method: Annotated[Path, "Python file with one class derived from Method"],
+    name: Annotated[str | None, "of its row (default: the file's)"] = None,
+    selftraining: Annotated[str, "of conf/selftraining, after the warm-up"] = "none",
+    table: Annotated[str, "whose rows and columns, all of experiment=leaderboard"] = "leaderboard",
+    seeds: _Seeds = (),
+    columns: _Columns = (),
+    jobs: _Jobs = None,
+    log_dir: _Logs = "logs",
+    data_dir: _Data = None,
+    overrides: _Overrides = "",
+    kept: _Kept = None,
+    out: _Out = None,
+    **settings: Annotated[str, "settings of the class, method.NAME"],
+) -> int:
+    """Train a method of your own and show it by the rules of table=leaderboard.
+
+    The file is imported, which runs it: name one that you trust. Its loss is tried on four random
+    clouds before any run begins; the runs need the data of the chosen columns. An edited file is
+    another row, whose runs begin anew; the same command goes on with interrupted runs and trains
+    nothing twice. Rules and an example: docs/how-to/leaderboard.md.
+
+    Example:
+        qs3 leaderboard method=my_method.py
+        qs3 leaderboard method=my_method.py method.weight=0.5 name="Mine, w = 0.5"
+        qs3 leaderboard method=my_method.py columns="S -> K" seeds=0 selftraining=qbst
+    """
+    from qs3.report.leaderboard import check_row, first_row, own_row, page
+    from qs3.report.tables.formats import csv_text, latex, save
+    from qs3.report.tables.running import launch, missing
+
+    if wrong := [key for key in settings if not key.startswith("method.")]:
+        raise ConfigError(f"unknown key {wrong[0]!r}")
+    words = [f"{key}={value}" for key, value in settings.items()]
+    row = own_row(method, name, selftraining, words)
+    given = (table, log_dir, data_dir, None, overrides, kept, columns)
+    check_row(_built(*given, rows=[row], runs=False), row["name"])
+    todo = missing(_built(*given, rows=[row]), seeds, [row["name"]], columns)
+    print(f"{row['name']}: {len(todo)} runs to do", flush=True)
+    status = launch(todo, "joblib" if (jobs or 1) > 1 else "basic", jobs, log_dir)
+    found = first_row(_built(*given, rows=[row]), row["name"])
+    text = page(found, row["name"])
+    place = _place(found.name, out, log_dir, row["name"], *columns)
+    said = save(place, {".md": text, ".csv": csv_text(found), ".tex": latex(found)})
+    print(f"{text}\n{said}", file=sys.stdout)
+    return status

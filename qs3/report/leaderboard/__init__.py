@@ -1,1 +1,0 @@
-"""A method of one's own as a row of the leaderboard."""

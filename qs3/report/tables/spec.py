@@ -1,0 +1,214 @@
+"""A table's file: its rows and columns, published numbers, and the command behind each cell.
+
+A file of conf/table/ has `columns`, a list of names or a mapping from names to overrides (null for
+columns of published numbers alone), and `rows`. A row's `run` is a command line of train.py that
+is followed by the overrides of each column; its `paper` has a published number a column, in
+percent, or [mean, SEM]. An entry under a column's name, `<column>: {run:, paper:, ...}`, is for
+that cell alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from annotated_types import Ge, Interval, MinLen
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
+
+from qs3.config.compose import choices
+from qs3.config.location import CONF
+from qs3.errors import ConfigError
+
+_STRICT = ConfigDict(extra="forbid")
+_Percent = Annotated[float, Interval(ge=0, le=100)]
+_SHARED = ("selected", "source", "take", "first")  # keys of cells that a row may have for all
+_Number = _Percent | tuple[_Percent, _Percent]
+
+Metric = Literal[
+    "accuracy", "balanced_accuracy",
+    "accuracy_clean", "accuracy_hard", "balanced_accuracy_clean", "balanced_accuracy_hard",
+]  # fmt: skip
+"""What a table can show: scores of all clouds, or of one tier of a dataset that has tiers."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class Entry:
+    """One cell.
+
+    Attributes:
+        run: overrides of train.py; None: a published number alone.
+        paper: published, in percent; with its SEM if there is one.
+        selected: how the epoch of the published number was chosen.
+        source: where it was read; a key of the file's `sources`, or text.
+        take: "warmup": the run's teacher before self-training, which equals the result of the same
+            run with selftraining=none.
+        first: its runs are started before those of other cells.
+    """
+
+    run: str | None = None
+    paper: _Number | None = None
+    selected: str = ""
+    source: str = ""
+    take: Literal["final", "warmup"] = "final"
+    first: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class _Column:
+    """Overrides of a column, and how many seeds it has where rows have more."""
+
+    run: str
+    seeds: Annotated[int, Ge(1)] = 1000
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Row:
+    """One row.
+
+    Attributes:
+        name: of it.
+        cells: by column.
+        seeds: how many each cell should have.
+        factors: level of each factor, of rows that cross several, such as two selectors by two
+            schemes.
+        average: published average where it differs in the last digit from the numbers' mean.
+    """
+
+    name: str
+    cells: dict[str, Entry]
+    seeds: Annotated[int, Ge(1)] = 3
+    factors: dict[str, str] = field(default_factory=dict)
+    average: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Spec:
+    """A table's file.
+
+    Attributes:
+        layout: "benchmark": published numbers on lines of their own, with how they were selected,
+            and an average over the columns.
+        costs: whether time and memory stand next to the numbers.
+    """
+
+    title: str
+    metrics: Annotated[list[Metric], MinLen(1)]
+    columns: dict[str, _Column | None]
+    rows: list[Row]
+    layout: Literal["", "benchmark"] = ""
+    notes: list[str] = field(default_factory=list)
+    sources: dict[str, str] = field(default_factory=dict)
+    costs: bool = False
+
+    @property
+    def rows_have_targets(self) -> bool:
+        """Whether columns have no overrides, so that one target can be given for all of them."""
+        return all(column is not None and not column.run for column in self.columns.values())
+
+
+def read_spec(name: str, more_rows: Sequence[Mapping[str, Any]] = ()) -> tuple[str, Spec]:
+    """A table's name and content.
+
+    Args:
+        name: of a file in conf/table, or the path of one's own, NAME.yaml.
+        more_rows: further ones, as in the file.
+
+    Raises:
+        ConfigError: there is no such table, or an entry is wrong.
+    """
+    path = Path(name) if name.endswith(".yaml") else CONF / "table" / f"{name}.yaml"
+    try:
+        plain = yaml.safe_load(path.read_text(encoding="utf-8"))
+        plain["columns"] = _columns(plain["columns"])
+        rows = [*plain["rows"], *map(dict, more_rows)]
+        plain["rows"] = [_row(row, plain) for row in rows]
+        spec = TypeAdapter(Spec).validate_python(plain)
+    except FileNotFoundError as error:
+        known = ", ".join(choices("table"))
+        raise ConfigError(f"there is no table {name!r}; there are {known}; or NAME.yaml") from error
+    except ValidationError as error:
+        first = max(error.errors(), key=lambda one: len(one["loc"]))
+        place = ".".join(map(str, first["loc"]))
+        raise ConfigError(f"{path}: {place}: {first['msg']}") from error
+    except (yaml.YAMLError, TypeError, KeyError, ValueError, AttributeError) as error:
+        raise ConfigError(f"{path}: missing or wrong entry {error}") from error
+    names = [row.name for row in spec.rows]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"{path}: two rows are called {twice[0]!r}")
+    return path.stem, spec
+
+
+def _columns(given: Any) -> dict[str, Any]:
+    if isinstance(given, list):
+        given = dict.fromkeys(given, "")
+    return {name: {"run": run} if isinstance(run, str) else run for name, run in given.items()}
+
+
+def _row(row: Mapping[str, Any], spec: Mapping[str, Any]) -> dict[str, Any]:
+    """A row with an entry for each column that it has a run or a published number for."""
+    row, columns = dict(row), spec["columns"]
+    run, numbers = row.pop("run", None), row.pop("paper", None)
+    meant = row.pop("columns", [*columns])
+    if lost := {*meant} - {*columns}:
+        raise KeyError(f"{row['name']}: columns: {lost.pop()}")
+    shared = {key: row.pop(key) for key in _SHARED if key in row}
+    cells = {}
+    for name, number in zip(columns, numbers or [None] * len(columns), strict=True):
+        cell = {"paper": number, **shared, **row.pop(name, {})}
+        if run is not None and columns[name] is not None and name in meant:
+            cell.setdefault("run", f"{run} {columns[name]['run']}")
+        if cell.get("run") is not None or cell["paper"] is not None:
+            source = cell.get("source", "")
+            cells[name] = {**cell, "source": spec.get("sources", {}).get(source, source)}
+    return {**row, "cells": cells}
+
+
+def by_column(words: Iterable[str], columns: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The overrides of each column, in the order of `words`.
+
+    report.pictures=false                      all columns
+    R->A:data.target.published.file=FILE       the column "R → A" alone
+    R->A,R->A0:data.target.published.file=FILE two columns
+
+    Raises:
+        ConfigError: a word is for columns of which there are none.
+    """
+    found: dict[str, list[str]] = {column: [] for column in columns}
+    for word in words:
+        named, colon, override = word.partition(":")
+        if not colon or "=" in named:  # a colon of a value
+            named, override = "", word
+        for column in chosen(columns, named.split(",") if named else [], f"overrides: {word}: "):
+            found[column].append(override)
+    return {column: tuple(own) for column, own in found.items()}
+
+
+def chosen(names: Iterable[str], words: Sequence[str], place: str = "") -> list[str]:
+    """Names that are meant by the words: the one that is the word, else all that contain it.
+
+    Case and spaces do not count, and an arrow may be typed as "->". No words mean all names.
+
+    Raises:
+        ConfigError: a word means no name; begins with `place`.
+    """
+    names = list(names)
+    meant: set[str] = set() if words else set(names)
+    for word in words:
+        exact = [name for name in names if _plain(name) == _plain(word)]
+        found = exact or [name for name in names if _plain(word) in _plain(name)]
+        if not found:
+            known = ", ".join(map(repr, names))
+            raise ConfigError(
+                f"{place}nothing is called {word!r} or contains it; there are {known}"
+            )
+        meant.update(found)
+    return [name for name in names if name in meant]
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\s", "", name.lower().replace("→", "->"))

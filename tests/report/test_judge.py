@@ -1,0 +1,159 @@
+"""Runs judged on an archive: by hand, by family and by tier."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from qs3.classes import CLASSES
+from qs3.datasets.importers.object_archive import read_archive
+from qs3.errors import ConfigError, MissingDataError
+from qs3.inference.model_file import Result, write_result
+from qs3.inference.predictor import load
+from qs3.models.pointnet import pointnet
+from qs3.report.judge import find_runs, judge, text
+from tests.fixtures.frame_files import write_archive
+from tests.report.made_runs import write_run
+from tests.running import main
+
+
+def add_net(folder, seed, *, classes=CLASSES, **changes):
+    """A run's result.pt of an untrained net; its last bias makes it name several classes."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        net = pointnet(num_classes=len(classes))
+    values = {
+        "model": {"_target_": "qs3.models.pointnet.pointnet", "num_classes": len(classes)},
+        "classes": tuple(classes), "points": 64, "stored_points": 128, "target": "kinectsim10",
+        "gravity": "z", "scale": "unit_ball", "usual": {}, "weights": net.state_dict(),
+    }  # fmt: skip
+    write_result(folder / "result.pt", Result(**{**values, **changes}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("judge") / "held_back.npz"
+    write_archive(path, {"train": 1, "test": 5}, points=150)
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Two seeds of one config, and one of another."""
+    root = tmp_path_factory.mktemp("logs")
+    for seed, more in ((0, {}), (1, {"commit": "c0ffee"})):
+        add_net(write_run(root, seed=seed, versions={"qs3": "0.1.0", **more}), seed)
+    add_net(write_run(root, experiment="other", hash="ffff0000"), 5)
+    return root
+
+
+def test_by_hand(archive, logs):
+    verdict = judge([str(logs / "exp")], archive)
+    everything, *tiers = verdict.figures
+    assert (everything.family.name, everything.family.seeds) == ("exp 0123abcd", (0, 1))
+    assert verdict.part == "judge"
+    held = read_archive(archive)
+    kept = np.flatnonzero(held.dev == "judge")
+    truth = np.array([CLASSES.index(name) for name in held.cls[kept]])
+    nets = map(load, everything.family.runs)
+    right = np.stack([net([held.cloud(i, True) for i in kept]).argmax(1) == truth for net in nets])
+    assert (everything.n, everything.majority) == (50, 0.1)
+    assert everything.accuracy.mean == pytest.approx(right.mean())
+    per_seed = right.mean(axis=1)
+    assert everything.accuracy.sem == pytest.approx(per_seed.std(ddof=1) / np.sqrt(2))
+    for tier in tiers:
+        mine = held.tier[kept] == tier.tier
+        assert tier.n == mine.sum()
+        assert tier.accuracy.mean == pytest.approx(right[:, mine].mean())
+        recalls = [right[:, mine & (truth == k)].mean() for k in np.unique(truth[mine])]
+        assert tier.balanced.mean == pytest.approx(np.mean(recalls))
+    assert sum(tier.n for tier in tiers) == everything.n
+
+
+def test_classes_of_one_block_are_named(archive, logs, tmp_path):
+    """Their recalls add nothing to the interval, which is too narrow then."""
+    assert "one block alone" not in text(judge([str(logs / "other")], archive))
+    arrays = dict(np.load(archive))
+    beds = np.flatnonzero((arrays["cls"] == "bed") & (arrays["dev"] == "judge"))
+    arrays["cls"][beds[1:]] = "sofa"
+    np.savez(tmp_path / "held_back.npz", **arrays)
+    verdict = judge([str(logs / "other")], tmp_path / "held_back.npz")
+    assert [f.alone for f in verdict.figures] == [("bed",), ("bed",), ()]
+    assert "(!) bed (all) lie in one block alone" in text(verdict)
+
+
+def test_families_parts_and_classes(archive, logs):
+    verdict = judge([str(logs)], archive, part="adapt", classes=["chair", "sofa"])
+    first, *_, other = [f for f in verdict.figures if f.tier == "all"]
+    assert (first.family.name, other.family.name) == ("exp 0123abcd", "other ffff0000")
+    assert other.accuracy.sem is None
+    assert first.counts == {"chair": 1, "sofa": 1}
+    assert verdict.left_out == 8
+    with pytest.raises(ConfigError, match="adapt, gap, judge"):
+        judge([str(logs)], archive, part="x")
+    with pytest.raises(ConfigError, match="throne"):
+        judge([str(logs)], archive, classes=["throne"])
+
+
+def test_other_rows_are_compared_with_the_first(archive, logs, tmp_path):
+    both = judge([str(logs / "exp"), str(logs / "other")], archive).figures
+    seed0 = judge([str(logs / "exp" / "seed0-0123abcd")], archive).figures
+    for ours, theirs in zip(both[3:], seed0, strict=True):  # by the seed that both have
+        assert ours.more[0].seeds == 1
+        assert ours.more[0].mean == pytest.approx(ours.accuracy.mean - theirs.accuracy.mean)
+    assert all(f.more is None for f in both[:3])
+    for seed in (6, 7):  # as many seeds, and none in common
+        add_net(write_run(tmp_path, experiment="apart", hash="eeee0000", seed=seed), seed)
+    verdict = judge([str(logs / "exp"), str(tmp_path / "apart")], archive)
+    assert all(f.more[0].sem is None for f in verdict.figures[3:])
+    assert "fewer than two common seeds" in text(verdict)
+
+
+def test_runs_of_other_classes_and_of_heights(archive, logs, tmp_path):
+    few = add_net(tmp_path, 3, classes=("sofa", "chair", "bed"))
+    verdict = judge([str(logs / "other"), str(few)], archive)
+    assert verdict.classes == ("bed", "chair", "sofa")
+    assert verdict.figures[3].family.name == str(few / "result.pt")
+    standing = add_net(tmp_path, 3, scale="above_floor", floor_m=0.0)
+    with pytest.raises(ConfigError, match="floor"):
+        judge([str(standing)], archive)
+    low, high = (judge([str(standing)], archive, floor=floor) for floor in (-1.2, -25.0))
+    assert low.figures[0].recall != high.figures[0].recall
+    camera = add_net(tmp_path, 3, gravity="none")
+    with pytest.raises(ConfigError, match="frame of their camera"):
+        judge([str(camera)], archive)
+
+
+def test_runs_are_found(archive, logs, tmp_path):
+    assert len(find_runs([str(logs)])) == 3
+    assert len(find_runs([f"{logs}/exp/seed*", str(logs / "exp")])) == 2
+    files = find_runs(["dgcnn-rooms", str(add_net(tmp_path, 0))])
+    assert [file.name for file in files] == ["model.safetensors", "result.pt"]
+    (tmp_path / "empty").mkdir()
+    for words in (tmp_path / "nothing", f"{logs}/no*", tmp_path / "empty"):
+        with pytest.raises(MissingDataError):
+            find_runs([str(words)])
+    again = write_run(tmp_path / "again", experiment="other", hash="ffff0000")
+    add_net(again, 5)
+    with pytest.raises(ConfigError, match="twice"):
+        judge([str(logs / "other"), str(again)], archive)
+
+
+def test_the_command_with_a_prior(archive, logs, tmp_path, capsys):
+    words = ["report", "judge", f"runs={logs / 'exp'}", f"data={archive}", "prior=chair:9"]
+    assert main([*words, f"out={tmp_path}/judged.csv"]) == 0
+    printed = capsys.readouterr().out
+    assert "trained by, exp 0123abcd: qs3 0.1.0; qs3 0.1.0, commit c0ffee\n" in printed
+    rows = list(csv.DictReader((tmp_path / "judged.csv").read_text().splitlines()))
+    assert [row["tier"] for row in rows] == ["all", "clean", "hard"] * 2
+    assert [row["run"] for row in rows[::3]] == ["exp 0123abcd", "exp 0123abcd, prior=chair:9"]
+    assert float(rows[3]["recall_chair"]) >= float(rows[0]["recall_chair"])
+    more = float(rows[3]["accuracy"]) - float(rows[0]["accuracy"])
+    assert float(rows[3]["accuracy_more"]) == pytest.approx(more)
+    assert rows[0]["objects_chair"] == "5"
+    assert main([*words, f"out={tmp_path}/judged.json"]) == 0
+    found = json.loads((tmp_path / "judged.json").read_text())
+    assert found["figures"][0]["accuracy"]["mean"] == float(rows[0]["accuracy"])
