@@ -1,7 +1,7 @@
 """Second draws: the student learns each source cloud from two draws of it.
 
 Ours: a simulation can scan an object again. Of what else it knows (whole objects, clouds without
-error) nothing helped on real objects: docs/results/twin.md.
+error) nothing helped on real objects: docs/results/tried.md.
 """
 
 from __future__ import annotations
